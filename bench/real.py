@@ -465,7 +465,7 @@ def run(task: tuple[Case, Path]) -> dict:
         setup, known = setups.load(name), setups.known(name)
         logs = case.change(_read(case.files, data, name))
         try:
-            diagnosis = diagnose(logs, setups.model_of(setup, logs), known=known)
+            diagnosis = diagnose(logs, setups.model_of(setup, logs), vehicle=known)
             said = report.summary(diagnosis)
         except Exception as error:  # what a user would be told
             said = f"error: {error}\n" + "\n".join(

@@ -336,7 +336,8 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
     at = beside_a_law(model, [6, 8], DRAG)
     assert acts_on(at.point, at.names) == ["payload force"] * 2
-    assert [acts_on(at.point, [j], beside=[14 - j])[0] for j in at.names] == ["vehicle force"] * 2
+    blocks = [acts_on(at.point, [j], free_effects=[14 - j])[0] for j in at.names]
+    assert blocks == ["vehicle force"] * 2
     assert at.law()[0] == {6, 8}
 
 

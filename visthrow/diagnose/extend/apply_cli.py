@@ -134,15 +134,15 @@ def run(args: argparse.Namespace) -> int:
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )
-    name, said = _made_with(report, args, option, folder), origin(report, args.diagnosis)
+    name, account = _made_with(report, args, option, folder), origin(report, args.diagnosis)
     base = _named(folder, name)
     diagnosed = config.load(
         schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ()
     )
     content = (
-        patch.text(base, diagnosed, theta, covariance, args.plants, said, laws)
+        patch.text(base, diagnosed, theta, covariance, args.plants, account, laws)
         if of_throw
-        else patch.of_setup(base, diagnosed, report, args.diagnosis, said, args.laws)
+        else patch.of_setup(base, diagnosed, report, args.diagnosis, account, args.laws)
     )
     atomic_write(args.out, content)
     config.load(
@@ -179,18 +179,19 @@ def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str)
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
     """
-    told, asked = report.get(option), getattr(args, option)
-    if not (told or asked):
+    recorded, requested = report.get(option), getattr(args, option)
+    if not (recorded or requested):
         model = report.get("model", "throw")
         raise DiagnoseError(
             f"{args.diagnosis}: a diagnosis of the model '{model}' names no {option}; expected"
             f" --{option} NAME"
         )
-    if told and asked and _named(folder, told) != _named(folder, asked):
+    if recorded and requested and _named(folder, recorded) != _named(folder, requested):
         raise DiagnoseError(
-            f"{args.diagnosis}: made with --{option} {told}; its sizes do not count from {asked}"
+            f"{args.diagnosis}: made with --{option} {recorded}; its sizes do not count from "
+            f"{requested}"
         )
-    return told or asked
+    return recorded or requested
 
 
 def _named(folder: str, name: str) -> str:
@@ -218,7 +219,7 @@ def harm(report: dict) -> list[str]:
 
 def origin(report: dict, path: str) -> list[str]:
     """Lines on where a diagnosis comes from."""
-    made = report.get("provenance") or {}
+    provenance = report.get("provenance") or {}
     lines = [
         f"Extended by `visthrow diagnose apply` from {path}:"
         f" {report.get('overall', 'a diagnosis')}."
@@ -227,7 +228,11 @@ def origin(report: dict, path: str) -> list[str]:
         f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
         f" {report.get('samples', 0)} samples."
     ]
-    lines += [f"{name}: {made[name]}" for name in ("commit", "time", "command") if made.get(name)]
+    lines += [
+        f"{name}: {provenance[name]}"
+        for name in ("commit", "time", "command")
+        if provenance.get(name)
+    ]
     for c in (report.get("gain") or {}).get("channels", []) if report.get("theta") else []:
         lines.append(
             f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
@@ -240,12 +245,12 @@ def origin(report: dict, path: str) -> list[str]:
             f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m"
             " after."
         )
-    own = [
+    causes = [
         f
         for f in report.get("findings") or []
         if f["name"] in report.get("theta", {}) and f.get("low") is not None
     ]
-    if own:
+    if causes:
         lines.append(
             "The sizes are those with which these causes alone explain the flights. With everything"
             " else below its floor:"
@@ -253,9 +258,10 @@ def origin(report: dict, path: str) -> list[str]:
         lines += [
             f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
             f" {f['high']:.3g})."
-            for f in own
+            for f in causes
         ]
-    drawn = [(s.get("by", "flight"), s) for s in report.get("scatter") or [] if s["found"]]
+    scatter = [(s.get("by", "flight"), s) for s in report.get("scatter") or [] if s["found"]]
     return lines + [
-        f"Varies from {by} to {by}: {s['name']} {s['size']:.3g} {s['unit']}." for by, s in drawn
+        f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
+        for group, s in scatter
     ]

@@ -34,16 +34,16 @@ def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
     Raises ConfigError: an effect that the catalogue does not hold.
     """
     base = generalised(Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera))
-    found = apply(chosen(theta), base, theta)
-    plant = specialised(found.plant, plant_of(experiment))
+    sizes = apply(chosen(theta), base, theta)
+    plant = specialised(sizes.plant, plant_of(experiment))
     return dataclasses.replace(
         experiment,
         vehicle=plant.vehicle,
         rope=plant.rope,
         release=plant.release,
         air=plant.air,
-        sensing=found.sensing,
-        camera=found.camera,
+        sensing=sizes.sensing,
+        camera=sizes.camera,
     )
 
 
@@ -83,26 +83,26 @@ def text(
     )
     # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
     # blocks there are
-    own = [
+    header = [
         i
         for i, e in enumerate(named)
         if e.changes and all(key.path.startswith("plant.") for key in e.changes)
     ]
-    rows = tuple(map(tuple, covariance[np.ix_(own, own)].tolist()))
-    drawn = dataclasses.replace(
+    rows = tuple(map(tuple, covariance[np.ix_(header, header)].tolist()))
+    varied = dataclasses.replace(
         experiment.diagnosed,
-        effects=tuple(named[i].name for i in own),
+        effects=tuple(named[i].name for i in header),
         covariance=rows,
         plants=plants,
     )
     after = dataclasses.replace(
-        extended(experiment, theta), diagnosed=drawn, laws=(*experiment.laws, *laws)
+        extended(experiment, theta), diagnosed=varied, laws=(*experiment.laws, *laws)
     )
     check_laws(after.laws)
     plain = config.load(Experiment, config.find("train", base))
     changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
-    told = {
+    values = {
         e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}"
         for i, e in enumerate(named)
     }
@@ -111,7 +111,7 @@ def text(
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
         words = [
-            told[e.name]
+            values[e.name]
             for e in named
             for key in e.changes
             if key.path.removeprefix("plant.") == path
@@ -132,11 +132,11 @@ def with_scatter(
     """Sizes and covariance with what varies from flight to flight: training draws it with the rest
     of the posterior.
     """
-    drawn = variances(report.get("scatter") or [])
-    names = [*theta, *[name for name in drawn if name not in theta]]
+    variances_of = variances(report.get("scatter") or [])
+    names = [*theta, *[name for name in variances_of if name not in theta]]
     whole = np.zeros((len(names), len(names)))
     whole[: len(theta), : len(theta)] = np.reshape(covariance, (len(theta), len(theta)))
-    for name, variance in drawn.items():
+    for name, variance in variances_of.items():
         whole[names.index(name), names.index(name)] += variance
     return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
 
@@ -146,12 +146,13 @@ def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
 
     Raises DiagnoseError: it holds fewer.
     """
-    if rank > len(there := _explanations(report)):
+    if rank > len(explanations := _explanations(report)):
         raise DiagnoseError(
-            f"{path}: {len(there)} explanations by laws outside the catalogue; --laws asks for"
+            f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws "
+            f"asks for"
             f" number {rank}"
         )
-    laws = there[rank - 1] if rank else []
+    laws = explanations[rank - 1] if rank else []
     return [
         LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"]))
         for x in laws
@@ -241,22 +242,25 @@ def of_setup(
     """
     theta, covariance = read(report, path)
     if report.get("model", THROW) != setup.model:
-        own = setup.model or "none"
+        model_name = setup.model or "none"
         raise DiagnoseError(
             f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base}"
-            f" is {own}"
+            f" is {model_name}"
         )
     effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
     refuse_strange(report, path, after, effects, setup.model)
     laws = laws_of(report, path, rank)
-    known = (
+    effects_of_model = (
         [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]]
         if rank
         else []
     )
     lines = [f"# {line}" for line in provenance]
-    for rows, names in ((covariance, list(theta)), (known, [term_of(law).formula for law in laws])):
+    for rows, names in (
+        (covariance, list(theta)),
+        (effects_of_model, [term_of(law).formula for law in laws]),
+    ):
         lines += [f"# covariance of {', '.join(names)}:"] * bool(names) + [
             f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in rows
         ]
@@ -278,8 +282,8 @@ def refuse_strange(
     report: Mapping[str, Any],
     path: str,
     theta: Mapping[str, float],
-    known: Mapping[str, Effect] | None = None,
-    of: str = "throw",
+    effects: Mapping[str, Effect] | None = None,
+    model_name: str = "throw",
 ) -> None:
     """Refuse effects that are none of a model's, though they may bear the same name, and sizes that
     it cannot have.
@@ -290,26 +294,29 @@ def refuse_strange(
     Args:
         report: of the diagnosis. path: of its file.
         theta: sizes that the model would have.
-        known: its effects; None: the throw's.
-        of: its name.
+        effects: its effects; None: the throw's.
+        model_name: its name.
     """
-    known = catalogue() if known is None else known
-    strange = [name for name in theta if name not in known]
+    effects = catalogue() if effects is None else effects
+    strange = [name for name in theta if name not in effects]
     if strange:
         raise DiagnoseError(
-            f"{path}: {', '.join(strange)} are no effects of the {of}; {suggest(strange[0], known)}"
+            f"{path}: {', '.join(strange)} are no effects of the {model_name}; "
+            f"{suggest(strange[0], effects)}"
         )
     units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
     for name, size in theta.items():
-        effect = known[name]
+        effect = effects[name]
         if units.get(name, effect.unit) != effect.unit:
             raise DiagnoseError(
-                f"{path}: {name} in '{units[name]}'; the {of}'s {name} is in '{effect.unit}': of"
+                f"{path}: {name} in '{units[name]}'; the {model_name}'s {name} is in "
+                f"'{effect.unit}': of"
                 " another model"
             )
         low, high = effect.bounds
         if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
             raise DiagnoseError(
-                f"{path}: {name} = {size:.4g} {effect.unit}; the {of} has it from {low:g} to"
+                f"{path}: {name} = {size:.4g} {effect.unit}; the {model_name} has it from "
+                f"{low:g} to"
                 f" {high:g}"
             )

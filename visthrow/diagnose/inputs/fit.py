@@ -71,31 +71,31 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     """
     from visthrow.diagnose.select.point import Problem, fitted, linearise
 
-    known = [effect.name for effect in model.effects]
-    expect_known(free, known, "no effect '{}' to fit", DiagnoseError)
+    names = [effect.name for effect in model.effects]
+    expect_known(free, names, "no effect '{}' to fit", DiagnoseError)
     if not free:
-        raise DiagnoseError(f"nothing to fit; name effects with --free: {', '.join(known)}")
-    at = [known.index(name) for name in free]
+        raise DiagnoseError(f"nothing to fit; name effects with --free: {', '.join(names)}")
+    columns = [names.index(name) for name in free]
     before = model.windows({})
     problem = Problem.of(model, before, range(len(before)))
-    point = linearise(problem, np.zeros(len(known)), windows=before)
+    point = linearise(problem, np.zeros(len(names)), windows=before)
     for _ in range(ROUNDS):
         start = point.theta
-        point = fitted(problem, point, at)
+        point = fitted(problem, point, columns)
         point = linearise(problem, point.theta, point.noise)
         if np.max(np.abs(point.theta - start)) < 0.5:  # floors
             break
-    slab = problem.priors.slab[at]
-    posterior = np.linalg.inv(point.information[np.ix_(at, at)] + np.diag(slab**-2.0))
-    floors = problem.priors.floor[at]
-    sizes = point.theta[at] * floors
+    slab = problem.priors.slab[columns]
+    posterior = np.linalg.inv(point.information[np.ix_(columns, columns)] + np.diag(slab**-2.0))
+    floors = problem.priors.floor[columns]
+    sizes = point.theta[columns] * floors
     identified = tuple(
         bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab)
     )
     after = model.residuals(problem.sizes(point.theta))
-    units = tuple(model.effects[i].unit for i in at)
+    units = tuple(model.effects[i].unit for i in columns)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    channel, seen = (
+    channel, measured = (
         np.concatenate([w.channel for w in before]),
         (
             [w.residual for w in before],
@@ -108,7 +108,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
             for i, name in enumerate(model.channels)
             if np.any(channel == i)
         }
-        for value in map(np.concatenate, seen)
+        for value in map(np.concatenate, measured)
     ]
     return Fitted(
         tuple(free),
@@ -121,17 +121,17 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     )
 
 
-def vehicle_of(setup: Setup, found: Fitted, base: VehicleParams) -> VehicleParams:
+def vehicle_of(setup: Setup, result: Fitted, base: VehicleParams) -> VehicleParams:
     """A simulated vehicle with what was found; everything else as in ``base``.
 
     A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest
     thrust follows the map. ``base``: vehicle that lends all other numbers. Raises DiagnoseError:
     the setup's model is of no vehicle."""
-    size = defaultdict(float, zip(found.names, map(float, found.theta)))
+    size = defaultdict(float, zip(result.names, map(float, result.theta)))
     if setup.flyer is not None:
         return _of_flyer(setup.flyer, size, base)
     if setup.stand is not None:
-        return _of_stand(setup.stand, size, found.middle_speed, base)
+        return _of_stand(setup.stand, size, result.middle_speed, base)
     raise DiagnoseError(
         f"'{setup.about}' is no vehicle and no motor; a vehicle is fitted by a setup with [flyer]"
         " or [stand]"
@@ -169,7 +169,7 @@ def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicle
         full *= 1.0 + curve * (full / hover - 1.0)
         controller = dataclasses.replace(controller, max_thrust=full)
     else:
-        thrust = dataclasses.replace(thrust, gain=tuple(gain * own for own in thrust.gain))
+        thrust = dataclasses.replace(thrust, gain=tuple(gain * scale for scale in thrust.gain))
     return dataclasses.replace(
         base,
         body=dataclasses.replace(base.body, mass=mass),
@@ -198,7 +198,7 @@ def write(
     folder: str | Path,
     name: str,
     setup: Setup,
-    found: Fitted,
+    result: Fitted,
     logs: Sequence[FlightLog],
     base: VehicleParams,
 ) -> list[Path]:
@@ -213,37 +213,37 @@ def write(
     sources = {str(log.meta.get("source", "")): _digest(log) for log in logs}
     record = {
         "setup": name,
-        "effects": list(found.names),
-        "units": list(found.units),
-        "theta": found.theta.tolist(),
-        "covariance": found.covariance.tolist(),
-        "told_by_logs": list(found.identified),
-        "rms_before": dict(found.rms_before),
-        "rms_after": dict(found.rms_after),
+        "effects": list(result.names),
+        "units": list(result.units),
+        "theta": result.theta.tolist(),
+        "covariance": result.covariance.tolist(),
+        "told_by_logs": list(result.identified),
+        "rms_before": dict(result.rms_before),
+        "rms_after": dict(result.rms_after),
         "logs": sources,
     }
     write_json(folder / "fit.json", record)
     if setup.flyer is None and setup.stand is None:
         return [folder / "fit.json"]
-    vehicle = vehicle_of(setup, found, base)
-    atomic_write(folder / "vehicle.toml", _head(name, found, sources) + config.dumps(vehicle))
+    vehicle = vehicle_of(setup, result, base)
+    atomic_write(folder / "vehicle.toml", _head(name, result, sources) + config.dumps(vehicle))
     return [folder / "vehicle.toml", folder / "fit.json"]
 
 
-def _head(name: str, found: Fitted, sources: Mapping[str, str]) -> str:
+def _head(name: str, result: Fitted, sources: Mapping[str, str]) -> str:
     lines = [
         f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance"
         " also in fit.json."
     ]
-    for i, (effect, unit) in enumerate(zip(found.names, found.units)):
-        low, high = found.interval(i)
-        note = "" if found.identified[i] else " (the prior: these logs do not tell)"
+    for i, (effect, unit) in enumerate(zip(result.names, result.units)):
+        low, high = result.interval(i)
+        note = "" if result.identified[i] else " (the prior: these logs do not tell)"
         lines.append(
-            f"# {effect} = {found.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}"
+            f"# {effect} = {result.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}"
         )
     lines.append(
         "# covariance, row by row:"
-        f" {json.dumps([[float(f'{x:.4g}') for x in row] for row in found.covariance])}"
+        f" {json.dumps([[float(f'{x:.4g}') for x in row] for row in result.covariance])}"
     )
     lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]
     return "\n".join(lines) + "\n\n"

@@ -60,19 +60,21 @@ def run(args: argparse.Namespace) -> int:
     free = args.free or [
         n for n in fitting.DEFAULT_FREE.get(setup.model, ()) if n in {e.name for e in model.effects}
     ]
-    found = fitting.fit(model, free)
-    for i, name in enumerate(found.names):
-        low, high = found.interval(i)
-        note = "" if found.identified[i] else "   not told by these logs"
-        print(f"{name:<20} {found.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {found.units[i]}{note}")
-    for channel, before in found.rms_before.items():
-        print(f"residual of {channel}: {before:.4g} before, {found.rms_after[channel]:.4g} after")
+    result = fitting.fit(model, free)
+    for i, name in enumerate(result.names):
+        low, high = result.interval(i)
+        note = "" if result.identified[i] else "   not told by these logs"
+        print(
+            f"{name:<20} {result.theta[i]:+.5g}  [{low:+.5g}, {high:+.5g}] {result.units[i]}{note}"
+        )
+    for channel, before in result.rms_before.items():
+        print(f"residual of {channel}: {before:.4g} before, {result.rms_after[channel]:.4g} after")
     base = config.load(VehicleParams, config.find("vehicle", args.vehicle))
-    for path in fitting.write(args.out, args.config, setup, found, logs, base):
+    for path in fitting.write(args.out, args.config, setup, result, logs, base):
         print(path)
     if args.json:
         write_json(
             args.json,
-            {"effects": list(found.names), "theta": found.theta, "covariance": found.covariance},
+            {"effects": list(result.names), "theta": result.theta, "covariance": result.covariance},
         )
     return 0

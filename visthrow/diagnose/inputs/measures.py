@@ -54,11 +54,13 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     for name, sd in measured.items():
         if not sd >= 0.0:
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected 0 or more")
-    own = [(e, measured.get(e.name, np.inf) or RIGHT * e.floor) for e in effects]
-    within = [(max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in own]
+    deviations = [(e, measured.get(e.name, np.inf) or RIGHT * e.floor) for e in effects]
+    limits = [
+        (max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in deviations
+    ]
     return tuple(
         replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd))
-        for (e, sd), bounds in zip(own, within)
+        for (e, sd), bounds in zip(deviations, limits)
     )
 
 

@@ -120,7 +120,7 @@ class Opened:
         return diagnose(
             self.logs,
             lambda: self.model,
-            known=self.known,
+            vehicle=self.known,
             seed=self._args.seed,
             without=without,
             laws=laws,
@@ -143,9 +143,9 @@ def made_with(args: argparse.Namespace) -> dict[str, Any]:
     """
     from visthrow.diagnose.inputs import setup
 
-    own = setup.load(args.config).model if args.config else ""
+    model_name = setup.load(args.config).model if args.config else ""
     return {
-        "model": own or THROW,
+        "model": model_name or THROW,
         "plant": args.plant,
         "config": args.config,
         "overrides": args.overrides,
@@ -168,15 +168,15 @@ def throw_model(
     threads.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only is not None else None
-    known = {
+    measured = {
         "sensing": experiment.sensing,
         "camera": experiment.camera,
         "device": resolve(args.device),
     }
-    known |= {"only": only, "simpler": only is not None}
+    measured |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)
     return put_right(
-        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **known)
+        [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **measured)
     )
 
 
@@ -186,15 +186,15 @@ def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
     Raises DiagnoseError: no numbers between commas, no such flight, or all of them.
     """
     try:
-        found = tuple(int(part) for part in text.split(",") if part.strip())
+        flights = tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:
         raise DiagnoseError(
             f"--without {text}; expected numbers of flights between commas, such as 0,3"
         ) from error
     listed = ", ".join(f"{i} ({label(log, i)})" for i, log in enumerate(logs))
-    for number in found:
+    for number in flights:
         if not 0 <= number < len(logs):
             raise DiagnoseError(f"--without {text}: no flight {number}; there are {listed}")
-    if len(set(found)) == len(logs):
+    if len(set(flights)) == len(logs):
         raise DiagnoseError(f"--without {text} leaves no flight; there are {listed}")
-    return found
+    return flights

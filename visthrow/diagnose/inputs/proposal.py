@@ -103,21 +103,21 @@ def propose(
     numbers = {name: np.where(np.isfinite(cells), cells, np.nan) for name, cells in numbers.items()}
     if not any(_moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
-    found, channels, clocks = Proposal(None), {}, {}
+    proposal, channels, clocks = Proposal(None), {}, {}
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
-        clock, time = _clock(part, found, time_unit)
+        clock, time = _clock(part, proposal, time_unit)
         columns = {
             name: cells
             for name, cells in part.items()
             if name != clock.column and len(cells) == len(time)
         }
         settings = getattr(table, "settings", {})
-        mine = _Chooser(time, _groups(columns), found, settings).channels()
+        mine = _Chooser(time, _groups(columns), proposal, settings).channels()
         for entry in mine:
             if entry.name in channels:
-                found.questions.append(
+                proposal.questions.append(
                     f"'{entry.name}' is also {', '.join(entry.columns)}: which one?"
                 )
             else:
@@ -126,22 +126,24 @@ def propose(
             clocks[topic] = clock
     used = {column for entry in channels.values() for column in entry.columns}
     used |= {clock.column for clock in clocks.values()}
-    found.left_out = [name for name in table if name not in used] + getattr(table, "left_out", [])
+    proposal.left_out = [name for name in table if name not in used] + getattr(
+        table, "left_out", []
+    )
     if not channels:
-        found.questions.append(
+        proposal.questions.append(
             "no column looks like a position, an attitude, rates, forces or motors: which columns"
             " are they?"
         )
-        return found
-    first, *others = clocks
+        return proposal
+    first, *remaining = clocks
     entries = tuple(
         replace(c, clock="" if c.clock == first else c.clock) for c in channels.values()
     )
-    found.mapping = TableMap(
-        clocks[first], entries, {name: clocks[name] for name in others} or None
+    proposal.mapping = TableMap(
+        clocks[first], entries, {name: clocks[name] for name in remaining} or None
     )
-    _corrected(table, source, found, mass)
-    return found
+    _corrected(table, source, proposal, mass)
+    return proposal
 
 
 def _tables(numbers: Table) -> dict[str, Table]:
@@ -152,7 +154,9 @@ def _tables(numbers: Table) -> dict[str, Table]:
     return tables
 
 
-def _clock(numbers: Table, found: Proposal, told: str | None) -> tuple[TimeColumn, np.ndarray]:
+def _clock(
+    numbers: Table, proposal: Proposal, stated_unit: str | None
+) -> tuple[TimeColumn, np.ndarray]:
     """The column of stamps and its unit, or evenly spaced rows."""
     rising = [name for name, cells in numbers.items() if _rises(cells)]
     named = [name for name in rising if _TIME.search(name)]
@@ -160,26 +164,26 @@ def _clock(numbers: Table, found: Proposal, told: str | None) -> tuple[TimeColum
     name = next(iter(named or rising), None)
     if name is None:
         count = max(map(len, numbers.values()))
-        found.questions.append(
+        proposal.questions.append(
             "no column rises as a clock does: how far are the rows apart? row_period = 0.01 [s] is"
             " a guess"
         )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
     step = float(np.nanmedian(np.diff(numbers[name])))
-    suffix = told or _split_unit(name)[1] or _SUFFIX.get(_words(name)[-1], "")
+    suffix = stated_unit or _split_unit(name)[1] or _SUFFIX.get(_words(name)[-1], "")
     rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
     if rate and f"1/{rate[1]} s" in UNITS:
         suffix = f"1/{rate[1]} s"
     fitting = [unit for unit in ("s", "ms", "us", "ns") if 2e-4 <= step * UNITS[unit][1] <= 0.25]
     unit = suffix if suffix in UNITS and UNITS[suffix][0] == "s" else fitting[0] if fitting else "s"
     if not suffix and len(fitting) != 1:
-        found.questions.append(
+        proposal.questions.append(
             f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'};"
             f" '{unit}' is a guess"
         )
     if not named:
-        found.questions.append(f"is '{name}', the first column that rises, the time?")
-    found.why["time"] = f"rises by {step:g} a row, {1.0 / (step * UNITS[unit][1]):.4g} Hz"
+        proposal.questions.append(f"is '{name}', the first column that rises, the time?")
+    proposal.why["time"] = f"rises by {step:g} a row, {1.0 / (step * UNITS[unit][1]):.4g} Hz"
     return TimeColumn(name, unit), numbers[name] * UNITS[unit][1]
 
 
@@ -213,8 +217,10 @@ def _split_unit(name: str) -> tuple[str, str]:
     if match is None:
         return name, ""
     unit = unit_of(match[2])
-    known = next((u for u in (match[2], unit or "", _SUFFIX.get(unit or "", "")) if u in UNITS), "")
-    return (match[1], known) if known or unit is not None else (name, "")
+    unit_name = next(
+        (u for u in (match[2], unit or "", _SUFFIX.get(unit or "", "")) if u in UNITS), ""
+    )
+    return (match[1], unit_name) if unit_name or unit is not None else (name, "")
 
 
 _ENDINGS = {
@@ -259,19 +265,19 @@ def _groups(numbers: Table) -> list[Group]:
             angle = "rpy" if match[2].lower() in ("roll", "pitch", "yaw") else ""
             key = (match[1] + angle, unit or _SUFFIX.get((match[3] or "").lower(), ""))
             parts.setdefault(key, {}).setdefault(_ENDINGS[match[2].lower()], name)
-    found = [("motor", unit, names) for (_, unit), names in motors.items() if len(names) == 4]
-    found += [
-        (stem, unit, [of[i] for i in sorted(of)])
-        for (stem, unit), of in digits.items()
-        if sorted(of) in ([*range(9)], [1, 2, 3, 4])
+    listed = [("motor", unit, names) for (_, unit), names in motors.items() if len(names) == 4]
+    listed += [
+        (stem, unit, [columns[i] for i in sorted(columns)])
+        for (stem, unit), columns in digits.items()
+        if sorted(columns) in ([*range(9)], [1, 2, 3, 4])
     ]
-    for (stem, unit), of in parts.items():
-        letters = "xyzw" if set("xyzw") <= of.keys() else "xyz"
-        if set(letters) <= of.keys():
-            found.append((stem, unit, [of[letter] for letter in letters]))
-    found += [("", "", names) for names in _without_names(numbers)]
+    for (stem, unit), columns in parts.items():
+        letters = "xyzw" if set("xyzw") <= columns.keys() else "xyz"
+        if set(letters) <= columns.keys():
+            listed.append((stem, unit, [columns[letter] for letter in letters]))
+    listed += [("", "", names) for names in _without_names(numbers)]
     groups, used = [], set()
-    for stem, unit, names in found:
+    for stem, unit, names in listed:
         if not used & set(names):
             values = np.column_stack([numbers[name] for name in names])
             groups.append(Group(stem, tuple(names), values, unit))
@@ -293,29 +299,29 @@ def _without_names(numbers: Table) -> list[list[str]]:
     names = list(numbers)
     if not names or not all(name.startswith("column ") for name in names):
         return []
-    found, i, run = [], 0, []
+    groups, i, run = [], 0, []
     while i < len(names):
         four = np.column_stack([numbers[name] for name in names[i : i + 4]])
         length = np.linalg.norm(four, axis=1)
         if four.shape[1] == 4 and np.nanmax(np.abs(length - 1.0)) < 0.05:
-            found.append(names[i : i + 4])
+            groups.append(names[i : i + 4])
             i, run = i + 4, []
             continue
         run.append(names[i])
         i += 1
         if len(run) == 3:
-            found.append(run)
+            groups.append(run)
             run = []
-    return found
+    return groups
 
 
 class _Chooser:
     """Decides which group is which channel."""
 
     def __init__(
-        self, time: np.ndarray, groups: list[Group], found: Proposal, settings: dict[str, str]
+        self, time: np.ndarray, groups: list[Group], proposal: Proposal, settings: dict[str, str]
     ) -> None:
-        self.time, self.found, self.settings = time, found, settings
+        self.time, self.found, self.settings = time, proposal, settings
         for group in groups:
             group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
         self.groups = [g for g in groups if _moves(g.values)]
@@ -375,11 +381,11 @@ class _Chooser:
             if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)
         ]
 
-    def _take(self, name: str, group: Group, unit: str, why: str, **more: Any) -> None:
+    def _take(self, name: str, group: Group, unit: str, why: str, **options: Any) -> None:
         """Make a channel of a group, unless its units contradict what the name stands for;
-        ``more``: of its :class:`ChannelMap`.
+        ``options``: of its :class:`ChannelMap`.
         """
-        entry, values = ChannelMap(name, group.columns, unit, **more), group.values
+        entry, values = ChannelMap(name, group.columns, unit, **options), group.values
         if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
             entry, why = (
                 replace(entry, held=True),
@@ -395,7 +401,7 @@ class _Chooser:
     def _hinted(self, group: Group, kind: str) -> bool:
         stem = group.stem.lower()
         return bool(re.search(dict(_HINTS)[kind], stem)) and not any(
-            re.search(of, stem) for name, of in _HINTS if name not in (kind, "position")
+            re.search(pattern, stem) for name, pattern in _HINTS if name not in (kind, "position")
         )
 
     def _quaternions(self) -> None:
@@ -405,10 +411,10 @@ class _Chooser:
                 or not 0.95 < np.nanmedian(np.linalg.norm(group.values, axis=1)) < 1.05
             ):
                 continue
-            other = _NOT_VEHICLE.search(group.stem)
+            foreign = _NOT_VEHICLE.search(group.stem)
             name = (
                 ("payload_quat_wb" if "cam" not in group.stem.lower() else "marker_quat_c")
-                if other
+                if foreign
                 else "quat_wb"
             )
             if name in self.made:
@@ -466,7 +472,7 @@ class _Chooser:
                 scores[order, axes] = unit_evidence.lean_misfit(
                     path.time, np.where(path.valid[:, None], turned, np.nan), quat
                 )
-        ranked = sorted(scores, key=lambda of: scores[of][0])
+        ranked = sorted(scores, key=lambda name: scores[name][0])
         best = ranked[0]
         nats = scores[best][1] * (
             np.log(scores[ranked[1]][0] / scores[best][0]) if len(ranked) > 1 else 0.0
@@ -484,18 +490,22 @@ class _Chooser:
             words = f"axes {axes or 'x,y,z'}" if named else f"order {order}, axes {axes or 'x,y,z'}"
             self.found.why["quat_wb"] += f"; {words} by gravity, {nats:.0f} nats"
         elif len(ranked) > 1:
-            asked = (
+            question = (
                 "" if named else f"is the order of {', '.join(entry.columns)} {order}, as taken? "
             )
-            asked += f"which axis is up? '{axes or 'x,y,z'}' is taken; " if len(ups) > 1 else ""
-            self.found.questions.append(asked + "nothing in the motion says")
+            question += f"which axis is up? '{axes or 'x,y,z'}' is taken; " if len(ups) > 1 else ""
+            self.found.questions.append(question + "nothing in the motion says")
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
         if not groups:  # no name speaks of a place
-            others = [of for name, of in _HINTS if name != "position"]
-            groups = [g for g in smooth if not any(re.search(of, g.stem.lower()) for of in others)]
+            patterns = [pattern for name, pattern in _HINTS if name != "position"]
+            groups = [
+                g
+                for g in smooth
+                if not any(re.search(pattern, g.stem.lower()) for pattern in patterns)
+            ]
             self.found.questions += [
                 f"are {', '.join(g.columns)} a position? Their names do not say" for g in groups
             ]
@@ -503,7 +513,7 @@ class _Chooser:
         groups = [
             g
             for g in groups
-            if all(other is g or self._relation(other, g, _FIRMLY) is None for other in moving)
+            if all(rival is g or self._relation(rival, g, _FIRMLY) is None for rival in moving)
         ]  # no derivatives
         for group in [g for g in groups if "cam" in g.stem.lower()]:
             unit = self._length_unit(group)
@@ -575,7 +585,7 @@ class _Chooser:
             > 0.0
         ):
             return named
-        fit, far = unit_evidence.by_hall(group.values)
+        fit, reach = unit_evidence.by_hall(group.values)
         leans = unit_evidence.by_lean(
             self.time, group.values, self.attitudes, [named] if named else unit_evidence.LENGTHS
         )
@@ -606,12 +616,15 @@ class _Chooser:
         if leans:
             return self._guess_pair(group, leans)
         unit = next(iter(fit), "m")
-        self.by[group.columns] = f"{unit} by the size of a hall: {far:.3g} from the origin"
+        self.by[group.columns] = f"{unit} by the size of a hall: {reach:.3g} from the origin"
         if len(fit) != 1:
-            others = f"{' and '.join(fit[1:])} fit a hall too" if fit else "no unit fits a hall"
+            alternatives = (
+                f"{' and '.join(fit[1:])} fit a hall too" if fit else "no unit fits a hall"
+            )
             self.found.questions.append(
-                f"{', '.join(group.columns)} reach {far:.3g} from the origin: '{unit}' is a guess;"
-                f" {others}"
+                f"{', '.join(group.columns)} reach {reach:.3g} from the origin: '{unit}' is a "
+                f"guess;"
+                f" {alternatives}"
             )
         return unit
 
@@ -623,7 +636,7 @@ class _Chooser:
         unit, angle, ratio = min(leans, key=lambda lean: abs(np.log(lean[2])))
         listed, angles = ", ".join(path.columns), ", ".join(self.made["quat_wb"][0].columns)
         pairs = " or ".join(
-            f"{of} and {leaning} ({times:.2g} times)" for of, leaning, times in leans
+            f"{unit_name} and {leaning} ({times:.2g} times)" for unit_name, leaning, times in leans
         )
         self.found.questions.append(
             f"{listed} and the angles {angles}: are they in {pairs}? So many times what its lean"
@@ -654,7 +667,7 @@ class _Chooser:
 
     def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
         """The path below another one that keeps its distance from it."""
-        found = []
+        candidates = []
         for upper, a in paths:
             for lower, b in paths:
                 if upper is lower:
@@ -667,8 +680,8 @@ class _Chooser:
                     and spread < 0.1 * middle
                     and np.nanmedian(gap[:, 2]) < -0.3 * middle
                 ):
-                    found.append((spread / middle, lower, b, middle))
-        best = min(found, key=lambda of: of[0], default=None)
+                    candidates.append((spread / middle, lower, b, middle))
+        best = min(candidates, key=lambda candidate: candidate[0], default=None)
         if best is None and len(paths) == 1 and _NOT_VEHICLE.search(" ".join(paths[0][0].columns)):
             return (*paths[0], "the only path, and its name speaks of no vehicle")
         return best and (best[1], best[2], f"keeps {best[3]:.3f} m from another path, below it")
@@ -680,15 +693,19 @@ class _Chooser:
         moves, steps = np.std(values, axis=0), np.std(np.diff(values, axis=0), axis=0)
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
-    def _relation(self, path: Group, rate: Group, least: float) -> relations.Relation | None:
-        time, both = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
+    def _relation(self, path: Group, rate: Group, threshold: float) -> relations.Relation | None:
+        time, columns = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
         if len(time) < 100:
             return None
-        at, derived = relations.derivative(time, both[:, : path.values.shape[1]], 0.1)
-        found = relations.relate(at, derived, time, both[:, path.values.shape[1] :], reach=0.2)
+        stamps, derived = relations.derivative(time, columns[:, : path.values.shape[1]], 0.1)
+        relation = relations.relate(
+            stamps, derived, time, columns[:, path.values.shape[1] :], reach=0.2
+        )
         return (
-            found
-            if found is not None and found.correlation > least and abs(found.delay) < 0.15
+            relation
+            if relation is not None
+            and relation.correlation > threshold
+            and abs(relation.delay) < 0.15
             else None
         )
 
@@ -698,45 +715,53 @@ class _Chooser:
                 continue
             entry = self.made[name][0]
             path = next(g for g in self.groups if g.columns == entry.columns)
-            found = [
+            candidates = [
                 (r.correlation, g, r)
                 for g in self._open(3)
                 if (r := self._relation(path, g, _BELONGS)) is not None
             ]
-            if name == "pos_w" and self._body_velocity(path, found):
+            if name == "pos_w" and self._body_velocity(path, candidates):
                 continue
-            if not found:
+            if not candidates:
                 continue
-            _, group, relation = max(found, key=lambda of: of[0])
+            _, group, relation = max(candidates, key=lambda candidate: candidate[0])
             size = UNITS[entry.unit][1] / relation.scale
             unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
-            own = name.replace("pos", "vel")
+            velocity_name = name.replace("pos", "vel")
             why = (
                 f"the derivative of {name}, correlation {relation.correlation:.2f},"
                 f" {relation.scale:.3g} of its unit a second"
             )
-            self._take(own, group, unit, why, frame="world" if own == "est_vel_w" else "")
+            self._take(
+                velocity_name,
+                group,
+                unit,
+                why,
+                frame="world" if velocity_name == "est_vel_w" else "",
+            )
 
     def _body_velocity(self, path: Group, world: list) -> bool:
         """Take a velocity that is the path's in the body's axes rather than in the world's."""
         attitude = self.made.get("quat_wb", (None, None))[1]
         if attitude is None or len(attitude.time) < 100:
             return False
-        time, both = unit_evidence.rising(self.time, path.values)
-        at, derived = relations.derivative(time, both, 0.1)
-        if len(at) < 100:
+        time, columns = unit_evidence.rising(self.time, path.values)
+        stamps, derived = relations.derivative(time, columns, 0.1)
+        if len(stamps) < 100:
             return False
-        turned = relations.attitude_at(*attitude.samples(), at).inv().apply(derived)
+        turned = relations.attitude_at(*attitude.samples(), stamps).inv().apply(derived)
         best = max((correlation for correlation, *_ in world), default=0.0)
         for group in self._open(3):
             good = np.all(np.isfinite(group.values), axis=1)
             if not self._hinted(group, "velocity") or np.sum(good) < 100:
                 continue
-            found = relations.relate(at, turned, self.time[good], group.values[good], reach=0.2)
-            if found is None or found.correlation < _FIRMLY:
+            relation = relations.relate(
+                stamps, turned, self.time[good], group.values[good], reach=0.2
+            )
+            if relation is None or relation.correlation < _FIRMLY:
                 continue
-            clear = 0.5 * np.ptp(at) / relations.INDEPENDENT
-            nats = clear * np.log((1.0 - best**2) / max(1.0 - found.correlation**2, 1e-6))
+            clear = 0.5 * np.ptp(stamps) / relations.INDEPENDENT
+            nats = clear * np.log((1.0 - best**2) / max(1.0 - relation.correlation**2, 1e-6))
             if nats > 10.0:
                 unit = group.unit if group.unit.endswith("/s") else "m/s"
                 why = (
@@ -779,12 +804,12 @@ class _Chooser:
         attitude = self.made.get("quat_wb", (None, None))[1]
         ranked = []
         for group in (g for g in self._open(3) if self._hinted(g, "rate_b")):
-            found, times = None, 1.0
+            relation, times = None, 1.0
             if attitude is not None and len(attitude.time) > 100:
-                at, derived = relations.rates_of(*attitude.samples())
+                stamps, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
-                found = relations.relate(
-                    at, derived, self.time[good], group.values[good], reach=0.2
+                relation = relations.relate(
+                    stamps, derived, self.time[good], group.values[good], reach=0.2
                 )
                 times = float(
                     np.sqrt(
@@ -792,10 +817,12 @@ class _Chooser:
                         / max(np.mean(np.var(derived, axis=0)), 1e-12)
                     )
                 )
-            ranked.append((found.axes_correlation if found is not None else 0.0, group, times))
+            ranked.append(
+                (relation.axes_correlation if relation is not None else 0.0, group, times)
+            )
         if not ranked:
             return
-        score, group, times = max(ranked, key=lambda of: of[0])
+        score, group, times = max(ranked, key=lambda candidate: candidate[0])
         largest = float(np.nanpercentile(np.abs(group.values), 99))
         unit = group.unit if group.unit.endswith("/s") else "deg/s" if largest > 30.0 else "rad/s"
         why = f"99 % within {largest:.3g}"
@@ -897,12 +924,12 @@ class _Chooser:
                 self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
 
 
-def _corrected(table: Table, source: str, found: Proposal, weighed: float | None) -> None:
+def _corrected(table: Table, source: str, proposal: Proposal, weighed: float | None) -> None:
     """Read the table by the proposal, hold it against physics, and turn axes that another set
     explains; mirrors are asked about.
     """
     for _ in range(3):
-        log = logs_of(table, found.mapping, source)[0]
+        log = logs_of(table, proposal.mapping, source)[0]
         full = FlightLog({n: c for n, c in log.channels.items() if np.sum(c.valid) >= 50}, log.meta)
         wrong = [row for row in physics.look(full) if row.verdict == "bad"]
         turns = [
@@ -915,30 +942,30 @@ def _corrected(table: Table, source: str, found: Proposal, weighed: float | None
         row = turns[0]
         entries = [
             replace(c, axes=row.figures["axes"]) if c.name == "rate_b" else c
-            for c in found.mapping.channels
+            for c in proposal.mapping.channels
         ]
-        if entries == list(found.mapping.channels):
+        if entries == list(proposal.mapping.channels):
             break
-        found.mapping = replace(found.mapping, channels=tuple(entries))
-        found.why["rate_b"] += f"; axes by physics: {row.text}"
-    found.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
-    full = _weighed(full, found, weighed)
-    found.flyer = _flyer(full, found, weighed)
-    if weighed is not None and found.flyer is None:
-        found.questions.append(
+        proposal.mapping = replace(proposal.mapping, channels=tuple(entries))
+        proposal.why["rate_b"] += f"; axes by physics: {row.text}"
+    proposal.questions += [f"physics speaks against {row.channel}: {row.text}" for row in wrong]
+    full = _weighed(full, proposal, weighed)
+    proposal.flyer = _flyer(full, proposal, weighed)
+    if weighed is not None and proposal.flyer is None:
+        proposal.questions.append(
             "--mass is not used: a flying model needs a thrust or motors, an attitude and a"
             " position; not all are found"
         )
 
 
-def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLog:
+def _weighed(log: FlightLog, proposal: Proposal, weighed: float | None) -> FlightLog:
     """Hold the thrust against the mass.
 
     Returns the log with its thrust in the unit in which it carries what was weighed.
 
     Raises LogError: in grams it fits, in kilograms it does not.
     """
-    entry = next((c for c in found.mapping.channels if c.name == "thrust_command"), None)
+    entry = next((c for c in proposal.mapping.channels if c.name == "thrust_command"), None)
     carried = _carried(log)
     if entry is None or carried is None:
         if weighed is not None and weighed >= 1e3 * unit_evidence.LIGHTEST:
@@ -946,17 +973,17 @@ def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLo
                 f"the vehicle weighs {weighed:g} kg? Nothing in the log is in newtons, to compare;"
                 f" for grams write {weighed / 1e3:g}"
             )
-            found.questions.append(text)
+            proposal.questions.append(text)
         return log
     named = _SUFFIX.get(_words(entry.columns[0])[-1]) == entry.unit
     units = (entry.unit,) if named else unit_evidence.THRUSTS
     one = carried / UNITS[entry.unit][1]  # if a number of its column were a newton
     if weighed is None:
         if not named:
-            each = ", ".join(f"{one * UNITS[unit][1]:.3g} kg in {unit}" for unit in units)
-            found.questions.append(
+            masses = ", ".join(f"{one * UNITS[unit][1]:.3g} kg in {unit}" for unit in units)
+            proposal.questions.append(
                 f"thrust '{entry.columns[0]}': newtons of all motors together, as taken? It carries"
-                f" {each}"
+                f" {masses}"
             )
         return log
     unit = unit_evidence.by_mass(one, weighed, units)
@@ -972,22 +999,22 @@ def _weighed(log: FlightLog, found: Proposal, weighed: float | None) -> FlightLo
             f" {weighed / 1e3:g}"
         )
     if not unit:
-        found.questions.append(
+        proposal.questions.append(
             f"thrust '{entry.columns[0]}' carries {carried:.3g} kg in {entry.unit}, and the vehicle"
             f" weighs {weighed:g} kg: no unit explains that; is it of one motor, of another"
             " vehicle, or no force?"
         )
         return log
-    found.why[entry.name] += f"; {unit} by the mass: it carries {one * UNITS[unit][1]:.4g} kg"
+    proposal.why[entry.name] += f"; {unit} by the mass: it carries {one * UNITS[unit][1]:.4g} kg"
     if in_grams:
-        found.questions.append(
+        proposal.questions.append(
             f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or"
             f" {weighed:g} g and {in_grams}?"
         )
     if unit == entry.unit:
         return log
-    mine = [replace(c, unit=unit) if c is entry else c for c in found.mapping.channels]
-    found.mapping = replace(found.mapping, channels=tuple(mine))
+    mine = [replace(c, unit=unit) if c is entry else c for c in proposal.mapping.channels]
+    proposal.mapping = replace(proposal.mapping, channels=tuple(mine))
     channel, times = log[entry.name], UNITS[unit][1] / UNITS[entry.unit][1]
     return FlightLog(
         {**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta
@@ -1010,7 +1037,7 @@ def _usual(total: np.ndarray) -> float:
     return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 
 
-def _driving(log: FlightLog, found: Proposal) -> str:
+def _driving(log: FlightLog, proposal: Proposal) -> str:
     """The input that the force follows best, "" where that cannot be told."""
     inputs = [name for name in thrust.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust.follows(log, name)) is not None}
@@ -1018,18 +1045,18 @@ def _driving(log: FlightLog, found: Proposal) -> str:
         return ""
     best = max(scores, key=scores.__getitem__)
     listed = ", ".join(f"{name} {score:.2f}" for name, score in scores.items())
-    found.questions.append(
+    proposal.questions.append(
         f"which of {', '.join(inputs)} drives the vehicle? The force follows '{best}' best"
         f" (correlations: {listed})"
     )
     return best
 
 
-def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | None:
+def _flyer(log: FlightLog, proposal: Proposal, weighed: float | None) -> dict | None:
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """
-    applied = thrust.thrust_of(log, KnownVehicle(thrust_input=_driving(log, found)))
+    applied = thrust.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
     if (
         applied is None
         or "quat_wb" not in log
@@ -1053,11 +1080,11 @@ def _flyer(log: FlightLog, found: Proposal, weighed: float | None) -> dict | Non
             if mass
             else "stands for any, and the thrust is scaled to it"
         )
-        found.questions.append(
+        proposal.questions.append(
             f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG"
         )
     if gap:
-        found.questions.append(
+        proposal.questions.append(
             f"what does the payload weigh? {(1.0 - share) * whole:.3g} kg is a guess"
         )
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]

@@ -59,24 +59,28 @@ def by_lean(
         Each pair of units that goes together; none where nothing leans.
     """
     time, path = rising(time, path)
-    found = []
-    at, acc = physics.accelerations(time, path, "m", _SPAN)
+    fits = []
+    stamps, acc = physics.accelerations(time, path, "m", _SPAN)
     for angle, attitude in attitudes.items():
         time_q, quat = attitude.samples()
-        if min(len(at), len(time_q)) < 50:
+        if min(len(stamps), len(time_q)) < 50:
             continue
-        up = relations.attitude_at(time_q, quat, at).apply([0.0, 0.0, 1.0])
-        lean = relations.mean_over(at, GRAVITY * up[:, :2] / np.maximum(up[:, 2:], 0.2), at, _SPAN)
-        size, does = (float(np.sqrt(np.sum(np.var(of, axis=0)))) for of in (lean, acc[:, :2]))
+        up = relations.attitude_at(time_q, quat, stamps).apply([0.0, 0.0, 1.0])
+        lean = relations.mean_over(
+            stamps, GRAVITY * up[:, :2] / np.maximum(up[:, 2:], 0.2), stamps, _SPAN
+        )
+        size, does = (
+            float(np.sqrt(np.sum(np.var(values, axis=0)))) for values in (lean, acc[:, :2])
+        )
         if size < _LEANS or does <= 0.0:
             continue
         ratios = {unit: does * UNITS[unit][1] / size for unit in units}
-        found += [
+        fits += [
             (unit, angle, ratio)
             for unit, ratio in ratios.items()
             if abs(np.log10(ratio)) < _DECADES
         ]
-    return found
+    return fits
 
 
 def lean_misfit(time: np.ndarray, path: np.ndarray, attitude: Channel) -> tuple[float, float]:
@@ -92,13 +96,13 @@ def lean_misfit(time: np.ndarray, path: np.ndarray, attitude: Channel) -> tuple[
         count as independent; infinite and 0 where too little is known.
     """
     time_q, quat = attitude.samples()
-    at, acc = physics.accelerations(*rising(time, path), "m", _SPAN)
-    if min(len(at), len(time_q)) < 50:
+    stamps, acc = physics.accelerations(*rising(time, path), "m", _SPAN)
+    if min(len(stamps), len(time_q)) < 50:
         return np.inf, 0.0
-    up = relations.attitude_at(time_q, quat, at).apply([0.0, 0.0, 1.0])
-    across = np.cross(up, acc + [0.0, 0.0, GRAVITY])
-    least = 1e-4  # noise of a still path [m^2/s^4]
-    return float(np.mean(np.sum(across**2, axis=1))) + least, 0.5 * float(np.ptp(at)) / _SPAN
+    up = relations.attitude_at(time_q, quat, stamps).apply([0.0, 0.0, 1.0])
+    sideways = np.cross(up, acc + [0.0, 0.0, GRAVITY])
+    floor = 1e-4  # noise of a still path [m^2/s^4]
+    return float(np.mean(np.sum(sideways**2, axis=1))) + floor, 0.5 * float(np.ptp(stamps)) / _SPAN
 
 
 def by_fall(time: np.ndarray, path: np.ndarray) -> str:
@@ -111,7 +115,8 @@ def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])
     off = {unit: np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2) for unit in LENGTHS}
     shares = {
-        unit: float(np.max(np.mean(of < _FALLS * GRAVITY, axis=0))) for unit, of in off.items()
+        unit: float(np.max(np.mean(excess < _FALLS * GRAVITY, axis=0)))
+        for unit, excess in off.items()
     }
     best = max(shares, key=shares.__getitem__)
     return best if shares[best] > _SHARE else ""
@@ -122,8 +127,8 @@ def by_hall(path: np.ndarray) -> tuple[list[str], float]:
 
     Returns them and how far it reaches from the origin, in its own unit.
     """
-    far = float(np.nanmax(np.abs(path)))
-    return [unit for unit in LENGTHS if _HALL[0] <= far * UNITS[unit][1] <= _HALL[1]], far
+    reach = float(np.nanmax(np.abs(path)))
+    return [unit for unit in LENGTHS if _HALL[0] <= reach * UNITS[unit][1] <= _HALL[1]], reach
 
 
 def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> str:

@@ -83,16 +83,22 @@ def components(window: Window, channel: int) -> np.ndarray | None:
     return rows[np.argsort(window.time[rows], kind="stable")].reshape(len(stamps), counts[0])
 
 
-def with_correlations(windows: Sequence[Window], known: Mapping[int, Correlation]) -> list[Window]:
+def with_correlations(
+    windows: Sequence[Window], correlations_of: Mapping[int, Correlation]
+) -> list[Window]:
     """Tell windows of the correlations of their channels' noise; ``windows``: of white noise;
-    ``known``: of channels, by number.
+    ``correlations_of``: of channels, by number.
     """
-    return each(lambda window: _told(window, known), windows) if known else list(windows)
+    return (
+        each(lambda window: _told(window, correlations_of), windows)
+        if correlations_of
+        else list(windows)
+    )
 
 
-def _told(window: Window, known: Mapping[int, Correlation]) -> Window:
+def _told(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
     factors, sigma = [], window.sigma.copy()
-    for channel, correlation in known.items():
+    for channel, correlation in correlations_of.items():
         rows = components(window, channel)
         if rows is not None:
             time = window.time[rows[:, 0]]
@@ -110,16 +116,16 @@ def correlations(
     model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = each(lambda window: hidden_gram(window, channels), free)
-    left = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
+    residuals = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
     suspects = {
-        c: scale for c in range(channels) if (scale := _suspected(free, left, c)) is not None
+        c: scale for c in range(channels) if (scale := _suspected(free, residuals, c)) is not None
     }
-    known: dict[int, Correlation] = {}
+    correlations_of: dict[int, Correlation] = {}
     for channel, scale in suspects.items():
-        best, ahead = _climbed(free, channels, known, channel, scale)
-        if ahead > VERY_STRONG:
-            known[channel] = best
-    return known
+        best, nats = _climbed(free, channels, correlations_of, channel, scale)
+        if nats > VERY_STRONG:
+            correlations_of[channel] = best
+    return correlations_of
 
 
 def few_of(items: Sequence[T]) -> list[T]:
@@ -138,23 +144,25 @@ def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
     )
 
 
-def _suspected(windows: Sequence[Window], left: Sequence[np.ndarray], channel: int) -> float | None:
+def _suspected(
+    windows: Sequence[Window], residuals: Sequence[np.ndarray], channel: int
+) -> float | None:
     """Deviation of what is left of a channel, in that which is stated; None where its neighbours
     are hardly correlated.
     """
     parts = [
         r[rows] / w.sigma[rows]
-        for w, r in zip(windows, left)
+        for w, r in zip(windows, residuals)
         if (rows := components(w, channel)) is not None
     ]
     if not parts:
         return None
-    far = (
+    distant = (
         noise.HUBER
         * noise.MAD_TO_SIGMA
         * np.median(np.abs(np.concatenate([p.ravel() for p in parts])))
     )
-    parts = [np.clip(p, -far, far) for p in parts]
+    parts = [np.clip(p, -distant, distant) for p in parts]
     square = sum(float((p**2).sum()) for p in parts)
     if sum(float((p[1:] * p[:-1]).sum()) for p in parts) < SUSPECT * square:
         return None
@@ -164,7 +172,7 @@ def _suspected(windows: Sequence[Window], left: Sequence[np.ndarray], channel: i
 def _climbed(
     windows: Sequence[Window],
     channels: int,
-    known: Mapping[int, Correlation],
+    correlations_of: Mapping[int, Correlation],
     channel: int,
     scale: float,
 ) -> tuple[Correlation, float]:
@@ -172,8 +180,8 @@ def _climbed(
     above white noise.
     """
     stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
-    period = float(np.median(np.concatenate([np.diff(own) for own in stamps])))
-    found: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
+    period = float(np.median(np.concatenate([np.diff(stamps_of) for stamps_of in stamps])))
+    scores: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
     levels: noise.Noise | None = None
     times = int(np.searchsorted(PERIODS * period, LONGEST))
     if not times:
@@ -181,11 +189,13 @@ def _climbed(
 
     def tried(place: tuple[int, int, int]) -> float:
         nonlocal levels
-        if place not in found:
-            own = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
-            value, levels = _likelihood(windows, channels, {**known, channel: own}, levels)
-            found[place] = value, replace(own, scale=own.scale * levels.scale[channel])
-        return found[place][0]
+        if place not in scores:
+            stamps_of = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
+            value, levels = _likelihood(
+                windows, channels, {**correlations_of, channel: stamps_of}, levels
+            )
+            scores[place] = value, replace(stamps_of, scale=stamps_of.scale * levels.scale[channel])
+        return scores[place][0]
 
     best = max(
         ((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried
@@ -196,17 +206,17 @@ def _climbed(
         ):
             best = better
     if best[0] == times - 1:  # it would last for still longer
-        return found[best][1], 0.0
+        return scores[best][1], 0.0
     white = max(
         _likelihood(
             [replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows],
             channels,
-            known,
+            correlations_of,
         )[0]
         for s in (1.0, scale)
     )
-    value, own = found[best]
-    return own, value - white
+    value, stamps_of = scores[best]
+    return stamps_of, value - white
 
 
 def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
@@ -214,23 +224,23 @@ def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[in
     the other order.
     """
     time, share, order = place
-    near = [(time + step, share, order) for step in (-stride, stride)]
+    neighbours = [(time + step, share, order) for step in (-stride, stride)]
     if stride == STRIDES[0]:
-        near += [(time, share - 1, order), (time, share + 1, order), (time, share, 3 - order)]
-    return [p for p in near if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
+        neighbours += [(time, share - 1, order), (time, share + 1, order), (time, share, 3 - order)]
+    return [p for p in neighbours if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
 
 
 def _likelihood(
     windows: Sequence[Window],
     channels: int,
-    known: Mapping[int, Correlation],
+    correlations_of: Mapping[int, Correlation],
     start: noise.Noise | None = None,
 ) -> tuple[float, noise.Noise]:
     """Log marginal likelihood of windows, and their levels; ``start``: where these are searched
     from.
     """
-    told = with_correlations(windows, known)
-    grams = each(lambda window: hidden_gram(window, channels), told)
-    shaped = designs.correlated_of(grams, told, noise.CORRELATION_TIMES[1], "cpu")
+    correlated = with_correlations(windows, correlations_of)
+    grams = each(lambda window: hidden_gram(window, channels), correlated)
+    shaped = designs.correlated_of(grams, correlated, noise.CORRELATION_TIMES[1], "cpu")
     levels, value = noise.roughly(shaped, start)
     return value, levels

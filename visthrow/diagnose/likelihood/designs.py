@@ -82,25 +82,25 @@ class _Design:
     def inner(self) -> list[There]:
         """Inner products of each window's columns by channel, shape (C, P, P)."""
         count, _, channels = self._member.shape
-        found = self._columns.new_empty(
+        products = self._columns.new_empty(
             (count, channels, self._columns.shape[2], self._columns.shape[2])
         )
         for c in range(channels):
             torch.matmul(
                 (self._columns * self._member[:, :, c, None]).transpose(1, 2),
                 self._columns,
-                out=found[:, c],
+                out=products[:, c],
             )
-        return _on_both(found, self._widths)
+        return _on_both(products, self._widths)
 
     def left(self, residuals: Sequence[np.ndarray], fits: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Return each window's residual after fits of the first columns, shape (N,)."""
         fit = np.zeros((len(fits), self._columns.shape[2]))
-        for row, own in zip(fit, fits):
-            row[: len(own)] = own
+        for row, fit_of in zip(fit, fits):
+            row[: len(fit_of)] = fit_of
         explained = self._columns @ torch.from_numpy(fit).to(self._sigma.device)[:, :, None]
-        left = ((self._off(residuals) - explained[:, :, 0]) * self._sigma).cpu().numpy()
-        return [own[: len(residual)] for own, residual in zip(left, residuals)]
+        residual_after = ((self._off(residuals) - explained[:, :, 0]) * self._sigma).cpu().numpy()
+        return [fit_of[: len(residual)] for fit_of, residual in zip(residual_after, residuals)]
 
     def _off(self, residuals: Sequence[np.ndarray]) -> torch.Tensor:
         """Residuals over sigmas, shape (W, N)."""
@@ -118,7 +118,10 @@ class _Design:
         cross, square = all_to_host(
             (by_channel @ self._columns, (by_channel @ off[:, :, None])[..., 0])
         )
-        return ((own[:, :width], its) for own, width, its in zip(cross, self._widths, square))
+        return (
+            (products_of[:, :width], its)
+            for products_of, width, its in zip(cross, self._widths, square)
+        )
 
 
 def _designed(windows: Sequence[Window], floors: np.ndarray, channels: int, device: str) -> _Design:
@@ -166,8 +169,8 @@ def _correlated(windows: Sequence[Window]) -> bool:
 def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[There]:
     """Square matrices of some channels, shape (W, C, P, P), as far as they are not padded."""
     return [
-        There(own[:, :n, :n], host[:, :n, :n])
-        for own, host, n in zip(values, to_host(values), widths)
+        There(device_values[:, :n, :n], host[:, :n, :n])
+        for device_values, host, n in zip(values, to_host(values), widths)
     ]
 
 
@@ -182,14 +185,14 @@ def padded(
 
     ``inner``: of the grams, see :attr:`Gram.placed`; ``part``: of one gram's, given its number;
     ``shape``: to pad to."""
-    if not any(isinstance(own, There) for own in inner):
-        return side_by_side([[part(own, i)] for i, own in enumerate(inner)], shape, device)
+    if not any(isinstance(product, There) for product in inner):
+        return side_by_side([[part(product, i)] for i, product in enumerate(inner)], shape, device)
     out = torch.zeros((len(inner), *shape), dtype=torch.float64, device=device)
-    for i, own in enumerate(inner):
+    for i, product in enumerate(inner):
         values = (
-            part(own.values, i)
-            if isinstance(own, There)
-            else torch.tensor(part(own, i), device=device)
+            part(product.values, i)
+            if isinstance(product, There)
+            else torch.tensor(part(product, i), device=device)
         )
         out[(i, *map(slice, values.shape))] = values
     return out
@@ -211,20 +214,21 @@ def correlated_of(
     )
     channels, size = len(grams[0].count), max(widths)
     places, values = [], []
-    for w, (gram, own) in enumerate(zip(grams, factors)):
-        knots = np.arange(gram.nuisances, gram.nuisances + gram.latents).reshape(-1, len(own))
+    for w, (gram, factor) in enumerate(zip(grams, factors)):
+        knots = np.arange(gram.nuisances, gram.nuisances + gram.latents).reshape(-1, len(factor))
         places.append(((w * size + knots[:, :, None]) * size + knots[:, None]).ravel())
-        values.append(np.broadcast_to(own, (len(knots), *own.shape)).ravel())
+        values.append(np.broadcast_to(factor, (len(knots), *factor.shape)).ravel())
     right = torch.eye(size, dtype=torch.float64, device=device).repeat(len(grams), 1, 1)
     where, what = (torch.from_numpy(np.concatenate(parts)).to(device) for parts in (places, values))
     right.view(-1)[where] = what
     right = right[:, None]
     inner = padded(
-        [gram.placed for gram in grams], lambda own, _: own, (channels, size, size), device
+        [gram.placed for gram in grams], lambda factor, _: factor, (channels, size, size), device
     )
-    there = _on_both(right.mT @ inner @ right, widths)
+    products = _on_both(right.mT @ inner @ right, widths)
     return [
-        correlated_with(gram, both.of, own, both) for gram, both, own in zip(grams, there, factors)
+        correlated_with(gram, product.of, factor, product)
+        for gram, product, factor in zip(grams, products, factors)
     ]
 
 

@@ -136,13 +136,15 @@ def log_evidence(
     mean = lapack.dpotrs(factor, half, lower=1)[0]
     value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
     if len(active):
-        at = list(active)
-        spread = lapack.dpotrs(factor, np.eye(len(factor))[:, at], lower=1)[0][at].diagonal()
-        mean, spread = mean[at] * deviation[at], np.sqrt(spread) * deviation[at]
-        low, high = priors.low[at], priors.high[at]
+        columns = list(active)
+        spread = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0][
+            columns
+        ].diagonal()
+        mean, spread = mean[columns] * deviation[columns], np.sqrt(spread) * deviation[columns]
+        low, high = priors.low[columns], priors.high[columns]
         value += (
             _log_mass(mean, spread, low, high)
-            - _log_mass(np.zeros(len(at)), deviation[at], low, high)
+            - _log_mass(np.zeros(len(columns)), deviation[columns], low, high)
         ).sum()
     return float(value)
 
@@ -177,29 +179,31 @@ def _naming(
     score: np.ndarray,
     priors: Priors,
     active: list[int] | tuple[int, ...],
-    at: np.ndarray,
+    sets: np.ndarray,
 ) -> np.ndarray:
-    """Gain of log Z by naming several effects more, for P sets of them; ``at``: their numbers,
+    """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their numbers,
     shape (P, m).
     """
     sigma = covariance(information, priors.deviation(active))
-    mean, change = (score @ sigma)[..., at], (priors.slab**-2.0 - SPIKE**-2.0)[at]
-    own, unit = sigma[at[:, :, None], at[:, None]], np.eye(at.shape[1])
-    taken = np.linalg.inv(own + unit / change[:, None])
-    wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", own, taken, mean, optimize=True)
-    wide_sd = np.sqrt(np.maximum((own - own @ taken @ own).diagonal(axis1=1, axis2=2), 1e-300))
+    mean, change = (score @ sigma)[..., sets], (priors.slab**-2.0 - SPIKE**-2.0)[sets]
+    variance, unit = sigma[sets[:, :, None], sets[:, None]], np.eye(sets.shape[1])
+    taken = np.linalg.inv(variance + unit / change[:, None])
+    wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
+    wide_sd = np.sqrt(
+        np.maximum((variance - variance @ taken @ variance).diagonal(axis1=1, axis2=2), 1e-300)
+    )
     gain = (
-        -np.log(priors.slab / SPIKE)[at].sum(1)
-        - 0.5 * np.linalg.slogdet(unit + change[..., None] * own)[1]
+        -np.log(priors.slab / SPIKE)[sets].sum(1)
+        - 0.5 * np.linalg.slogdet(unit + change[..., None] * variance)[1]
     )
     gain = gain - 0.5 * np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
-    low, high, slab = priors.low[at], priors.high[at], priors.slab[at]
+    low, high, slab = priors.low[sets], priors.high[sets], priors.slab[sets]
     gain = gain + (
         _log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)
     ).sum(-1)
     out = ~priors.visible
     out[list(active)] = True
-    return np.where(out[at].any(1), -np.inf, gain)
+    return np.where(out[sets].any(1), -np.inf, gain)
 
 
 def estimate(
@@ -212,11 +216,13 @@ def estimate(
 
     theta = np.zeros(len(score))
     if len(active):
-        at = list(active)
-        normal = information[np.ix_(at, at)] + np.diag(priors.slab[at] ** -2.0)
+        columns = list(active)
+        normal = information[np.ix_(columns, columns)] + np.diag(priors.slab[columns] ** -2.0)
         factor = np.linalg.cholesky(normal)
-        right = np.linalg.solve(factor, score[at])
-        theta[at] = lsq_linear(factor.T, right, (priors.low[at], priors.high[at]), method="bvls").x
+        right = np.linalg.solve(factor, score[columns])
+        theta[columns] = lsq_linear(
+            factor.T, right, (priors.low[columns], priors.high[columns]), method="bvls"
+        ).x
     return theta
 
 
@@ -228,9 +234,9 @@ def certainty(
 
     Above 1 it is more than what may go unnamed.
     """
-    at = list(active)
-    spread = np.diag(covariance(information, priors.deviation(at)))[at]
-    return np.abs(theta[at]) / (NORMAL_95 * np.hypot(np.sqrt(spread), SPIKE))
+    columns = list(active)
+    spread = np.diag(covariance(information, priors.deviation(columns)))[columns]
+    return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(spread), SPIKE))
 
 
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:

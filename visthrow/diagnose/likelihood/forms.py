@@ -76,13 +76,13 @@ def errors(
     names, row = np.unique(groups, return_inverse=True)
     sums = np.zeros((3, len(names), channels, len(HORIZONS)))
     for window, f, residual in zip(windows, row, residuals):
-        left, expected, horizon = predicted(window, noise, residual)
-        ahead = horizon >= 0
-        own = np.zeros((3, channels, len(HORIZONS)))
-        for total, values in zip(own, (left**2, np.ones_like(left), expected)):
-            np.add.at(total, (window.channel[ahead], horizon[ahead]), values[ahead])
-        own[2] = np.where(own[2] > FAR_ABOVE * own[0], own[0], own[2])
-        sums[:, f] += own
+        innovation, expected, horizon = predicted(window, noise, residual)
+        predicts = horizon >= 0
+        sums_of = np.zeros((3, channels, len(HORIZONS)))
+        for total, values in zip(sums_of, (innovation**2, np.ones_like(innovation), expected)):
+            np.add.at(total, (window.channel[predicts], horizon[predicts]), values[predicts])
+        sums_of[2] = np.where(sums_of[2] > FAR_ABOVE * sums_of[0], sums_of[0], sums_of[2])
+        sums[:, f] += sums_of
     return Errors(*sums)
 
 
@@ -106,11 +106,11 @@ def predicted(
     off = (residual.T / sigma).T
     begin, length = window.time.min(), np.ptp(window.time)
     fits = states.shape[1] > 0
-    ahead = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
-    head = (ahead <= 0.0) & fits
+    horizon_time = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
+    head = (horizon_time <= 0.0) & fits
     weighted = (states[head] / scale[head, None] ** 2).T
     spread = np.linalg.inv(weighted @ states[head] + np.eye(states.shape[1]))
-    left = off - states @ (spread @ (weighted @ off[head]))
+    innovation = off - states @ (spread @ (weighted @ off[head]))
     if window.correlated:
         root = _root(window, scale)
         expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + (
@@ -118,14 +118,16 @@ def predicted(
         ).sum(1)
     else:  # what that is where noise is white
         expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
-    horizon = np.where(head, -1, np.minimum(np.searchsorted(HORIZONS, ahead), len(HORIZONS) - 1))
-    return left, expected, horizon
+    horizon = np.where(
+        head, -1, np.minimum(np.searchsorted(HORIZONS, horizon_time), len(HORIZONS) - 1)
+    )
+    return innovation, expected, horizon
 
 
 def _root(window: Window, scale: np.ndarray) -> np.ndarray:
     """Square root of the covariance of a window's noise in sigmas, shape (N, N)."""
     root = np.diag(scale)
     for rows, factor in window.correlated:
-        for own in rows.T:
-            root[np.ix_(own, own)] = scale[own[0]] * factor
+        for row in rows.T:
+            root[np.ix_(row, row)] = scale[row[0]] * factor
     return root

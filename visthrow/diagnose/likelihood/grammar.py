@@ -22,7 +22,7 @@ def joined(knots: Sequence[Known], names: Sequence[str]) -> Known:
     What follows from them follows at each knot by itself, but for the thrust's slope, which is
     taken within windows."""
     taken = [*names, "slope"] if {"thrust", "time"} <= set(names) else names
-    return Known({name: np.concatenate([known[name] for known in knots]) for name in taken})
+    return Known({name: np.concatenate([knots_of[name] for knots_of in knots]) for name in taken})
 
 
 @lru_cache(maxsize=64)
@@ -40,18 +40,18 @@ def between(count: int) -> np.ndarray:
     return np.linalg.lstsq(hats, curve, rcond=None)[0]
 
 
-def through_latents(window: Window, known: Known, block: str) -> np.ndarray:
+def through_latents(window: Window, quantities: Known, block: str) -> np.ndarray:
     """Latent-force coefficients that what a block exerts at the knots stands for.
 
     Returns shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
     """
-    size = 3 * len(known["time"])
+    size = 3 * len(quantities["time"])
     if block != JOINT:
-        return _hats(window, known["time"], block)
+        return _hats(window, quantities["time"], block)
     units = np.eye(size).reshape(-1, 3, size)
-    shares = loads(block, known, units)
+    shares = loads(block, quantities, units)
     return sum(
-        _hats(window, known["time"], name) @ values.reshape(size, size)
+        _hats(window, quantities["time"], name) @ values.reshape(size, size)
         for name, values in shares.items()
     )
 
@@ -60,8 +60,8 @@ def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
     """Return the interpolation weights of one latent block."""
     out = np.zeros((len(window.latent_block), len(time), 3))
     rows = np.flatnonzero(window.latent_block == LATENT_BLOCKS.index(block))
-    at = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)
-    out[rows, :, window.latent_axis[rows].astype(int)] = between(len(time))[at]
+    nearest = np.abs(window.latent_time[rows, None] - time).argmin(axis=1)
+    out[rows, :, window.latent_axis[rows].astype(int)] = between(len(time))[nearest]
     return out.reshape(len(out), -1)
 
 
@@ -77,9 +77,9 @@ def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
     T).
     """
-    out, known = np.zeros((len(window.latent_block), len(terms_))), Known(window.knots)
+    out, quantities = np.zeros((len(window.latent_block), len(terms_))), Known(window.knots)
     for i, effect in enumerate(terms_):
         if carries(window.latent_block, effect.term.block):
-            values = Layout.of([effect.term]).table(known).ravel()
-            out[:, i] = through_latents(window, known, effect.term.block) @ values
+            values = Layout.of([effect.term]).table(quantities).ravel()
+            out[:, i] = through_latents(window, quantities, effect.term.block) @ values
     return out

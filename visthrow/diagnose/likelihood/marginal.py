@@ -190,15 +190,15 @@ def without_effects(gram: Gram) -> Gram:
     size = gram.nuisances + gram.latents
     if not isinstance(gram.placed, There):
         return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
-    there = There(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
-    return replace(gram, inner=there.of, cross=gram.cross[:, :size], there=there)
+    device_inner = There(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
+    return replace(gram, inner=device_inner.of, cross=gram.cross[:, :size], there=device_inner)
 
 
 def whitened(window: Window, values: np.ndarray) -> np.ndarray:
     """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
     for rows, factor in window.correlated:
-        own = values[rows].reshape(len(rows), -1)
-        values[rows] = lapack.dtrtrs(factor, own, lower=1)[0].reshape(*rows.shape, -1)
+        group = values[rows].reshape(len(rows), -1)
+        values[rows] = lapack.dtrtrs(factor, group, lower=1)[0].reshape(*rows.shape, -1)
     return values
 
 
@@ -209,8 +209,8 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
     cross, square = np.zeros((channels, z.shape[1])), np.zeros(channels)
     for c in np.unique(window.channel):
         rows = window.channel == c
-        own, left = z[rows], r[rows]
-        inner[c], cross[c], square[c] = own.T @ own, left @ own, left @ left
+        white, residual = z[rows], r[rows]
+        inner[c], cross[c], square[c] = white.T @ white, residual @ white, residual @ residual
     return gram_with(window, inner, cross, square)
 
 
@@ -287,15 +287,15 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     correlate by exp(-dt/time)."""
     if not gram.latents:
         return gram
-    own = knot_factor(window, time)
-    knots, groups = len(own), gram.latents // len(own)
+    factor = knot_factor(window, time)
+    knots, groups = len(factor), gram.latents // len(factor)
     part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
     inner = gram.inner.copy()
-    inner[:, part] = (own.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
+    inner[:, part] = (factor.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
         channels, -1, size
     )
-    inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ own).reshape(channels, size, -1)
-    return correlated_with(gram, inner, own)
+    inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ factor).reshape(channels, size, -1)
+    return correlated_with(gram, inner, factor)
 
 
 def knot_factor(window: Window, time: float) -> np.ndarray:
@@ -310,21 +310,23 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
 
 
 def correlated_with(
-    gram: Gram, inner: np.ndarray, own: np.ndarray, there: There | None = None
+    gram: Gram, inner: np.ndarray, factors: np.ndarray, device_inner: There | None = None
 ) -> Gram:
     """The gram into which a factor of each group's knots was multiplied, with the inner products
     that came of it.
     """
     part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
-    cross[:, part] = (cross[:, part].reshape(-1, len(own)) @ own).reshape(len(cross), -1)
-    groups = gram.latents // len(own)
-    factor, every = np.zeros((groups, len(own), groups, len(own))), range(groups)
-    factor[every, :, every] = own  # of each group, the same
-    factor, shown = (
+    cross[:, part] = (cross[:, part].reshape(-1, len(factors)) @ factors).reshape(len(cross), -1)
+    groups = gram.latents // len(factors)
+    factor, groups_range = np.zeros((groups, len(factors), groups, len(factors))), range(groups)
+    factor[groups_range, :, groups_range] = factors  # of each group, the same
+    factor, information = (
         factor.reshape(gram.latents, gram.latents),
         _shown(inner, gram.nuisances, gram.latent_block),
     )
-    return replace(gram, inner=inner, cross=cross, factor=factor, shown=shown, there=there)
+    return replace(
+        gram, inner=inner, cross=cross, factor=factor, shown=information, there=device_inner
+    )
 
 
 def _knots(group: np.ndarray, time: np.ndarray) -> int:
@@ -369,8 +371,8 @@ def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
     knots, shape (D + L,); shape (N,).
     """
     states = window.nuisance.shape[1]
-    left = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
-    return left - window.latent @ fit[states:] if len(fit) > states else left
+    residual = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
+    return residual - window.latent @ fit[states:] if len(fit) > states else residual
 
 
 def with_products(gram: Gram, cross: np.ndarray, square: np.ndarray) -> Gram:
@@ -410,14 +412,14 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
     information, score, square, samples = (
         np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ())
     )
-    own = np.zeros(size)
+    total = np.zeros(size)
     for i, gram, part in zip(row, grams, parts):
         information[i] += part.information
         score[i] += part.score
         square[i] += part.square
         samples[i] += gram.count.sum()
-        own += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
-    silent = np.diagonal(information.sum(0)) < ROUNDING * own
+        total += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
+    silent = np.diagonal(information.sum(0)) < ROUNDING * total
     information[:, silent], information[:, :, silent], score[:, silent] = 0.0, 0.0, 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
@@ -434,16 +436,16 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
 
 
 def rescored(
-    known: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray
+    statistics: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray
 ) -> Statistics:
     """Return statistics of windows with other residuals: their information stays.
 
-    ``known``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
+    ``statistics``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
     """
-    row = {flight: i for i, flight in enumerate(known.flights.tolist())}
+    row = {flight: i for i, flight in enumerate(statistics.flights.tolist())}
     which = [row[gram.flight] for gram in grams]
-    score, square = np.zeros_like(known.score), np.zeros_like(known.square)
+    score, square = np.zeros_like(statistics.score), np.zeros_like(statistics.square)
     np.add.at(score, which, [part.score for part in parts])
     np.add.at(square, which, [part.square for part in parts])
-    score[:, np.diagonal(known.information.sum(0)) == 0.0] = 0.0
-    return replace(known, score=score, square=square, theta=np.array(theta, dtype=float))
+    score[:, np.diagonal(statistics.information.sum(0)) == 0.0] = 0.0
+    return replace(statistics, score=score, square=square, theta=np.array(theta, dtype=float))

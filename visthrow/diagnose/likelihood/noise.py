@@ -84,24 +84,24 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
     """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
     has one maximum over it.
     """
-    bare, found = [without_effects(gram) for gram in grams], {}
+    bare, levels_of = [without_effects(gram) for gram in grams], {}
 
     def likely(i: int, noise: Noise | None) -> float:
-        if i not in found:
+        if i not in levels_of:
             shaped = designs.correlated_of(bare, windows, CORRELATION_TIMES[i], device)
             begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
-            found[i] = maximised(shaped, begin, device, ROUGHLY_NATS)
-        return found[i][1]
+            levels_of[i] = maximised(shaped, begin, device, ROUGHLY_NATS)
+        return levels_of[i][1]
 
     best = len(CORRELATION_TIMES) // 2
     likely(best, None)
     for way in (-1, 1):
         while (
             0 <= best + way < len(CORRELATION_TIMES)
-            and likely(best + way, found[best][0]) > found[best][1]
+            and likely(best + way, levels_of[best][0]) > levels_of[best][1]
         ):
             best += way
-    return found[best][0]
+    return levels_of[best][0]
 
 
 def only(noise: Noise, grams: Sequence[Gram], windows: Sequence[int]) -> Noise:
@@ -130,9 +130,9 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
     for gram in grams:
-        for block, seen in gram.shown.items():
-            if seen > 0.0:  # else these forces show nowhere in the window
-                visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(seen))
+        for block, information in gram.shown.items():
+            if information > 0.0:  # else these forces show nowhere in the window
+                visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(information))
     return Noise(
         scale,
         {key: float(np.median(v)) for key, v in visible.items()},
@@ -160,11 +160,13 @@ class _Layout:
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters: of the same windows, once."""
         count, phases = sum(gram.count for gram in grams), tuple(gram.phase for gram in grams)
-        latents, seen = (
+        latents, measured = (
             designs.Same([gram.latent_block for gram in grams]),
             tuple(np.flatnonzero(count > 0).tolist()),
         )
-        return _Layout._numbered(latents, phases, tuple(sorted(noise.latent_sd)), seen, len(count))
+        return _Layout._numbered(
+            latents, phases, tuple(sorted(noise.latent_sd)), measured, len(count)
+        )
 
     @staticmethod
     @lru_cache(maxsize=8)
@@ -174,39 +176,43 @@ class _Layout:
         """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``:
         those with samples, of so many.
         """
-        index, blocks, seen = (
+        index, blocks, measured = (
             {key: i for i, key in enumerate(keys)},
             len(LATENT_BLOCKS),
             np.array(channels, dtype=int),
         )
         present = [
-            [b for b in range(blocks) if (b, name) in index and np.any(own == b)]
-            for own, name in zip(latents, names)
+            [b for b in range(blocks) if (b, name) in index and np.any(levels_of == b)]
+            for levels_of, name in zip(latents, names)
         ]
-        pairs = np.array([(w, b) for w, own in enumerate(present) for b in own], dtype=int).reshape(
-            -1, 2
-        )
+        pairs = np.array(
+            [(w, b) for w, levels_of in enumerate(present) for b in levels_of], dtype=int
+        ).reshape(-1, 2)
         phases = np.array(
-            [index[b, name] for name, own in zip(names, present) for b in own], dtype=int
+            [index[b, name] for name, levels_of in zip(names, present) for b in levels_of],
+            dtype=int,
         )
         first = len(keys) + len(pairs)
-        size, width, at = first + len(seen), blocks + count, len(keys)
+        size, width, position = first + len(measured), blocks + count, len(keys)
         slopes, curvatures = [], []
-        for w, (name, own) in enumerate(zip(names, present)):
-            shared = [index[b, name] for b in own]
-            to = np.array([*shared, *range(at, at + len(own)), *range(first, size)], dtype=int)
+        for w, (name, levels_of) in enumerate(zip(names, present)):
+            shared = [index[b, name] for b in levels_of]
+            places = np.array(
+                [*shared, *range(position, position + len(levels_of)), *range(first, size)],
+                dtype=int,
+            )
             part = np.array(
-                [*own, *own, *(blocks + seen)], dtype=int
+                [*levels_of, *levels_of, *(blocks + measured)], dtype=int
             )  # levels and shares of the blocks, scales
-            slopes.append((w * width + part, to))
+            slopes.append((w * width + part, places))
             curvatures.append(
                 [
                     (w * width * width + np.add.outer(width * part, part)).ravel(),
-                    np.add.outer(size * to, to).ravel(),
+                    np.add.outer(size * places, places).ravel(),
                 ]
             )
-            at += len(own)
-        return _Layout(keys, pairs, phases, seen, np.hstack(slopes), np.hstack(curvatures))
+            position += len(levels_of)
+        return _Layout(keys, pairs, phases, measured, np.hstack(slopes), np.hstack(curvatures))
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
@@ -245,13 +251,13 @@ class _Layout:
 
 
 def maximised(
-    grams: Sequence[Gram], noise: Noise, device: str, enough: float = ENOUGH_NATS
+    grams: Sequence[Gram], noise: Noise, device: str, tolerance: float = ENOUGH_NATS
 ) -> tuple[Noise, float]:
     """Most probable logarithms of all levels, with exact gradients and explicit limits.
 
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at
-    all windows suffice. ``noise``: where the search starts; ``enough``: nats; a step that promises
-    less is the last."""
+    all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
+    promises less is the last."""
     layout, stack = _Layout.of(grams, noise), Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
@@ -262,7 +268,7 @@ def maximised(
     value, slope, curvature = look(x, first=True)
     for _ in range(ITERATIONS):
         step, promised = _scoring_step(layout, x, slope, curvature, low, high)
-        if promised < enough:  # it is taken without another look
+        if promised < tolerance:  # it is taken without another look
             return layout.unpack(x + step, noise), value + 0.5 * promised
         for _ in range(HALVINGS):
             tried, its_slope, expected = look(x + step)
@@ -289,22 +295,22 @@ def _scoring_step(
     What a limit holds back stays there, and the others move without it. A variance far too small
     shows in no likelihood's logarithm, but its own step is finite. A window's variance takes the
     steps of its phase's level and of its share together."""
-    known = np.diag(curvature)
+    diagonal = np.diag(curvature)
     free = (
-        (known > 0.0)
+        (diagonal > 0.0)
         & ~((x <= low + STALLED) & (slope < 0.0))
         & ~((x >= high - STALLED) & (slope > 0.0))
     )
     step = np.zeros_like(x)
     if not np.any(free):
         return step, 0.0
-    size = np.sqrt(known[free])
+    size = np.sqrt(diagonal[free])
     part = curvature[np.ix_(free, free)]
     part /= size[:, None]
     part /= size
     part.flat[:: len(part) + 1] += 1e-6
-    _, found, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
-    step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else found) / size
+    _, solution, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
+    step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else solution) / size
     promised = float(slope @ step)
     shares, turned = (
         slice(len(layout.keys), len(layout.keys) + len(layout.pairs)),
@@ -327,14 +333,14 @@ def _likelihood(
     """
     size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
     value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
-    own = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
+    place = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
     inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
-    slope[own] = TAIL * (inverse - 1.0)
-    curvature[own, own] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
+    slope[place] = TAIL * (inverse - 1.0)
+    curvature[place, place] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
     values, slopes, curvatures = stack.look(noise, first)
-    (own, to), (both, pair) = layout.slopes, layout.curvatures
-    slope += np.bincount(to, slopes.ravel()[own], size)
-    curvature += np.bincount(pair, curvatures.ravel()[both], size * size).reshape(size, size)
+    (place, target), (places, pair) = layout.slopes, layout.curvatures
+    slope += np.bincount(target, slopes.ravel()[place], size)
+    curvature += np.bincount(pair, curvatures.ravel()[places], size * size).reshape(size, size)
     return value + float(values.sum()), slope, curvature
 
 
@@ -348,24 +354,24 @@ def without_outliers(
     force can do stands out. ``grams``: of the windows, with ``factor`` the identity; ``floors``: of
     the effects, shape (K,)."""
     sigmas = [window.sigma for window in windows]
-    left, given, bare = (
+    windows_left, starts, bare = (
         list(range(len(windows))),
         list(windows),
         [without_effects(gram) for gram in grams],
     )
-    for again in range(CLEANINGS):
-        where = "cpu" if again else device  # few are looked at once more
+    for round_ in range(CLEANINGS):
+        where = "cpu" if round_ else device  # few are looked at once more
         residuals = designs.left_by(
-            given, floors, len(grams[0].count), widely_fitted(given, bare, where), where
+            starts, floors, len(grams[0].count), widely_fitted(starts, bare, where), where
         )
-        far = {w: _far(windows[w], residual) for w, residual in zip(left, residuals)}
-        left = [w for w in left if np.any(far[w] > 1.0)]
-        if not left:
+        distances = {w: _far(windows[w], residual) for w, residual in zip(windows_left, residuals)}
+        windows_left = [w for w in windows_left if np.any(distances[w] > 1.0)]
+        if not windows_left:
             break
-        for w in left:
-            sigmas[w] = windows[w].sigma * np.maximum(far[w], 1.0)
-        given = [replace(windows[w], sigma=sigmas[w]) for w in left]
-        bare = each(lambda window: hidden_gram(window, len(grams[0].count)), given)
+        for w in windows_left:
+            sigmas[w] = windows[w].sigma * np.maximum(distances[w], 1.0)
+        starts = [replace(windows[w], sigma=sigmas[w]) for w in windows_left]
+        bare = each(lambda window: hidden_gram(window, len(grams[0].count)), starts)
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 
@@ -386,10 +392,9 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
     return fits
 
 
-def _far(window: Window, left: np.ndarray) -> np.ndarray:
-    """Return how far samples lie outside, in the distance at which they count as far, shape (N,).
-    """
-    normal = np.abs(left) / window.sigma
+def _far(window: Window, residual: np.ndarray) -> np.ndarray:
+    """Return how far samples lie outside, in the distance at which they are far, shape (N,)."""
+    normal = np.abs(residual) / window.sigma
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
 
 

@@ -60,9 +60,9 @@ class _Columns:
         them.
         """
         with self._lock:
-            found = self._begun.pop(noise, None) or shaped()
-            self._begun = dict([*self._begun.items(), (noise, found)][-BEGUN:])
-            return found
+            start = self._begun.pop(noise, None) or shaped()
+            self._begun = dict([*self._begun.items(), (noise, start)][-BEGUN:])
+            return start
 
     @cached_property
     def hidden(self) -> torch.Tensor:
@@ -111,7 +111,7 @@ class _Batch:
     count: torch.Tensor  # shape (W, C)
     log_sigma: torch.Tensor  # shape (W,)
     member: torch.Tensor  # 1 where a column is of a block, shape (W, n, B)
-    known: torch.Tensor  # 1 where it is one of the initial state, shape (W, n)
+    initial: torch.Tensor  # 1 where it is one of the initial state, shape (W, n)
 
 
 @dataclass(frozen=True)
@@ -147,16 +147,16 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
 
 def _of_latents(share: Share, gram: Gram) -> WindowStatistics:
     latents, whole = gram.latents, share.information
-    back = (
+    inverse = (
         lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor
     )  # from unit latents to knots
     return WindowStatistics(
         whole[latents:, latents:],
         share.score[latents:],
         share.square,
-        back.T @ whole[:latents, :latents] @ back,
-        back.T @ share.score[:latents],
-        back.T @ whole[:latents, latents:],
+        inverse.T @ whole[:latents, :latents] @ inverse,
+        inverse.T @ share.score[:latents],
+        inverse.T @ whole[:latents, latents:],
     )
 
 
@@ -176,7 +176,7 @@ class Stack:
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
         self._batches = each(
-            lambda own: self._padded([grams[w] for w in own], rows[own]), self._order
+            lambda members: self._padded([grams[w] for w in members], rows[members]), self._order
         )
         self._count = len(grams)
 
@@ -184,18 +184,18 @@ class Stack:
         sizes = [gram.nuisances + gram.latents for gram in grams]
         count, channels, n = len(grams), len(grams[0].count), max(sizes)
         cross = np.zeros((count, channels, n))
-        member, known = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
+        member, initial = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
         for w, (gram, size) in enumerate(zip(grams, sizes)):
             cross[w, :, :size] = gram.cross[:, :size]
             member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
-            known[w, : gram.nuisances] = 1.0
+            initial[w, : gram.nuisances] = 1.0
         square, counts = (
             np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count")
         )
         log_sigma = np.array([gram.log_sigma for gram in grams])
         arrays = [
             torch.from_numpy(a).to(self.device)
-            for a in (cross, square, counts, log_sigma, member, known)
+            for a in (cross, square, counts, log_sigma, member, initial)
         ]
         inner = [gram.placed for gram in grams]
         columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(
@@ -224,14 +224,14 @@ class Stack:
         Raises DiagnoseError: as :meth:`values`.
         """
 
-        def found(batch: _Batch) -> tuple[torch.Tensor]:
+        def fit(batch: _Batch) -> tuple[torch.Tensor]:
             at = _shape(batch, noise)
             return (at.level * _solved(at, batch).mean,)
 
         by_window = {
             w: row
-            for own, (rows,) in zip(self._order, self._each(found))
-            for w, row in zip(own, rows)
+            for members, (rows,) in zip(self._order, self._each(fit))
+            for w, row in zip(members, rows)
         }
         return [by_window[w][:size] for w, size in enumerate(self._sizes)]
 
@@ -243,8 +243,8 @@ class Stack:
         DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B blocks'
         deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales share
         with the fitted columns is given to the channels by their part in them."""
-        found = self._each(lambda batch: _looked(batch, noise, first))
-        return tuple(self._in_order([part[i] for part in found]) for i in range(3))
+        parts = self._each(lambda batch: _looked(batch, noise, first))
+        return tuple(self._in_order([part[i] for part in parts]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
         """Integrate initial states out of each window, and latent forces unless they are asked for.
@@ -260,8 +260,8 @@ class Stack:
 
     def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)
-        for own, part in zip(self._order, parts):
-            out[own] = part
+        for members, part in zip(self._order, parts):
+            out[members] = part
         return out
 
 
@@ -299,13 +299,13 @@ def _shape(batch: _Batch, noise: Noise) -> _Shape:
     return _Shape(weight, level, factor, log_det)
 
 
-def _solved(at: _Shape, batch: _Batch) -> _Solved:
+def _solved(shape: _Shape, batch: _Batch) -> _Solved:
     """A shape with the residuals of a batch of the same derivatives."""
-    right = (at.level * (at.weight @ batch.cross))[:, :, None]
-    along = torch.linalg.solve_triangular(at.factor, right, upper=False)
-    mean = torch.linalg.solve_triangular(at.factor.mT, along, upper=True)[..., 0]
+    right = (shape.level * (shape.weight @ batch.cross))[:, :, None]
+    projected = torch.linalg.solve_triangular(shape.factor, right, upper=False)
+    mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)[..., 0]
     return _Solved(
-        mean, -0.5 * (batch.square @ at.weight - along.square().sum((1, 2)) + at.log_det)
+        mean, -0.5 * (batch.square @ shape.weight - projected.square().sum((1, 2)) + shape.log_det)
     )
 
 
@@ -317,10 +317,10 @@ def _inverse(factor: torch.Tensor) -> torch.Tensor:
         return torch.cholesky_inverse(
             factor
         ).mT  # it comes by columns, beside all else by rows; it is symmetric
-    back = torch.linalg.solve_triangular(
+    factor_inverse = torch.linalg.solve_triangular(
         factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False
     )
-    return back.mT @ back
+    return factor_inverse.mT @ factor_inverse
 
 
 def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
@@ -329,24 +329,24 @@ def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
     return (weight @ inner.reshape(count, channels, -1)).reshape(count, *shape)
 
 
-def _curved(at: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and
     curvature by [blocks, scales].
     """
-    covariance = _inverse(at.factor)
+    covariance = _inverse(shape.factor)
     variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2).clone(), batch.count.shape
     in_blocks = batch.member.mT
-    scaled = covariance * at.level[:, :, None] * at.level[:, None]
+    scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
     spread = (batch.columns.hidden * scaled[:, None]).sum(
         (2, 3)
     )  # as products of matrices they take ten times as long on a GPU
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
     # kept from taking others.
-    taken = torch.minimum(torch.clamp(at.weight * spread, min=0.0), batch.count)
+    taken = torch.minimum(torch.clamp(shape.weight * spread, min=0.0), batch.count)
     squared = covariance.square_()
     shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
     squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
-    curvature = at.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
+    curvature = shape.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
     curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
     mixed = (
         2.0
@@ -367,17 +367,19 @@ def _looked(
     """Value, gradient and curvature by [blocks, scales]."""
 
     def shaped() -> tuple[_Shape, tuple[torch.Tensor, ...]]:
-        at = _shape(batch, noise)
-        return at, _curved(at, batch)
+        start = _shape(batch, noise)
+        return start, _curved(start, batch)
 
     levels = noise.scale.tobytes(), _levels(batch, noise).tobytes()
-    at, (variance, spread, curvature) = batch.columns.begun(levels, shaped) if first else shaped()
-    solved = _solved(at, batch)
+    shape, (variance, spread, curvature) = (
+        batch.columns.begun(levels, shaped) if first else shaped()
+    )
+    solved = _solved(shape, batch)
     by_block = (batch.member.mT @ (variance + solved.mean**2 - 1.0)[:, :, None])[..., 0]
-    moved = at.level * solved.mean
+    moved = shape.level * solved.mean
     bent = ((moved[:, None, None] @ batch.columns.hidden)[:, :, 0] @ moved[:, :, None])[..., 0]
-    left = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
-    return solved.value, torch.cat((by_block, left * at.weight - batch.count), -1), curvature
+    square = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
+    return solved.value, torch.cat((by_block, square * shape.weight - batch.count), -1), curvature
 
 
 @dataclass(frozen=True)
@@ -394,21 +396,24 @@ class _Integrated:
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
         weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
-        hidden, beside = np.zeros((count, n)), np.zeros((count, columns))
-        for w, (gram, left) in enumerate(zip(grams, self.left)):
+        hidden, effects = np.zeros((count, n)), np.zeros((count, columns))
+        for w, (gram, kept_columns) in enumerate(zip(grams, self.left)):
             cross, size = weight @ gram.cross, gram.nuisances + gram.latents
-            hidden[w, :size], beside[w, left] = cross[:size], cross[len(cross) - len(left) :]
+            hidden[w, :size], effects[w, kept_columns] = (
+                cross[:size],
+                cross[len(cross) - len(kept_columns) :],
+            )
         right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
-        along = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
-        told = (
-            (self.half.transpose(1, 2) @ along)[..., 0],
-            self.at.log_det - along.square().sum((1, 2)),
+        projected = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
+        results = (
+            (self.half.transpose(1, 2) @ projected)[..., 0],
+            self.at.log_det - projected.square().sum((1, 2)),
         )
-        explained, taken = all_to_host(told)
+        explained, taken = all_to_host(results)
         return [
-            Share(information, score[left], float(weight @ gram.square + own))
-            for gram, left, information, score, own in zip(
-                grams, self.left, self.information, beside - explained, taken
+            Share(information, score[kept_columns], float(weight @ gram.square + square_of))
+            for gram, kept_columns, information, score, square_of in zip(
+                grams, self.left, self.information, effects - explained, taken
             )
         ]
 
@@ -437,33 +442,39 @@ class Integrals:
         """
         return self._by_window(
             [
-                part.shares([grams[w] for w in own], noise)
-                for own, part in zip(self._order, self._parts)
+                part.shares([grams[w] for w in members], noise)
+                for members, part in zip(self._order, self._parts)
             ]
         )
 
     def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
-        found = {w: value for own, part in zip(self._order, parts) for w, value in zip(own, part)}
-        return [found[w] for w in sorted(found)]
+        values = {
+            w: value for members, part in zip(self._order, parts) for w, value in zip(members, part)
+        }
+        return [values[w] for w in sorted(values)]
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
-    at, columns = _shape(batch, noise), batch.columns
-    right, own = _weighed(at.weight, columns.beside), _weighed(at.weight, columns.own)
+    shape, columns = _shape(batch, noise), batch.columns
+    right, effects = _weighed(shape.weight, columns.beside), _weighed(shape.weight, columns.own)
     n = right.shape[1]
     if latents:
-        hidden = _weighed(at.weight, columns.hidden)
-        own = torch.cat(
-            (torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), own), 2)), 1
+        hidden = _weighed(shape.weight, columns.hidden)
+        effects = torch.cat(
+            (torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), effects), 2)), 1
         )
-        right = own[:, :n]
-    half = torch.linalg.solve_triangular(at.factor, at.level[:, :, None] * right, upper=False)
-    reduced = own - half.transpose(1, 2) @ half
+        right = effects[:, :n]
+    half = torch.linalg.solve_triangular(shape.factor, shape.level[:, :, None] * right, upper=False)
+    reduced = effects - half.transpose(1, 2) @ half
     whole = (0.5 * (reduced + reduced.transpose(1, 2))).cpu().numpy()
     sizes, width = (
         [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams],
         whole.shape[1],
     )
-    left = [np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes]
-    information = [own[np.ix_(columns, columns)] for own, columns in zip(whole, left)]
-    return _Integrated(left, at, half, information)
+    kept_columns = [
+        np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes
+    ]
+    information = [
+        effects[np.ix_(columns, columns)] for effects, columns in zip(whole, kept_columns)
+    ]
+    return _Integrated(kept_columns, shape, half, information)

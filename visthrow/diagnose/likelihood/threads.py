@@ -83,10 +83,10 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     parts = _pool("algebra", threads).map(
         lambda first: [function(item) for item in items[first::pieces]], range(pieces)
     )
-    found: list[R] = [None] * len(items)
+    results: list[R] = [None] * len(items)
     for first, part in enumerate(parts):
-        found[first::pieces] = part
-    return found
+        results[first::pieces] = part
+    return results
 
 
 def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -45,13 +45,13 @@ def side_by_side(
     rows = out.numpy()
 
     def lay(i: int) -> None:
-        row, at, heights = rows[i], 0, (0,) * (len(shape) - 1)
+        row, offset, heights = rows[i], 0, (0,) * (len(shape) - 1)
         for values in parts[i]:
             if values.size:
                 *heights, width = values.shape
-                row[(*map(slice, heights), slice(at, at + width))] = values
-                at += width
-        row[..., at:] = 0.0
+                row[(*map(slice, heights), slice(offset, offset + width))] = values
+                offset += width
+        row[..., offset:] = 0.0
         for axis, height in enumerate(heights):
             row[(slice(None),) * axis + (slice(height, None),)] = 0.0
 

@@ -73,11 +73,11 @@ class BallModel(NumericModel):
         gravity = np.array([0.0, 0.0, -self.params.gravity])
         quadratic, linear = (self.params.drag + drag)[:, None], linear[:, None]
 
-        def slope(at: int, state: np.ndarray) -> np.ndarray:
+        def slope(index: int, state: np.ndarray) -> np.ndarray:
             vel = state[:, 3:]
             air = vel - wind
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
-            acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[at]
+            acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[index]
             if self.laws:
                 acc = acc + exerted(self.laws, _known(state[:, 0], state))["payload force"]
             return np.concatenate([vel, acc], 1)
@@ -111,14 +111,14 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
     times, path = log[CHANNEL].samples()
     if len(times) < 40:
         return []
-    sigma, found = sigma_of(log[CHANNEL], 1e-5), []
+    sigma, flights = sigma_of(log[CHANNEL], 1e-5), []
     for start, end in _free(times, path, params):
-        inside = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
-        time, pos = times[inside], path[inside]
+        rows = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
+        time, pos = times[rows], path[rows]
         fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
-        along = fit[1] * np.array([1.0, 1.0, 0.0])
-        along = along / max(np.linalg.norm(along), 1e-6)
-        found.append(
+        horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
+        horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
+        flights.append(
             Stretch(
                 number,
                 "ballistic",
@@ -128,25 +128,26 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
                 np.tile(sigma, len(time)),
                 np.concatenate([fit[0], fit[1]]),
                 np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
-                {"time": time, "across": np.array([-along[1], along[0], 0.0])},
+                {"time": time, "across": np.array([-horizontal[1], horizontal[0], 0.0])},
                 **latent_layout(time[0], time[-1], KNOTS, (2,)),
             )
         )
-    return found
+    return flights
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:
     """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth
     of a second each way.
     """
-    at, vel = derivative(time, pos, 0.05)
-    if len(at) < 20:
+    stamps, vel = derivative(time, pos, 0.05)
+    if len(stamps) < 20:
         return []
-    at, acc = derivative(at, vel, 0.05)
+    stamps, acc = derivative(stamps, vel, 0.05)
     off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
     falls = off < FALLS * params.gravity
     edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
     spans = [
-        (at[a] + params.edge, at[b - 1] - params.edge) for a, b in zip(edges[::2], edges[1::2])
+        (stamps[a] + params.edge, stamps[b - 1] - params.edge)
+        for a, b in zip(edges[::2], edges[1::2])
     ]
     return [(a, b) for a, b in spans if b - a >= params.shortest]

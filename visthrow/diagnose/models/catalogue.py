@@ -28,17 +28,17 @@ class ModelEffect(Effect):
     def of(self, params: Any) -> "ModelEffect":
         """Return the effect in the parameters' numbers."""
 
-        def told(name: str, value: float) -> float:
+        def scaled(name: str, value: float) -> float:
             for factor in filter(None, self.times.get(name, "").split(" * ")):
                 value *= attrgetter(factor)(params)
             return value
 
-        low, high = (told("bounds", bound) for bound in self.bounds)
+        low, high = (scaled("bounds", bound) for bound in self.bounds)
         return replace(
             self,
             bounds=(-attrgetter(self.lowest)(params) if self.lowest else low, high),
-            prior_sd=told("prior_sd", self.prior_sd),
-            floor=told("floor", self.floor),
+            prior_sd=scaled("prior_sd", self.prior_sd),
+            floor=scaled("floor", self.floor),
             channels=tuple(name.format_map(vars(params)) for name in self.channels),
         )
 

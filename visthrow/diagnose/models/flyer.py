@@ -44,18 +44,18 @@ class FlyerModel(NumericModel):
         """
         self.params = params
         self.has_voltage = all("battery_voltage" in log for log in logs)
-        more = {"payload_pos_w": params.cable, "rate_b": params.torque}
+        optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
         channels = [
             params.position,
-            *(name for name, simulated in more.items() if simulated is not None),
+            *(name for name, simulated in optional.items() if simulated is not None),
         ]
         stretches = stretches_of(logs, params, channels)
-        there = [
+        channels_present = [
             name
             for name in ("battery_voltage", "acc_b", "rate_b")
             if all(name in log for log in logs)
         ]
-        inputs = [params.attitude, params.input, *there]
+        inputs = [params.attitude, params.input, *channels_present]
         effects = [
             e
             for e in effects_of("flyer", params)
@@ -64,11 +64,11 @@ class FlyerModel(NumericModel):
         super().__init__(effects, channels, stretches, inputs)
         self.steps = round(params.window / params.step)
         # see flyer_windows; the stretch is the first axis
-        self._rot, told, self._volts, self._since, self._lean, self._direction = (
+        self._rot, given_inputs, self._volts, self._since, self._lean, self._direction = (
             np.array([s.data[name] for s in stretches])
             for name in ("rot", "input", "volts", "since", "lean", "direction")
         )
-        self._told = params.thrust(told)  # [N], (S, fine steps, motors)
+        self._told = params.thrust(given_inputs)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
         self._rate_at = 12 if params.cable is not None else 6
@@ -85,17 +85,20 @@ class FlyerModel(NumericModel):
             p.motor_time_constant + self.of(lanes, "motor_tau"),
         )
         tau = np.maximum(tau, SHORTEST)
-        at = (
+        position = (
             p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
         ) / fine  # tables begin one window early
-        left = np.clip(at.astype(int), 0, self._told.shape[1] - 1)
-        share, out = (at - left)[..., None], np.empty((2, *at.shape, self._told.shape[2]))
-        for own in np.unique(tau):
-            keep, lanes_ = np.exp(-fine / own), np.flatnonzero(tau == own)
+        index = np.clip(position.astype(int), 0, self._told.shape[1] - 1)
+        share, out = (
+            (position - index)[..., None],
+            np.empty((2, *position.shape, self._told.shape[2])),
+        )
+        for lag in np.unique(tau):
+            keep, lanes_ = np.exp(-fine / lag), np.flatnonzero(tau == lag)
             after, _ = lfilter([1.0 - keep], [1.0, -keep], self._told, 1, keep * self._told[:, :1])
             thrust = np.concatenate([self._told[:, :1], after], 1)
             whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
-            which, rows, part = lanes.owner[lanes_], left[:, lanes_], share[:, lanes_]
+            which, rows, part = lanes.owner[lanes_], index[:, lanes_], share[:, lanes_]
             begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
             out[:, :, lanes_] = (
                 begin + part * rise,
@@ -143,30 +146,30 @@ class FlyerModel(NumericModel):
             stretch.data["start"] + p.step * np.arange(len(path)),
             np.arange(2 * self.steps + 1) + self._spare,
         )
-        known = triangles(time, grid) @ path
+        values = triangles(time, grid) @ path
         rot = Rotation.from_matrix(stretch.data["rot"][halves])
         turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
         rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
         out = {
             "time": time,
-            "pos_w": known[:, :3],
-            "vel_w": known[:, 3:6],
+            "pos_w": values[:, :3],
+            "vel_w": values[:, 3:6],
             "quat_wb": turned(time).as_quat(),
             "rate_b": (
                 triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
             ),
-            "thrust": known[:, -self._told.shape[2] :].sum(1),
+            "thrust": values[:, -self._told.shape[2] :].sum(1),
         }
         if p.cable is not None:
             gap, vel = path[:, 6:9], path[:, 3:6] + path[:, 9:12]
-            along = gap / np.linalg.norm(gap, axis=1, keepdims=True)
+            direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
             at_knots = triangles(time, grid) @ np.column_stack(
-                [along, np.maximum(-np.sum(along * force, 1), 0.0)]
+                [direction, np.maximum(-np.sum(direction * force, 1), 0.0)]
             )
             out |= {
-                "payload_pos_w": known[:, :3] + known[:, 6:9],
-                "payload_vel_w": known[:, 3:6] + known[:, 9:12],
+                "payload_pos_w": values[:, :3] + values[:, 6:9],
+                "payload_vel_w": values[:, 3:6] + values[:, 9:12],
                 "cable_dir_w": at_knots[:, :3],
                 "tension": at_knots[:, 3],
                 "mount_b": np.zeros((len(time), 3)),
@@ -186,23 +189,23 @@ class FlyerModel(NumericModel):
         motors = self._told.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
-        own = np.stack([self.of(lanes, f"motor_{name}") for name in MOTORS], 1)
-        return scale[:, None] * (1.0 + own)
+        scales = np.stack([self.of(lanes, f"motor_{name}") for name in MOTORS], 1)
+        return scale[:, None] * (1.0 + scales)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         p, start = self.params, stretch.data["start"]
         out = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
-            own = stretch.channel == channel
-            if not np.any(own):
+            rows = stretch.channel == channel
+            if not np.any(rows):
                 continue
-            time = stretch.time[own].reshape(-1, 3)[:, 0]
+            time = stretch.time[rows].reshape(-1, 3)[:, 0]
             if name == "rate_b":
-                at = self._rate_at
+                rate_index = self._rate_at
                 grid = start + p.step * np.arange(path.shape[1])
-                out[:, own] = np.array(
-                    [on_grid(grid, x[:, at : at + 3], time) for x in path]
+                out[:, rows] = np.array(
+                    [on_grid(grid, x[:, rate_index : rate_index + 3], time) for x in path]
                 ).reshape(len(path), -1)
                 continue
             late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
@@ -212,11 +215,13 @@ class FlyerModel(NumericModel):
             pos = hermite(late, start, p.step, value, rate)
             if channel == 0 and "marker_z" in self.numbers:
                 lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
-                at = np.clip(
+                rate_index = np.clip(
                     ((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps
                 )
-                pos = pos + np.einsum("nij,bj->bni", stretch.data["rot"][at + self._spare], lever)
-            out[:, own] = pos.reshape(len(path), -1)
+                pos = pos + np.einsum(
+                    "nij,bj->bni", stretch.data["rot"][rate_index + self._spare], lever
+                )
+            out[:, rows] = pos.reshape(len(path), -1)
         return out
 
 
@@ -269,10 +274,10 @@ class _Dynamics:
         """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in
         a row are asked for at each.
         """
-        self.half, at = half, half + self.shift
-        left = np.minimum(np.maximum(at.astype(int), 0), self.model._rot.shape[1] - 2)
-        share, before = (at - left)[:, None, None], self.model._rot[self.owner, left]
-        self.rot = before + share * (self.model._rot[self.owner, left + 1] - before)
+        self.half, position = half, half + self.shift
+        index = np.minimum(np.maximum(position.astype(int), 0), self.model._rot.shape[1] - 2)
+        share, before = (position - index)[:, None, None], self.model._rot[self.owner, index]
+        self.rot = before + share * (self.model._rot[self.owner, index + 1] - before)
         if self.turns:
             self.off = (
                 self.turn + self.lean * self.model._lean[self.owner, half + self.model._spare]
@@ -281,7 +286,7 @@ class _Dynamics:
     def start(self, lanes: Lanes) -> np.ndarray:
         """States from the unknowns at the window's start."""
         parts = [lanes.nuisance[:, :6]]
-        at = 6
+        index = 6
         if self.p.cable is not None:
             down = self.model._direction[lanes.owner]
             side = np.stack(
@@ -294,9 +299,9 @@ class _Dynamics:
             )
             swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
             parts += [self.length * direction, self.length * swing]
-            at = 10
+            index = 10
         if self.p.torque is not None:
-            parts.append(lanes.nuisance[:, at : at + 3])
+            parts.append(lanes.nuisance[:, index : index + 3])
         return np.concatenate(parts, 1)
 
     def __call__(self, half: int, state: np.ndarray) -> np.ndarray:
@@ -313,17 +318,17 @@ class _Dynamics:
             force_b = force_b + cross(self.off, force_b)
         force = np.einsum("bij,bj->bi", self.rot, force_b) + latent[0]
         if self.model.laws:
-            own = self._exerted(half, state, force, latent)
-            force = force + own.get("vehicle force", 0.0)
+            loads = self._exerted(half, state, force, latent)
+            force = force + loads.get("vehicle force", 0.0)
             latent = np.stack(
-                [push + own.get(block, 0.0) for push, block in zip(latent, self.blocks)]
+                [push + loads.get(block, 0.0) for push, block in zip(latent, self.blocks)]
             )
         parts = [vel]
         if self.p.cable is None:
             parts.append(force / self.mass + self.gravity)
         else:
-            free_q, free_p, along, pull = self._pull(state, vel, force, latent[1])
-            pull_w = pull * along
+            free_q, free_p, direction, pull = self._pull(state, vel, force, latent[1])
+            pull_w = pull * direction
             acc_q, acc_p = free_q + pull_w / self.mass, free_p - pull_w / self.payload
             parts += [acc_q, state[:, 9:12], acc_p - acc_q]
         if self.p.torque is not None:
@@ -351,9 +356,9 @@ class _Dynamics:
             (drag + latent) / self.payload + self.gravity,
         )
         length = np.sqrt(_products(gap, gap))
-        along = gap / length
-        relative = _products(along, free_p - free_q) + _products(gap_rate, gap_rate) / length
-        return free_q, free_p, along, np.maximum(relative * self.reduced, 0.0)
+        direction = gap / length
+        relative = _products(direction, free_p - free_q) + _products(gap_rate, gap_rate) / length
+        return free_q, free_p, direction, np.maximum(relative * self.reduced, 0.0)
 
     def _exerted(
         self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray
@@ -361,9 +366,11 @@ class _Dynamics:
         """Return the forces and torques of the laws in each latent block, at the cable's tension
         without them.
         """
-        vel, none, at = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
+        vel, none, half_step = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
         turn = np.einsum(
-            "bji,bjk->bik", self.model._rot[self.owner, at - 1], self.model._rot[self.owner, at + 1]
+            "bji,bjk->bik",
+            self.model._rot[self.owner, half_step - 1],
+            self.model._rot[self.owner, half_step + 1],
         )
         skew = np.stack(
             [
@@ -373,7 +380,7 @@ class _Dynamics:
             ],
             1,
         )
-        known = {
+        values = {
             "time": none[:, 0],
             "pos_w": state[:, :3],
             "vel_w": vel,
@@ -383,29 +390,29 @@ class _Dynamics:
             **{f"axis_{a}": self.rot[:, :, i] for i, a in enumerate("xyz")},
         }
         if self.p.cable is not None:
-            _, _, along, pull = self._pull(state, vel, force, latent[1])
-            known |= {
+            _, _, direction, pull = self._pull(state, vel, force, latent[1])
+            values |= {
                 "payload_pos_w": state[:, :3] + state[:, 6:9],
                 "payload_vel_w": vel + state[:, 9:12],
-                "cable_dir_w": along,
+                "cable_dir_w": direction,
                 "tension": pull[:, 0],
                 "mount_b": none,
             }
-        return exerted(self.model.laws, known)
+        return exerted(self.model.laws, values)
 
     def _turning(
         self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray
     ) -> np.ndarray:
         """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""
-        of = self.p.torque
+        torque_params = self.p.torque
         front_left, front_right, rear_left, rear_right = thrust.T
         torque = np.stack(
             [
-                of.arm_y * (front_left + rear_left - front_right - rear_right)
+                torque_params.arm_y * (front_left + rear_left - front_right - rear_right)
                 - self.com[:, 1] * total[:, 0],
-                of.arm_x * (rear_left + rear_right - front_left - front_right)
+                torque_params.arm_x * (rear_left + rear_right - front_left - front_right)
                 + self.com[:, 0] * total[:, 0],
-                of.torque_ratio * thrust @ np.array(of.spin),
+                torque_params.torque_ratio * thrust @ np.array(torque_params.spin),
             ],
             1,
         )

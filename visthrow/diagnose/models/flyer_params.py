@@ -78,9 +78,9 @@ class FlyerParams:
         """Return the vehicle's mass in 0.21 kg, the mass that the catalogue's forces refer to."""
         return self.mass / 0.21
 
-    def thrust(self, told: np.ndarray) -> np.ndarray:
+    def thrust(self, inputs: np.ndarray) -> np.ndarray:
         """Return the thrust that the map gives for inputs [N]."""
-        return sum(c * told**power for power, c in enumerate(self.thrust_map))
+        return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
 
     def __post_init__(self) -> None:
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):

@@ -41,26 +41,26 @@ def stretches_of(
             f"no log has all of {', '.join(needed)}; missing everywhere:"
             f" {', '.join(lacking) or 'none'}"
         )
-    found = [s for number, log in usable for s in _windows(log, number, params, channels)]
-    if found:
-        _expect_thrust(found, params)
-    if len(found) > params.most_windows:
-        found = [
-            found[i]
-            for i in np.linspace(0, len(found) - 1, params.most_windows).round().astype(int)
+    stretches = [s for number, log in usable for s in _windows(log, number, params, channels)]
+    if stretches:
+        _expect_thrust(stretches, params)
+    if len(stretches) > params.most_windows:
+        stretches = [
+            stretches[i]
+            for i in np.linspace(0, len(stretches) - 1, params.most_windows).round().astype(int)
         ]
-    return found
+    return stretches
 
 
 def _holds(log: FlightLog, name: str) -> bool:
     return name in log and bool(np.any(log[name].valid))
 
 
-def _expect_thrust(found: Sequence[Stretch], params: FlyerParams) -> None:
+def _expect_thrust(stretches: Sequence[Stretch], params: FlyerParams) -> None:
     """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
     weight = params.gravity * params.total_mass
-    told = np.concatenate([s.data["input"] for s in found])
-    ratio = float(np.median(params.thrust(told).sum(axis=1))) / weight
+    inputs = np.concatenate([s.data["input"] for s in stretches])
+    ratio = float(np.median(params.thrust(inputs).sum(axis=1))) / weight
     if ratio > _MOST_THRUST:
         raise LogError(
             f"the thrust by {params.input} and the setup's thrust_map is {ratio:.3g} times the"
@@ -85,15 +85,15 @@ def _windows(
         for start in starts
         if all(_covered(c, start, start + params.window) for c in driven)
     )
-    found = (_window(log, number, params, channels, sigma, start) for start in covered)
-    return [stretch for stretch in found if stretch is not None]
+    windows = (_window(log, number, params, channels, sigma, start) for start in covered)
+    return [stretch for stretch in windows if stretch is not None]
 
 
 def _covered(channel: Channel, start: float, end: float) -> bool:
-    inside = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
+    stamps = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
     return (
-        len(inside) > 5
-        and float(np.max(np.diff(np.concatenate([[start], inside, [end]])))) < _MOST_MISSING
+        len(stamps) > 5
+        and float(np.max(np.diff(np.concatenate([[start], stamps, [end]])))) < _MOST_MISSING
     )
 
 
@@ -101,10 +101,10 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     end = start + params.window
     rows = []
     for channel in (log[name] for name in channels):
-        inside = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[
+        samples = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[
             :: params.every
         ]
-        rows.append((channel.time[inside], channel.values[inside].astype(float)))
+        rows.append((channel.time[samples], channel.values[samples].astype(float)))
     if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
         return None
     inputs = _inputs(log[params.input], params, start)
@@ -176,8 +176,8 @@ def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
 def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     """Rotations at the half steps, shape (half steps, 3, 3)."""
     time, quat = channel.samples()
-    near = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
-    return attitude_at(time[near], quat[near], times).as_matrix()
+    span = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
+    return attitude_at(time[span], quat[span], times).as_matrix()
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:
@@ -227,9 +227,9 @@ def _guess(rows, channels, params: FlyerParams) -> tuple[np.ndarray, np.ndarray,
     pos, vel = _line(*rows[0], start)
     guess, spread, direction = [*pos, *vel], [0.1] * 3 + [1.0] * 3, np.array([0.0, 0.0, -1.0])
     if params.cable is not None:
-        at = rows[channels.index("payload_pos_w")]
-        if len(at[0]) >= 4:
-            pos_p, vel_p = _line(*at, start)
+        first_row = rows[channels.index("payload_pos_w")]
+        if len(first_row[0]) >= 4:
+            pos_p, vel_p = _line(*first_row, start)
             direction = (pos_p - pos) / np.linalg.norm(pos_p - pos)
             rate = (vel_p - vel) / params.cable.length
             swing = (rate - direction * np.dot(direction, rate))[:2]

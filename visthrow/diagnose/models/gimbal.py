@@ -80,11 +80,11 @@ class GimbalModel(NumericModel):
         )
         body = np.einsum("bnji,bnj->bni", axes.reshape(*late.shape, 3, 3), gap)
         body = body + cross(turn[:, None], body)
-        seen = np.einsum(
+        points = np.einsum(
             "bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b)
         )
-        seen = seen - np.array([self.params.camera_offset, 0.0, 0.0])
-        point = np.einsum("ij,bnj->bni", self.camera, seen)
+        points = points - np.array([self.params.camera_offset, 0.0, 0.0])
+        point = np.einsum("ij,bnj->bni", self.camera, points)
         point = point + cross(tilt[:, None], point) - lever[:, None]
         weights = triangles(
             time, np.unique(stretch.latent_time)
@@ -127,26 +127,26 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
     if not all(np.any(log[name].valid) for name in NEEDED):
         return []
     table_time, tables = _tables(log, params)
-    found, apart, seen = [], 0, 0
+    stretches, rejected, frames = [], 0, 0
     for start in np.arange(
         marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window
     ):
-        inside = np.flatnonzero(
+        rows = np.flatnonzero(
             marker.valid & (marker.time >= start) & (marker.time < start + params.window)
         )[:: params.every]
-        near = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
-        if len(inside) < 10 or np.sum(near) < 20:
+        in_table = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
+        if len(rows) < 10 or np.sum(in_table) < 20:
             continue
-        time, point = marker.time[inside], marker.values[inside].astype(float)
-        distance = np.linalg.norm(tables["gap"][near], axis=1)
+        time, point = marker.time[rows], marker.values[rows].astype(float)
+        distance = np.linalg.norm(tables["gap"][in_table], axis=1)
         fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
-        apart += len(fits) - int(np.sum(fits))
-        seen += len(fits)
+        rejected += len(fits) - int(np.sum(fits))
+        frames += len(fits)
         if np.sum(fits) < 10:
             continue
         time, point = time[fits], point[fits]
         sigma = np.tile([params.sigma_across, params.sigma_across, params.sigma_along], len(time))
-        found.append(
+        stretches.append(
             Stretch(
                 number,
                 "view",
@@ -156,13 +156,17 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
                 sigma,
                 np.zeros(0),
                 np.zeros(0),
-                {"table_time": table_time[near], "table": {k: v[near] for k, v in tables.items()}},
+                {
+                    "table_time": table_time[in_table],
+                    "table": {k: v[in_table] for k, v in tables.items()},
+                },
                 **latent_layout(start, start + params.window, KNOTS, (2,)),
             )
         )
-    if apart > MOST_APART * seen:
+    if rejected > MOST_APART * frames:
         raise LogError(
-            f"the marker's distance is more than {params.largest:g} m from the payload's in {apart}"
-            f" of {seen} detections: other axes, another unit, or another marker"
+            f"the marker's distance is more than {params.largest:g} m from the payload's in "
+            f"{rejected}"
+            f" of {frames} detections: other axes, another unit, or another marker"
         )
-    return found
+    return stretches

@@ -93,15 +93,15 @@ class Model(Protocol):
         ...
 
     def residuals(
-        self, theta: Mapping[str, float], about: Linearised | None = None
+        self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
         """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
 
         Args:
             theta: sizes of the effects.
-            about: where the caller's derivatives were taken. Initial states begin with those of
-                that place and follow the effects; what that does by the derivatives is added to the
-                residuals again, which so are those of b = 0. A model that fits initial states in
-                every simulation has no need of it.
+            linearised: where the caller's derivatives were taken. Initial states begin with those
+                of that place and follow the effects; what that does by the derivatives is added to
+                the residuals again, which so are those of b = 0. A model that fits initial states
+                in every simulation has no need of it.
         """
         ...

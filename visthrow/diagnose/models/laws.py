@@ -90,8 +90,10 @@ class Term:
         """
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
         parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
-        left = zip(("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target)))
-        return " ".join(name if n == 1 else f"{name}^{n}" for name, n in left if n) or "1"
+        exponents = zip(
+            ("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target))
+        )
+        return " ".join(name if n == 1 else f"{name}^{n}" for name, n in exponents if n) or "1"
 
     @property
     def formula(self) -> str:
@@ -99,10 +101,13 @@ class Term:
         symbols = [SCALARS[f].symbol for f in self.factors] + [
             VECTORS[self.block][self.vector].symbol
         ]
-        left = {"vehicle force": "F", "vehicle torque": "M", "payload force": "F_p", JOINT: "M_j"}[
-            self.block
-        ]
-        return f"{left} = c {' '.join(symbols)}"
+        symbol = {
+            "vehicle force": "F",
+            "vehicle torque": "M",
+            "payload force": "F_p",
+            JOINT: "M_j",
+        }[self.block]
+        return f"{symbol} = c {' '.join(symbols)}"
 
 
 def term_of(law: LawParams) -> Term:
@@ -110,12 +115,12 @@ def term_of(law: LawParams) -> Term:
 
     Raises ConfigError: a factor or vector that the grammar does not have there.
     """
-    for name, there in (
+    for name, present in (
         (law.vector, VECTORS[law.block]),
         *((factor, SCALARS) for factor in law.factors),
     ):
-        if name not in there:
-            raise ConfigError(f"law on {law.block}: no '{name}'; {suggest(name, there)}")
+        if name not in present:
+            raise ConfigError(f"law on {law.block}: no '{name}'; {suggest(name, present)}")
     if len(law.factors) > MOST_SCALARS:
         raise ConfigError(
             f"law on {law.block}: {len(law.factors)} factors; expected at most {MOST_SCALARS}"
@@ -123,17 +128,17 @@ def term_of(law: LawParams) -> Term:
     return Term(law.block, law.factors, law.vector)
 
 
-def exerted(laws: Sequence[LawParams], known: Knots) -> dict[str, np.ndarray]:
+def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
     """Return the forces and torques of laws in each latent block at states with these quantities,
     shape (k, 3); empty without laws.
     """
-    known, total = Known(known), {}
+    values, total = Known(values), {}
     for law in laws:
-        value = law.coefficient * VECTORS[law.block][law.vector].read(known)
+        value = law.coefficient * VECTORS[law.block][law.vector].read(values)
         for factor in law.factors:
-            value *= SCALARS[factor].read(known)[:, None]
-        for block, own in loads(law.block, known, value[:, :, None]).items():
-            total[block] = total.get(block, 0.0) + own[:, :, 0]
+            value *= SCALARS[factor].read(values)[:, None]
+        for block, load in loads(law.block, values, value[:, :, None]).items():
+            total[block] = total.get(block, 0.0) + load[:, :, 0]
     return total
 
 
@@ -333,9 +338,9 @@ VECTORS: dict[str, dict[str, Factor]] = {
 MOST_SCALARS = 2
 
 
-def terms_of(block: str, known: Sequence[str]) -> list[Term]:
+def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
-    have = set(known)
+    have = set(quantities)
     out = () if block == JOINT else ONLY_JOINT
     scalars = [
         name for name, factor in SCALARS.items() if set(factor.needs) <= have and name not in out
@@ -364,8 +369,14 @@ class Layout:
         """Sort out the factors of terms."""
         scalars = tuple(dict.fromkeys(f for t in terms_ for f in t.factors))
         vectors = tuple(dict.fromkeys(t.vector for t in terms_))
-        at, place = {f: i + 1 for i, f in enumerate(scalars)}, {v: i for i, v in enumerate(vectors)}
-        rows = [([at[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS] for t in terms_]
+        scalar_index, place = (
+            {f: i + 1 for i, f in enumerate(scalars)},
+            {v: i for i, v in enumerate(vectors)},
+        )
+        rows = [
+            ([scalar_index[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS]
+            for t in terms_
+        ]
         return Layout(
             terms_[0].block,
             scalars,
@@ -374,15 +385,16 @@ class Layout:
             np.array([place[t.vector] for t in terms_]),
         )
 
-    def factors(self, known: Known) -> tuple[np.ndarray, np.ndarray]:
+    def factors(self, values: Known) -> tuple[np.ndarray, np.ndarray]:
         """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors);
         each is computed once.
         """
         scalars = np.stack(
-            (np.ones(len(known["time"])), *(SCALARS[f].read(known) for f in self.scalars)), axis=-1
+            (np.ones(len(values["time"])), *(SCALARS[f].read(values) for f in self.scalars)),
+            axis=-1,
         )
         return scalars, np.stack(
-            [VECTORS[self.block][v].read(known) for v in self.vectors], axis=-1
+            [VECTORS[self.block][v].read(values) for v in self.vectors], axis=-1
         )
 
     def table(self, knots: Knots) -> np.ndarray:
@@ -403,11 +415,11 @@ def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]
     """
     if block != JOINT:
         return {block: values}
-    known = knots if isinstance(knots, Known) else Known(knots)
-    torque_b, reach = np.swapaxes(values, 1, 2), known["reach_w"][:, None, :]
-    turn = np.stack([known[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
+    quantities = knots if isinstance(knots, Known) else Known(knots)
+    torque_b, reach = np.swapaxes(values, 1, 2), quantities["reach_w"][:, None, :]
+    turn = np.stack([quantities[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
     torque_w = np.einsum("kij,ktj->kti", turn, torque_b)
     pair = -cross(torque_w, reach) / (reach**2).sum(-1, keepdims=True)
-    at_mount = cross(known["mount_b"][:, None, :], -np.einsum("kij,kti->ktj", turn, pair))
+    at_mount = cross(quantities["mount_b"][:, None, :], -np.einsum("kij,kti->ktj", turn, pair))
     out = {"vehicle force": -pair, "vehicle torque": torque_b + at_mount, "payload force": pair}
     return {name: np.swapaxes(value, 1, 2) for name, value in out.items()}

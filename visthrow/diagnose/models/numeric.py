@@ -99,9 +99,10 @@ class NumericModel(ABC):
                 f"no stretch of these logs shows {', '.join(channels)} in a way that this model"
                 " explains"
             )
-        given = set(inputs) - set(channels)
+        missing_inputs = set(inputs) - set(channels)
         self.effects = tuple(
-            replace(e, channels=tuple(c for c in e.channels if c not in given)) for e in effects
+            replace(e, channels=tuple(c for c in e.channels if c not in missing_inputs))
+            for e in effects
         )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self.channels, self.stretches = tuple(channels), list(stretches)
@@ -129,9 +130,9 @@ class NumericModel(ABC):
                 )
         if laws:
             first, one = self.stretches[0], self._lanes(base).part([0])
-            there = self.knots(first, self.simulate(one)[0]).keys()
+            quantities = self.knots(first, self.simulate(one)[0]).keys()
             for term in map(term_of, laws):
-                lacking = sorted(term.needs - there) or (
+                lacking = sorted(term.needs - quantities) or (
                     [] if carries(first.latent_block, term.block) else [term.block]
                 )
                 if lacking:
@@ -147,15 +148,15 @@ class NumericModel(ABC):
 
     def choose(self, names: Sequence[str]) -> None:
         """Keep these effects alone. Raises DiagnoseError for one that it does not know."""
-        known = {effect.name: effect for effect in self.effects}
-        expect_known(names, known, "no effect '{}' for these logs", DiagnoseError)
-        self.effects = tuple(known[name] for name in names)
+        by_name = {effect.name: effect for effect in self.effects}
+        expect_known(names, by_name, "no effect '{}' for these logs", DiagnoseError)
+        self.effects = tuple(by_name[name] for name in names)
 
     def plain(self) -> "NumericModel":
         """Return the model without its extensions."""
-        other = copy(self)
-        other._base, other.laws, other._flown = np.zeros_like(self._base), (), None
-        return other
+        model = copy(self)
+        model._base, model.laws, model._flown = np.zeros_like(self._base), (), None
+        return model
 
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
         """Return the model with further laws."""
@@ -225,7 +226,7 @@ class NumericModel(ABC):
         ]
 
     def residuals(
-        self, theta: Mapping[str, float], about: Linearised | None = None
+        self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`; initial states are fitted anew."""
         return self._settle(self.size(theta))
@@ -251,9 +252,12 @@ class NumericModel(ABC):
             part = lanes.part(rows)
             path = self.simulate(part)
             for i in np.unique(part.owner):
-                own = np.flatnonzero(part.owner == i)
+                lanes_of_stretch = np.flatnonzero(part.owner == i)
                 for row, samples in zip(
-                    rows[own], self.measure(self.stretches[i], path[own], part.part(own))
+                    rows[lanes_of_stretch],
+                    self.measure(
+                        self.stretches[i], path[lanes_of_stretch], part.part(lanes_of_stretch)
+                    ),
                 ):
                     out[row] = samples
         return out
@@ -279,11 +283,11 @@ class NumericModel(ABC):
             for shrink in (1.0, 0.3):
                 trial = self._start + shrink * steps
                 after = self._off(size, trial)
-                found = self._costs(after, trial)
-                better = found < costs
+                new_costs = self._costs(after, trial)
+                better = new_costs < costs
                 self._start = np.where(better[:, None], trial, self._start)
                 residuals = [new if yes else old for new, old, yes in zip(after, residuals, better)]
-                costs = np.where(better, found, costs)
+                costs = np.where(better, new_costs, costs)
                 steps = np.where(better[:, None], 0.0, steps)
                 if np.all(better | (np.max(np.abs(steps), 1) == 0.0)):
                     break
@@ -293,9 +297,9 @@ class NumericModel(ABC):
 
     def _costs(self, residuals: list[np.ndarray], start: np.ndarray) -> np.ndarray:
         costs = []
-        for s, residual, at in zip(self.stretches, residuals, start):
+        for s, residual, state in zip(self.stretches, residuals, start):
             value = np.sum((residual / s.sigma) ** 2) + np.sum(
-                ((at - s.nuisance) / s.nuisance_sd) ** 2
+                ((state - s.nuisance) / s.nuisance_sd) ** 2
             )
             costs.append(value if np.isfinite(value) else np.inf)
         return np.array(costs)
@@ -322,12 +326,12 @@ class NumericModel(ABC):
             "nuisance": len(first.nuisance),
             "latent": len(first.latent_block),
         }
-        asked = (
+        lanes_of = (
             np.arange(counts[name])
             if name != "theta"
             else np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
         )
-        count = len(asked)
+        count = len(lanes_of)
         steps = np.broadcast_to(
             {
                 "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
@@ -337,14 +341,17 @@ class NumericModel(ABC):
             (stretches, count),
         )
         moves = {key: np.zeros((stretches * count, n)) for key, n in counts.items()}
-        moves[name] = (steps[:, :, None] * np.eye(counts[name])[asked]).reshape(
+        moves[name] = (steps[:, :, None] * np.eye(counts[name])[lanes_of]).reshape(
             stretches * count, counts[name]
         )
-        still = Lanes(
+        lanes_at_rest = Lanes(
             np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0
         )
         moved = [
-            Lanes(still.owner, *(getattr(still, key) + sign * move for key, move in moves.items()))
+            Lanes(
+                lanes_at_rest.owner,
+                *(getattr(lanes_at_rest, key) + sign * move for key, move in moves.items()),
+            )
             for sign in (1.0, -1.0)
         ]
         sides = [self._run(lanes) for lanes in moved]
@@ -355,13 +362,13 @@ class NumericModel(ABC):
         ]
 
 
-def sigma_of(channel: Channel, least: float) -> np.ndarray:
+def sigma_of(channel: Channel, floor: float) -> np.ndarray:
     """Noise of a channel's components as the samples show it.
 
-    ``least``: below which none is believed; ten times that stands where too few samples tell.
+    ``floor``: below which none is believed; ten times that stands where too few samples tell.
     """
-    seen = noise(channel)
-    return np.maximum(np.where(np.isfinite(seen), seen, 10.0 * least), least)
+    estimate = noise(channel)
+    return np.maximum(np.where(np.isfinite(estimate), estimate, 10.0 * floor), floor)
 
 
 def integrate(
@@ -396,11 +403,16 @@ def hermite(
         value: Shape (L, T, C).
         rate: Their derivatives, shape (L, T, C).
     """
-    at = np.broadcast_to((np.asarray(time) - start) / step, (len(value), np.shape(time)[-1]))
-    left = np.clip(at.astype(int), 0, value.shape[1] - 2)
-    s = (at - left)[..., None]
+    position = np.broadcast_to((np.asarray(time) - start) / step, (len(value), np.shape(time)[-1]))
+    index = np.clip(position.astype(int), 0, value.shape[1] - 2)
+    s = (position - index)[..., None]
     lane = np.arange(len(value))[:, None]
-    a, b, da, db = value[lane, left], value[lane, left + 1], rate[lane, left], rate[lane, left + 1]
+    a, b, da, db = (
+        value[lane, index],
+        value[lane, index + 1],
+        rate[lane, index],
+        rate[lane, index + 1],
+    )
     out = (1 + 2 * s) * (1 - s) ** 2 * a + s**2 * (3 - 2 * s) * b
     return out + step * (s * (1 - s) ** 2 * da + s**2 * (s - 1) * db)
 

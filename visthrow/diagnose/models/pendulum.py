@@ -93,19 +93,19 @@ class PendulumModel(NumericModel):
         )
         push = latent_force(lanes.latent, self._steps, 1, 2)[:, 0]
 
-        def slope(at: int, state: np.ndarray) -> np.ndarray:
+        def slope(index: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T
             sine, friction = (
                 np.sin(angle),
                 viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate,
             )
-            force = push[at]
+            force = push[index]
             if self.laws:
                 force = (
                     force + exerted(self.laws, self._known(angle, state))["payload force"][:, ::2]
                 )
-            along = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
-            return np.stack([rate, -stiffness * sine - spring * angle - friction + along], 1)
+            pull = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
+            return np.stack([rate, -stiffness * sine - spring * angle - friction + pull], 1)
 
         step = p.window / self._steps * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance.copy(), self._steps, step)
@@ -123,21 +123,21 @@ class PendulumModel(NumericModel):
         still.
         """
         length, (angle, rate) = self.params.length, state.T
-        along, vel, upright = (
+        direction, vel, upright = (
             np.zeros((len(state), 3)),
             np.zeros((len(state), 3)),
             np.zeros((len(state), 4)),
         )
-        along[:, 0], along[:, 2], upright[:, 3] = np.sin(angle), -np.cos(angle), 1.0
-        vel[:, 0], vel[:, 2] = -length * rate * along[:, 2], length * rate * along[:, 0]
-        tension = np.maximum(length * rate**2 - self.params.gravity * along[:, 2], 0.0)
+        direction[:, 0], direction[:, 2], upright[:, 3] = np.sin(angle), -np.cos(angle), 1.0
+        vel[:, 0], vel[:, 2] = -length * rate * direction[:, 2], length * rate * direction[:, 0]
+        tension = np.maximum(length * rate**2 - self.params.gravity * direction[:, 2], 0.0)
         return {
             "time": time,
-            "payload_pos_w": length * along,
+            "payload_pos_w": length * direction,
             "payload_vel_w": vel,
-            "cable_dir_w": along,
+            "cable_dir_w": direction,
             "quat_wb": upright,
-            "under": -along[:, 2],
+            "under": -direction[:, 2],
             "tension": tension,
         }
 
@@ -168,14 +168,14 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
             " another zero?"
         )
     sigma = float(sigma_of(channel, 1e-5)[0])
-    found = []
+    stretches = []
     for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
-        inside = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
-        if len(inside) < FEWEST:
+        rows = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
+        if len(rows) < FEWEST:
             continue
-        t, y = time[inside], angle[inside]
+        t, y = time[rows], angle[rows]
         fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
-        found.append(
+        stretches.append(
             Stretch(
                 number,
                 "swing",
@@ -189,4 +189,4 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
                 **latent_layout(start, start + params.window, KNOTS, (2,), (0, 2)),
             )
         )
-    return found
+    return stretches

@@ -75,12 +75,13 @@ class TrimModel(NumericModel):
             2
         )  # a push along the vertical, then three torques
         if self.laws:
-            own = {
+            predictions = {
                 block: np.mean(value, axis=0)
                 for block, value in exerted(self.laws, self.knots(stretch, path)).items()
             }
             draught = draught + np.append(
-                own.get("vehicle force", np.zeros(3))[2], own.get("vehicle torque", np.zeros(3))
+                predictions.get("vehicle force", np.zeros(3))[2],
+                predictions.get("vehicle torque", np.zeros(3)),
             )
         push, roll, pitch, turn = draught.T
         share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
@@ -133,35 +134,35 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
         log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
     )
     time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
-    found = []
+    stretches = []
     for start in np.arange(stamps[0], stamps[-1] - window, window):
-        inside, near, moving, charged = (
+        rows, window_rows, moving, charged = (
             (t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u)
         )
-        if min(np.sum(inside), np.sum(near), np.sum(moving)) < 20:
+        if min(np.sum(rows), np.sum(window_rows), np.sum(moving)) < 20:
             continue
-        own = vel[moving]
+        speeds = vel[moving]
         if (
-            np.min(pos[near][:, 2]) < params.lowest
-            or np.mean(np.linalg.norm(own, axis=1)) > params.fastest
+            np.min(pos[window_rows][:, 2]) < params.lowest
+            or np.mean(np.linalg.norm(speeds, axis=1)) > params.fastest
         ):
             continue
-        lift = 1.0 + (own[-5:, 2].mean() - own[:5, 2].mean()) / window / params.gravity
+        lift = 1.0 + (speeds[-5:, 2].mean() - speeds[:5, 2].mean()) / window / params.gravity
         data = {
             "volts": (
                 float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage
             ),
             "lift": lift,
-            "pos": np.mean(pos[near], axis=0),
-            "vel": np.mean(own, axis=0),
+            "pos": np.mean(pos[window_rows], axis=0),
+            "vel": np.mean(speeds, axis=0),
         }
-        found.append(
+        stretches.append(
             Stretch(
                 number,
                 "hover",
                 np.full(4, start),
                 np.zeros(4, dtype=int),
-                np.mean(sent[inside], axis=0),
+                np.mean(sent[rows], axis=0),
                 np.full(4, params.spread),
                 np.zeros(0),
                 np.zeros(0),
@@ -169,4 +170,4 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
                 **_latent(start, start + window),
             )
         )
-    return found
+    return stretches

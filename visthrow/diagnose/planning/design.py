@@ -76,7 +76,7 @@ class Limits:
         ):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
-    def share(self, path: np.ndarray, more: np.ndarray) -> float:
+    def share(self, path: np.ndarray, rates: np.ndarray) -> float:
         """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of
         both ``PERIOD`` apart, (N, 3).
         """
@@ -87,8 +87,8 @@ class Limits:
                 0.5 * (self.highest - self.lowest),
             ),
         )
-        ways = [((path - middle)[:, [i]], more[:, [i]], room[i]) for i in range(3)]
-        ways += zip(_derivatives(path), _derivatives(more), (self.speed, self.acceleration))
+        ways = [((path - middle)[:, [i]], rates[:, [i]], room[i]) for i in range(3)]
+        ways += zip(_derivatives(path), _derivatives(rates), (self.speed, self.acceleration))
         return min(1.0, *(_leaving(*way) for way in ways))
 
     def around(self, path: np.ndarray) -> "Limits":
@@ -112,12 +112,12 @@ def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return vel, np.gradient(vel, PERIOD, axis=0)
 
 
-def _leaving(at: np.ndarray, along: np.ndarray, radius: float) -> float:
+def _leaving(position: np.ndarray, velocity: np.ndarray, radius: float) -> float:
     """Share of a way from within a ball about 0 at which its first row leaves it, shapes (N, D)."""
     inward, square, slack = (
-        -(at * along).sum(1),
-        (along**2).sum(1),
-        np.maximum(radius**2 - (at**2).sum(1), 0.0),
+        -(position * velocity).sum(1),
+        (velocity**2).sum(1),
+        np.maximum(radius**2 - (position**2).sum(1), 0.0),
     )
     with np.errstate(divide="ignore", invalid="ignore"):  # of a row that does not move
         return float(
@@ -134,14 +134,14 @@ class Sweep:
     seconds: float
     phase: float = 0.0  # at the start [rad]
 
-    def at(self, t: np.ndarray, most: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Values at times after its start [s], with the amplitude that ``most`` gives for a
+    def at(self, t: np.ndarray, limit: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Values at times after its start [s], with the amplitude that ``limit`` gives for a
         frequency [Hz].
         """
         frequency = self.low + (self.high - self.low) * t / self.seconds
         turned = 2.0 * np.pi * (self.low + 0.5 * (self.high - self.low) * t / self.seconds) * t
         fade = rise(t, 0.0, FADE) * (1.0 - rise(t, self.seconds - FADE, FADE))
-        return most(frequency) * fade * np.sin(turned + self.phase)
+        return limit(frequency) * fade * np.sin(turned + self.phase)
 
 
 NUMBERS = (
@@ -178,7 +178,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     reach = dict(zip("xyz", (*limits.half, 0.5 * (limits.highest - limits.lowest))))
 
-    def kept(t: np.ndarray) -> np.ndarray:
+    def ramped(t: np.ndarray) -> np.ndarray:
         return middle + x["kept"] * (base.path(t) - middle)
 
     def swept(t: np.ndarray) -> np.ndarray:
@@ -191,22 +191,22 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         )
 
     rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
-    fitting = limits.share(kept(rows), swept(rows))
+    fitting = limits.share(ramped(rows), swept(rows))
     top = ADDED[0] * (ADDED[1] / ADDED[0]) ** x["added_to"]
     added = [Sweep(ADDED[0], top, seconds, phase=2.0 * np.pi * i / 3.0) for i in range(3)]
 
     def rates(t: np.ndarray) -> np.ndarray:
-        own = [
+        sweeps = [
             limits.rate * x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)
         ]
-        return x["kept"] * base.rates(t) + np.column_stack(own)
+        return x["kept"] * base.rates(t) + np.column_stack(sweeps)
 
     return replace(
         base,
         name=f"{base.name}, optimised",
         purpose="the most nats a second within the limits",
         rates=rates,
-        path=lambda t: kept(t) + fitting * swept(t),
+        path=lambda t: ramped(t) + fitting * swept(t),
         yaw=lambda t: (
             x["kept"] * base.yaw(t)
             + x["share_yaw"] * sweep("yaw").at(t, farthest(np.pi, YAW_RATE, np.inf))

@@ -68,27 +68,26 @@ Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
 def simulator_of(
     model: Model,
     diagnosis: Diagnosis,
-    made: Callable[[Sequence[FlightLog]], Model] | None = None,
+    build: Callable[[Sequence[FlightLog]], Model] | None = None,
     *,
     seed: int = 0,
 ) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:
     """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it
     can.
 
-    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``made``: gives a setup's
-    own model of some logs.
-    Raises DiagnoseError: no vehicle flies in this model.
+    ``diagnosis``: for the sizes of what was found and the sensors' noise; ``build``: gives a
+    setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
     """
     if isinstance(model, ThrowModel):
-        plant, device, asked = (
+        plant, device, requested = (
             apply(model.entries, model.setting, diagnosis.theta).plant,
             model.device,
             {e.name for e in model.effects},
         )
 
-        def own(flight: "Flight") -> Model:
+        def model_of_flight(flight: "Flight") -> Model:
             log, carries = flight.log(noise), flight.manoeuvre.payload
-            there = effects_for(
+            effects = effects_for(
                 model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
             )
             return ThrowModel(
@@ -97,11 +96,11 @@ def simulator_of(
                 sensing=model.setting.sensing,
                 device=device,
                 substep=COARSE * model.substep,
-                only=[n for n in there if n in asked],
+                only=[n for n in effects if n in requested],
                 carries=carries,
             )
 
-    elif isinstance(model, FlyerModel) and made is not None:
+    elif isinstance(model, FlyerModel) and build is not None:
         plant, device = (
             vehicle_of(
                 model.params, plant_of(config.load(Experiment, config.find("train", "state")))
@@ -109,8 +108,8 @@ def simulator_of(
             "cpu",
         )
 
-        def own(flight: "Flight") -> Model:
-            return made(
+        def model_of_flight(flight: "Flight") -> Model:
+            return build(
                 [flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)]
             )
 
@@ -122,7 +121,9 @@ def simulator_of(
     noise = _sensor_noise(diagnosis)
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
-        return [flight.simulated(own) for flight in fly(plant, manoeuvres, seed, device)]
+        return [
+            flight.simulated(model_of_flight) for flight in fly(plant, manoeuvres, seed, device)
+        ]
 
     return (
         simulate,
@@ -140,17 +141,17 @@ def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
     return replace(manoeuvre, payload=carries)
 
 
-def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
+def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the
     numbers that the setup tells.
     """
-    ratio = known.vehicle.body.mass / params.mass
+    ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
-    v, rope = in_units(known.vehicle, alike), in_units(known.rope, alike)
-    still = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
+    v, rope = in_units(plant.vehicle, alike), in_units(plant.rope, alike)
+    no_drag = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
     aero = replace(
         v.aero,
-        **{**still, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z},
+        **{**no_drag, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z},
     )
     v = replace(
         v,
@@ -169,7 +170,7 @@ def vehicle_of(params: FlyerParams, known: PlantParams) -> PlantParams:
             mount=(0.0, 0.0, 0.0),
             rope_mass=THREAD * params.cable.mass,
         )
-    return replace(known, vehicle=v, rope=rope)
+    return replace(plant, vehicle=v, rope=rope)
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
@@ -195,9 +196,9 @@ class Flight:
         """Return the times of the samples [s]."""
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
-    def simulated(self, own: Callable[["Flight"], Model]) -> Simulated:
-        """Say how near it came to being aborted, and give it the model that ``own`` makes of it if
-        it was not.
+    def simulated(self, model_of: Callable[["Flight"], Model]) -> Simulated:
+        """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
+        it if it was not.
         """
         places = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)]
         used = max(
@@ -206,7 +207,7 @@ class Flight:
         )
         used = min(used, LOST) if np.isfinite(used) else LOST
         try:
-            return Simulated(own(self) if used < 1.0 else None, used)
+            return Simulated(model_of(self) if used < 1.0 else None, used)
         except (DiagnoseError, LogError):
             return Simulated(None, used)
 
@@ -217,23 +218,23 @@ class Flight:
         """
         if not self.manoeuvre.payload:
             return 0.0
-        held = self.time < np.min(self.reference.time[self.reference.release], initial=np.inf)
-        hangs = (self.truth["payload_pos_w"] - self.truth["pos_w"])[held]
-        along = -matrix_of_quat(self.truth["quat_wb"][held])[:, :, 2]
-        cosine = np.einsum("ni,ni->n", hangs, along) / np.linalg.norm(hangs, axis=1)
+        hanging = self.time < np.min(self.reference.time[self.reference.release], initial=np.inf)
+        hangs = (self.truth["payload_pos_w"] - self.truth["pos_w"])[hanging]
+        axes = -matrix_of_quat(self.truth["quat_wb"][hanging])[:, :, 2]
+        cosine = np.einsum("ni,ni->n", hangs, axes) / np.linalg.norm(hangs, axis=1)
         return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
     def log(self, noise: Mapping[str, float]) -> FlightLog:
         """Return a flight log like the throw's: poses from motion capture, commands as sent."""
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
-        seen = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
+        measured = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         channels = {
-            "pos_w": Channel(self.time, seen["pos_w"], "m", "world"),
-            "quat_wb": Channel(self.time, seen["quat_wb"], "1", "world"),
+            "pos_w": Channel(self.time, measured["pos_w"], "m", "world"),
+            "quat_wb": Channel(self.time, measured["quat_wb"], "1", "world"),
             "command": Channel(self.reference.time, self.commands, "N, rad/s", "body"),
         }
         if self.manoeuvre.payload:
-            channels["payload_pos_w"] = Channel(self.time, seen["payload_pos_w"], "m", "world")
+            channels["payload_pos_w"] = Channel(self.time, measured["payload_pos_w"], "m", "world")
             channels["release_command"] = Channel(
                 self.reference.time, self.reference.release.astype(float), "1"
             )
@@ -252,7 +253,7 @@ class Flight:
             * truth["voltage"]
             / self.plant.vehicle.battery.reference_voltage
         )
-        seen = {
+        measured = {
             params.position: truth["pos_w"],
             "payload_pos_w": truth["payload_pos_w"],
             "rate_b": truth["rate_b"],
@@ -265,7 +266,7 @@ class Flight:
                 frame,
             )
             for (name, values), unit, frame in zip(
-                seen.items(), ("m", "m", "rad/s"), ("world", "world", "body")
+                measured.items(), ("m", "m", "rad/s"), ("world", "world", "body")
             )
         }
         channels |= {
@@ -289,19 +290,21 @@ class Flight:
     def _input(self, params: FlyerParams) -> Channel:
         """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
         if params.input in ("command", "thrust_command"):
-            told = command_of(params.thrust_map, self.commands[:, :1])
-            values = np.hstack((told, self.commands[:, 1:])) if params.input == "command" else told
+            command = command_of(params.thrust_map, self.commands[:, :1])
+            values = (
+                np.hstack((command, self.commands[:, 1:])) if params.input == "command" else command
+            )
             return Channel(
                 self.reference.time, values, "N, rad/s" if params.input == "command" else "N"
             )
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
-        wanted = thrust + self.plant.vehicle.motor.time_constant * np.gradient(
+        lagged = thrust + self.plant.vehicle.motor.time_constant * np.gradient(
             thrust, SAMPLE_PERIOD, axis=0
         )
         stamps = (
             self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
         )  # samples that are held stand for what lies about them
-        return Channel(stamps, command_of(params.thrust_map, wanted), "1")
+        return Channel(stamps, command_of(params.thrust_map, lagged), "1")
 
 
 def fly(
@@ -350,9 +353,9 @@ class _Pilot:
 
         Returns samples of the period: :data:`SAMPLED`, shape (S, E, ...).
         """
-        at = [min(row or 0, len(r.time) - 1) for r in self.references]
+        rows = [min(row or 0, len(r.time) - 1) for r in self.references]
         place, speed, push = (
-            np.array([getattr(r, name)[i] for r, i in zip(self.references, at)])
+            np.array([getattr(r, name)[i] for r, i in zip(self.references, rows)])
             for name in ("pos_w", "vel_w", "acc_w")
         )
         gains = self.controller.params
@@ -361,13 +364,13 @@ class _Pilot:
             self.sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")
         )
         mass = np.where(self.let_go, self.bare, self.loaded)
-        yaw = np.array([r.yaw[i] for r, i in zip(self.references, at)])
+        yaw = np.array([r.yaw[i] for r, i in zip(self.references, rows)])
         command = self.controller.step(pos, quat, vel, goal, mass, yaw)
         if row is not None:
-            command[:, 1:] += np.array([r.rates_b[i] for r, i in zip(self.references, at)])
-            command[:, 0] *= np.array([r.thrust_factor[i] for r, i in zip(self.references, at)])
+            command[:, 1:] += np.array([r.rates_b[i] for r, i in zip(self.references, rows)])
+            command[:, 0] *= np.array([r.thrust_factor[i] for r, i in zip(self.references, rows)])
             self.let_go = self.let_go | np.array(
-                [r.release[i] for r, i in zip(self.references, at)]
+                [r.release[i] for r, i in zip(self.references, rows)]
             )
             self.sent.append(command)
         self.sim.set_command(command, self.let_go)

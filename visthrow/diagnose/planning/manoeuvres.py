@@ -130,14 +130,14 @@ def _passes(
     between.
     """
 
-    def along(t: np.ndarray) -> np.ndarray:
+    def position(t: np.ndarray) -> np.ndarray:
         value, begin, forth = np.zeros_like(t), 0.0, 1.0
         for speed in speeds:
             value += forth * length * rise(t, begin, length / speed)
             begin, forth = begin + length / speed + 1.0, -forth
         return value - 0.5 * length
 
-    return along, sum(length / speed + 1.0 for speed in speeds)
+    return position, sum(length / speed + 1.0 for speed in speeds)
 
 
 def _doublets(size: float, width: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -145,8 +145,8 @@ def _doublets(size: float, width: float) -> Callable[[np.ndarray], np.ndarray]:
 
     def rates(t: np.ndarray) -> np.ndarray:
         out = np.zeros((len(t), 3))
-        number, inside = np.floor(t / 0.8).astype(int), np.mod(t, 0.8)
-        value = size * ((inside < width) * 1.0 - ((inside >= width) & (inside < 2 * width)))
+        number, phase = np.floor(t / 0.8).astype(int), np.mod(t, 0.8)
+        value = size * ((phase < width) * 1.0 - ((phase >= width) & (phase < 2 * width)))
         out[np.arange(len(t)), number % 3] = value
         return out
 
@@ -157,8 +157,8 @@ def _steps(t: np.ndarray) -> np.ndarray:
     """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the
     height back.
     """
-    inside = np.mod(t, 1.5)
-    return 1.0 + 0.4 * ((inside < 0.15) * 1.0 - ((inside >= 0.15) & (inside < 0.3)))
+    phase = np.mod(t, 1.5)
+    return 1.0 + 0.4 * ((phase < 0.15) * 1.0 - ((phase >= 0.15) & (phase < 0.3)))
 
 
 def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
@@ -171,9 +171,9 @@ def _stop(t: np.ndarray) -> np.ndarray:
     """Gather 1.5 m/s over 1.6 s, stop within 0.3 s, come back slowly: from this speed the rope
     stays taut.
     """
-    far = 1.5 * 0.5 * (1.6 + 0.3)
-    there = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
-    return there - far * rise(t, 3.9, 2.5) - 0.5 * far
+    distance = 1.5 * 0.5 * (1.6 + 0.3)
+    velocity = 1.5 * (_risen(t, 0.0, 1.6) - _risen(t, 1.6, 0.3))
+    return velocity - distance * rise(t, 3.9, 2.5) - 0.5 * distance
 
 
 def _run(speed: float) -> Callable[[np.ndarray], np.ndarray]:

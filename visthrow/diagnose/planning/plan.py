@@ -53,33 +53,33 @@ class Aim:
     information for it.
     """
 
-    def __init__(self, diagnosis: Diagnosis, about: Sequence[str] = ()) -> None:
+    def __init__(self, diagnosis: Diagnosis, names: Sequence[str] = ()) -> None:
         """Take the classes to be separated, or else what could not be identified, or else every
         effect that can be seen.
 
-        ``about``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect
+        ``names``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect
         that the diagnosis does not know."""
         work = diagnosis.work
         self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors
         self.names = [e.name for e in work.problem.model.effects]
-        expect_known(about, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
+        expect_known(names, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
         number = self.names.index
         classes = [
             f for f in diagnosis.findings if f.verdict == result.CLASS and f.name in diagnosis.theta
         ]
         self.pairs = [
-            (number(f.name), number(other))
+            (number(f.name), number(partner))
             for f in classes
-            for other in f.partners
-            if not about or {f.name, other} & set(about)
+            for partner in f.partners
+            if not names or {f.name, partner} & set(names)
         ]
         unclear = [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
         graded = [
             e.name
-            for e, seen in zip(work.problem.model.effects, self.priors.visible)
-            if seen and not e.switch
+            for e, visible in zip(work.problem.model.effects, self.priors.visible)
+            if visible and not e.switch
         ]
-        self.vague = [] if self.pairs else [number(name) for name in about or unclear or graded]
+        self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
     def information(self, model: Model) -> np.ndarray:
         """Expected information of one simulated flight."""
@@ -124,18 +124,18 @@ class Aim:
         A member that is already behind by more than a class allows is no truth to plan for.
         """
         information, score, priors, gaps = self.base.information, self.base.score, self.priors, []
-        rest = [j for j in self.diagnosis.work.active if j not in pair]
-        now = {j: log_evidence(information, score, priors, [*rest, j]) for j in pair}
-        for truth, other in (pair, pair[::-1]):
-            if now[truth] < now[other] - STRONG:
+        remaining = [j for j in self.diagnosis.work.active if j not in pair]
+        evidence = {j: log_evidence(information, score, priors, [*remaining, j]) for j in pair}
+        for truth, rival in (pair, pair[::-1]):
+            if evidence[truth] < evidence[rival] - STRONG:
                 continue
             theta = np.zeros(len(priors.floor))
-            for j in [*rest, truth]:
+            for j in [*remaining, truth]:
                 theta[j] = self.diagnosis.findings[j].estimate / priors.floor[j]
             after, total = score + new @ theta, information + new
             gaps.append(
-                log_evidence(total, after, priors, [*rest, truth])
-                - log_evidence(total, after, priors, [*rest, other])
+                log_evidence(total, after, priors, [*remaining, truth])
+                - log_evidence(total, after, priors, [*remaining, rival])
             )
         return float(min(gaps))
 
@@ -167,12 +167,14 @@ class Aim:
         )
 
 
-def propose(aim: Aim, told: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
-    """Rank manoeuvres and measurements, best first; ``told``: manoeuvres to choose among, and the
-    expected information of each.
+def propose(aim: Aim, informed: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
+    """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
+    the expected information of each.
     """
     return sorted(
-        [*(aim.proposal(*each) for each in told), *_measured(aim)], key=_worth, reverse=True
+        [*(aim.proposal(*manoeuvre) for manoeuvre in informed), *_measured(aim)],
+        key=_worth,
+        reverse=True,
     )
 
 
@@ -180,11 +182,11 @@ def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
     """Return the flights of one session: of ranked proposals, each that separates what none before
     it does.
     """
-    chosen, apart = [], set()
+    chosen, separated = [], set()
     for p in proposals:
-        if new := set(p.separates) - apart:
+        if new := set(p.separates) - separated:
             chosen.append(p)
-            apart |= new
+            separated |= new
     return tuple(chosen)
 
 
@@ -201,18 +203,26 @@ def _measured(aim: Aim) -> list[Proposal]:
     findings = {f.name: f for f in diagnosis.findings}
     out = []
     for m in MEASUREMENTS:
-        own = [(a, b) for a, b in pairs if m.effect in (names[a], names[b])]
-        if not own:
+        pairs_of = [(a, b) for a, b in pairs if m.effect in (names[a], names[b])]
+        if not pairs_of:
             continue
         j = names.index(m.effect)
-        seen = (
+        information = (
             0.5 * (findings[m.effect].estimate / m.sd) ** 2
         )  # if it is the cause, the measurement shows it
-        gaps = [min(seen, _denied(diagnosis, j, a + b - j, m)) for a, b in own]
-        apart = tuple((names[a], names[b]) for (a, b), gap in zip(own, gaps) if gap > DECISIVE)
+        gaps = [min(information, _denied(diagnosis, j, a + b - j, m)) for a, b in pairs_of]
+        separated = tuple(
+            (names[a], names[b]) for (a, b), gap in zip(pairs_of, gaps) if gap > DECISIVE
+        )
         out.append(
             Proposal(
-                m.name, f"settles {m.effect}", m.seconds, min(gaps), apart, int(bool(apart)), ""
+                m.name,
+                f"settles {m.effect}",
+                m.seconds,
+                min(gaps),
+                separated,
+                int(bool(separated)),
+                "",
             )
         )
     return out
@@ -224,13 +234,15 @@ def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
     """
     work = diagnosis.work
     problem = work.problem
-    known = Priors.of(
+    priors = Priors.of(
         narrowed(problem.model.effects, {m.effect: m.sd}), tuple(problem.model.channels)
     )
-    rest = [k for k in work.active if k not in (j, truth)]
-    sets = ([*rest, truth], [*rest, j])
-    ahead, behind = (log_evidence(work.after.information, work.after.score, known, s) for s in sets)
-    return ahead - behind
+    remaining = [k for k in work.active if k not in (j, truth)]
+    sets = ([*remaining, truth], [*remaining, j])
+    true_nats, other_nats = (
+        log_evidence(work.after.information, work.after.score, priors, s) for s in sets
+    )
+    return true_nats - other_nats
 
 
 def expected_information(
@@ -239,11 +251,11 @@ def expected_information(
     """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0
     for what they hide.
     """
-    known = {e.name for e in model.effects}
-    windows = model.windows({name: value for name, value in theta.items() if name in known})
+    flown = {e.name for e in model.effects}
+    windows = model.windows({name: value for name, value in theta.items() if name in flown})
     floors = np.array([e.floor for e in model.effects])
-    at = np.array([names.index(e.name) for e in model.effects if e.name in names])
-    own = np.array([i for i, e in enumerate(model.effects) if e.name in names])
+    places = np.array([names.index(e.name) for e in model.effects if e.name in names])
+    columns = np.array([i for i, e in enumerate(model.effects) if e.name in names])
     total = np.zeros((len(names), len(names)))
     loudest = {
         block: max(v for (b, _), v in noise.latent_sd.items() if b == block)
@@ -265,7 +277,7 @@ def expected_information(
         alike = np.ones((1, len(LATENT_BLOCKS)))
         expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
         part = integrals([gram], expected).shares([gram], expected)[0].information
-        total[np.ix_(at, at)] += part[np.ix_(own, own)]
+        total[np.ix_(places, places)] += part[np.ix_(columns, columns)]
     floor = {
         e.name: e.floor for e in model.effects
     }  # both catalogues name the same effect, the floors may differ
@@ -279,9 +291,9 @@ def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
     """Return the most that the fewest flights settle, and their number."""
     best: tuple[list, int] = [], 0
     for count in range(1, MOST_REPEATS + 1):
-        now = settled(count)
-        if len(now) > len(best[0]):
-            best = now, count
+        settled_now = settled(count)
+        if len(settled_now) > len(best[0]):
+            best = settled_now, count
         if len(best[0]) == all_of_them:
             break
     return best

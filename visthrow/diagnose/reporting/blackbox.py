@@ -55,19 +55,19 @@ class Table:
 
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
-        basis, parts, known = self.radial(_inputs(window)), [], laws.Known(window.knots)
+        basis, parts, values = self.radial(_inputs(window)), [], laws.Known(window.knots)
         for block in self.blocks:
-            turned = block != "vehicle torque" and "quat_wb" in known
+            turned = block != "vehicle torque" and "quat_wb" in values
             axes = np.stack(
                 [
-                    known[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1))
+                    values[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1))
                     for i, row in zip("xyz", np.eye(3))
                 ],
                 -1,
             )
-            through = grammar.through_latents(window, known, block)
+            latents = grammar.through_latents(window, values, block)
             parts.append(
-                through @ (axes[..., None] * basis[:, None, None]).reshape(through.shape[1], -1)
+                latents @ (axes[..., None] * basis[:, None, None]).reshape(latents.shape[1], -1)
             )
         return np.hstack(parts)
 
@@ -120,7 +120,7 @@ def train(
 
     ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
     shape (K,); default 0."""
-    back = point.statistics.theta - (0.0 if theta is None else theta)
+    shift = point.statistics.theta - (0.0 if theta is None else theta)
     names = np.array(sorted(set(groups)))
     size = table.columns(point.windows[0]).shape[1]
     information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
@@ -130,7 +130,7 @@ def train(
         columns = table.columns(window)
         f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
-        score[f] += columns.T @ (part.latent_score + part.latent_effects @ back)
+        score[f] += columns.T @ (part.latent_score + part.latent_effects @ shift)
     reach = np.concatenate(
         [
             np.full(

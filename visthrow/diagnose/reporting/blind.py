@@ -58,8 +58,8 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     first; ``draws``: worlds for each effect, size and sign."""
     work, rng = diagnosis.work, np.random.default_rng(seed)
     point, priors, effects = work.after, work.problem.priors, work.problem.model.effects
-    information, own = point.information, point.statistics.score
-    parametric = len(own) < FEWEST_FLIGHTS
+    information, score_of = point.information, point.statistics.score
+    parametric = len(score_of) < FEWEST_FLIGHTS
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
@@ -67,7 +67,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
         small = rng.uniform(-1.0, 1.0, (draws, len(effects))) @ information
         if parametric:
             return small + rng.standard_normal((draws, len(effects))) @ root.T
-        return small + rng.choice((-1.0, 1.0), (draws, len(own))) @ own
+        return small + rng.choice((-1.0, 1.0), (draws, len(score_of))) @ score_of
 
     def named(score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         gain = additions(information, score, priors, ())
@@ -81,19 +81,24 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             if not signs or not priors.visible[j]:
                 break
             score = np.vstack([worlds() + s * size * information[j] for s in signs])
-            gain, found = named(score)
+            gain, named_effect = named(score)
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
             rows.append(
-                (size, np.mean(found & best), np.mean(found & close), np.mean(found & ~close))
+                (
+                    size,
+                    np.mean(named_effect & best),
+                    np.mean(named_effect & close),
+                    np.mean(named_effect & ~close),
+                )
             )
-        size, exact, near, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
-        limit = _limit(size, near) * effect.floor if rows else float("nan")
+        size, exact, similar, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
+        limit = _limit(size, similar) * effect.floor if rows else float("nan")
         curves.append(
             Completeness(
                 effect.name,
                 effect.unit,
-                *map(tuple, (size * effect.floor, exact, near, wrong)),
+                *map(tuple, (size * effect.floor, exact, similar, wrong)),
                 limit,
             )
         )
@@ -140,10 +145,10 @@ class Hidden:
         ]
 
     def residuals(
-        self, theta: Mapping[str, float], about: Linearised | None = None
+        self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`."""
-        return [r + s for r, s in zip(self.model.residuals(theta, about), self._shift)]
+        return [r + s for r, s in zip(self.model.residuals(theta, linearised), self._shift)]
 
 
 @dataclass(frozen=True)
@@ -189,15 +194,23 @@ def verify(
         if not signs:
             continue
         size = float(rng.choice(signs)) * floors * effect.floor
-        found = explain(
+        verdicts = explain(
             Hidden(problem.model, {effect.name: size}),
             seed=seed,
             without=diagnosis.events,
             laws=False,
         )
-        own = found[effect.name]
+        finding = verdicts[effect.name]
         expected = diagnosis.theta.get(effect.name, 0.0) + size
         trials.append(
-            Trial(effect.name, size, effect.unit, expected, own.estimate, own.verdict, found.named)
+            Trial(
+                effect.name,
+                size,
+                effect.unit,
+                expected,
+                finding.estimate,
+                finding.verdict,
+                verdicts.named,
+            )
         )
     return trials

@@ -56,11 +56,11 @@ def run(args: argparse.Namespace) -> int:
         else []
     )
     for t in trials:
-        said = (
+        verdict = (
             f"{t.verdict}, {t.estimate:+.3g} of {t.expected:+.3g}; named"
             f" {', '.join(t.named) or 'nothing'}"
         )
-        print(f"  hidden {t.name} {t.size:+.3g} {t.unit}: {said}")
+        print(f"  hidden {t.name} {t.size:+.3g} {t.unit}: {verdict}")
     value = {**dataclasses.asdict(hidden), "trials": [dataclasses.asdict(t) for t in trials]}
     folder = Path(args.out)
     floors = [e.floor for e in opened.model.effects]

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     if not args.no_report:
         check_place(Path(args.out) / "report.html")
     opened = opening.Opened(args)
-    others = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
+    test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
     diagnosis = opened.diagnose(say=lambda line: print(line, flush=True))
     gain = None
     if not args.no_report and diagnosis.work is not None:
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
             opening.made_with(args),
         )
     print("\n" + report.summary(diagnosis, gain))
-    tested = _tested(others, diagnosis) if args.test and diagnosis.work is not None else {}
+    tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
     if not args.no_report and diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {args.out}")
     if args.json:
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def _tested(others: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, float, float]]:
+def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, float, float]]:
     """Return prediction errors of other flights by the model as its setup has it without
     extensions, by that with all that was found, and of noise alone; print them.
     """
@@ -89,10 +89,10 @@ def _tested(others: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, fl
     from visthrow.diagnose.select.search import refused_of
     from visthrow.logs.check.run import check, contradictions
 
-    checked = check(others.logs, others.known)
+    checked = check(test_flights.logs, test_flights.known)
     for reason in contradictions(checked):
         print(f"left out of the tested flights: {reason}")
-    after = others.model
+    after = test_flights.model
     before = after.plain() if hasattr(after, "plain") else after
     if diagnosis.explanations and hasattr(after, "with_laws"):
         after = after.with_laws(
@@ -100,12 +100,13 @@ def _tested(others: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, fl
         )
     tested = on_others(before, after, diagnosis.theta, diagnosis, refused_of(checked))
     print(
-        f"tested on {tested.windows} windows of {tested.flights} of {len(others.logs)} flights;"
+        f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
+        f"flights;"
         f" {tested.outliers} of {tested.samples} samples are outliers, which weigh less"
     )
-    for channel, found in tested.errors.items():
+    for channel, channel_errors in tested.errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
-        before, after, floor = (factor * x for x in found)
+        before, after, floor = (factor * x for x in channel_errors)
         won = (
             f", {(before - after) / (before - floor):.0%} of what is above it"
             if before > floor
@@ -144,18 +145,18 @@ def write_report(
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error() if hasattr(model, "step_error") else None
     origin = provenance.collect()
-    about = {
+    source = {
         "logs": len(logs),
         "command": origin["command"],
         "commit": origin["commit"],
         "time": origin["time"],
     }
-    made = report.sections(diagnosis, measured, hidden, step_check=steps, about=about)
+    parts = report.sections(diagnosis, measured, hidden, step_check=steps, provenance=source)
     page.write(
         folder,
         "What the simulation gets wrong about these flights",
         report.sentence_of(diagnosis),
-        made,
+        parts,
     )
     table = (
         blackbox.unexplained(diagnosis.work.after, seed)

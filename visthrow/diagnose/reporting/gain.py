@@ -105,22 +105,27 @@ def landing_gain(
     parts = (
         [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
     )
-    held = Landings(
+    held_landings = Landings(
         *(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts)))
     )
-    good = np.isfinite(plain.errors) & np.isfinite(held.errors)
+    good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)
     if not good.any():
         return None
     moved = {}
     for name in theta:
-        others = {other: size for other, size in theta.items() if other != name}
-        without = model.landings(others, flown) if others else plain
+        remaining = {effect: size for effect, size in theta.items() if effect != name}
+        without = model.landings(remaining, flown) if remaining else plain
         moved[name] = float(
             np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1))
         )
-    after = mean(held.errors[good], seed=seed)
-    released = [float(np.nanmean(found.released_errors[good])) for found in (plain, held)]
-    off = [tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist())) for x in (plain, held)]
+    after = mean(held_landings.errors[good], seed=seed)
+    released = [
+        float(np.nanmean(prediction.released_errors[good])) for prediction in (plain, held_landings)
+    ]
+    off = [
+        tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist()))
+        for x in (plain, held_landings)
+    ]
     return LandingGain(
         int(good.sum()),
         bool(trained),
@@ -151,7 +156,7 @@ def on_others(
     before: Model,
     after: Model,
     theta: Mapping[str, float],
-    found: Diagnosis,
+    diagnosis: Diagnosis,
     without: Sequence[int] = (),
 ) -> Tested:
     """Return prediction errors of flights that nothing was estimated from.
@@ -160,35 +165,37 @@ def on_others(
         before: model of these flights that says what is worth it.
         after: model of these flights that was diagnosed, with the laws that were found.
         theta: sizes that were found.
-        found: that diagnosis, whose noise is taken.
+        diagnosis: that diagnosis, whose noise is taken.
         without: flights that are left out.
     """
     noise, rms = (
         replace(
-            found.work.after.noise,
-            scale=np.array([found.sensor_scale[name] for name in after.channels]),
+            diagnosis.work.after.noise,
+            scale=np.array([diagnosis.sensor_scale[name] for name in after.channels]),
         ),
         [],
     )
-    floors, channels = found.work.problem.priors.floor, len(after.channels)
+    floors, channels = diagnosis.work.problem.priors.floor, len(after.channels)
     outliers = 0
     for model, sizes in ((before, {}), (after, theta)):
         sums = np.zeros((3, channels))
         windows = [w for w in model.windows(sizes) if finite(w) and w.flight not in without]
-        own = floors[: windows[0].effects.shape[1]] if windows else floors
-        given = with_correlations(windows, found.work.problem.correlated)
-        mended = without_outliers(given, grams_of(given, own, channels, "cpu"), own)
+        floors_of = floors[: windows[0].effects.shape[1]] if windows else floors
+        correlated = with_correlations(windows, diagnosis.work.problem.correlated)
+        mended = without_outliers(
+            correlated, grams_of(correlated, floors_of, channels, "cpu"), floors_of
+        )
         outliers = 0
-        for plain, window in zip(given, mended):
-            left, expected, horizon = predicted(window, noise, window.residual)
+        for plain, window in zip(correlated, mended):
+            innovation, expected, horizon = predicted(window, noise, window.residual)
             weight = (plain.sigma / window.sigma) ** 2
             outliers += int((weight < 1.0).sum())
-            squares = np.array([left**2, expected, window.sigma**-2.0]) * window.sigma**2
-            ahead = horizon >= 0
+            squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2
+            predicts = horizon >= 0
             added = np.array(
                 [
-                    np.bincount(window.channel[ahead], values, channels)
-                    for values in (weight * squares)[:, ahead]
+                    np.bincount(window.channel[predicts], values, channels)
+                    for values in (weight * squares)[:, predicts]
                 ]
             )
             added[1] = np.where(added[1] > FAR_ABOVE * added[0], added[0], added[1])
@@ -220,22 +227,23 @@ def _blackbox(
     trained = train(before, table, groups)
     weights = np.zeros((len(trained.groups), len(trained.reach)))
     for fold in folds:
-        rest = np.setdiff1d(np.arange(len(weights)), fold)
-        weights[fold] = trained.weights(rest) if len(rest) else 0.0
-    own = weights[np.searchsorted(trained.groups, groups)]
-    left = [
-        w.residual - w.latent @ (table.columns(w) @ size) for w, size in zip(before.windows, own)
+        training = np.setdiff1d(np.arange(len(weights)), fold)
+        weights[fold] = trained.weights(training) if len(training) else 0.0
+    weights_of = weights[np.searchsorted(trained.groups, groups)]
+    residuals = [
+        w.residual - w.latent @ (table.columns(w) @ size)
+        for w, size in zip(before.windows, weights_of)
     ]
-    return errors(before.windows, groups, after.noise, left, channels).square
+    return errors(before.windows, groups, after.noise, residuals, channels).square
 
 
 def _nats(before: Point, after: Point, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain, own, change = (
+    plain, named, change = (
         regrouped(before, cross.groups),
         regrouped(after, cross.groups),
         cross.trained - after.theta,
     )
-    quadratic = np.einsum("fi,fij,fj->f", change, own.information, change)
-    square = own.square - 2.0 * np.einsum("fi,fi->f", change, own.score) + quadratic
-    return float(0.5 * (plain.square.sum() - square.sum()) / own.samples.sum())
+    quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
+    square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic
+    return float(0.5 * (plain.square.sum() - square.sum()) / named.samples.sum())

@@ -38,39 +38,39 @@ STEPS_OF_TICKS = (
 )  # within a decade of a logarithmic axis; the finest that leaves room is taken
 
 
-def _figure(rows: int, columns: int, height: float, **more):
+def _figure(rows: int, columns: int, height: float, **options):
     import matplotlib.pyplot as plt
 
     style.use()
     return plt.subplots(
-        rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **more
+        rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **options
     )
 
 
-def plain_ticks(low: float, high: float, most: int) -> list[float]:
+def plain_ticks(low: float, high: float, count: int) -> list[float]:
     """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no
     choice of them fits.
     """
-    far = max(abs(low), abs(high))
+    reach = max(abs(low), abs(high))
     for digits in STEPS_OF_TICKS:
         sizes = [
             digit * 10.0**power
             for power in range(-4, 7)
             for digit in digits
-            if digit * 10.0**power <= far
+            if digit * 10.0**power <= reach
         ]
         if low <= 0.0 <= high:
             sizes = [size for size in sizes if size >= 1.0]
             sizes = [*(-size for size in sizes[::-1]), 0.0, *sizes]
-        inside = [tick for tick in sizes if low <= tick <= high]
-        if 2 <= len(inside) <= most:
-            return inside
+        ticks = [tick for tick in sizes if low <= tick <= high]
+        if 2 <= len(ticks) <= count:
+            return ticks
     return []
 
 
-def _plain(axis, most: int) -> None:
+def _plain(axis, count: int) -> None:
     """Ticks of one axis of a picture as plain numbers instead of powers of ten."""
-    if ticks := plain_ticks(*axis.get_view_interval(), most):
+    if ticks := plain_ticks(*axis.get_view_interval(), count):
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
         axis.set_ticks([], minor=True)
 
@@ -86,7 +86,7 @@ def left_over(window: Window, noise: Noise) -> np.ndarray:
     return window.residual - window.nuisance * window.nuisance_sd @ fitted
 
 
-def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> bytes:
+def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) -> bytes:
     """Draw an optimised manoeuvre over the one that it began with, and what each manoeuvre
     promises.
 
@@ -104,7 +104,7 @@ def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> by
     }
     figure, axes = _figure(3, 3, 6.2)
     for axis, (label, value) in zip(axes.flat, rows.items()):
-        for manoeuvre, colour in ((base, BEFORE), (found, AFTER)):
+        for manoeuvre, colour in ((base, BEFORE), (designed, AFTER)):
             reference = manoeuvre.reference()
             axis.plot(reference.time, value(reference), color=colour, lw=1.0, label=manoeuvre.name)
         axis.set(ylabel=label, xlabel="time [s]")
@@ -113,7 +113,7 @@ def planned(base: Manoeuvre, found: Manoeuvre, rates: Mapping[str, float]) -> by
     axes[2, 2].barh(
         best,
         [rates[name] for name in best],
-        color=[AFTER if name == found.name else BEFORE for name in best],
+        color=[AFTER if name == designed.name else BEFORE for name in best],
     )
     axes[2, 2].tick_params(axis="y", labelsize=6)
     axes[2, 2].set(xlabel="expected nats a second")
@@ -168,12 +168,12 @@ def ladder(diagnosis: Diagnosis) -> bytes:
     must exceed; rows of three.
     """
     steps = diagnosis.steps
-    across = min(len(steps), STEPS_ACROSS)
-    down, most = (
-        -(-len(steps) // across),
+    columns = min(len(steps), STEPS_ACROSS)
+    down, height = (
+        -(-len(steps) // columns),
         max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps),
     )
-    figure, axes = _figure(down, across, down * (0.55 + 0.27 * most))
+    figure, axes = _figure(down, columns, down * (0.55 + 0.27 * height))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
     for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
@@ -199,7 +199,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
             title=f"step {number}: {several if ', ' in step.named else step.named}",
         )
         axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
-        _plain(axis.xaxis, MOST_TICKS // across)
+        _plain(axis.xaxis, MOST_TICKS // columns)
         axis.tick_params(axis="y", labelsize=8)
     return png_of(figure)
 
@@ -213,13 +213,13 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
         result.BOUNDED: style.QUIET,
         result.NOT_IDENTIFIABLE: style.COLOURS[4],
     }
-    shown = [f for f in diagnosis.findings if f.verdict in colours][::-1]
-    figure, axes = _figure(1, 1, 0.8 + 0.19 * len(shown))
-    axis, seen = axes[0, 0], set()
+    findings = [f for f in diagnosis.findings if f.verdict in colours][::-1]
+    figure, axes = _figure(1, 1, 0.8 + 0.19 * len(findings))
+    axis, labelled = axes[0, 0], set()
     axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
-    for y, f in enumerate(shown):
-        label = None if f.verdict in seen else f.verdict
-        seen.add(f.verdict)
+    for y, f in enumerate(findings):
+        label = None if f.verdict in labelled else f.verdict
+        labelled.add(f.verdict)
         middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
         axis.plot(
             np.array([f.low, f.high]) / f.floor,
@@ -239,10 +239,10 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     axis.axvline(0.0, color=style.QUIET, lw=0.8)
     axis.set(
         xlabel="size in floors (grey: within the floor)",
-        yticks=range(len(shown)),
-        ylim=(-1, len(shown)),
+        yticks=range(len(findings)),
+        ylim=(-1, len(findings)),
     )
-    axis.set_yticklabels([f.name for f in shown], fontsize=8)
+    axis.set_yticklabels([f.name for f in findings], fontsize=8)
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
     _plain(axis.xaxis, MOST_TICKS)
     axis.tick_params(axis="x", top=True, labeltop=True)
@@ -300,17 +300,17 @@ def confusion(diagnosis: Diagnosis) -> bytes:
         2.0,
         np.abs(correlation - np.eye(len(visible))).max(axis=1, initial=0.0),
     )
-    at = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
-    names = [work.problem.model.effects[j].name for j in visible[at]]
-    figure, axes = _figure(1, 1, 1.6 + 0.3 * len(at))
-    axis, shown = axes[0, 0], correlation[np.ix_(at, at)]
-    image = axis.imshow(shown, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
-    for (i, j), value in np.ndenumerate(shown):
+    strongest_effects = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
+    names = [work.problem.model.effects[j].name for j in visible[strongest_effects]]
+    figure, axes = _figure(1, 1, 1.6 + 0.3 * len(strongest_effects))
+    axis, block = axes[0, 0], correlation[np.ix_(strongest_effects, strongest_effects)]
+    image = axis.imshow(block, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
+    for (i, j), value in np.ndenumerate(block):
         if i != j and abs(value) > 0.3:
             colour = "white" if abs(value) > 0.7 else style.INK
             axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
-    axis.set_xticks(range(len(at)), names, rotation=60, ha="right", fontsize=8)
-    axis.set_yticks(range(len(at)), names, fontsize=8)
+    axis.set_xticks(range(len(strongest_effects)), names, rotation=60, ha="right", fontsize=8)
+    axis.set_yticks(range(len(strongest_effects)), names, fontsize=8)
     figure.colorbar(image, ax=axis, shrink=0.7, label="correlation")
     return png_of(figure)
 
@@ -356,12 +356,12 @@ def _rises(pairs: Sequence[tuple]) -> bytes:
     axis = axes[0, 0]
     for y, (curve, floor) in enumerate(pairs[::-1]):
         sizes, share = np.array(curve.sizes) / floor, np.maximum.accumulate(curve.up_to_class)
-        half, most = (
+        half, top = (
             float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9)
         )
-        axis.plot((half, most), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
+        axis.plot((half, top), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
         axis.plot(
-            most,
+            top,
             y,
             "o" if share[-1] >= 0.9 else ">",
             color=AFTER if share[-1] >= 0.9 else BEFORE,

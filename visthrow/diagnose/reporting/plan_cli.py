@@ -74,25 +74,25 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     manoeuvres = [m for m in map(flown, chosen) if m is not None]
-    told = [
+    informed = [
         (m, aim.information(s.model))
         for m, s in zip(manoeuvres, simulate(manoeuvres))
         if s.model is not None
     ]
-    found = None
-    if told and args.steps > 0:
-        base = max(told, key=lambda each: aim.nats(each[1]) / each[0].seconds)[0]
-        found = design.optimise(
+    designed = None
+    if informed and args.steps > 0:
+        base = max(informed, key=lambda candidate: aim.nats(candidate[1]) / candidate[0].seconds)[0]
+        designed = design.optimise(
             aim, base, simulate, limits, seed=args.seed, steps=args.steps, progress=print
         )
-    if found:
-        told.append((found.manoeuvre, found.information))
-        rates = {m.name: aim.nats(information) / m.seconds for m, information in told}
+    if designed:
+        informed.append((designed.manoeuvre, designed.information))
+        rates = {m.name: aim.nats(information) / m.seconds for m, information in informed}
         atomic_write(
-            Path(args.out) / "plan.png", pictures.planned(found.base, found.manoeuvre, rates)
+            Path(args.out) / "plan.png", pictures.planned(designed.base, designed.manoeuvre, rates)
         )
-    ranked = plan.propose(aim, told)
-    for manoeuvre, _ in told:
+    ranked = plan.propose(aim, informed)
+    for manoeuvre, _ in informed:
         atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.reference().csv())
     _print(ranked)
     session = plan.session(ranked)
@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     extra = {
         "proposals": [dataclasses.asdict(p) for p in ranked],
         "session": [p.name for p in session],
-        "optimised": found.said() if found else None,
+        "optimised": designed.said() if designed else None,
     }
     value = report.to_json(diagnosis, extra=extra)
     write_json(Path(args.out) / "plan.json", value)
@@ -139,10 +139,10 @@ def _limits(args: argparse.Namespace):
 def _chosen(names: str | None):
     from visthrow.diagnose.planning import manoeuvres
 
-    known = {m.name: m for m in manoeuvres.catalogue()}
-    chosen = names.split(",") if names else list(known)
-    expect_known(chosen, known, "no manoeuvre '{}'", DiagnoseError)
-    return [known[name] for name in chosen]
+    by_name = {m.name: m for m in manoeuvres.catalogue()}
+    chosen = names.split(",") if names else list(by_name)
+    expect_known(chosen, by_name, "no manoeuvre '{}'", DiagnoseError)
+    return [by_name[name] for name in chosen]
 
 
 def _print(ranked) -> None:

@@ -46,16 +46,16 @@ def _channel(
     width = int(np.sum(time == time[0]))  # components of a sample stand together
     if len(rows) % width:
         return
-    at = time[::width]
+    stamps = time[::width]
     old, new = (left_over(w, noise)[rows].reshape(-1, width) for w in (before, after))
     home = f"flight_{before.flight:02d}"
     for values, label, colour in ((old, "before", BEFORE), (new, "after", AFTER)):
-        _series(stream, f"{home}/residual/{name}/{label}", at, values, colour)
+        _series(stream, f"{home}/residual/{name}/{label}", stamps, values, colour)
     if name not in PATHS or log is None or name not in log or width != 3:
         return
     measured = log[name]
-    index = np.clip(np.searchsorted(measured.time, at - 1e-9), 0, len(measured.time) - 1)
-    if np.abs(measured.time[index] - at).max() > 1e-6:
+    index = np.clip(np.searchsorted(measured.time, stamps - 1e-9), 0, len(measured.time) - 1)
+    if np.abs(measured.time[index] - stamps).max() > 1e-6:
         return
     place = measured.values[index]
     for points, label, colour in (
@@ -63,7 +63,7 @@ def _channel(
         (place - old, "before", BEFORE),
         (place - new, "after", AFTER),
     ):
-        _path(stream, f"{home}/{name}/{label}", at, points, colour)
+        _path(stream, f"{home}/{name}/{label}", stamps, points, colour)
 
 
 def _series(stream, entity: str, time: np.ndarray, values: np.ndarray, colour: str) -> None:

@@ -47,29 +47,31 @@ def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]
     moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
     moves = {name: f" It moves landings by {1e3 * size:.0f} mm." for name, size in moved.items()}
     named = [f for f in diagnosis.findings if f.verdict in result.NAMED]
-    apart = {
+    separations = {
         f.name: f" To tell them apart: {'; '.join(f.manoeuvres)}."
         for f in named
         if f.partners and f.manoeuvres
     }
-    found = [(f.verdict, f.sentence + moves.get(f.name, "") + apart.get(f.name, "")) for f in named]
-    found += [("OR", line) for line in instead(diagnosis)]
-    found += [("FOUND", m.sentence) for m in diagnosis.mistakes]
-    found += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
-    found += [("EVENT", _event(diagnosis, flight)) for flight in diagnosis.events]
-    return found + [
-        ("COPY", f"flight {flight} repeats flight {of} and was left out")
-        for flight, of in diagnosis.duplicates.items()
+    named_findings = [
+        (f.verdict, f.sentence + moves.get(f.name, "") + separations.get(f.name, "")) for f in named
+    ]
+    named_findings += [("OR", line) for line in instead(diagnosis)]
+    named_findings += [("FOUND", m.sentence) for m in diagnosis.mistakes]
+    named_findings += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
+    named_findings += [("EVENT", _event(diagnosis, flight)) for flight in diagnosis.events]
+    return named_findings + [
+        ("COPY", f"flight {flight} repeats flight {original} and was left out")
+        for flight, original in diagnosis.duplicates.items()
     ]
 
 
 def _gain_line(c: ChannelGain) -> str:
     unit, before, after, floor, box = _errors(c)
     errors = f"{before} -> {after} {unit}".rstrip()
-    beside = f"noise alone {floor}" + (f", black box {box}" if box else "")
+    comparison = f"noise alone {floor}" + (f", black box {box}" if box else "")
     return (
         f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less [{percent(c.low)},"
-        f" {percent(c.high)}]; {beside}"
+        f" {percent(c.high)}]; {comparison}"
     )
 
 
@@ -125,12 +127,12 @@ def instead(diagnosis: Diagnosis) -> list[str]:
     """
     lines, named = [], set(diagnosis.theta)
     withdrawn = not diagnosis.sets or set(diagnosis.sets[0][0]) != named  # for a law
-    for names, behind in () if withdrawn else diagnosis.sets:
-        gone, new = sorted(named - set(names)), sorted(set(names) - named)
-        if max(len(gone), len(new)) > 1:
+    for names, nats in () if withdrawn else diagnosis.sets:
+        removed, new = sorted(named - set(names)), sorted(set(names) - named)
+        if max(len(removed), len(new)) > 1:
             lines.append(
-                f"{', '.join(new) or 'nothing'} in place of {', '.join(gone) or 'nothing'},"
-                f" {behind:.1f} nats behind"
+                f"{', '.join(new) or 'nothing'} in place of {', '.join(removed) or 'nothing'},"
+                f" {nats:.1f} nats behind"
             )
     return lines
 
@@ -154,12 +156,12 @@ def sections(
     gain: Gain | None = None,
     blind: Blind | None = None,
     step_check: Mapping[str, float] | None = None,
-    about: Mapping[str, Any] | None = None,
+    provenance: Mapping[str, Any] | None = None,
 ) -> list[Section]:
     """All sections of the page; ``step_check``: channel -> largest difference between the replay
     and one with finer steps, in sigmas.
     """
-    made = [_verdict(diagnosis, gain)]
+    parts = [_verdict(diagnosis, gain)]
     work = diagnosis.work
     if work is not None and diagnosis.theta:
         fitted = (
@@ -167,7 +169,7 @@ def sections(
             if any(w.nuisance.size for w in work.after.windows)
             else ""
         )
-        drawn = tuple(
+        variations = tuple(
             Picture(
                 f"residual_{name}",
                 pictures.residuals(work, c),
@@ -176,12 +178,12 @@ def sections(
             for c, name in enumerate(work.problem.model.channels)
             if any(np.any(w.channel == c) for w in work.after.windows)
         )
-        made.append(Section("residuals", "Residuals before and after", drawn))
+        parts.append(Section("residuals", "Residuals before and after", variations))
     if gain is not None:
-        made.append(_gain(gain, diagnosis))
+        parts.append(_gain(gain, diagnosis))
     if diagnosis.steps:
         rows = tuple(
-            (", ".join(names) or "nothing", f"{behind:.1f}") for names, behind in diagnosis.sets
+            (", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets
         )
         alike = (
             [Grid("Sets of causes that explain the flights as well", ("set", "nats behind"), rows)]
@@ -193,7 +195,7 @@ def sections(
             " before; as a line what it must exceed; marks: with the simulation run again (circle:"
             " taken, triangle: beaten)."
         )
-        made.append(
+        parts.append(
             Section(
                 "ladder",
                 "Candidates",
@@ -205,12 +207,12 @@ def sections(
             )
         )
     if diagnosis.levels:
-        made.append(_levels(diagnosis))
+        parts.append(_levels(diagnosis))
     if diagnosis.laws:
-        made.append(_laws(diagnosis))
+        parts.append(_laws(diagnosis))
     if work is not None:
-        made.append(_catalogue(diagnosis))
-        made.append(
+        parts.append(_catalogue(diagnosis))
+        parts.append(
             Section(
                 "confusion",
                 "What looks alike",
@@ -224,10 +226,10 @@ def sections(
             )
         )
     if blind is not None:
-        made.append(_blind(blind, diagnosis))
-    made += _next_flights(diagnosis)
-    made.append(_ground(diagnosis, step_check, about))
-    return made
+        parts.append(_blind(blind, diagnosis))
+    parts += _next_flights(diagnosis)
+    parts.append(_ground(diagnosis, step_check, provenance))
+    return parts
 
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
@@ -276,13 +278,14 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
         ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items())
         or "nothing in any"
     )
-    of = (
+    channels = (
         "whole windows"
         if gain.whole
         else f"predictions from the first {HEAD_SECONDS:g} s of each window"
     )
     note = (
-        f"Root mean square errors of {of}, {gain.left_out} left out in {gain.folds} folds, the"
+        f"Root mean square errors of {channels}, {gain.left_out} left out in {gain.folds} "
+        f"folds, the"
         f" selection repeated in each ({named}). Interval: 95 %, bootstrap over flights."
         f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
     )
@@ -430,7 +433,9 @@ def _next_flights(diagnosis: Diagnosis) -> list[Section]:
 
 
 def _ground(
-    diagnosis: Diagnosis, step_check: Mapping[str, float] | None, about: Mapping[str, Any] | None
+    diagnosis: Diagnosis,
+    step_check: Mapping[str, float] | None,
+    provenance: Mapping[str, Any] | None,
 ) -> Section:
     rows = [
         (
@@ -455,7 +460,7 @@ def _ground(
         (f"replay against finer steps, {name}", f"{value:.2g} sigma")
         for name, value in (step_check or {}).items()
     ]
-    rows += [(str(key), str(value)) for key, value in (about or {}).items()]
+    rows += [(str(key), str(value)) for key, value in (provenance or {}).items()]
     return Section(
         "ground", "What this rests on", (Grid("Numbers", ("what", "value"), tuple(rows), heads=2),)
     )

@@ -60,31 +60,38 @@ class Told:
             columns: of each window's commands, shape (N, T).
             rows: numbers of the windows among the point's.
         """
-        most, known = max(own.shape[1] for own in columns), len(point.theta)
+        longest, effect_count = max(columns_of.shape[1] for columns_of in columns), len(point.theta)
         wide = [
             np.hstack(
                 (
                     w.effects,
-                    np.pad(own, ((0, len(w.residual) - len(own)), (0, most - own.shape[1]))),
+                    np.pad(
+                        columns_of,
+                        (
+                            (0, len(w.residual) - len(columns_of)),
+                            (0, longest - columns_of.shape[1]),
+                        ),
+                    ),
                 )
             )
-            for w, own in zip(windows, columns)
+            for w, columns_of in zip(windows, columns)
         ]
         windows = [replace(w, effects=effects) for w, effects in zip(windows, wide)]
         grams = grams_of(
             windows,
-            np.append(problem.priors.floor, np.ones(most)),
+            np.append(problem.priors.floor, np.ones(longest)),
             len(problem.model.channels),
             point.device,
         )
         grams = correlated_of(grams, windows, point.noise.correlation_time, point.device)
         noise = levels.only(point.noise, grams, rows)
         shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
-        information = np.array([own.information for own in shares])
+        information = np.array([columns_of.information for columns_of in shares])
         return Told(
             information,
-            np.array([own.score for own in shares]) + information[:, :, :known] @ point.theta,
-            most,
+            np.array([columns_of.score for columns_of in shares])
+            + information[:, :, :effect_count] @ point.theta,
+            longest,
         )
 
     def ahead(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
@@ -97,26 +104,28 @@ class Told:
         e, c = (slice(0, -self.commands), slice(-self.commands, None))
         information, score, value = self.information[:, e, e], self.score[:, e], 0.0
         if share > 0.0:
-            variance, beside = share * (1.0 - share), self.information[:, c, e]
-            own, mean = self.information[:, c, c], np.full(self.commands, share)
-            left, moved = self.score[:, c] - own @ mean, score - mean @ beside
-            factor = np.linalg.cholesky(variance * own + np.eye(self.commands))
+            variance, crossed = share * (1.0 - share), self.information[:, c, e]
+            command_information, mean = self.information[:, c, c], np.full(self.commands, share)
+            remaining, moved = self.score[:, c] - command_information @ mean, score - mean @ crossed
+            factor = np.linalg.cholesky(variance * command_information + np.eye(self.commands))
             half = np.linalg.solve(
-                factor, np.sqrt(variance) * np.concatenate((left[..., None], beside), axis=2)
+                factor, np.sqrt(variance) * np.concatenate((remaining[..., None], crossed), axis=2)
             )
-            tells, through = half[..., 0], half[..., 1:]
-            value = float((mean @ (self.score[:, c] + left).T).sum() + (tells**2).sum()) / 2.0
+            tells, transfer = half[..., 0], half[..., 1:]
+            value = float((mean @ (self.score[:, c] + remaining).T).sum() + (tells**2).sum()) / 2.0
             value -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
-            information = information - through.transpose(0, 2, 1) @ through
-            score = moved - (tells[:, None] @ through)[:, 0]
+            information = information - transfer.transpose(0, 2, 1) @ transfer
+            score = moved - (tells[:, None] @ transfer)[:, 0]
         return value + log_evidence(information.sum(0), score.sum(0), priors, list(active))
 
 
-def verdict(problem: Problem, point: Point, active: Sequence[int], least: float) -> Scatter | None:
+def verdict(
+    problem: Problem, point: Point, active: Sequence[int], threshold: float
+) -> Scatter | None:
     """Whether commands got lost, beside a set of effects or any that are still missing; None where
     none was, or a model cannot tell.
 
-    ``least``: nats that a finding needs.
+    ``threshold``: nats that a finding needs.
     """
     if not hasattr(problem.model, "without_commands"):
         return None
@@ -127,40 +136,43 @@ def verdict(problem: Problem, point: Point, active: Sequence[int], least: float)
     )
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
-    every = range(len(problem.kept))
-    for rows, shares in ((few_of(every), reach[::LOOK]), (every, reach)):
+    windows_all = range(len(problem.kept))
+    for rows, shares in ((few_of(windows_all), reach[::LOOK]), (windows_all, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
-        told = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
-        nats = np.minimum(*(told.ahead(shares, priors, named) for named in sets))
+        statistics = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
+        nats = np.minimum(*(statistics.ahead(shares, priors, named) for named in sets))
         if nats.max() <= 0.0:
             return None
-    return judged(v, reach, nats, least, sum(own.shape[1] for own in columns), COMMAND)
+    return judged(
+        v, reach, nats, threshold, sum(columns_of.shape[1] for columns_of in columns), COMMAND
+    )
 
 
-def sized(problem: Problem, point: Point, found: Scatter) -> Scatter:
+def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
     """The verdict with the share of those commands of which a window tells by itself whether they
     came, with Jeffreys' interval.
 
     ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these
-    leave; ``found``: the verdict before."""
-    told = Told.of(
+    leave; ``scatter``: the verdict before."""
+    statistics = Told.of(
         problem,
         point,
         [point.about.windows[i] for i in problem.kept],
         point.commands,
         range(len(problem.kept)),
     )
-    own, score = (
-        told.information[:, -told.commands :, -told.commands :],
-        told.score[:, -told.commands :],
+    information, score = (
+        statistics.information[:, -statistics.commands :, -statistics.commands :],
+        statistics.score[:, -statistics.commands :],
     )
-    spread = np.linalg.inv(own + np.eye(told.commands) / EITHER**2)
-    off = (spread @ (score - EITHER * own.sum(2))[..., None])[..., 0]  # from half way
+    spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)
+    off = (spread @ (score - EITHER * information.sum(2))[..., None])[..., 0]  # from half way
     clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
-    count, gone = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
+    count, lost_commands = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
     if not count:
-        return found
+        return scatter
     size, low, high = (
-        float(x) for x in beta.ppf((0.5, 0.025, 0.975), gone + 0.5, count - gone + 0.5)
+        float(x)
+        for x in beta.ppf((0.5, 0.025, 0.975), lost_commands + 0.5, count - lost_commands + 0.5)
     )
-    return replace(found, size=size, low=low, high=high)
+    return replace(scatter, size=size, low=low, high=high)

@@ -32,28 +32,32 @@ A level that nothing holds up lies anywhere below.
 """
 
 
-def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple[Level, ...]:
+def levels(problem: Problem, before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     """Compare the latent forces of each block and phase with the block's quietest phase, and with
     what would move a landing.
 
-    ``least``: nats from which a level would count as excessive if it were the only one; of many,
-    one is higher by chance."""
-    found, least = [], least + np.log(max(len(after.noise.latent_sd), 1))
+    ``threshold``: nats from which a level would count as excessive if it were the only one; of
+    many, one is higher by chance."""
+    levels_found, threshold = [], threshold + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
-    of = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
+    phases = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     floors = floors_of(problem, after)
     for block in blocks:
         limits = {
-            phase: of[phase].upper_limit(block) for b, phase in after.noise.latent_sd if b == block
+            phase: phases[phase].upper_limit(block)
+            for b, phase in after.noise.latent_sd
+            if b == block
         }
         quiet = min(limits.values())
         for phase in limits:
             level = after.noise.latent_sd[block, phase]
-            nats, most = 0.0, max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
-            if level > most:
-                nats = of[phase].likelihood(block, level) - of[phase].likelihood(block, most)
+            nats, limit = 0.0, max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
+            if level > limit:
+                nats = phases[phase].likelihood(block, level) - phases[phase].likelihood(
+                    block, limit
+                )
             earlier = before.noise.latent_sd.get((block, phase), float("nan"))
-            found.append(
+            levels_found.append(
                 Level(
                     LATENT_BLOCKS[block],
                     phase,
@@ -61,10 +65,10 @@ def levels(problem: Problem, before: Point, after: Point, least: float) -> tuple
                     level,
                     quiet,
                     float(nats),
-                    bool(nats > least),
+                    bool(nats > threshold),
                 )
             )
-    return tuple(found)
+    return tuple(levels_found)
 
 
 def compares_phases(point: Point) -> bool:
@@ -85,16 +89,16 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
         if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"
     ]
     for gram, window in zip(point.grams, point.windows):
-        seen = window.latent[np.isin(window.channel, positions)]
-        for block in np.unique(gram.latent_block) if len(seen) else ():
-            reach = seen @ gram.factor[:, gram.latent_block == block]
+        positions_moved = window.latent[np.isin(window.channel, positions)]
+        for block in np.unique(gram.latent_block) if len(positions_moved) else ():
+            reach = positions_moved @ gram.factor[:, gram.latent_block == block]
             moves.setdefault((int(block), gram.phase), []).append(
                 float(np.sqrt((reach**2).sum(1).max()))
             )
     return {
         key: LANDING / median
-        for key, found in moves.items()
-        if (median := float(np.median(found))) > 0.0
+        for key, distances in moves.items()
+        if (median := float(np.median(distances))) > 0.0
     }
 
 
@@ -126,15 +130,15 @@ class _Phase:
 
 
 def acts_on(
-    point: Point, effects: Sequence[int], *, joint: bool = False, beside: Sequence[int] = ()
+    point: Point, effects: Sequence[int], *, joint: bool = False, free_effects: Sequence[int] = ()
 ) -> list[str]:
     """Block through which each of some effects moves things, or "" where it moves measurements
     alone.
 
     Its column is laid over the columns of each block's latent forces; the block that explains most
     of it, and at least half, is it. ``point``: with the latent forces' derivatives; ``joint``:
-    consider the torque between vehicle and rope as well; ``beside``: effects that may take any
-    size: what they can stand in for is left out."""
+    consider the torque between vehicle and rope as well; ``free_effects``: effects that may take
+    any size: what they can stand in for is left out."""
     weight = point.noise.scale**-2.0
     total, by_block = (
         np.zeros(len(effects)),
@@ -142,10 +146,10 @@ def acts_on(
     )
     for gram, window in zip(point.grams, point.windows):
         inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
-        free = np.array([*range(gram.nuisances), *(size + k for k in beside)], dtype=int)
+        free = np.array([*range(gram.nuisances), *(size + k for k in free_effects)], dtype=int)
         columns = size + np.asarray(effects, dtype=int)
-        own = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])
-        total += inner[columns, columns] - own
+        explained_free = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])
+        total += inner[columns, columns] - explained_free
         for block in np.unique(gram.latent_block):
             with_block = np.concatenate(
                 (free, gram.nuisances + np.flatnonzero(gram.latent_block == block))
@@ -153,12 +157,14 @@ def acts_on(
             explained = _explained(
                 inner[np.ix_(with_block, with_block)], inner[np.ix_(with_block, columns)]
             )
-            by_block[LATENT_BLOCKS[block]] += explained - own
+            by_block[LATENT_BLOCKS[block]] += explained - explained_free
         if joint and (torques := joint_torques(gram, window)) is not None:
             move = np.zeros((len(inner), len(free) + torques.shape[1]))
             move[free, np.arange(len(free))] = 1.0
             move[gram.nuisances : size, len(free) :] = torques
-            by_block[JOINT] += _explained(move.T @ inner @ move, move.T @ inner[:, columns]) - own
+            by_block[JOINT] += (
+                _explained(move.T @ inner @ move, move.T @ inner[:, columns]) - explained_free
+            )
     best = [max(by_block, key=lambda name: by_block[name][i]) for i in range(len(effects))]
     return [
         name if total[i] > 0.0 and by_block[name][i] > 0.5 * total[i] else ""
@@ -170,10 +176,12 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
     """Latents of a gram that torques in the rope's joint about each axis at each knot stand for,
     shape (L, 3k); None without.
     """
-    known = Known(window.knots)
-    if not set(JOINT_NEEDS) <= set(known) or len(np.unique(gram.latent_block)) < len(LATENT_BLOCKS):
+    values = Known(window.knots)
+    if not set(JOINT_NEEDS) <= set(values) or len(np.unique(gram.latent_block)) < len(
+        LATENT_BLOCKS
+    ):
         return None
-    return np.linalg.solve(gram.factor, through_latents(window, known, JOINT))
+    return np.linalg.solve(gram.factor, through_latents(window, values, JOINT))
 
 
 def _explained(normal: np.ndarray, right: np.ndarray) -> np.ndarray:

@@ -72,7 +72,7 @@ def select(
     information: np.ndarray,
     score: np.ndarray,
     priors: Priors,
-    least: float,
+    threshold: float,
     begin: Sequence[int] = (),
 ) -> list[int]:
     """Forward search with backward elimination by the statistics alone.
@@ -80,25 +80,28 @@ def select(
     Args:
         information: of the flights, shape (K, K).
         score: about 0, shape (K,).
-        least: threshold [nats].
+        threshold: threshold [nats].
         begin: a set to begin from; causes that hide each other are not found one by one.
     """
     active, new = list(begin), []
     while True:
         whole = log_evidence(information, score, priors, [*active, *new])
         for j in list(active):  # without those that the others make superfluous
-            rest = [k for k in active if k != j]
-            if whole - (left := log_evidence(information, score, priors, [*rest, *new])) < least:
-                active, whole = rest, left
+            remaining = [k for k in active if k != j]
+            if (
+                whole - (reduced := log_evidence(information, score, priors, [*remaining, *new]))
+                < threshold
+            ):
+                active, whole = remaining, reduced
         active += new
         gain = additions(information, score, priors, active)
         best = int(np.argmax(gain))
-        if len(active) >= MOST_NAMES or gain[best] <= least:
+        if len(active) >= MOST_NAMES or gain[best] <= threshold:
             return active
         new = [best]
 
 
-def groups_of(point: Point, kept: Sequence[int]) -> tuple[list[int], str]:
+def groups_of(point: Point, windows: Sequence[int]) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
@@ -119,7 +122,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     """Repeat a search without each of the flights, by statistics; what an effect that varies has of
     its own there is integrated out.
     """
-    work, least = diagnosis.work, diagnosis.threshold
+    work, threshold = diagnosis.work, diagnosis.threshold
     point, priors = work.after, work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
     varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
@@ -128,15 +131,19 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
     trained, named = np.zeros((count, len(priors.floor))), Counter()
     for fold in folds:
-        rest = np.setdiff1d(np.arange(count), fold)
-        if not len(rest):
+        training = np.setdiff1d(np.arange(count), fold)
+        if not len(training):
             continue
-        information, score = statistics.information[rest].sum(0), statistics.absolute[rest].sum(0)
+        information, score = (
+            statistics.information[training].sum(0),
+            statistics.absolute[training].sum(0),
+        )
         anew, active = (
-            select(information, score, priors, least, begin=begin) for begin in ((), work.active)
+            select(information, score, priors, threshold, begin=begin)
+            for begin in ((), work.active)
         )
         worth = [
-            log_evidence(information, score, priors, s) - least * len(s) for s in (anew, active)
+            log_evidence(information, score, priors, s) - threshold * len(s) for s in (anew, active)
         ]
         if (
             worth[0] > worth[1] + STRONG
@@ -160,16 +167,16 @@ def borne_out(
     sizes that all flights gave, shape (K,)."""
     promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
     quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
-    came, total = (
+    brought, total = (
         np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic,
         promised.sum(),
     )
     if total <= 0.0:
         return 0.0, float("nan"), float("nan")
-    value, n = came.sum() / total, int((promised > TELLING * promised.mean()).sum())
+    value, n = brought.sum() / total, int((promised > TELLING * promised.mean()).sum())
     if n < 2:
         return float(value), float("nan"), float("nan")
-    scatter = np.sqrt(n / (n - 1.0) * ((came - value * promised) ** 2).sum()) / total
+    scatter = np.sqrt(n / (n - 1.0) * ((brought - value * promised) ** 2).sum()) / total
     reach = max(stdtrit(n - 1, 0.975) * scatter, NORMAL_95 * np.sqrt(2.0 / total))
     return float(value), float(value - reach), float(value + reach)
 
@@ -185,43 +192,48 @@ def channel_gains(
     change = (after.theta - cross.trained)[
         np.unique(cross.groups, return_inverse=True)[1]
     ] * work.problem.priors.floor
-    named = [w.residual + w.effects @ own for w, own in zip(after.windows, change)]
-    own = errors(after.windows, cross.groups, after.noise, named, len(names))
+    named = [w.residual + w.effects @ shift for w, shift in zip(after.windows, change)]
+    shift = errors(after.windows, cross.groups, after.noise, named, len(names))
     plain = errors(
         before.windows, cross.groups, after.noise, [w.residual for w in before.windows], len(names)
     )
     return tuple(
-        _channel(name, c, after, own, plain.square[:, c], None if box is None else box[:, c])
+        _channel(name, c, after, shift, plain.square[:, c], None if box is None else box[:, c])
         for c, name in enumerate(names)
-        if own.count[:, c].sum() > 0
+        if shift.count[:, c].sum() > 0
     )
 
 
 def _channel(
-    name: str, c: int, after: Point, own: Errors, before: np.ndarray, box: np.ndarray | None
+    name: str,
+    c: int,
+    after: Point,
+    errors_named: Errors,
+    before: np.ndarray,
+    box: np.ndarray | None,
 ) -> ChannelGain:
-    error, count = own.square[:, c], own.count[:, c].sum()
+    error, count = errors_named.square[:, c], errors_named.count[:, c].sum()
     sigma = after.sigma(c)
 
     def rms(square: np.ndarray) -> float:
         return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
 
     value, low, high = jackknifed(before.sum(1), error.sum(1))
-    by_horizon = own.count[:, c].sum(0)
-    seen = by_horizon > 0
+    by_horizon = errors_named.count[:, c].sum(0)
+    measured = by_horizon > 0
     curves = [
-        np.sqrt(np.maximum(x.sum(0)[seen], 0.0) / by_horizon[seen])
-        for x in (before, error, own.floor[:, c])
+        np.sqrt(np.maximum(x.sum(0)[measured], 0.0) / by_horizon[measured])
+        for x in (before, error, errors_named.floor[:, c])
     ]
     horizons = tuple(
-        (h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[seen].tolist(), *curves)
+        (h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[measured].tolist(), *curves)
     )
     return ChannelGain(
         name,
         unit_of(name),
         rms(before),
         rms(error),
-        min(rms(own.floor[:, c]), rms(error)),
+        min(rms(errors_named.floor[:, c]), rms(error)),
         float("nan") if box is None else rms(box),
         value,
         low,
@@ -279,13 +291,13 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             return _unconfirmed(diagnosis, None, spanning, reason)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    held, alone = measure(diagnosis), not compares_phases(diagnosis.work.after)
+    measured, uncompared = measure(diagnosis), not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
-    harmed = [c for c in held.channels if alone and c.high < 0.0]
-    if held.share <= 0.0 or harmed:
-        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(held)
+    harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
+    if measured.share <= 0.0 or harmed:
+        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(measured)
         reason = (
-            f"held-out {held.left_out} are explained worse with {', '.join(names)} ({how});"
+            f"held-out {measured.left_out} are explained worse with {', '.join(names)} ({how});"
             " withdrawn"
         )
         return _unconfirmed(
@@ -295,20 +307,20 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
                 result.NOT_IDENTIFIABLE,
                 "held-out flights are explained worse with it",
             ),
-            held,
+            measured,
             names,
             reason,
         )
-    falls = [c.low if alone else c.gain for c in held.channels]
-    shown = not held.channels or max(falls) > 0.0
-    if not (held.low > 0.0 and shown):
-        failed = _share(held) if not held.low > 0.0 else _no_gain(held)
-        reason = f"held-out {held.left_out} do not confirm {', '.join(names)} ({failed})"
-        if np.isnan(held.low) or held.folds < PARTS:
+    falls = [c.low if uncompared else c.gain for c in measured.channels]
+    confirmed = not measured.channels or max(falls) > 0.0
+    if not (measured.low > 0.0 and confirmed):
+        failed = _share(measured) if not measured.low > 0.0 else _no_gain(measured)
+        reason = f"held-out {measured.left_out} do not confirm {', '.join(names)} ({failed})"
+        if np.isnan(measured.low) or measured.folds < PARTS:
             reason += f"; {_one_more(diagnosis, names)}"
         return _unconfirmed(
             _demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"),
-            held,
+            measured,
             names,
             reason,
         )
@@ -318,20 +330,20 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     unsure = [
         name
         for name in names
-        if sum(held.named_in.get(own, 0.0) for own in alike[name]) < FIRM + 1e-9
+        if sum(measured.named_in.get(member, 0.0) for member in alike[name]) < FIRM + 1e-9
     ]
     after = _demoted(
         diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it"
     )
     if not after.theta:
-        reason = f"searches that leave {held.left_out} out do not agree on a name"
-        return _unconfirmed(after, held, names, reason)
-    left = [c for c in held.channels if alone and c.after > UNKNOWN_RATIO * c.floor]
-    after = replace(after, held_out=held)
-    if diagnosis.overall == result.UNKNOWN or not left:
+        reason = f"searches that leave {measured.left_out} out do not agree on a name"
+        return _unconfirmed(after, measured, names, reason)
+    unexplained = [c for c in measured.channels if uncompared and c.after > UNKNOWN_RATIO * c.floor]
+    after = replace(after, held_out=measured)
+    if diagnosis.overall == result.UNKNOWN or not unexplained:
         return after
     return replace(
-        after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in left)
+        after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in unexplained)
     )
 
 
@@ -346,11 +358,11 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         return diagnosis
     groups, left_out = groups_of(point, work.problem.kept)
     names = work.problem.model.channels
-    own = errors(
+    errors_of = errors(
         point.windows, groups, point.noise, [w.residual for w in point.windows], len(names)
     )
-    error, most = own.square.sum(2), UNKNOWN_RATIO**2 * own.floor.sum(2)
-    firm = [name for c, name in enumerate(names) if jackknifed(most[:, c], error[:, c])[2] < 0.0]
+    error, limit = errors_of.square.sum(2), UNKNOWN_RATIO**2 * errors_of.floor.sum(2)
+    firm = [name for c, name in enumerate(names) if jackknifed(limit[:, c], error[:, c])[2] < 0.0]
     if not firm:
         return diagnosis
     gains = channel_gains(
@@ -372,16 +384,20 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
 
 
 def _unconfirmed(
-    diagnosis: Diagnosis, held: HeldOut | None, names: Sequence[str], reason: str
+    diagnosis: Diagnosis, measured: HeldOut | None, names: Sequence[str], reason: str
 ) -> Diagnosis:
     """Something is there that no confirmed name explains: in the block of the name that promised
     most.
     """
-    most = max((diagnosis[name] for name in names), key=lambda f: f.nats)
-    block = diagnosis.block or most.block
+    strongest = max((diagnosis[name] for name in names), key=lambda f: f.nats)
+    block = diagnosis.block or strongest.block
     earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
     return replace(
-        diagnosis, overall=result.UNKNOWN, block=block, reasons=(reason, *earlier), held_out=held
+        diagnosis,
+        overall=result.UNKNOWN,
+        block=block,
+        reasons=(reason, *earlier),
+        held_out=measured,
     )
 
 
@@ -391,18 +407,20 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
     """
     if not names:
         return diagnosis
-    gone = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
-    kept = {name: size for name, size in diagnosis.theta.items() if name not in names}
+    removed = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
+    remaining = {name: size for name, size in diagnosis.theta.items() if name not in names}
     findings = tuple(
         (
             replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
-            if f.name in gone and f.name not in kept and f.verdict in (result.FOUND, result.CLASS)
+            if f.name in removed
+            and f.name not in remaining
+            and f.verdict in (result.FOUND, result.CLASS)
             else f
         )
         for f in diagnosis.findings
     )
-    work, known = diagnosis.work, [e.name for e in diagnosis.work.problem.effects]
-    active = [known.index(name) for name in kept]
+    work, effect_names = diagnosis.work, [e.name for e in diagnosis.work.problem.effects]
+    active = [effect_names.index(name) for name in remaining]
     theta, spread, _ = sized(work.problem, work.after, active)
     work = (
         replace(work, active=tuple(active))
@@ -422,46 +440,47 @@ def sized(
     in what is allowed, see :func:`visthrow.diagnose.select.scatter.between_flights`."""
     priors, named = problem.priors, list(active)
     theta = estimate(point.information, point.score, priors, named)
-    unlike, kept = between_flights(point.statistics, priors, named, theta)
+    unlike, mean_part = between_flights(point.statistics, priors, named, theta)
     spread = covariance(point.information, priors.deviation(named)) + np.diag(
-        OWN_FLOOR**2 + unlike * kept * allowed(theta) ** 2
+        OWN_FLOOR**2 + unlike * mean_part * allowed(theta) ** 2
     )
-    own = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
+    variance = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
     sizes = {problem.effects[j].name: float(theta[j] * priors.floor[j]) for j in named}
-    return sizes, tuple(tuple(map(float, row)) for row in own), unlike
+    return sizes, tuple(tuple(map(float, row)) for row in variance), unlike
 
 
-def _share(held: HeldOut) -> str:
-    if np.isnan(held.low):
+def _share(measured: HeldOut) -> str:
+    if np.isnan(measured.low):
         return "only one of them can tell"
     return (
-        f"they bear out {100 * held.share:.0f} % [{100 * held.low:.0f}, {100 * held.high:.0f}] of"
+        f"they bear out {100 * measured.share:.0f} % [{100 * measured.low:.0f}, "
+        f"{100 * measured.high:.0f}] of"
         " what it promises"
     )
 
 
-def _no_gain(held: HeldOut) -> str:
+def _no_gain(measured: HeldOut) -> str:
     """Return the gains of all channels, of which none is sure."""
     gains = (
         f"{c.channel} {100 * c.gain:.0f} % [{100 * c.low:.0f}, {100 * c.high:.0f}]"
-        for c in held.channels
+        for c in measured.channels
     )
     return f"no channel's error falls for sure: {', '.join(gains)}"
 
 
 def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     """Return which flight would settle it."""
-    wanted = list(dict.fromkeys(m for name in names for m in diagnosis[name].manoeuvres))
-    return f"fly once more{f', such as: {wanted[0]}' if wanted else ' like these'}"
+    manoeuvres = list(dict.fromkeys(m for name in names for m in diagnosis[name].manoeuvres))
+    return f"fly once more{f', such as: {manoeuvres[0]}' if manoeuvres else ' like these'}"
 
 
 def _left(c: ChannelGain, work: Work) -> str:
     """Return a sentence on what remains of a channel's error, and of which kind it is."""
     factor, unit = READABLE.get(c.unit, (1.0, c.unit))
-    said = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
+    text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
     return (
-        f"{c.channel}: {said} left on held-out flights, noise alone"
+        f"{c.channel}: {text} left on held-out flights, noise alone"
         f" {factor * c.floor:.3g}{f'; {kind}' if kind else ''}"
     )
 
@@ -475,13 +494,13 @@ def _kind(work: Work, channel: int) -> str:
     for window in point.windows:
         spans.setdefault(window.flight, []).append(window.time.mean())
     for window in point.windows:
-        rows, (left, _, horizon) = (
+        rows, (innovation, _, horizon) = (
             window.channel == channel,
             predicted(window, point.noise, window.residual),
         )
         if not rows.any():
             continue
-        square, times = np.where(horizon < 0, 0.0, left**2)[rows], window.time[rows]
+        square, times = np.where(horizon < 0, 0.0, innovation**2)[rows], window.time[rows]
         if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())

@@ -65,14 +65,15 @@ class Problem:
     lost: float = 0.0  # share of the commands that did not come
 
     @staticmethod
-    def of(model: Model, windows: Sequence[Window], kept: Sequence[int]) -> "Problem":
+    def of(model: Model, windows: Sequence[Window], numbers: Sequence[int]) -> "Problem":
         """The problem of some of a model's windows, with the correlation of their
         channels' noise.
         """
-        plain = Problem(model, tuple(kept), varies=Varies(getattr(model, "days", ())))
+        plain = Problem(model, tuple(numbers), varies=Varies(getattr(model, "days", ())))
         slabs = plain.priors.slab * plain.priors.floor
         return replace(
-            plain, correlated=correlations([windows[i] for i in kept], slabs, len(model.channels))
+            plain,
+            correlated=correlations([windows[i] for i in numbers], slabs, len(model.channels)),
         )
 
     @cached_property
@@ -154,13 +155,13 @@ class Point:
         """Median of what the model states as a channel's noise, in its unit; NaN where there is no
         sample.
         """
-        own = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
-        return float(np.median(own)) if len(own) else float("nan")
+        sigmas = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
+        return float(np.median(sigmas)) if len(sigmas) else float("nan")
 
     def evidence(self, priors: Priors, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
-        own = log_evidence(self.information, self.score, priors, list(active))
-        return own - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
+        value = log_evidence(self.information, self.score, priors, list(active))
+        return value - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
 
 
 def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
@@ -204,38 +205,52 @@ def linearise(
     sizes, channels = problem.sizes(theta), len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
-    own = with_correlations([windows[i] for i in problem.kept], problem.correlated)
+    windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
     commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
     commands = [
-        np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, own)
+        np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, windows_of)
     ]  # nothing behind replayed samples
-    found = (
-        own
+    extended = (
+        windows_of
         if not problem.terms
         else each(
-            lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta), own
+            lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta),
+            windows_of,
         )
     )
-    found = (
-        found if not commands else [_losing(w, c, problem.lost) for w, c in zip(found, commands)]
+    extended = (
+        extended
+        if not commands
+        else [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     )
     device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
-    first = grams_of(found, floors, channels, device)
-    kept = levels.without_outliers(found, first, floors, device)
-    mended = [w for w in range(len(kept)) if kept[w] is not found[w]]
-    again = dict(zip(mended, grams_of([kept[w] for w in mended], floors, channels, "cpu")))
-    raw = [again.get(w, gram) for w, gram in enumerate(first)]
-    noise, grams = levels.fit(kept, raw, start, device)
-    integrals, at = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
-    about = Linearised(
+    first = grams_of(extended, floors, channels, device)
+    cleaned = levels.without_outliers(extended, first, floors, device)
+    mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]
+    recomputed = dict(zip(mended, grams_of([cleaned[w] for w in mended], floors, channels, "cpu")))
+    raw = [recomputed.get(w, gram) for w, gram in enumerate(first)]
+    noise, grams = levels.fit(cleaned, raw, start, device)
+    integrals, position = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
+    linearised = Linearised(
         sizes,
         {
-            i: w if found is own else replace(o, sigma=w.sigma)
-            for i, w, o in zip(problem.kept, kept, own)
+            i: w if extended is windows_of else replace(o, sigma=w.sigma)
+            for i, w, o in zip(problem.kept, cleaned, windows_of)
         },
     )
-    said = _statistics(grams, integrals, noise, at)
-    return Point(at, kept, grams, noise, said, problem.varies, integrals, about, commands, device)
+    statistics = _statistics(grams, integrals, noise, position)
+    return Point(
+        position,
+        cleaned,
+        grams,
+        noise,
+        statistics,
+        problem.varies,
+        integrals,
+        linearised,
+        commands,
+        device,
+    )
 
 
 def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -> Window:
@@ -262,15 +277,15 @@ def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
 
 def only(point: Point, windows: Sequence[int]) -> Point:
     """Return a point of some of its windows, with noise levels estimated from these."""
-    own = {
+    parts = {
         name: [getattr(point, name)[w] for w in windows]
         for name in ("windows", "grams", "commands")
         if getattr(point, name)
     }
     noise = levels.maximised(
-        own["grams"], levels.only(point.noise, own["grams"], windows), point.device
+        parts["grams"], levels.only(point.noise, parts["grams"], windows), point.device
     )[0]
-    return regathered(point, noise=noise, **own)
+    return regathered(point, noise=noise, **parts)
 
 
 def lost(point: Point) -> list[int]:
@@ -281,15 +296,15 @@ def lost(point: Point) -> list[int]:
     lost, but something is missing."""
     shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
     misfit = [
-        (own.square - log_det) / max(gram.count.sum(), 1.0)
-        for own, log_det, gram in zip(shares, log_dets, point.grams)
+        (share.square - log_det) / max(gram.count.sum(), 1.0)
+        for share, log_det, gram in zip(shares, log_dets, point.grams)
     ]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    most = min(
+    limit = min(
         (1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO
     )  # what an unknown motion does is no effect's doing
-    far = np.flatnonzero(np.array(misfit) > np.where(shaken, most, UNKNOWN_RATIO))
-    return far.tolist() if len(far) <= LOST_SHARE * len(misfit) else []
+    distant = np.flatnonzero(np.array(misfit) > np.where(shaken, limit, UNKNOWN_RATIO))
+    return distant.tolist() if len(distant) <= LOST_SHARE * len(misfit) else []
 
 
 def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
@@ -297,20 +312,21 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     simulation fails there.
     """
     kinds = problem.switches
-    about = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
-    own = len(
+    linearised = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
+    count = len(
         problem.model.effects
     )  # a term's column stays that of the place where derivatives were taken
     sizes, change = problem.priors.floor * theta, problem.priors.floor * (theta - point.theta)
     if (flown := problem.flown(theta)) is not None:
-        found = flown.residuals(problem.sizes(theta), about)
-        residuals = [found[i] for i in problem.kept]
-    elif np.array_equal(theta[:own], point.theta[:own]):
-        residuals = [w.residual - w.effects[:, own:] @ change[own:] for w in point.windows]
+        residuals_of = flown.residuals(problem.sizes(theta), linearised)
+        residuals = [residuals_of[i] for i in problem.kept]
+    elif np.array_equal(theta[:count], point.theta[:count]):
+        residuals = [w.residual - w.effects[:, count:] @ change[count:] for w in point.windows]
     else:
-        found = problem.model.residuals(problem.sizes(theta), about)
+        residuals_of = problem.model.residuals(problem.sizes(theta), linearised)
         residuals = [
-            found[i] - w.effects[:, own:] @ sizes[own:] for i, w in zip(problem.kept, point.windows)
+            residuals_of[i] - w.effects[:, count:] @ sizes[count:]
+            for i, w in zip(problem.kept, point.windows)
         ]
         residuals = (
             [r - problem.lost * c.sum(1) for r, c in zip(residuals, point.commands)]
@@ -329,7 +345,7 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
         theta=np.array(theta, dtype=float),
         windows=windows,
         grams=grams,
-        about=about,
+        about=linearised,
     )
 
 
@@ -349,31 +365,33 @@ def advantage(
     points = first[0], second[0]
     if not np.array_equal(*(point.theta[switches] != 0.0 for point in points)):
         return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
-    ahead, behind = (
+    first_value, second_value = (
         max(point.evidence(priors, active) for point in points) for active in (first[1], second[1])
     )
-    return ahead - behind
+    return first_value - second_value
 
 
-def bend(problem: Problem, origin: Point, there: Point, active: Sequence[int]) -> np.ndarray:
+def bend(problem: Problem, origin: Point, moved_point: Point, active: Sequence[int]) -> np.ndarray:
     """Return the sizes of all effects that the simulation's distance from its linearisation would
     be taken for, in floors, shape (K,).
 
-    ``origin``: where the derivatives were taken; ``there``: a point moved from it, with the same
-    derivatives; ``active``: effects that are named."""
-    change = problem.priors.floor * (there.theta - origin.theta)
+    ``origin``: where the derivatives were taken; ``moved_point``: a point moved from it, with the
+    same derivatives; ``active``: effects that are named."""
+    change = problem.priors.floor * (moved_point.theta - origin.theta)
     bent = [
         new.residual - (old.residual - old.effects @ change)
-        for old, new in zip(origin.windows, there.windows)
+        for old, new in zip(origin.windows, moved_point.windows)
     ]
-    grams = with_residuals(there.grams, there.windows, problem.priors.floor, bent, there.device)
-    total = sum(share.score for share in there.integrals.shares(grams, there.noise))
-    return covariance(there.information, problem.priors.deviation(list(active))) @ total
+    grams = with_residuals(
+        moved_point.grams, moved_point.windows, problem.priors.floor, bent, moved_point.device
+    )
+    total = sum(share.score for share in moved_point.integrals.shares(grams, moved_point.noise))
+    return covariance(moved_point.information, problem.priors.deviation(list(active))) @ total
 
 
-def curvature(problem: Problem, origin: Point, there: Point) -> float:
+def curvature(problem: Problem, origin: Point, moved_point: Point) -> float:
     """The largest size that :func:`bend` says of any effect while none is named."""
-    return float(np.abs(bend(problem, origin, there, ())).max(initial=0.0))
+    return float(np.abs(bend(problem, origin, moved_point, ())).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:
@@ -409,13 +427,15 @@ def with_varying(point: Point, varies: Varies) -> Point:
     )
 
 
-def _with_noise_at(point: Point, theta: np.ndarray, own: np.ndarray | None = None) -> Point:
+def _with_noise_at(point: Point, theta: np.ndarray, shares: np.ndarray | None = None) -> Point:
     """Return the point with noise levels estimated from the residuals at ``theta``, and each
-    flight's ``own`` shares beside it, shape (F, K).
+    flight's ``shares`` shares beside it, shape (F, K).
     """
-    at = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (0.0 if own is None else own)
+    positions = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (
+        0.0 if shares is None else shares
+    )
     row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
-    moves = [at[row[window.flight]] for window in point.windows]
+    moves = [positions[row[window.flight]] for window in point.windows]
     grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
     return regathered(point, noise=levels.maximised(grams, point.noise, point.device)[0])
 
@@ -434,11 +454,11 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
     ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to
     0."""
-    inside = np.isin(np.arange(len(point.theta)), list(active))
+    named = np.isin(np.arange(len(point.theta)), list(active))
     best = (
         point
-        if np.all(point.theta[~inside] == 0.0)
-        else moved(problem, point, np.where(inside, point.theta, 0.0))
+        if np.all(point.theta[~named] == 0.0)
+        else moved(problem, point, np.where(named, point.theta, 0.0))
     )
     if best is None:
         return point
@@ -458,9 +478,9 @@ def to_gain(problem: Problem, point: Point, active: Sequence[int]) -> float:
     """Nats that another step of these effects' sizes would bring by the derivatives, no block
     turned into another.
     """
-    left = estimate(point.information, point.score, problem.priors, active) - point.theta
-    left[problem.switches] = 0.0
-    return float(0.5 * left @ point.information @ left)
+    remaining = estimate(point.information, point.score, problem.priors, active) - point.theta
+    remaining[problem.switches] = 0.0
+    return float(0.5 * remaining @ point.information @ remaining)
 
 
 def _step(problem: Problem, point: Point, goal: np.ndarray) -> Point | None:
@@ -504,9 +524,9 @@ def candidates(problem: Problem, point: Point, sets: Sequence[Sequence[int]]) ->
         return [candidate(problem, point, active) for active in sets]
     turned = [i for i, active in enumerate(sets) if _off(problem, point, active)]
     plain = [i for i in range(len(sets)) if i not in turned]
-    found = {i: candidate(problem, point, sets[i]) for i in turned}
-    found |= zip(plain, beside(lambda i: candidate(problem, point, sets[i]), plain))
-    return [found[i] for i in range(len(sets))]
+    simulated = {i: candidate(problem, point, sets[i]) for i in turned}
+    simulated |= zip(plain, beside(lambda i: candidate(problem, point, sets[i]), plain))
+    return [simulated[i] for i in range(len(sets))]
 
 
 def _off(problem: Problem, point: Point, active: Sequence[int]) -> list[int]:

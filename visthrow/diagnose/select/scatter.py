@@ -101,12 +101,14 @@ class Varies:
         """
         return Varies((), self.effects)
 
-    def also(self, at: Sequence[int], size: Mapping[int, float], by: str = FLIGHT) -> "Varies":
+    def also(
+        self, columns: Sequence[int], size: Mapping[int, float], group: str = FLIGHT
+    ) -> "Varies":
         """Return these random effects with more of them."""
-        new = {j: size[j] for j in at}
+        new = {j: size[j] for j in columns}
         return (
             replace(self, drifts={**self.drifts, **new})
-            if by == DAY
+            if group == DAY
             else replace(self, flights={**self.flights, **new})
         )
 
@@ -123,9 +125,9 @@ def varying(
     theta: np.ndarray,
     priors: Priors,
     names: Sequence[str],
-    least: float,
-    again: Callable[[np.ndarray], Statistics | None] | None = None,
-    others: Sequence[RandomEffect] = (),
+    threshold: float,
+    simulate: Callable[[np.ndarray], Statistics | None] | None = None,
+    further: Sequence[RandomEffect] = (),
     active: Sequence[int] = (),
     days: Sequence[int] = (),
 ) -> tuple[Scatter, ...]:
@@ -133,56 +135,65 @@ def varying(
 
     Args:
         theta: sizes found, in floors, shape (K,).
-        least: nats that a finding needs.
-        again: the flights simulated at other sizes, in floors; None where that fails.
-        others: what may vary besides the catalogue's random effects; told where it does.
+        threshold: nats that a finding needs.
+        simulate: the flights simulated at other sizes, in floors; None where that fails.
+        further: what may vary besides the catalogue's random effects; told where it does.
         active: effects that are named.
         days: of each flight, by its number; none where nobody told.
     """
-    known, told, drawn = list(names), {}, Varies(days)
-    may_vary = [*(v for v in random_effects() if v.of), *others]
-    at = {
-        v.name: [j for name in v.of if name in known and priors.visible[j := known.index(name)]]
+    effect_names, verdicts, selected = list(names), {}, Varies(days)
+    may_vary = [*(v for v in random_effects() if v.of), *further]
+    columns = {
+        v.name: [
+            j
+            for name in v.of
+            if name in effect_names and priors.visible[j := effect_names.index(name)]
+        ]
         for v in may_vary
     }
     price = {
-        v: least + (np.log(len(theta)) if v in others else 0.0) for v in may_vary
+        v: threshold + (np.log(len(theta)) if v in further else 0.0) for v in may_vary
     }  # of all effects, one varies more by chance
     for _ in range(CHAIN + 1):
-        given = priors, drawn, active
-        likely = _likely(freed(statistics, drawn), priors, active, least) if others else ()
+        context = priors, selected, active
+        likely = _likely(freed(statistics, selected), priors, active, threshold) if further else ()
         free = [
             v
             for v in may_vary
-            if not (v.name in told and told[v.name].found)
-            and (v not in others or likely[at[v.name]].any())
+            if not (v.name in verdicts and verdicts[v.name].found)
+            and (v not in further or likely[columns[v.name]].any())
         ]
         new = {
             v: s
             for v in free
-            if (s := _verdict(v, statistics, at[v.name], price[v], *given)) is not None
+            if (s := _verdict(v, statistics, columns[v.name], price[v], *context)) is not None
         }
-        found = [
+        positive = [
             v
             for v, s in new.items()
-            if s.found and not _one_alone(v, statistics, at[v.name], *given)
+            if s.found and not _one_alone(v, statistics, columns[v.name], *context)
         ]
-        told |= {v.name: replace(s, found=False) for v, s in new.items() if v not in others}
-        best = max(found, key=lambda v: new[v].nats, default=None)
+        verdicts |= {v.name: replace(s, found=False) for v, s in new.items() if v not in further}
+        best = max(positive, key=lambda v: new[v].nats, default=None)
         if best is None:
             break
-        told[best.name] = new[best]
-        if again is not None and len(at[best.name]) == 1:
-            statistics = straightened(statistics, theta, priors, at[best.name][0], again)
-            told[best.name] = _verdict(best, statistics, at[best.name], price[best], *given)
-            if not told[best.name].found:
+        verdicts[best.name] = new[best]
+        if simulate is not None and len(columns[best.name]) == 1:
+            statistics = straightened(statistics, theta, priors, columns[best.name][0], simulate)
+            verdicts[best.name] = _verdict(
+                best, statistics, columns[best.name], price[best], *context
+            )
+            if not verdicts[best.name].found:
                 break
-        drawn = drawn.also(at[best.name], told[best.name].size / priors.floor, told[best.name].by)
-    own = {
-        v.name for v in others
+        selected = selected.also(
+            columns[best.name], verdicts[best.name].size / priors.floor, verdicts[best.name].by
+        )
+    forms = {
+        v.name for v in further
     }  # whose names say what has the shares: the catalogue's random effects need no such
     return tuple(
-        replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in own else s for s in told.values()
+        replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in forms else s
+        for s in verdicts.values()
     )
 
 
@@ -190,7 +201,7 @@ def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
     """Every effect as one that differs from flight to flight, but for those of the catalogue's
     random effects.
     """
-    known = {name for v in random_effects() for name in v.of}
+    covered = {name for v in random_effects() for name in v.of}
     return tuple(
         RandomEffect(
             e.name,
@@ -205,7 +216,7 @@ def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
             manoeuvres=tuple(e.manoeuvres),
         )
         for e in effects
-        if e.name not in known
+        if e.name not in covered
     )
 
 
@@ -214,110 +225,116 @@ def straightened(
     theta: np.ndarray,
     priors: Priors,
     j: int,
-    again: Callable[[np.ndarray], Statistics | None],
+    simulate: Callable[[np.ndarray], Statistics | None],
 ) -> Statistics:
     """Statistics whose scores are those about the size of one effect at which each flight fits best
     by itself.
 
-    ``theta``: sizes found, in floors; ``again``: see :func:`varying`.
+    ``theta``: sizes found, in floors; ``simulate``: see :func:`varying`.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
-    own, score = statistics.information[:, j, j], statistics.score[:, j] - shift
-    reach = np.abs(np.divide(score, own, out=np.zeros_like(own), where=own > 0.0)).max(initial=0.0)
+    diagonal, score = statistics.information[:, j, j], statistics.score[:, j] - shift
+    reach = np.abs(
+        np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
+    ).max(initial=0.0)
     if reach < FAR:
         return statistics
-    sizes, found = [], []
+    sizes, simulated = [], []
     for size in np.unique(
         np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]
     ):
-        there = again(np.where(np.arange(len(theta)) == j, theta + size, theta))
-        if there is not None:
-            sizes, found = [*sizes, size], [*found, there]
+        statistics_moved = simulate(np.where(np.arange(len(theta)) == j, theta + size, theta))
+        if statistics_moved is not None:
+            sizes, simulated = [*sizes, size], [*simulated, statistics_moved]
     if len(sizes) < len(SIZES) // 2:
         return statistics
-    squares = np.array([there.square for there in found])
+    squares = np.array([statistics_moved.square for statistics_moved in simulated])
     curve, best, scores = (
         CubicSpline(sizes, squares),
         np.argmin(squares, axis=0),
         statistics.score.copy(),
     )
-    for f in np.flatnonzero(own > 0.0):
-        near = np.linspace(
+    for f in np.flatnonzero(diagonal > 0.0):
+        grid = np.linspace(
             sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE
         )
-        at = np.where(np.arange(len(theta)) == j, theta + near[np.argmin(curve(near)[:, f])], theta)
-        information, left = statistics.information[f], found[best[f]].score[f]
+        position = np.where(
+            np.arange(len(theta)) == j, theta + grid[np.argmin(curve(grid)[:, f])], theta
+        )
+        information, misfit = statistics.information[f], simulated[best[f]].score[f]
         scores[f] = (
-            left - information[:, j] * left[j] / own[f] + information @ (at - statistics.theta)
+            misfit
+            - information[:, j] * misfit[j] / diagonal[f]
+            + information @ (position - statistics.theta)
         )
     return replace(statistics, score=scores)
 
 
 def _likely(
-    statistics: Statistics, priors: Priors, active: Sequence[int], least: float
+    statistics: Statistics, priors: Priors, active: Sequence[int], threshold: float
 ) -> np.ndarray:
-    """Which effects may vary by more than ``least`` nats, as if there were no other that could in
-    their stead, shape (K,).
+    """Which effects may vary by more than ``threshold`` nats, as if there were no other that could
+    in their stead, shape (K,).
     """
     theta = covariance(
         statistics.information.sum(0), priors.deviation(list(active))
     ) @ statistics.absolute.sum(0)
-    own = np.maximum(np.diagonal(statistics.information, axis1=1, axis2=2), 1e-12)
-    square = (statistics.absolute - statistics.information @ theta) ** 2 / own
-    part = own * (REACH[::LOOK, None, None] * priors.slab) ** 2
-    return (0.5 * (square * part / (1.0 + part) - np.log1p(part)).sum(1)).max(0) > least
+    precision = np.maximum(np.diagonal(statistics.information, axis1=1, axis2=2), 1e-12)
+    square = (statistics.absolute - statistics.information @ theta) ** 2 / precision
+    part = precision * (REACH[::LOOK, None, None] * priors.slab) ** 2
+    return (0.5 * (square * part / (1.0 + part) - np.log1p(part)).sum(1)).max(0) > threshold
 
 
 def _verdict(
     v: RandomEffect,
     statistics: Statistics,
-    at: Sequence[int],
-    least: float,
+    columns: Sequence[int],
+    threshold: float,
     priors: Priors,
-    drawn: Varies,
+    selected: Varies,
     active: Sequence[int],
 ) -> Scatter | None:
     """The verdict on one quantity, at the level that says more; None where too few flights say
     something of it.
     """
-    reach, found = REACH * v.prior_sd, []
-    for by in drawn.levels(statistics):
-        groups = by_day(statistics, drawn.days) if by == DAY else statistics
-        seen = np.count_nonzero((groups.information[:, at, at] > 0.0).any(axis=1))
-        if seen >= LEAST_FLIGHTS:
-            found.append(
+    reach, verdicts = REACH * v.prior_sd, []
+    for group in selected.levels(statistics):
+        groups = by_day(statistics, selected.days) if group == DAY else statistics
+        informed = np.count_nonzero((groups.information[:, columns, columns] > 0.0).any(axis=1))
+        if informed >= LEAST_FLIGHTS:
+            verdicts.append(
                 judged(
                     v,
                     reach,
-                    _ahead(statistics, at, reach, priors, drawn, active, by),
-                    least,
-                    int(seen),
-                    by,
+                    _ahead(statistics, columns, reach, priors, selected, active, group),
+                    threshold,
+                    int(informed),
+                    group,
                 )
             )
-    return max(found, key=lambda s: s.nats, default=None)
+    return max(verdicts, key=lambda s: s.nats, default=None)
 
 
 def judged(
     v: RandomEffect,
     reach: np.ndarray,
     nats: np.ndarray,
-    least: float,
+    threshold: float,
     flights: int,
-    by: str = FLIGHT,
+    group: str = FLIGHT,
 ) -> Scatter:
     """The verdict on a quantity by the evidence of its sizes.
 
     Args:
         reach: sizes that were tried, from small to large, above 0.
         nats: of evidence of each against none.
-        least: that a finding needs.
+        threshold: that a finding needs.
         flights: or days or commands, that say something of it.
-        by: what has shares.
+        group: what has shares.
     """
     size = np.append(0.0, np.geomspace(reach[0], reach[-1], FINE))
-    ahead = CubicSpline(np.log(reach), nats)
-    value = np.append(0.0, ahead(np.log(size[1:])))
+    spline = CubicSpline(np.log(reach), nats)
+    value = np.append(0.0, spline(np.log(size[1:])))
     weight = (
         np.gradient(size)
         * np.sqrt(2.0 / np.pi)
@@ -328,7 +345,7 @@ def judged(
     density = np.exp(value - best) * weight
     share = np.cumsum(density) / density.sum()
     low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    nats, most = (
+    nats, mode = (
         float(np.log(density.sum()) + best),
         float(size[np.argmax(density / np.gradient(size))]),
     )
@@ -339,35 +356,37 @@ def judged(
         v.block,
         v.unit,
         tuple(v.of),
-        nats > least and most > v.floor,
-        most,
+        nats > threshold and mode > v.floor,
+        mode,
         low,
         high,
         v.floor,
         nats,
         flights,
         v.manoeuvres,
-        by,
+        group,
     )
 
 
 def _ahead(
     statistics: Statistics,
-    at: Sequence[int],
+    columns: Sequence[int],
     sizes: np.ndarray,
     priors: Priors,
-    drawn: Varies,
+    selected: Varies,
     active: Sequence[int],
-    by: str = FLIGHT,
+    group: str = FLIGHT,
 ) -> np.ndarray:
     """Nats of deviations of some effects against none, beside what varies already; all flights may
     share any size of these effects.
     """
-    named = sorted({*active, *at})
-    nothing = _evidence(freed(statistics, drawn), priors, named)
+    named = sorted({*active, *columns})
+    nothing = _evidence(freed(statistics, selected), priors, named)
     return np.array(
         [
-            _evidence(freed(statistics, drawn.also(at, size / priors.floor, by)), priors, named)
+            _evidence(
+                freed(statistics, selected.also(columns, size / priors.floor, group)), priors, named
+            )
             - nothing
             for size in sizes
         ]
@@ -377,42 +396,46 @@ def _ahead(
 def disagreement(
     statistics: Statistics,
     priors: Priors,
-    drawn: Varies,
+    selected: Varies,
     active: Sequence[int],
     j: int,
-    least: float,
+    threshold: float,
     share: float = INEXACT,
 ) -> tuple[int | None] | None:
     """Whether flights disagree on an effect of a set: shares of their own say more than a floor and
     a part of the effect's size would.
 
-    ``least``: nats that a finding needs; ``share``: of the effect, by which flights may differ for
-    its form alone. Returns the flight that alone disagrees, or None in its place where all do; None
-    where they agree, too few can say, or other effects that are still missing may be why they
+    ``threshold``: nats that a finding needs; ``share``: of the effect, by which flights may differ
+    for its form alone. Returns the flight that alone disagrees, or None in its place where all do;
+    None where they agree, too few can say, or other effects that are still missing may be why they
     differ."""
     if np.count_nonzero(statistics.information[:, j, j] > 0.0) < LEAST_FLIGHTS:
         return None
 
-    def apart(statistics: Statistics, active: Sequence[int]) -> bool:
-        left = freed(statistics, drawn)
-        size = estimate(left.information.sum(0), left.absolute.sum(0), priors, active)[j]
-        least_sd = max(allowed(size, share), drawn.effects.get(j, 0.0))
+    def differ(statistics: Statistics, active: Sequence[int]) -> bool:
+        freed_flights = freed(statistics, selected)
+        size = estimate(
+            freed_flights.information.sum(0), freed_flights.absolute.sum(0), priors, active
+        )[j]
+        least_sd = max(allowed(size, share), selected.effects.get(j, 0.0))
         reach = least_sd * np.geomspace(
             1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK])
         )
-        nats = _ahead(statistics, [j], reach * priors.floor[j], priors, drawn, active)
-        return bool(nats.max() - nats[0] > least)
+        nats = _ahead(statistics, [j], reach * priors.floor[j], priors, selected, active)
+        return bool(nats.max() - nats[0] > threshold)
 
     if not all(
-        apart(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())
+        differ(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())
     ):
         return None
-    rest = [k for k in active if k != j]
+    remaining = [k for k in active if k != j]
     for f in range(len(statistics.flights)):
-        others = statistics.only(np.arange(len(statistics.flights)) != f)
-        told = freed(others, drawn)
-        alone = additions(told.information.sum(0), told.absolute.sum(0), priors, rest)[j]
-        if alone < least and not apart(others, active):
+        other_flights = statistics.only(np.arange(len(statistics.flights)) != f)
+        freed_flights = freed(other_flights, selected)
+        advantage = additions(
+            freed_flights.information.sum(0), freed_flights.absolute.sum(0), priors, remaining
+        )[j]
+        if advantage < threshold and not differ(other_flights, active):
             return (int(statistics.flights[f]),)
     return (None,)
 
@@ -437,14 +460,16 @@ def between_flights(
 
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
-    own = statistics.information.diagonal(axis1=1, axis2=2)
-    kept = ((own / np.maximum(own.sum(0), 1e-300)) ** 2).sum(0)  # 1 / F of F that say as much
-    apart = [
+    information = statistics.information.diagonal(axis1=1, axis2=2)
+    mean_part = ((information / np.maximum(information.sum(0), 1e-300)) ** 2).sum(
+        0
+    )  # 1 / F of F that say as much
+    freed_flights = [
         freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH
     ]
-    value = np.array([_evidence(each, priors, active) for each in apart])
+    value = np.array([_evidence(flights, priors, active) for flights in freed_flights])
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
-    return float(weight @ REACH**2 / weight.sum()) * bool(active), kept
+    return float(weight @ REACH**2 / weight.sum()) * bool(active), mean_part
 
 
 def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
@@ -452,11 +477,12 @@ def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> f
     return log_evidence(*total, priors, named) - 0.5 * float(statistics.absolute_square.sum())
 
 
-def _one_alone(v: RandomEffect, statistics: Statistics, at: Sequence[int], *given) -> bool:
+def _one_alone(v: RandomEffect, statistics: Statistics, columns: Sequence[int], *context) -> bool:
     """Whether it is one flight alone that differs: that is an event there."""
     flights = np.arange(len(statistics.flights))
     return any(
-        _ahead(statistics.only(flights != f), at, REACH[::LOOK] * v.prior_sd, *given).max() <= 0.0
+        _ahead(statistics.only(flights != f), columns, REACH[::LOOK] * v.prior_sd, *context).max()
+        <= 0.0
         for f in flights
     )
 
@@ -467,30 +493,43 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
 
     ``varies``: effects that have such shares. Where days have some, what is returned is of days.
     """
-    left = _integrated(statistics, varies.flights)
-    return _integrated(by_day(left, varies.days), varies.drifts) if varies.drifts else left
+    by_flights = _integrated(statistics, varies.flights)
+    return (
+        _integrated(by_day(by_flights, varies.days), varies.drifts) if varies.drifts else by_flights
+    )
 
 
 def freed_beside(
-    own: np.ndarray, score: np.ndarray, cross: np.ndarray, statistics: Statistics, varies: Varies
+    information: np.ndarray,
+    score: np.ndarray,
+    cross: np.ndarray,
+    statistics: Statistics,
+    varies: Varies,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Integrate out the flights' shares for candidates that are no effects yet, each alone beside
     the effects, summed over flights.
 
-    ``own``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
+    ``information``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
     information with the effects, shape (F, T, K)."""
     rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
     for shares in (varies.flights, varies.drifts):
         if shares is varies.drifts and shares:
             member = _members(rows, varies.days)[1]
-            own, score, cross = member @ own, member @ score, np.tensordot(member, cross, 1)
+            information, score, cross = (
+                member @ information,
+                member @ score,
+                np.tensordot(member, cross, 1),
+            )
             rows = by_day(rows, varies.days)
         for j, size in shares.items():
-            column, along = rows.information[:, :, j], cross[:, :, j]
-            part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * along
-            own, score = own - part * along, score - part * rows.score[:, j, None]
+            column, cross_column = rows.information[:, :, j], cross[:, :, j]
+            part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * cross_column
+            information, score = (
+                information - part * cross_column,
+                score - part * rows.score[:, j, None],
+            )
             cross, rows = cross - part[..., None] * column[:, None], _integrated(rows, {j: size})
-    return own.sum(0), score.sum(0), cross.sum(0)
+    return information.sum(0), score.sum(0), cross.sum(0)
 
 
 def _members(statistics: Statistics, days: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
@@ -518,14 +557,14 @@ def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Stati
     """
     for j, size in deviation.items():
         column, score = statistics.information[:, :, j], statistics.score
-        own = column[:, j]
-        part = size**2 / (1.0 + size**2 * own)
-        said = (part[:, None] * column)[:, :, None] * column[:, None, :]
+        diagonal = column[:, j]
+        part = size**2 / (1.0 + size**2 * diagonal)
+        explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
         statistics = replace(
             statistics,
-            information=np.subtract(statistics.information, said, out=said),
+            information=np.subtract(statistics.information, explained, out=explained),
             score=score - (part * score[:, j])[:, None] * column,
-            square=statistics.square - part * score[:, j] ** 2 + np.log1p(size**2 * own),
+            square=statistics.square - part * score[:, j] ** 2 + np.log1p(size**2 * diagonal),
         )
     return statistics
 
@@ -536,29 +575,34 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
 
     ``theta``: sizes that all flights share, in floors; ``varies``: effects that have shares. Those
     of days come first, and flights share what is left of them."""
-    at = np.tile(theta, (len(statistics.flights), 1))
+    positions = np.tile(theta, (len(statistics.flights), 1))
     if varies.drifts:
-        left = by_day(_integrated(statistics, varies.flights), varies.days)
-        row = np.searchsorted(left.flights, [varies.days[f] for f in statistics.flights.tolist()])
-        at = at + _shares(left, np.tile(theta, (len(left.flights), 1)), varies.drifts)[row]
-    return at + _shares(statistics, at, varies.flights) - theta
+        by_days = by_day(_integrated(statistics, varies.flights), varies.days)
+        row = np.searchsorted(
+            by_days.flights, [varies.days[f] for f in statistics.flights.tolist()]
+        )
+        positions = (
+            positions
+            + _shares(by_days, np.tile(theta, (len(by_days.flights), 1)), varies.drifts)[row]
+        )
+    return positions + _shares(statistics, positions, varies.flights) - theta
 
 
 def _shares(
     statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]
 ) -> np.ndarray:
     """Most probable shares of each row, beside its sizes ``theta`` (F, K)."""
-    own, at = np.zeros(statistics.score.shape), list(deviation)
-    if at:
-        left = (
+    shares, columns = np.zeros(statistics.score.shape), list(deviation)
+    if columns:
+        score = (
             statistics.score
             - np.einsum("fij,fj->fi", statistics.information, theta - statistics.theta)
-        )[:, at]
-        inside = statistics.information[:, at][:, :, at] + np.diag(
+        )[:, columns]
+        block = statistics.information[:, columns][:, :, columns] + np.diag(
             [size**-2.0 for size in deviation.values()]
         )
-        own[:, at] = np.linalg.solve(inside, left[..., None])[..., 0]
-    return own
+        shares[:, columns] = np.linalg.solve(block, score[..., None])[..., 0]
+    return shares
 
 
 def deviations(
@@ -567,13 +611,15 @@ def deviations(
     """Return the random effects that were found, of effects of these names; ``days`` are the
     flights'.
     """
-    known, found = list(names), Varies(days)
+    effect_names, selected = list(names), Varies(days)
     for s in scatter:
         if s.found:
-            found = found.also(
-                [known.index(name) for name in s.of if name in known], s.size / priors.floor, s.by
+            selected = selected.also(
+                [effect_names.index(name) for name in s.of if name in effect_names],
+                s.size / priors.floor,
+                s.by,
             )
-    return found
+    return selected
 
 
 def variances(scatter: Sequence[Mapping]) -> dict[str, float]:

@@ -31,7 +31,7 @@ def diagnose(
     flights: Sequence[FlightLog],
     model: Model | Callable[[], Model],
     *,
-    known: Known = UNKNOWN_VEHICLE,
+    vehicle: Known = UNKNOWN_VEHICLE,
     seed: int = 0,
     without: Sequence[int] = (),
     laws: bool = True,
@@ -43,7 +43,7 @@ def diagnose(
         flights: logs of what was measured.
         model: a simulation of these flights with its catalogue of effects, or what builds it; it is
             asked for once the logs were checked.
-        known: of the vehicle, for the checks.
+        vehicle: of the vehicle, for the checks.
         seed: of the null worlds that the threshold is calibrated on.
         without: numbers of flights that are left out.
         laws: whether to look for laws outside the catalogue.
@@ -52,17 +52,17 @@ def diagnose(
     Returns one verdict for every effect, and one overall. Raises DiagnoseError: the model gives no
     window, or contradicts itself."""
     say = progress or (lambda _: None)
-    checked = check(flights, known)
+    checked = check(flights, vehicle)
     refused, reasons = refused_of(checked), contradictions(checked)
     if len(refused) > MOST_REFUSED * len(flights):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
     model = model if hasattr(model, "windows") else model()
     say(f"{len(flights)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
-    copied = {i: of for i, of in copies(checked).items() if i not in refused}
+    copied = {i: original for i, original in copies(checked).items() if i not in refused}
     reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in copied]
     for reason in reasons:
         say(f"  left out: {reason}")
-    found = explain(
+    diagnosis = explain(
         model,
         seed=seed,
         without=(*without, *refused, *copied),
@@ -76,9 +76,9 @@ def diagnose(
         for row in log.rows
         if (row.topic, row.verdict) == ("thrust", "warn")
     ]
-    if (why := getattr(model, "lawless", "")) and found.overall in (UNKNOWN, IN_PART):
+    if (why := getattr(model, "lawless", "")) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
-    return replace(found, reasons=(*found.reasons, *notes), duplicates=copied)
+    return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
 
 
 def refused_of(checked: Sequence[Checked]) -> tuple[int, ...]:
@@ -106,34 +106,34 @@ def explain(
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
     simulated = each(finite, windows)
-    kept = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in without)
-    if len(kept) < 0.5 * sum(w.flight not in without for w in windows) or not kept:
+    usable = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in without)
+    if len(usable) < 0.5 * sum(w.flight not in without for w in windows) or not usable:
         return out_of_domain(model, windows, sum(simulated), seed)
-    problem = Problem.of(model, windows, kept)
+    problem = Problem.of(model, windows, usable)
     priors = problem.priors
-    for c, own in problem.correlated.items():
+    for c, correlation in problem.correlated.items():
         say(
-            f"noise of {model.channels[c]} is correlated over {1e3 * own.time:.0f} ms, for"
-            f" {own.share:.1%} of its variance"
+            f"noise of {model.channels[c]} is correlated over {1e3 * correlation.time:.0f} ms, for"
+            f" {correlation.share:.1%} of its variance"
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     for _ in range(ROUNDS):  # the worst hide others
-        if not (gone := lost(nominal)):
+        if not (windows_lost := lost(nominal)):
             break
-        problem, nominal = _left_out(problem, nominal, gone, say)
-    least = _least(nominal, priors, seed, say)
-    search = Selector(problem, nominal, least, say, laws)
+        problem, nominal = _left_out(problem, nominal, windows_lost, say)
+    threshold_nats = _least(nominal, priors, seed, say)
+    search = Selector(problem, nominal, threshold_nats, say, laws)
     for further in range(
         ROUNDS - 1, -1, -1
     ):  # where the causes are in the simulation, it may lose windows that it followed without
         search.run(follow=not further)
-        gone = lost(search.point) if further and not search.events else []
-        if not gone:
+        windows_lost = lost(search.point) if further and not search.events else []
+        if not windows_lost:
             break
-        problem, nominal = _left_out(problem, nominal, gone, say)
-        least = _least(nominal, priors, seed, say)
-        if not search.stands_without(gone, problem, nominal, least):
-            search = Selector(problem, nominal, least, say, laws)
+        problem, nominal = _left_out(problem, nominal, windows_lost, say)
+        threshold_nats = _least(nominal, priors, seed, say)
+        if not search.stands_without(windows_lost, problem, nominal, threshold_nats):
+            search = Selector(problem, nominal, threshold_nats, say, laws)
     diagnosis = held_out.judged(conclude(search))
     return replace(diagnosis, seconds=time.monotonic() - begun, seed=seed)
 
@@ -147,48 +147,52 @@ def put_right(
     ``plant``: that the commands are for; ``build``: makes a model of logs.
     Returns the model, which names what was put right as its ``mistakes``, and its logs.
     """
-    made, known = interface.commanded(logs, plant)
-    kept = interface.suspected(made, plant)
+    corrected, certain = interface.commanded(logs, plant)
+    suspected_mistakes = interface.suspected(corrected, plant)
 
     def built(mistakes: Sequence[Mistake]) -> tuple[Model, list[FlightLog]]:
-        mended = list(made)
+        mended = list(corrected)
         for mistake in mistakes:
             mended = [mistake.mended(log) for log in mended]
         return build(mended), mended
 
-    here = built(kept)
-    for mistake in list(kept):
-        rest = [k for k in kept if k is not mistake]
+    current = built(suspected_mistakes)
+    for mistake in list(suspected_mistakes):
+        remaining = [k for k in suspected_mistakes if k is not mistake]
         try:
-            there = built(rest)
+            alternative = built(remaining)
         except DiagnoseError:  # no flight can be replayed without it
             continue
-        nats = ahead(here[0], there[0])
+        nats = ahead(current[0], alternative[0])
         if nats > VERY_STRONG + np.log(mistake.ways):
-            kept = [replace(k, nats=nats) if k is mistake else k for k in kept]
+            suspected_mistakes = [
+                replace(k, nats=nats) if k is mistake else k for k in suspected_mistakes
+            ]
         else:
-            kept, here = rest, there
-    here[0].mistakes = (*known, *kept)
-    return here
+            suspected_mistakes, current = remaining, alternative
+    current[0].mistakes = (*certain, *suspected_mistakes)
+    return current
 
 
-def ahead(model: Model, other: Model) -> float:
+def ahead(model: Model, rival: Model) -> float:
     """Nats by which a model explains the windows that it shares with another better, nothing named
     in either.
     """
-    windows = [m.windows({}) for m in (model, other)]
-    at = [
-        {(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(own) if finite(w)}
-        for own in windows
+    windows = [m.windows({}) for m in (model, rival)]
+    places = [
+        {(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(windows_of) if finite(w)}
+        for windows_of in windows
     ]
-    shared = sorted(at[0].keys() & at[1].keys())
-    if 2 * len(at[1]) < len(windows[1]) or not shared:  # the other fails in most
-        return np.inf if 2 * len(at[0]) >= len(windows[0]) else -np.inf
+    shared = sorted(places[0].keys() & places[1].keys())
+    if 2 * len(places[1]) < len(windows[1]) or not shared:  # the other fails in most
+        return np.inf if 2 * len(places[0]) >= len(windows[0]) else -np.inf
     value = []
-    for m, own, number in zip((model, other), windows, at):
-        problem = Problem.of(m, own, [number[key] for key in shared])
+    for m, windows_of, number in zip((model, rival), windows, places):
+        problem = Problem.of(m, windows_of, [number[key] for key in shared])
         value.append(
-            linearise(problem, np.zeros(len(m.effects)), windows=own).evidence(problem.priors, ())
+            linearise(problem, np.zeros(len(m.effects)), windows=windows_of).evidence(
+                problem.priors, ()
+            )
         )
     return value[0] - value[1]
 
@@ -204,9 +208,9 @@ def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]
 
 
 def _left_out(
-    problem: Problem, nominal: Point, gone: Sequence[int], say: Callable[[str], None]
+    problem: Problem, nominal: Point, windows_lost: Sequence[int], say: Callable[[str], None]
 ) -> tuple[Problem, Point]:
     """The problem without some of its windows, and the model as it stands."""
-    say(f"{len(gone)} windows are left out, which the simulation does not follow")
-    left = [i for i in range(len(problem.kept)) if i not in set(gone)]
-    return problem.only(left), only(nominal, left)
+    say(f"{len(windows_lost)} windows are left out, which the simulation does not follow")
+    remaining = [i for i in range(len(problem.kept)) if i not in set(windows_lost)]
+    return problem.only(remaining), only(nominal, remaining)

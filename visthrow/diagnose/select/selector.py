@@ -174,10 +174,12 @@ class Selector(SearchState):
                 np.abs(move.point.theta),
                 np.abs(bend(self.problem, self.origin, move.point, active)),
             )
-            held = tuple(j for j in active if j in self.active or faked[j] <= INEXACT * sizes[j])
-            if held == active:
+            straight = tuple(
+                j for j in active if j in self.active or faked[j] <= INEXACT * sizes[j]
+            )
+            if straight == active:
                 return [move]
-            active = held
+            active = straight
         return []
 
     def _alike(self, j: int) -> list[int]:
@@ -210,8 +212,8 @@ class Selector(SearchState):
             self.problem, point, self.active
         )  # begins as it does: new states alone are no gain
         nats = min(
-            self.ahead((point, move.active), other)
-            for other in ((self.point, self.active), (alike, self.active))
+            self.ahead((point, move.active), rival)
+            for rival in ((self.point, self.active), (alike, self.active))
         )
         if self._best([Move(move.active, nats, point)], listed, self._contradicted()):
             return True
@@ -233,13 +235,13 @@ class Selector(SearchState):
         weakest = min(unsure or worth, key=lambda j: worth[j] - saved[j])
         if worth[weakest] > saved[weakest] and not unsure:
             return False
-        rest = [k for k in self.active if k != weakest]
-        without = candidate(self.problem, self.point, rest)
-        if not unsure and self.ahead((without, rest), (self.point, self.active)) < 0.0:
+        remaining = [k for k in self.active if k != weakest]
+        without = candidate(self.problem, self.point, remaining)
+        if not unsure and self.ahead((without, remaining), (self.point, self.active)) < 0.0:
             return False
         self.progress(f"{self.name(weakest)} dropped again")
-        self.active = rest
-        self.point = self.settle(without, rest)
+        self.active = remaining
+        self.point = self.settle(without, remaining)
         return True
 
     def _exchange(self) -> bool:
@@ -264,44 +266,44 @@ class Selector(SearchState):
     def _rivals(self) -> list[Move]:
         """Sets within reach of one move, by the linear statistics, best first."""
         singles, pairs, active = {}, {}, self.active
-        usable, own = self._usable(), self.linear(active, self.point)
-        for rest in self._rests():
-            known = self.point.information, self.point.score, self.priors, rest
-            base, alone = self.linear(rest, self.point) - own, additions(*known)
-            singles[rest] = base
+        usable, present = self._usable(), self.linear(active, self.point)
+        for subset in self._rests():
+            state = self.point.information, self.point.score, self.priors, subset
+            base, single = self.linear(subset, self.point) - present, additions(*state)
+            singles[subset] = base
             new = (
-                usable if len(rest) < len(active) else usable[self.term_columns[usable]]
+                usable if len(subset) < len(active) else usable[self.term_columns[usable]]
             )  # other additions were tried already
-            singles |= {(*rest, k): base + alone[k] - self.prices[k] for k in new.tolist()}
+            singles |= {(*subset, k): base + single[k] - self.prices[k] for k in new.tolist()}
             plain = usable[~self.problem.switches[usable]]
-            gain, each = pair_additions(*known)[np.ix_(plain, plain)], alone[plain]
+            gain, single_gain = pair_additions(*state)[np.ix_(plain, plain)], single[plain]
             reached = np.triu(
-                gain - np.maximum.outer(each, each) > self.least - STRONG
+                gain - np.maximum.outer(single_gain, single_gain) > self.least - STRONG
             )  # worth a name beside the other
             gain += base - np.add.outer(self.prices[plain], self.prices[plain])
-            near = reached & (gain > (-DOUBT if len(rest) + 2 == len(active) else -STRONG))
+            close = reached & (gain > (-DOUBT if len(subset) + 2 == len(active) else -STRONG))
             pairs |= {
-                (*rest, int(plain[a]), int(plain[b])): float(gain[a, b])
-                for a, b in np.argwhere(near)
+                (*subset, int(plain[a]), int(plain[b])): float(gain[a, b])
+                for a, b in np.argwhere(close)
             }
         if (
             active
         ):  # far from nothing, derivatives there may tell too little of what has no share of it
-            alone = (
+            single = (
                 additions(self.nominal.information, self.nominal.score, self.priors, ())
                 - self.prices
             )
-            alone += self.linear((), self.nominal) - self.linear(active, self.nominal)
-            singles |= {(k,): max(singles.get((k,), -np.inf), alone[k]) for k in usable.tolist()}
+            single += self.linear((), self.nominal) - self.linear(active, self.nominal)
+            singles |= {(k,): max(singles.get((k,), -np.inf), single[k]) for k in usable.tolist()}
         ranked = _ranked(singles, DOUBT)
         ranked = [m for i, m in enumerate(ranked) if i < 2 * SHORTLIST or abs(m.nats) < STRONG]
-        alone = (
+        single = (
             [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]
         )  # not to be told from here
         return [
             *ranked,
             *_ranked(pairs, DOUBT)[:SHORTLIST],
-            *(m for m in alone if m.active not in [r.active for r in ranked]),
+            *(m for m in single if m.active not in [r.active for r in ranked]),
         ]
 
     def _rests(self) -> Iterator[tuple[int, ...]]:
@@ -314,26 +316,30 @@ class Selector(SearchState):
             (*(j for j in self.names if not self._acts_beside(j, [k])), *self.terms)
             for k in blocks.values()
         }
-        for gone in range(min(2, len(self.active)) + 1):
-            yield from combinations(self.active, len(self.active) - gone)
+        for removed in range(min(2, len(self.active)) + 1):
+            yield from combinations(self.active, len(self.active) - removed)
 
     def _tried(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Move]:
         """Simulate sets from a point."""
-        here = self.point, self.active
+        present = self.point, self.active
         moves = [
-            Move(tuple(s), self.ahead((there, s), here), there)
-            for s, there in zip(sets, candidates(self.problem, point, sets))
+            Move(tuple(s), self.ahead((simulated, s), present), simulated)
+            for s, simulated in zip(sets, candidates(self.problem, point, sets))
         ]
         bare = [
             i for i, s in enumerate(sets) if all(map(self.is_term, s))
         ]  # where the names are, or where the model stands alone
-        for i, there in zip(bare, candidates(self.problem, self.nominal, [sets[i] for i in bare])):
-            nats = self.ahead((there, sets[i]), here)
-            moves[i] = max(moves[i], Move(tuple(sets[i]), nats, there), key=lambda move: move.nats)
+        for i, simulated in zip(
+            bare, candidates(self.problem, self.nominal, [sets[i] for i in bare])
+        ):
+            nats = self.ahead((simulated, sets[i]), present)
+            moves[i] = max(
+                moves[i], Move(tuple(sets[i]), nats, simulated), key=lambda move: move.nats
+            )
         return moves
 
     def _best(
-        self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], enough: float
+        self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], margin: float
     ) -> bool:
         """Go over to the best of some sets that may be named; False where none is worth enough
         more.
@@ -341,7 +347,7 @@ class Selector(SearchState):
         for move in sorted(tried, key=lambda move: -move.nats):
             new = [j for j in move.active if j not in self.active]
             joins = any(map(self.is_term, new)) and set(self.active) < set(move.active)
-            if move.nats <= (terms.LAW if joins else enough) or not self._believed(move):
+            if move.nats <= (terms.LAW if joins else margin) or not self._believed(move):
                 continue
             if any(map(self.is_term, new)) and self.nearer():
                 return True
@@ -363,14 +369,14 @@ class Selector(SearchState):
                 if len(new) == 1 and grown
                 else self._together
             )
-            again = {tell(m.active): m.nats for m in sorted(tried, key=lambda m: -m.nats)}
-            shown = {
+            simulated = {tell(m.active): m.nats for m in sorted(tried, key=lambda m: -m.nats)}
+            screened = {
                 tell(s): float(n)
                 for s, n in sorted(
-                    listed.items(), key=lambda item: -again.get(tell(item[0]), -np.inf)
+                    listed.items(), key=lambda item: -simulated.get(tell(item[0]), -np.inf)
                 )[:SHOWN]
             }
-            self.steps.append(Step(tell(move.active), move.nats, enough, shown, again))
+            self.steps.append(Step(tell(move.active), move.nats, margin, screened, simulated))
             self.origin = (
                 self.nominal if all(map(self.is_term, move.active)) and move.active else self.origin
             )
@@ -401,20 +407,20 @@ class Selector(SearchState):
             return False
         if any(self.is_term(j) for j in new):
             return all(self._lawful(move.point, move.active, j) for j in new if self.is_term(j))
-        alone = (
+        single = (
             len(move.active) > len(self.active) and len(new) == 1
         )  # of which :meth:`_differing` asks
-        if not alone and any(self.disagreement_on(move.point, move.active, j) for j in new):
+        if not single and any(self.disagreement_on(move.point, move.active, j) for j in new):
             return False
         if len(new) < 2:
             return True
-        left = levels(
+        levels_left = levels(
             self.problem,
             self.nominal,
             with_floors_noise(self.problem, move.point, move.active),
             self.least,
         )
-        return not any(level.excessive for level in left)
+        return not any(level.excessive for level in levels_left)
 
     def _differing(self, move: Move, j: int) -> bool:
         """Whether flights disagree on an addition, which is then refused, or is an event of the one
@@ -440,24 +446,26 @@ class Selector(SearchState):
             f"event in flight {verdict[0]}: something happened there that the other flights deny"
         )
         self.events.append(verdict[0])
-        left = [i for i, window in enumerate(self.point.windows) if window.flight != verdict[0]]
-        self.problem = self.problem.only(left)
+        remaining = [
+            i for i, window in enumerate(self.point.windows) if window.flight != verdict[0]
+        ]
+        self.problem = self.problem.only(remaining)
         self.nominal, self.origin, self.point = (
-            only(p, left) for p in (self.nominal, self.origin, self.point)
+            only(p, remaining) for p in (self.nominal, self.origin, self.point)
         )
         return True
 
     def stands_without(
-        self, gone: Sequence[int], problem: Problem, nominal: Point, least: float
+        self, windows_lost: Sequence[int], problem: Problem, nominal: Point, least: float
     ) -> bool:
         """Leave windows out, and say whether each name is still worth the threshold, so that the
         search may go on from there.
         """
         if self.terms or self.dropped is not None:
             return False
-        left = [i for i in range(len(self.problem.kept)) if i not in set(gone)]
+        remaining = [i for i in range(len(self.problem.kept)) if i not in set(windows_lost)]
         origin, point = (
-            only(terms.bare(self.problem, p)[1], left) for p in (self.origin, self.point)
+            only(terms.bare(self.problem, p)[1], remaining) for p in (self.origin, self.point)
         )
         self.problem, self.nominal, self.least = problem, nominal, least
         self.origin, self.point = origin, candidate(problem, point, self.active)
@@ -482,12 +490,12 @@ class Selector(SearchState):
             for s in scatter
             if not {self.name(j) for j in self.problem.varies.effects} & set(s.of)
         ]
-        most = max((s.nats for s in new), default=0.0)
+        strongest = max((s.nats for s in new), default=0.0)
         best = 0.0 if last else max(self._additions(self.point, self._usable()).max(), 0.0)
-        rival = max(most, best, *self.refused.values())
+        rival = max(strongest, best, *self.refused.values())
         if not (last or self.active) and self._lose_commands(rival):
             return True
-        if not new or most < best:
+        if not new or strongest < best:
             return False
         if last and self.nearer():  # differences may be what the derivatives lack
             return self._vary(last)
@@ -515,25 +523,25 @@ class Selector(SearchState):
         """
         if self.dropped is not None or self.terms or self.came is self.point:
             return False
-        found, self.came = (
+        verdict, self.came = (
             dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least),
             self.point,
         )
         if (
-            found is None
-            or not found.found
-            or found.nats <= max(rival, *self.refused.values(), 0.0) + self.varying_brings()
+            verdict is None
+            or not verdict.found
+            or verdict.nats <= max(rival, *self.refused.values(), 0.0) + self.varying_brings()
         ):
             return False
         problem, point = terms.bare(self.problem, self.point)
-        self.progress(f"commands got lost: {found.size:.1%} of them, {found.nats:.1f} nats")
-        self.problem = replace(problem, lost=found.size, varies=Varies(problem.varies.days))
+        self.progress(f"commands got lost: {verdict.size:.1%} of them, {verdict.nats:.1f} nats")
+        self.problem = replace(problem, lost=verdict.size, varies=Varies(problem.varies.days))
         self.nominal = linearise(self.problem, np.zeros_like(point.theta), point.noise)
         self.origin = (
             linearise(self.problem, point.theta, point.noise) if self.active else self.nominal
         )
         self.point = candidate(self.problem, self.origin, self.active)
-        self.dropped = dropped.sized(self.problem, self.nominal, found)
+        self.dropped = dropped.sized(self.problem, self.nominal, verdict)
         self.refused, self.visited, self.proposed = {}, {frozenset(self.active)}, set()
         return True
 
@@ -541,37 +549,37 @@ class Selector(SearchState):
         """Make the terms that say most candidates, beside the set and instead of its names; False
         where that brings no new one.
         """
-        strongest, here = (
+        strongest, present = (
             terms.strongest_forces(self.nominal) if self.laws else {},
             frozenset(self.active),
         )
-        if not strongest or here in self.proposed or len(self.terms) > 1:
+        if not strongest or present in self.proposed or len(self.terms) > 1:
             return False
-        self.proposed.add(here)
+        self.proposed.add(present)
         short = terms.shortlist(self.problem, self.point, self.active, strongest, self.least)
         instead = [(self.nominal, self.terms)] if self.names else []
-        for point, rest in [*instead, *([(self.point, self.names)] if self.terms else [])]:
+        for point, subset in [*instead, *([(self.point, self.names)] if self.terms else [])]:
             stead = [
                 log_evidence(point.information, point.score, self.priors, s)
-                for s in (self.active, rest)
+                for s in (self.active, subset)
             ]
-            enough = max(self.least, HOPELESS * (stead[0] - stead[1]))
+            margin = max(self.least, HOPELESS * (stead[0] - stead[1]))
             short += terms.shortlist(
                 self.problem,
                 point,
-                rest,
+                subset,
                 strongest,
-                enough,
-                [j for j in self.names if j not in rest],
+                margin,
+                [j for j in self.names if j not in subset],
             )
         short = list({effect.term: effect for effect in reversed(short)}.values())
         if not short:
             return False
         points = {id(p): p for p in (self.nominal, self.origin, self.point)}
         self.problem, wide = terms.extended(self.problem, list(points.values()), short)
-        at = dict(zip(points, wide))
+        widened = dict(zip(points, wide))
         self.nominal, self.origin, self.point = (
-            at[id(p)] for p in (self.nominal, self.origin, self.point)
+            widened[id(p)] for p in (self.nominal, self.origin, self.point)
         )
         return True
 

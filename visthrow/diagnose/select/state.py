@@ -124,26 +124,26 @@ class SearchState:
         """Return what the name of each candidate costs [nats], shape (K,)."""
         return self.least + np.array([getattr(e, "price", 0.0) for e in self.problem.effects])
 
-    def price(self, active: Sequence[int], beside: bool = True) -> float:
+    def price(self, active: Sequence[int], charge: bool = True) -> float:
         """Return what the names of a set cost [nats].
 
-        ``beside``: whether those that act in a law's block, and may be a part of its form, cost
+        ``charge``: whether those that act in a law's block, and may be a part of its form, cost
         more."""
-        prices, lawful = self.prices, [j for j in active if self.is_term(j)] if beside else []
-        more = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
+        prices, lawful = self.prices, [j for j in active if self.is_term(j)] if charge else []
+        charged = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
         return float(
             prices[list(active)].sum()
-            + len(more) * max((terms.LAW + prices[j] for j in lawful), default=0.0)
+            + len(charged) * max((terms.LAW + prices[j] for j in lawful), default=0.0)
         )
 
     def _acts_beside(self, j: int, laws: Sequence[int]) -> bool:
         """Whether an effect acts in the block of one of some laws."""
         blocks = {self.problem.effects[k].block for k in laws}
         if blocks and not self.acting:
-            every = range(len(self.problem.model.effects))
+            numbers = range(len(self.problem.model.effects))
             self.acting = dict(
                 enumerate(
-                    zip(acts_on(self.nominal, every), acts_on(self.nominal, every, joint=True))
+                    zip(acts_on(self.nominal, numbers), acts_on(self.nominal, numbers, joint=True))
                 )
             )
         return bool(blocks) and self.acting[j][grammar.JOINT in blocks] in blocks
@@ -153,10 +153,12 @@ class SearchState:
     ) -> float:
         """Return the nats by which a set at its point is worth more than another at its own."""
         evidence = advantage(self.priors, first, second, self.problem.switches)
-        beside = all(
+        comparable = all(
             any(map(self.is_term, active)) for _, active in (first, second)
         )  # law against law
-        return float(evidence - self.price(first[1], beside) + self.price(second[1], beside))
+        return float(
+            evidence - self.price(first[1], comparable) + self.price(second[1], comparable)
+        )
 
     def is_term(self, j: int) -> bool:
         """Tell whether a candidate is a term of a law."""
@@ -192,8 +194,8 @@ class SearchState:
         return estimate(point.information, point.score, self.priors, list(active))
 
     def _again(self, theta: np.ndarray) -> Statistics | None:
-        there = moved(self.problem, self.point, theta)
-        return None if there is None else there.plain
+        simulated = moved(self.problem, self.point, theta)
+        return None if simulated is None else simulated.plain
 
     def about_means(self, active: Sequence[int], varies: Varies) -> Statistics:
         """Return what the flights say of the means of effects that vary; flights far from the mean
@@ -212,14 +214,14 @@ class SearchState:
 
         ``every``: ask about all effects, not only those of the catalogue's random effects and those
         that are known to vary."""
-        asked = self.point, tuple(active), every
+        key = self.point, tuple(active), every
         if (
             self.varied is None
             or self.varied[0][0] is not self.point
-            or self.varied[0][1:] != asked[1:]
+            or self.varied[0][1:] != key[1:]
         ):
-            effects, about = self.problem.effects, self.sizes(active)
-            others = by_flight(
+            effects, sizes = self.problem.effects, self.sizes(active)
+            further = by_flight(
                 [
                     e
                     for j, e in enumerate(effects)
@@ -228,15 +230,15 @@ class SearchState:
                 ]
             )
             self.varied = (
-                asked,
+                key,
                 varying(
                     self.point.plain,
-                    about,
+                    sizes,
                     self.priors,
                     [e.name for e in effects],
                     self.least,
                     self._again,
-                    others,
+                    further,
                     active,
                     self.problem.varies.days,
                 ),
@@ -321,14 +323,14 @@ class SearchState:
         """Linearise where the search stands; False where that was done. Before a law is believed:
         it may explain what bends do.
         """
-        here = frozenset(self.active)
+        present = frozenset(self.active)
         if (
-            here in self.linearised
+            present in self.linearised
             or np.abs(self.origin.theta - self.point.theta)[~self.term_columns].max(initial=0.0)
             <= OWN_FLOOR
         ):
             return False
-        self.linearised.add(here)
+        self.linearised.add(present)
         self.progress(
             "derivatives are taken where the causes are, for a law may explain what they lack"
         )
@@ -346,43 +348,45 @@ class SearchState:
         effects, names = self.problem.effects, self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
-        near = {
+        same_block = {
             j for j, block in zip(names, acts_on(self.point, names, joint=joint)) if block in blocks
         }
-        near |= {
+        same_block |= {
             j
-            for j in set(names) - near
+            for j in set(names) - same_block
             if len(names) > 1
-            and acts_on(self.point, [j], joint=joint, beside=[k for k in names if k != j])[0]
+            and acts_on(self.point, [j], joint=joint, free_effects=[k for k in names if k != j])[0]
             in blocks
         }
-        left = [j for j in self.active if j not in near]
-        while near and (worth := {j: w for j, w in self.worth(left).items() if j in names}):
+        remaining = [j for j in self.active if j not in same_block]
+        while same_block and (
+            worth := {j: w for j, w in self.worth(remaining).items() if j in names}
+        ):
             weakest = min(worth, key=worth.get)
             if worth[weakest] > self.least:
                 break
-            left.remove(weakest)
-        told = terms.laws(self.problem, self.point, self.active, 0.0)
+            remaining.remove(weakest)
+        laws = terms.laws(self.problem, self.point, self.active, 0.0)
         text = " and ".join(
-            f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in told
+            f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in laws
         )
-        return set(names) - set(left), f"{text} explains what no cause of the catalogue does"
+        return set(names) - set(remaining), f"{text} explains what no cause of the catalogue does"
 
     def explanations(self) -> list[tuple[Law, ...]]:
         """Return the laws of the set, then others one by one in their place, best first."""
         if not self.terms:
             return []
-        point, found = (
+        point, listed = (
             self.point,
             [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()],
         )
         value = {
-            s: point.evidence(self.priors, s) - self.price(s) for s in {*found, tuple(self.active)}
+            s: point.evidence(self.priors, s) - self.price(s) for s in {*listed, tuple(self.active)}
         }
         without = point.evidence(self.priors, self.names) - self.price(self.names)
         best = [
             tuple(self.active),
-            *sorted((s for s in found if set(s) != set(self.active)), key=value.get, reverse=True),
+            *sorted((s for s in listed if set(s) != set(self.active)), key=value.get, reverse=True),
         ]
         return [
             terms.laws(self.problem, point, s, value[s] - without)

@@ -44,8 +44,8 @@ WEIGHED = 6
 
 
 @lru_cache(maxsize=32)
-def _laid(block: str, known: tuple[str, ...]) -> tuple[tuple[Term, ...], Layout | None]:
-    terms = tuple(terms_of(block, known))
+def _laid(block: str, quantities: tuple[str, ...]) -> tuple[tuple[Term, ...], Layout | None]:
+    terms = tuple(terms_of(block, quantities))
     return terms, Layout.of(terms) if terms else None
 
 
@@ -69,8 +69,8 @@ def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
     """The lower median of a block's levels; the least of a phase with few windows may
     be anything.
     """
-    own = sorted(level for (b, _), level in levels.items() if b == block)
-    return own[(len(own) - 1) // 2]
+    levels_of = sorted(level for (b, _), level in levels.items() if b == block)
+    return levels_of[(len(levels_of) - 1) // 2]
 
 
 def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
@@ -91,66 +91,71 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
 
 
 def screen(
-    point: Point, parts: Sequence[WindowStatistics], block: str, known: Sequence[Known]
+    point: Point, parts: Sequence[WindowStatistics], block: str, quantities: Sequence[Known]
 ) -> Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
-    through = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
-    names = [set(point.windows[w].knots) for w in through]
+    carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
+    names = [set(point.windows[w].knots) for w in carriers]
     shared = tuple(sorted(set.intersection(*names))) if names else ()
     terms, layout = _laid(block, shared) if "time" in shared else ((), None)
     if layout is None:
         return None
-    own, size = LATENT_BLOCKS.index(felt(block)), BATCH if point.device == "cpu" else len(through)
+    latent_block, size = (
+        LATENT_BLOCKS.index(felt(block)),
+        BATCH if point.device == "cpu" else len(carriers),
+    )
 
-    ends = np.cumsum([len(known[w]["time"]) for w in through])[:-1]
+    ends = np.cumsum([len(quantities[w]["time"]) for w in carriers])[:-1]
     factors = zip(
         *(
             np.split(values, ends)
-            for values in layout.factors(joined([known[w] for w in through], shared))
+            for values in layout.factors(joined([quantities[w] for w in carriers], shared))
         )
     )
-    exerted = each(lambda w: _exerted(point, parts[w], w, block, known[w], own), through)
-    told = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
-    flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in through])
+    exerted = each(
+        lambda w: _exerted(point, parts[w], w, block, quantities[w], latent_block), carriers
+    )
+    at_windows = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
+    flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in carriers])
     rows = (
         [np.flatnonzero(flights == f) for f in range(len(point.plain.flights))]
         if point.varies
-        else [np.arange(len(told))]
+        else [np.arange(len(at_windows))]
     )
     batches = [
-        [told[i] for i in own_rows[first : first + size]]
+        [at_windows[i] for i in own_rows[first : first + size]]
         for own_rows in rows
         for first in range(0, len(own_rows), size)
     ]
-    of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
+    row_of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
     shares = zip(*each(lambda batch: _products(batch, layout, point.device), batches))
-    square, information, score, cross = (_summed(values, of, len(rows)) for values in shares)
+    square, information, score, cross = (_summed(values, row_of, len(rows)) for values in shares)
     information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
-    count = sum(int((point.grams[w].latent_block == own).sum()) // 3 for w in through)
+    count = sum(int((point.grams[w].latent_block == latent_block).sum()) // 3 for w in carriers)
     return Screen(terms, np.sqrt(square.sum(0) / max(count, 1)), information, score, cross)
 
 
-def _summed(values: Sequence[np.ndarray], of: np.ndarray, rows: int) -> np.ndarray:
+def _summed(values: Sequence[np.ndarray], row_of: np.ndarray, rows: int) -> np.ndarray:
     """Sums of arrays by the row that each belongs to."""
     out = np.zeros((rows, *values[0].shape))
-    np.add.at(out, of, np.array(values))
+    np.add.at(out, row_of, np.array(values))
     return out
 
 
 def _exerted(
-    point: Point, part: WindowStatistics, w: int, block: str, known: Known, own: int
+    point: Point, part: WindowStatistics, w: int, block: str, values: Known, latent_block: int
 ) -> tuple[np.ndarray, ...]:
     """Return square and information, score and cross information of what is exerted at a window's
     knots.
     """
-    through = through_latents(point.windows[w], known, block)
-    here = through[point.grams[w].latent_block == own]
+    transfer = through_latents(point.windows[w], values, block)
+    felt_transfer = transfer[point.grams[w].latent_block == latent_block]
     score = part.latent_score + part.latent_effects @ point.theta
     return (
-        here.T @ here,
-        through.T @ part.latent_information @ through,
-        through.T @ score,
-        through.T @ part.latent_effects,
+        felt_transfer.T @ felt_transfer,
+        transfer.T @ part.latent_information @ transfer,
+        transfer.T @ score,
+        transfer.T @ part.latent_effects,
     )
 
 
@@ -190,49 +195,51 @@ def _padded(
 
 
 def gains(
-    point: Point, priors: Priors, active: Sequence[int], of: Screen, reach: float
+    point: Point, priors: Priors, active: Sequence[int], screened: Screen, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach``
     strong at the knots.
     """
-    own, score = _beside(point, priors.deviation(list(active)), of)
-    prior = reach / np.maximum(of.size, 1e-12 * of.size.max() + 1e-300)
-    gain = -0.5 * np.log1p(prior**2 * own) + 0.5 * score**2 / (own + prior**-2.0)
-    gain[of.size <= 1e-9 * of.size.max()] = -np.inf
+    information, score = _beside(point, priors.deviation(list(active)), screened)
+    prior = reach / np.maximum(screened.size, 1e-12 * screened.size.max() + 1e-300)
+    gain = -0.5 * np.log1p(prior**2 * information) + 0.5 * score**2 / (information + prior**-2.0)
+    gain[screened.size <= 1e-9 * screened.size.max()] = -np.inf
     return gain, prior
 
 
-def _beside(point: Point, deviation: np.ndarray, of: Screen) -> tuple[np.ndarray, np.ndarray]:
+def _beside(point: Point, deviation: np.ndarray, screened: Screen) -> tuple[np.ndarray, np.ndarray]:
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
-    own = np.maximum(
-        of.own - np.einsum("tk,kl,tl->t", of.cross, sigma, of.cross, optimize=True), 0.0
+    information = np.maximum(
+        screened.own
+        - np.einsum("tk,kl,tl->t", screened.cross, sigma, screened.cross, optimize=True),
+        0.0,
     )
-    return own, of.score - of.cross @ (sigma @ point.score)
+    return information, screened.score - screened.cross @ (sigma @ point.score)
 
 
 def _unsaid(
-    point: Point, priors: Priors, active: Sequence[int], of: Screen, name: int
+    point: Point, priors: Priors, active: Sequence[int], screened: Screen, name: int
 ) -> np.ndarray:
     """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see
     :func:`beyond`.
     """
     deviation = priors.deviation(list(active))
     deviation[name] = priors.slab[name] / NARROW
-    own, score = _beside(point, deviation, of)
-    return 0.5 * score**2 / np.maximum(own, 1e-300)
+    information, score = _beside(point, deviation, screened)
+    return 0.5 * score**2 / np.maximum(information, 1e-300)
 
 
-def distinct(gain: np.ndarray, of: Screen, most: int) -> list[int]:
+def distinct(gain: np.ndarray, screened: Screen, count: int) -> list[int]:
     """The best terms, without those that are a simpler one in other words in these flights."""
-    kept: list[int] = []
-    unit = of.score / np.maximum(of.size, 1e-300)
-    for i in np.argsort(-gain, kind="stable")[: 8 * most]:
-        if len(kept) == most or not np.isfinite(gain[i]):
+    chosen: list[int] = []
+    unit = screened.score / np.maximum(screened.size, 1e-300)
+    for i in np.argsort(-gain, kind="stable")[: 8 * count]:
+        if len(chosen) == count or not np.isfinite(gain[i]):
             break
-        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in kept):
-            kept.append(int(i))
-    return kept
+        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in chosen):
+            chosen.append(int(i))
+    return chosen
 
 
 def extended(
@@ -244,31 +251,38 @@ def extended(
     wide = replace(problem, terms=(*problem.terms, *terms))
 
     def laid(window: Window, gram: Gram) -> tuple[np.ndarray, ...]:
-        through = forces(window, terms)
-        own = through * wide.priors.floor[-len(terms) :]
-        own = lapack.dtrtrs(gram.factor, own, lower=1)[0] if gram.latents else own
-        return np.hstack((window.effects, window.latent @ through)), _appended(gram, own), own
+        transfer = forces(window, terms)
+        columns = transfer * wide.priors.floor[-len(terms) :]
+        columns = lapack.dtrtrs(gram.factor, columns, lower=1)[0] if gram.latents else columns
+        return (
+            np.hstack((window.effects, window.latent @ transfer)),
+            _appended(gram, columns),
+            columns,
+        )
 
-    known: dict[Same, list[tuple[np.ndarray, ...]]] = {}
-    found = []
+    columns_of: dict[Same, list[tuple[np.ndarray, ...]]] = {}
+    widened = []
     for point in points:
-        there = Same(
+        key = Same(
             [a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)]
         )
-        if there not in known:
-            known[there] = each(lambda pair: laid(*pair), zip(point.windows, point.grams))
+        if key not in columns_of:
+            columns_of[key] = each(lambda pair: laid(*pair), zip(point.windows, point.grams))
         windows = [
-            replace(w, effects=effects) for w, (effects, _, _) in zip(point.windows, known[there])
+            replace(w, effects=effects)
+            for w, (effects, _, _) in zip(point.windows, columns_of[key])
         ]
         grams = [
             replace(
                 gram,
                 inner=inner,
-                cross=np.concatenate((gram.cross, gram.cross[:, _latents(gram)] @ own), axis=1),
+                cross=np.concatenate(
+                    (gram.cross, gram.cross[:, _latents(gram)] @ laid_columns), axis=1
+                ),
             )
-            for gram, (_, inner, own) in zip(point.grams, known[there])
+            for gram, (_, inner, laid_columns) in zip(point.grams, columns_of[key])
         ]
-        found.append(
+        widened.append(
             regathered(
                 point,
                 theta=np.append(point.theta, np.zeros(len(terms))),
@@ -276,7 +290,7 @@ def extended(
                 grams=grams,
             )
         )
-    return wide, found
+    return wide, widened
 
 
 def _latents(gram: Gram) -> slice:
@@ -288,14 +302,14 @@ def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
     latents, shape (L, T).
     """
     part, size, count = _latents(gram), gram.inner.shape[1], columns.shape[1]
-    along = gram.inner[:, :, part] @ columns
-    inner = np.empty((len(along), size + count, size + count))
+    products = gram.inner[:, :, part] @ columns
+    inner = np.empty((len(products), size + count, size + count))
     inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = (
         gram.inner,
-        along,
-        along.transpose(0, 2, 1),
+        products,
+        products.transpose(0, 2, 1),
     )
-    inner[:, size:, size:] = columns.T @ along[:, part]
+    inner[:, size:, size:] = columns.T @ products[:, part]
     return inner
 
 
@@ -305,13 +319,14 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """
     if not problem.terms:
         return problem, point
-    own, count = replace(problem, terms=()), len(problem.model.effects)
+    plain, count = replace(problem, terms=()), len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
-    more = len(problem.terms)
+    term_count = len(problem.terms)
     grams = [
-        replace(g, inner=g.inner[:, :-more, :-more], cross=g.cross[:, :-more]) for g in point.grams
+        replace(g, inner=g.inner[:, :-term_count, :-term_count], cross=g.cross[:, :-term_count])
+        for g in point.grams
     ]
-    return own, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
+    return plain, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
 def shortlist(
@@ -319,34 +334,39 @@ def shortlist(
     point: Point,
     active: Sequence[int],
     strongest: Mapping[str, float],
-    least: float,
+    threshold: float,
     names: Sequence[int] = (),
 ) -> list[TermEffect]:
     """The terms that say most beside a set of names, by the linear statistics.
 
-    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``least``:
+    ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
     nats that a term must bring beyond its price; ``names``: that are not in the set: a term that
     one of these says as well is none."""
     calm, parts = calmed(point)
-    known = [Known(window.knots) for window in point.windows]
+    values = [Known(window.knots) for window in point.windows]
     screens = {
-        block: of for block in strongest if (of := screen(calm, parts, block, known)) is not None
+        block: screened
+        for block in strongest
+        if (screened := screen(calm, parts, block, values)) is not None
     }
-    depths = [term.depth for of in screens.values() for term in of.terms]
+    depths = [term.depth for screened in screens.values() for term in screened.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
-    found: list[tuple[float, Term, float]] = []
-    for block, of in screens.items():
-        gain, prior = gains(calm, problem.priors, active, of, UNKNOWN_RATIO * strongest[block])
-        gain -= [price[term.depth] for term in of.terms]
-        said = [_unsaid(calm, problem.priors, active, of, name) < LAW for name in names]
-        gain[np.any(said, axis=0)] = -np.inf
-        found += [
-            (float(gain[i]), of.terms[i], float(prior[i])) for i in distinct(gain, of, WEIGHED)
+    ranked: list[tuple[float, Term, float]] = []
+    for block, screened in screens.items():
+        gain, prior = gains(
+            calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
+        )
+        gain -= [price[term.depth] for term in screened.terms]
+        explained = [_unsaid(calm, problem.priors, active, screened, name) < LAW for name in names]
+        gain[np.any(explained, axis=0)] = -np.inf
+        ranked += [
+            (float(gain[i]), screened.terms[i], float(prior[i]))
+            for i in distinct(gain, screened, WEIGHED)
         ]
-    there = {e.term for e in problem.effects if isinstance(e, TermEffect)}
-    best = sorted((f for f in found if f[0] > least and f[1] not in there), key=lambda f: -f[0])[
-        :WEIGHED
-    ]
+    present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
+    best = sorted(
+        (f for f in ranked if f[0] > threshold and f[1] not in present), key=lambda f: -f[0]
+    )[:WEIGHED]
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
 
@@ -394,8 +414,8 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     square: dict[tuple[int, str], list[float]] = {}
     for window, gram in zip(point.windows, point.grams):
         if carries(gram.latent_block, term.block):
-            own = Known(window.knots)
-            for block, values in loads(term.block, own, layout.table(own)).items():
+            quantities = Known(window.knots)
+            for block, values in loads(term.block, quantities, layout.table(quantities)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(
                     float((values**2).sum((1, 2)).mean())
                 )
@@ -410,9 +430,9 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = covariance(point.information, problem.priors.deviation(list(active)))
     mean, effects = sigma @ point.score, problem.effects
-    told = [j for j in active if isinstance(effects[j], TermEffect)]
-    floor = np.array([effects[j].floor for j in told])
-    spread = sigma[np.ix_(told, told)] * np.outer(floor, floor)
+    columns = [j for j in active if isinstance(effects[j], TermEffect)]
+    floor = np.array([effects[j].floor for j in columns])
+    spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
     return tuple(
         Law(
             t.formula,
@@ -425,7 +445,7 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
             float(nats),
             tuple(spread[i].tolist()),
         )
-        for i, (j, t) in enumerate((j, effects[j].term) for j in told)
+        for i, (j, t) in enumerate((j, effects[j].term) for j in columns)
     )
 
 
@@ -438,9 +458,9 @@ def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name:
     deviation = priors.deviation([k for k in active if k != term])
     deviation[[name, term]] = priors.slab[name] / NARROW, 0.0
     information, score = point.information, point.score
-    known = covariance(information, deviation) @ np.column_stack((information[:, term], score))
-    own, left = (
-        information[term, term] - information[term] @ known[:, 0],
-        score[term] - information[term] @ known[:, 1],
+    solved = covariance(information, deviation) @ np.column_stack((information[:, term], score))
+    precision, remaining = (
+        information[term, term] - information[term] @ solved[:, 0],
+        score[term] - information[term] @ solved[:, 1],
     )
-    return float(0.5 * left**2 / max(own, 1e-300))
+    return float(0.5 * remaining**2 / max(precision, 1e-300))

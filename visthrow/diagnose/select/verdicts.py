@@ -52,15 +52,15 @@ def conclude(search: Selector) -> Diagnosis:
     )
     if varies or point.varies:
         point = search.point = with_varying(point, varies)
-    found = levels(
+    latent_levels = levels(
         search.problem,
         search.nominal,
         with_floors_noise(search.problem, point, search.active),
         search.least,
     )
-    drawn = {name for s in scatter if s.found for name in s.of}
-    search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in drawn}
-    overall, block, reasons, withdrawn = _overall(search, found)
+    varied = {name for s in scatter if s.found for name in s.of}
+    search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in varied}
+    overall, block, reasons, withdrawn = _overall(search, latent_levels)
     mistakes = tuple(getattr(model, "mistakes", ()))
     if overall == result.NO_EFFECT and (any(s.found for s in scatter) or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
@@ -72,18 +72,18 @@ def conclude(search: Selector) -> Diagnosis:
     explanations = (
         search.explanations() if overall == result.UNKNOWN else []
     )  # a term that is weaker than the names says nothing
-    search, here = _without_laws(search, point), not search.terms
+    search, without_terms = _without_laws(search, point), not search.terms
     active = [j for j in search.active if j not in withdrawn]
     point, model = search.point, search.problem.model
-    if not here:
+    if not without_terms:
         active = _sure(point, search.priors, active)
         withdrawn = set(search.active) - set(active)
-    here = here and bool(active or not search.active)
+    without_terms = without_terms and bool(active or not search.active)
     if not active and search.active:
         point = search.nominal
     point = replace(
         point,
-        plain=search.about_means(active, varies) if here else freed(point.plain, varies),
+        plain=search.about_means(active, varies) if without_terms else freed(point.plain, varies),
         varies=Varies(),
     )
     theta, spread, unlike = sized(search.problem, point, active)
@@ -100,7 +100,7 @@ def conclude(search: Selector) -> Diagnosis:
         search.least,
         tuple(search.steps),
         tuple((tuple(map(search.name, m.active)), 0.0 - m.nats) for m in search.sets),
-        found,
+        latent_levels,
         _different(explanations),
         _events(search, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
@@ -118,14 +118,14 @@ def conclude(search: Selector) -> Diagnosis:
 
 def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
     """Names that are surely not 0 at a point, the least certain gone first."""
-    left = list(active)
-    while left:
-        theta = estimate(point.information, point.score, priors, left)
-        sure = certainty(point.information, theta, priors, left)
+    remaining = list(active)
+    while remaining:
+        theta = estimate(point.information, point.score, priors, remaining)
+        sure = certainty(point.information, theta, priors, remaining)
         if sure.min() > 1.0:
             break
-        left.pop(int(np.argmin(sure)))
-    return left
+        remaining.pop(int(np.argmin(sure)))
+    return remaining
 
 
 def _without_laws(search: Selector, point: Point) -> Selector:
@@ -134,10 +134,12 @@ def _without_laws(search: Selector, point: Point) -> Selector:
     """
     if not search.problem.terms:
         return replace(search, work=point)
-    alone = moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
+    unlawful = (
+        moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
+    )
     problem = bare(search.problem, point)[0]
     nominal, origin, without, work = (
-        bare(search.problem, p)[1] for p in (search.nominal, search.origin, point, alone)
+        bare(search.problem, p)[1] for p in (search.nominal, search.origin, point, unlawful)
     )
     names = search.names
     sets = [m for m in search.sets if max(m.active, default=0) < len(problem.priors.floor)]
@@ -208,11 +210,13 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
     )
 
 
-def _overall(search: Selector, found: Sequence[Level]) -> tuple[str, str, list[str], set[int]]:
+def _overall(
+    search: Selector, latent_levels: Sequence[Level]
+) -> tuple[str, str, list[str], set[int]]:
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for
     it.
     """
-    point, every = search.point, set(search.active)
+    point, all_names = search.point, set(search.active)
     strong = too_strong(
         point, INEXACT
     )  # what no missing cause explains: the channels do not belong together
@@ -222,23 +226,23 @@ def _overall(search: Selector, found: Sequence[Level]) -> tuple[str, str, list[s
             f" missing in the phases {', '.join(strong)}: commands and poses, units or axes do not"
             " belong together"
         )
-        return result.INCONSISTENT, "", [reason], every
+        return result.INCONSISTENT, "", [reason], all_names
     if search.refused and not search.active:
         names = ", ".join(search.name(j) for j in sorted(search.refused))
         return (
             result.INCONSISTENT,
             "",
             [f"what looks like {names} changes its sign from flight to flight"],
-            every,
+            all_names,
         )
-    excessive = [level for level in found if level.excessive]
+    excessive = [level for level in latent_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
     if search.terms:
-        untold, said = search.law()
+        untold, sentence = search.law()
         return (
             result.UNKNOWN,
             search.problem.effects[search.terms[0]].block,
-            [said, *reasons],
+            [sentence, *reasons],
             untold,
         )
     stuck = [j for j in search.active if _on_bound(search, j)]
@@ -251,7 +255,7 @@ def _overall(search: Selector, found: Sequence[Level]) -> tuple[str, str, list[s
             result.UNKNOWN,
             acts_on(point, stuck[:1])[0] or search.problem.effects[stuck[0]].block,
             reasons,
-            every,
+            all_names,
         )
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
@@ -278,12 +282,12 @@ def _withdrawn(search: Selector, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one
     that left it as it was.
     """
-    through = dict(zip(search.active, acts_on(search.point, search.active)))
-    inside = {j for j, block in through.items() if block in {level.block for level in excessive}}
-    if len(inside) > CHAIN:
-        return inside
+    blocks = dict(zip(search.active, acts_on(search.point, search.active)))
+    in_excess = {j for j, block in blocks.items() if block in {level.block for level in excessive}}
+    if len(in_excess) > CHAIN:
+        return in_excess
     eased = {level.block: level.after < 0.5 * level.before for level in excessive}
-    return {j for j in inside if not eased.get(through[j], True)}
+    return {j for j in in_excess if not eased.get(blocks[j], True)}
 
 
 def _on_bound(search: Selector, j: int) -> bool:
@@ -291,10 +295,12 @@ def _on_bound(search: Selector, j: int) -> bool:
     threshold.
     """
     point, priors = search.point, search.priors
-    at = min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
+    on_bound = (
+        min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
+    )
     push = point.statistics.score[:, j].sum()
     return bool(
-        at
+        on_bound
         and push * point.theta[j] > 0.0
         and 0.5 * push**2 / point.information[j, j] > search.least
     )
@@ -313,19 +319,21 @@ def _finding(
             sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.",
         )
     partners, together = _class_of(search, j, active)
-    rest = [k for k in together if k != j]
+    remaining = [k for k in together if k != j]
     sigma = covariance(
-        point.information, priors.deviation([*rest, j])
+        point.information, priors.deviation([*remaining, j])
     )  # as if it were named beside the others
     mean, sd = float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
-    own = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
-    nats = point.evidence(priors, [*rest, j]) - point.evidence(priors, rest)
+    deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
+    nats = point.evidence(priors, [*remaining, j]) - point.evidence(priors, remaining)
     differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
-    blank = replace(blank, sd=own, nats=nats, differs=differs if j in active or partners else 0.0)
+    blank = replace(
+        blank, sd=deviation, nats=nats, differs=differs if j in active or partners else 0.0
+    )
     if j in active or partners:
         return _named(search, point, blank, mean, sorted({j, *partners}), active)
     low, high = (
-        float(np.clip(mean * effect.floor + side * NORMAL_95 * own, *effect.bounds)) + 0.0
+        float(np.clip(mean * effect.floor + side * NORMAL_95 * deviation, *effect.bounds)) + 0.0
         for side in (-1.0, 1.0)
     )  # no -0
     blank = replace(blank, low=low, high=high)
@@ -337,16 +345,16 @@ def _finding(
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     if sd > BIT * priors.slab[j]:
         text = (
-            f"{effect.name}: these flights say hardly more than was known ({own:.2g} of"
+            f"{effect.name}: these flights say hardly more than was known ({deviation:.2g} of"
             f" {effect.prior_sd:.2g} {effect.unit})."
         )
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
     text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
     if low == high:
-        beyond = "less" if mean * effect.floor < low else "more"
+        comparison = "less" if mean * effect.floor < low else "more"
         text = (
             f"{effect.name}: on its bound of {low:.3g} {effect.unit}; these flights ask for"
-            f" {beyond} than is possible."
+            f" {comparison} than is possible."
         )
     return replace(blank, verdict=result.BOUNDED, sentence=text)
 
@@ -379,11 +387,11 @@ def _class_of(
     """
     named, alike = set(active), [set(m.active) for m in search.sets if len(m.active) == len(active)]
     for home in active:
-        own = [members for members in alike if home not in members]
-        partners = {home}.union(*own) - (named - {home})
+        rivals = [members for members in alike if home not in members]
+        partners = {home}.union(*rivals) - (named - {home})
         if j in partners and len(partners) > 1:
             return tuple(sorted(partners - {j})), tuple(
-                active if j == home else next(m for m in own if j in m)
+                active if j == home else next(m for m in rivals if j in m)
             )
     return (), tuple(active)
 
@@ -422,17 +430,19 @@ def _named(
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(search: Selector, point: Point, members: list[int], rest: list[int]) -> str:
+def _joint(search: Selector, point: Point, members: list[int], named: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior
     deviations.
     """
     priors, effects = search.priors, search.problem.effects
-    others = np.setdiff1d(np.arange(len(effects)), members)
+    nuisances = np.setdiff1d(np.arange(len(effects)), members)
     information, slab = point.information, priors.slab[members]
-    nuisance = information[np.ix_(others, others)] + np.diag(priors.deviation(rest)[others] ** -2.0)
-    cross = information[np.ix_(members, others)]
+    nuisance = information[np.ix_(nuisances, nuisances)] + np.diag(
+        priors.deviation(named)[nuisances] ** -2.0
+    )
+    cross = information[np.ix_(members, nuisances)]
     schur = information[np.ix_(members, members)] - cross @ np.linalg.solve(nuisance, cross.T)
-    score = point.score[members] - cross @ np.linalg.solve(nuisance, point.score[others])
+    score = point.score[members] - cross @ np.linalg.solve(nuisance, point.score[nuisances])
     values, vectors = np.linalg.eigh(schur * np.outer(slab, slab))
     vector, value = vectors[:, -1] / slab, values[-1]  # per floor
     first = int(np.argmax(np.abs(vectors[:, -1])))
@@ -442,10 +452,10 @@ def _joint(search: Selector, point: Point, members: list[int], rest: list[int]) 
     )
     unit, parts = effects[members[first]].unit, [effects[members[first]].name]
     for i in (i for i in range(len(members)) if i != first):
-        other, coefficient = effects[members[i]], vector[i] / priors.floor[members[i]] / scale
+        effect, coefficient = effects[members[i]], vector[i] / priors.floor[members[i]] / scale
         parts.append(
-            f"{'+' if coefficient > 0 else '-'} {abs(coefficient):.3g} {unit}/({other.unit})"
-            f" {other.name}"
+            f"{'+' if coefficient > 0 else '-'} {abs(coefficient):.3g} {unit}/({effect.unit})"
+            f" {effect.name}"
         )
     sd = 1.0 / np.sqrt(max(value, 1e-300)) / abs(scale)
     return f"{' '.join(parts)} = {mean / scale:.4g} ± {sd:.2g} {unit}"

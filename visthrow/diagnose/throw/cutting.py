@@ -94,12 +94,12 @@ def cut(
     ]
 
 
-def thinned(cuts: list[Cut], most: int = MOST) -> list[Cut]:
+def thinned(cuts: list[Cut], count: int = MOST) -> list[Cut]:
     """Thin hours of flight out to all throws and what follows them, and so many of the other
-    windows that ``most`` are left.
+    windows that ``count`` are left.
     """
     plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
-    room = max(most - len(cuts) + len(plain), most // 4)
+    room = max(count - len(cuts) + len(plain), count // 4)
     if len(plain) <= room:
         return cuts
     dropped = set(plain) - {plain[i] for i in np.linspace(0, len(plain) - 1, room).astype(int)}
@@ -113,13 +113,13 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
     sooner leaves a window of the flight after it."""
     free = c.start < separation < min(last + LEAST_TAUT, c.end)
     last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
-    rest = (
+    quiet = (
         replace(c, start=last, payload=LOOSE, phase="ballistic")
         if free
         else replace(c, start=last, after_slack=True)
     )
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
-    pieces = [before, replace(c, start=first, end=last, retained=False), rest]
+    pieces = [before, replace(c, start=first, end=last, retained=False), quiet]
     return [
         replace(p, retained=p.retained and p.end - p.start > LEAST)
         for p in pieces

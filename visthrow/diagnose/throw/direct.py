@@ -76,9 +76,9 @@ def direct_measurements(
     logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting
 ) -> list[DirectMeasurement]:
     """All that the logs hold of windows that count."""
-    held = channels_of(logs, flights, setting.camera)
-    heights: list[DirectMeasurement] = [LandingHeight(flights, cuts)] if LANDING in held else []
-    return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in held else [])
+    channels = channels_of(logs, flights, setting.camera)
+    heights: list[DirectMeasurement] = [LandingHeight(flights, cuts)] if LANDING in channels else []
+    return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in channels else [])
 
 
 def needs_no_flight(e: SettingEffect) -> bool:
@@ -91,9 +91,9 @@ def seen_by_camera(log: FlightLog) -> bool:
     poses say nothing about it.
     """
     config = log.meta.get("config")
-    made = config.get("keypoints", "") if isinstance(config, dict) else ""
-    seen = made == "detector" or (made == "" and "policy" not in log.meta)
-    return seen and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
+    source = config.get("keypoints", "") if isinstance(config, dict) else ""
+    by_camera = source == "detector" or (source == "" and "policy" not in log.meta)
+    return by_camera and measured(log, KEYPOINTS) is not None and "keypoints_valid" in log
 
 
 def with_direct(
@@ -117,13 +117,13 @@ def with_direct(
         plain = kind.predicted(number, settings[0])
         columns = np.zeros((len(time), len(steps)))
         for k in np.flatnonzero(steps):
-            other = settings[1 + k]
+            perturbed = settings[1 + k]
             if (
-                other.sensing != settings[0].sensing
-                or other.camera != settings[0].camera
+                perturbed.sensing != settings[0].sensing
+                or perturbed.camera != settings[0].camera
                 or kind.channel == LANDING
             ):
-                columns[:, k] = (kind.predicted(number, other) - plain) / steps[k]
+                columns[:, k] = (kind.predicted(number, perturbed) - plain) / steps[k]
         window = replace(
             window,
             time=np.append(window.time, time),
@@ -155,9 +155,9 @@ class LandingHeight:
         """Give each landing to the last window of its flight that counts."""
         self.windows: dict[int, tuple[float, np.ndarray]] = {}
         for n, flight in enumerate(flights):
-            own = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
-            if flight.landing_point is not None and flight.latch != NEVER and own:
-                self.windows[own[-1]] = flight.landing, flight.landing_point
+            windows = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
+            if flight.landing_point is not None and flight.latch != NEVER and windows:
+                self.windows[windows[-1]] = flight.landing, flight.landing_point
 
     def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
         """See :class:`DirectMeasurement`."""
@@ -167,12 +167,12 @@ class LandingHeight:
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`."""
         x, point = setting.sensing, self.windows[window][1]
-        there = _origin(x, point[None])[0] - np.array(x.payload_offset)
-        there[2] = setting.plant.release.landing_height
-        seen = Rotation.from_rotvec(x.frame_tilt).apply(there + np.array(x.payload_offset)) * (
-            1.0 + x.scale
-        )
-        return seen[2:]
+        payload = _origin(x, point[None])[0] - np.array(x.payload_offset)
+        payload[2] = setting.plant.release.landing_height
+        measured = Rotation.from_rotvec(x.frame_tilt).apply(
+            payload + np.array(x.payload_offset)
+        ) * (1.0 + x.scale)
+        return measured[2:]
 
 
 class CameraView:
@@ -241,22 +241,22 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     grid about them.
     """
     channel = measured(log, KEYPOINTS)
-    inside = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
-    inside &= (channel.time > flight.payload.time[0]) & (channel.time < flight.payload.time[-1])
-    if np.count_nonzero(inside) < 5:
+    during = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
+    during &= (channel.time > flight.payload.time[0]) & (channel.time < flight.payload.time[-1])
+    if np.count_nonzero(during) < 5:
         return None
     valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
-    stamps, kept = channel.time[inside], np.flatnonzero(inside)
-    at = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
+    stamps, indices = channel.time[during], np.flatnonzero(during)
+    index = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
     points = np.asarray(channel.values, dtype=float)
     goal = (
         np.asarray(log["goal_w"].values, dtype=float)[0]
         if "goal_w" in log
         else log.meta.get("goal_w")
     )
-    seen = valid[np.minimum(at, len(valid) - 1)]
+    visible = valid[np.minimum(index, len(valid) - 1)]
     if goal is None:
-        seen[:, :4] = False
+        visible[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
     tracks = {
         "vehicle": (flight.vehicle, x.vehicle_delay),
@@ -269,16 +269,16 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in sources.items()}
     if any(row is None for rows in table.values() for row in rows):
         return None
-    seen = seen[..., None] & MEASURED
-    if not np.any(seen):
+    visible = visible[..., None] & MEASURED
+    if not np.any(visible):
         return None
     view = {
         "time": stamps,
-        "points": points[kept],
-        "valid": seen,
+        "points": points[indices],
+        "valid": visible,
         "grid": grid,
         "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
-        "sigma": max(_noise(points[kept], seen), LEAST_KEYPOINT_SIGMA),
+        "sigma": max(_noise(points[indices], visible), LEAST_KEYPOINT_SIGMA),
     }
     return view | {
         name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows]))
@@ -286,11 +286,11 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     }
 
 
-def _noise(points: np.ndarray, seen: np.ndarray) -> float:
+def _noise(points: np.ndarray, visible: np.ndarray) -> float:
     """Estimate the noise of coordinates while they are seen: what stands in the log elsewhere is
     none.
     """
-    tracks = [points[seen[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
+    tracks = [points[visible[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
     sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
     return float(np.median(sigmas)) if sigmas else 0.0
 
@@ -302,9 +302,9 @@ def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     h = time - grid[k]
     s = (h / GRID)[:, None]
     turns = name == "attitude"
-    here = Rotation.from_quat(values[k]) if turns else None
+    rotation = Rotation.from_quat(values[k]) if turns else None
     chord = (
-        (here.inv() * Rotation.from_quat(values[k + 1])).as_rotvec()
+        (rotation.inv() * Rotation.from_quat(values[k + 1])).as_rotvec()
         if turns
         else values[k + 1] - values[k]
     )
@@ -316,7 +316,7 @@ def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
         * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
     )
     way = s * chord + bend
-    return (here * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
+    return (rotation * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
 
 
 def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> np.ndarray:
@@ -345,6 +345,6 @@ def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> n
     points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[
         0
     ].numpy()
-    own, other = camera.fisheye, nominal.camera.fisheye
-    pixel = points * _reach(camera) + np.array([own.cx, own.cy])
-    return (pixel - np.array([other.cx, other.cy])) / _reach(nominal.camera)
+    fisheye, nominal_fisheye = camera.fisheye, nominal.camera.fisheye
+    pixel = points * _reach(camera) + np.array([fisheye.cx, fisheye.cy])
+    return (pixel - np.array([nominal_fisheye.cx, nominal_fisheye.cy])) / _reach(nominal.camera)

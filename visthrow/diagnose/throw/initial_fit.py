@@ -106,7 +106,7 @@ class InitialFit:
         )  # of each window, against the drift that is thought possible
         # deviation of each window's samples from a flight without gusts: noise, and how far gusts
         # may have led by then
-        self._spreads = [np.hypot(flights.sigma[w], own) for w, own in enumerate(self._drift)]
+        self._spreads = [np.hypot(flights.sigma[w], spread) for w, spread in enumerate(self._drift)]
         self._scales: dict[
             int, tuple
         ] = {}  # the last slopes and deviations of a window, and what comes of them
@@ -124,32 +124,36 @@ class InitialFit:
         were moved before; those that do not count keep the last; ``slopes``: of windows' samples by
         their states, as :attr:`slopes` of another fit has them."""
         count = len(self.flights.cuts)
-        damping, left, promised = np.full(count, DAMPING), self.retained, np.full(count, np.inf)
+        damping, remaining, promised = (
+            np.full(count, DAMPING),
+            self.retained,
+            np.full(count, np.inf),
+        )
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals, cost = self._best(starts)
         stale, doubtful = ~aged, np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
-            self.slopes |= self._slopes(states, left[stale[left]])
+            self.slopes |= self._slopes(states, remaining[stale[remaining]])
             aged &= ~stale
-            trial = self._tried(states, left, residuals, damping, doubtful)
-            helps = trial.cost < cost[left]
+            trial = self._tried(states, remaining, residuals, damping, doubtful)
+            helps = trial.cost < cost[remaining]
             tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
-            tried[left], hoped[left], whole[left] = (
+            tried[remaining], hoped[remaining], whole[remaining] = (
                 trial.cost,
                 np.where(helps, trial.hoped, trial.whole),
                 trial.whole,
             )
-            damping[left] = np.where(helps, trial.damping, damping[left])
+            damping[remaining] = np.where(helps, trial.damping, damping[remaining])
             better, rows = tried < cost, np.flatnonzero(helps)
-            residuals |= {left[row]: trial.residuals[row] for row in rows}
+            residuals |= {remaining[row]: trial.residuals[row] for row in rows}
             states = {name: value.copy() for name, value in states.items()}
             for name, value in states.items():
-                value[left[rows]] = trial.states[name][rows]
+                value[remaining[rows]] = trial.states[name][rows]
             fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
-            enough = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
-            little = better & (fall < enough)
-            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < enough) & (
+            tolerance = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
+            little = better & (fall < tolerance)
+            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < tolerance) & (
                 damping <= DAMPING
             )
             true = (fall > TRUE * hoped) & (hoped > WHOLE * whole)
@@ -159,12 +163,12 @@ class InitialFit:
             doubtful = ~(better & true)
             promised = np.where(better, hoped, promised)
             aged, cost = aged | better, np.where(better, tried, cost)
-            for w in left[settled[left]]:
+            for w in remaining[settled[remaining]]:
                 if self._lower_gusts(w, residuals[w]):
                     settled[w], promised[w] = False, np.inf
                     cost[w] = self._cost(w, residuals[w])
-            left = left[~settled[left] & (damping[left] < DAMPING_MOST)]
-            if not len(left):
+            remaining = remaining[~settled[remaining] & (damping[remaining] < DAMPING_MOST)]
+            if not len(remaining):
                 break
         return states
 
@@ -173,12 +177,15 @@ class InitialFit:
         flown at once.
         """
         retained, count = self.retained, len(self.retained)
-        seen = self._residuals(
+        residuals = self._residuals(
             stacked([rows_of(states, retained) for states in starts]),
             np.tile(retained, len(starts)),
         )
         tried = np.reshape(
-            [self._cost(w, residual) for w, residual in zip(np.tile(retained, len(starts)), seen)],
+            [
+                self._cost(w, residual)
+                for w, residual in zip(np.tile(retained, len(starts)), residuals)
+            ],
             (len(starts), count),
         )
         which, cost = tried.argmin(axis=0), np.full(len(self.flights.cuts), np.inf)
@@ -190,36 +197,46 @@ class InitialFit:
             ]
         return (
             best,
-            {w: seen[start * count + row] for row, (w, start) in enumerate(zip(retained, which))},
+            {
+                w: residuals[start * count + row]
+                for row, (w, start) in enumerate(zip(retained, which))
+            },
             cost,
         )
 
     def _tried(
         self,
         states: States,
-        left: np.ndarray,
+        windows: np.ndarray,
         residuals: Mapping[int, np.ndarray],
         damping: np.ndarray,
         doubtful: np.ndarray,
     ) -> _Trial:
         """The next step of each window that is left, or the best of several."""
-        rungs = np.where(doubtful[left], len(LADDER), 1)
-        which, first = np.repeat(left, rungs), np.cumsum(rungs) - rungs
-        dampings = [damping[w] * LADDER[:n] for w, n in zip(left, rungs)]
-        each(self._scaled, left)
-        found = [
+        rungs = np.where(doubtful[windows], len(LADDER), 1)
+        which, first = np.repeat(windows, rungs), np.cumsum(rungs) - rungs
+        dampings = [damping[w] * LADDER[:n] for w, n in zip(windows, rungs)]
+        each(self._scaled, windows)
+        trials = [
             self._increments(w, residuals[w], states[MOVED][w], its)
-            for w, its in zip(left, dampings)
+            for w, its in zip(windows, dampings)
         ]
-        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*found))
-        there = moved_along(rows_of(states, which), self.directions, steps)
-        there[MOVED] = there[MOVED] + steps
-        seen = self._residuals(there, which)
-        cost = np.array([self._cost(w, residual) for w, residual in zip(which, seen)])
-        best = np.array([at + cost[at : at + n].argmin() for at, n in zip(first, rungs)])
-        rest = [seen[lane] for lane in best]
+        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*trials))
+        states_moved = moved_along(rows_of(states, which), self.directions, steps)
+        states_moved[MOVED] = states_moved[MOVED] + steps
+        left_over = self._residuals(states_moved, which)
+        cost = np.array([self._cost(w, residual) for w, residual in zip(which, left_over)])
+        best = np.array(
+            [start + cost[start : start + n].argmin() for start, n in zip(first, rungs)]
+        )
+        best_residuals = [left_over[lane] for lane in best]
         return _Trial(
-            rows_of(there, best), tries[best], hoped[best], hoped[first], cost[best], rest
+            rows_of(states_moved, best),
+            tries[best],
+            hoped[best],
+            hoped[first],
+            cost[best],
+            best_residuals,
         )
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
@@ -227,8 +244,8 @@ class InitialFit:
         each.
         """
         f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
-        seen = f.fly(self.simulation, states, lanes, self._shortened).seen
-        return [self._sensitive[w] * f.residual(seen, w, lane) for lane, w in enumerate(which)]
+        measured = f.fly(self.simulation, states, lanes, self._shortened).seen
+        return [self._sensitive[w] * f.residual(measured, w, lane) for lane, w in enumerate(which)]
 
     def _cost(self, w: int, residual: np.ndarray) -> float:
         """Huber's cost of a window's residual; infinite where one is not finite."""
@@ -258,19 +275,24 @@ class InitialFit:
         if not len(which):
             return {}
         count, lanes, first = len(which), [], []
-        ways = {d: 1 + at for at, d in enumerate(sorted({d for w in which for d in self._free[w]}))}
+        ways = {
+            d: 1 + index
+            for index, d in enumerate(sorted({d for w in which for d in self._free[w]}))
+        }
         for row, w in enumerate(which):
             first.append(len(lanes))
             lanes += [
                 Lane(w, 0, row, rough=True),
                 *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]],
             ]
-        there = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
-        seen = self.flights.fly(self.simulation, there, lanes, self._shortened).seen
+        states_moved = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
+        measured = self.flights.fly(self.simulation, states_moved, lanes, self._shortened).seen
         slopes = {}
-        for at, w in zip(first, which):
+        for index, w in zip(first, which):
             ds, rows = self._free[w], int(self.flights.rows[w])
-            flat = np.swapaxes(seen[:rows, at : at + 1 + len(ds)], 1, 2).reshape(3 * rows, -1)
+            flat = np.swapaxes(measured[:rows, index : index + 1 + len(ds)], 1, 2).reshape(
+                3 * rows, -1
+            )
             steps = np.array([self.directions[d].step for d in ds])
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._sensitive[w][:, None]
         return slopes
@@ -280,12 +302,12 @@ class InitialFit:
         deviations, and their inner products.
         """
         slopes, spread = self.slopes[w], self._spreads[w]
-        known = self._scales.get(w)
-        if known is None or known[0] is not slopes or known[1] is not spread:
+        scales = self._scales.get(w)
+        if scales is None or scales[0] is not slopes or scales[1] is not spread:
             sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
             scaled = slopes * sd / spread[:, None]
-            known = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
-        return known[2]
+            scales = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
+        return scales[2]
 
     def _increments(
         self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
@@ -300,9 +322,11 @@ class InitialFit:
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):
             bend = scaled.T @ (scaled * weight[:, None])
-        own, slope = bend.diagonal() + 1.0, scaled.T @ (off * weight)
+        diagonal, slope = bend.diagonal() + 1.0, scaled.T @ (off * weight)
         damped = np.repeat(bend[None], len(dampings), axis=0)
-        damped.reshape(len(dampings), -1)[:, :: len(ds) + 1] = own + dampings[:, None] * own
+        damped.reshape(len(dampings), -1)[:, :: len(ds) + 1] = (
+            diagonal + dampings[:, None] * diagonal
+        )
         step = np.linalg.solve(damped, (slope - done[ds] / sd)[:, None])[..., 0]
         out = np.zeros((len(dampings), len(done)))
         out[:, ds] = step * sd
@@ -323,10 +347,10 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
     few are left."""
     c, time = flights.cuts[w], flights.time[w]
-    left = flights.flights[c.flight].latch + lag - EARLIER
-    if c.payload != ATTACHED or not c.start + SEEN < left < c.end:
+    time_left = flights.flights[c.flight].latch + lag - EARLIER
+    if c.payload != ATTACHED or not c.start + SEEN < time_left < c.end:
         return np.ones(len(time)), c.end
-    return (time < left).astype(float), min(left + ONWARD, c.end)
+    return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
 
 
 def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
@@ -350,8 +374,8 @@ def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: f
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
     rows, parts = np.arange(len(states["pos_w"])), [states]
-    for _, own in groupby(directions, key=lambda d: d.field):
-        group = list(own)
+    for _, members in groupby(directions, key=lambda d: d.field):
+        group = list(members)
         steps = np.repeat(np.diag([d.step for d in group]), len(rows), axis=0)
         parts.append(moved_along(rows_of(states, np.tile(rows, len(group))), group, steps))
     return stacked(parts)

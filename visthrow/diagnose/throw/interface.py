@@ -68,16 +68,16 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     """Return what may be wrong with the commands of all logs, in the order of correction; not
     weighed yet.
     """
-    found: list[Mistake] = []
+    mistakes: list[Mistake] = []
     for look in (_axes, _rate_unit):
         relation = [r for log in logs if (r := _followed(log)) is not None]
         mistake = look(relation) if relation else None
         if mistake is not None:
-            found.append(mistake)
+            mistakes.append(mistake)
             logs = [mistake.mended(log) for log in logs]
     units = thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust}
     mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
-    return found if mistake is None else [*found, mistake]
+    return mistakes if mistake is None else [*mistakes, mistake]
 
 
 def commanded(
@@ -90,7 +90,7 @@ def commanded(
     h of full throttle. The slope s is fitted where an accelerometer tells the force and the
     throttle varies enough, else it is 1."""
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
-    made, shares = list(logs), []
+    corrected, shares = list(logs), []
     for i, log in enumerate(logs):
         if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
             continue
@@ -104,17 +104,17 @@ def commanded(
         values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
         command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
         channels = {**log.channels, "command": command}
-        made[i] = FlightLog(
+        corrected[i] = FlightLog(
             {name: c.only((c.time >= start) & (c.time <= end)) for name, c in channels.items()},
             log.meta,
         )
         shares.append((hover, slope))
     if not shares:
-        return made, ()
+        return corrected, ()
     hover, slope = np.median(shares, axis=0)
     cause = "Commanded thrust is a throttle, calibrated by the weight that it carries in flight"
     equation = f"thrust = {weight:.3f} N (1 + {slope:.2f} (throttle / {hover:.3f} - 1))"
-    return made, (Mistake("throttle", cause, equation, 0.0, len(shares)),)
+    return corrected, (Mistake("throttle", cause, equation, 0.0, len(shares)),)
 
 
 def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
@@ -135,38 +135,37 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     if np.count_nonzero(flies) < 50:
         return None
     start, end = float(time[flies][0]), float(time[flies][-1])
-    inside = (time >= start) & (time <= end)
-    hover = float(np.median(share[inside]))
-    if "acc_b" not in log or np.std(share[inside]) < VARIED * hover:
+    rows = (time >= start) & (time <= end)
+    hover = float(np.median(share[rows]))
+    if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
         return hover, 1.0, start, end
     acc = log["acc_b"]
-    grid = time[inside][(time[inside] > acc.time[0] + 0.2) & (time[inside] < acc.time[-1] - 0.2)]
+    grid = time[rows][(time[rows] > acc.time[0] + 0.2) & (time[rows] < acc.time[-1] - 0.2)]
     felt = (
         relations.mean_over(
             acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1
         )[:, 0]
         / GRAVITY
     )
-    asked = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
-    slope, level = np.polyfit(asked, felt, 1)
+    commanded = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
+    slope, level = np.polyfit(commanded, felt, 1)
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
         return hover, 1.0, start, end
     return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
 
 
 def _followed(log: FlightLog) -> relations.Relation | None:
-    """Return how the measured attitude's rates follow the commanded ones; None where nothing turns.
-    """
+    """Return how the measured attitude's rates follow the commanded ones; None if nothing turns."""
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
         return None
     time, rate = relations.rates_of(*attitude.samples())
-    asked, wanted = log["command"].samples()
-    wanted = wanted[:, 1:]
-    if len(time) < 50 or len(wanted) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
+    stamps, commanded = log["command"].samples()
+    commanded = commanded[:, 1:]
+    if len(time) < 50 or len(commanded) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
         return None
-    found = relations.relate(asked, wanted, time, rate)
-    return found if found is not None and found.axes_correlation > FOLLOWS else None
+    relation = relations.relate(stamps, commanded, time, rate)
+    return relation if relation is not None and relation.axes_correlation > FOLLOWS else None
 
 
 def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:

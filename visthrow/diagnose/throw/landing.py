@@ -102,17 +102,20 @@ def landings(
     flights to look at; default all."""
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights
-    known = {
-        n: seen
+    measured = {
+        n: landing
         for n in numbers
-        if (seen := seen_landing(model.flights.flights[n], plane)) is not None
+        if (landing := seen_landing(model.flights.flights[n], plane)) is not None
     }
-    spans = {n: found for n in known if (found := _spans(model, n)) is not None}
+    spans = {n: span for n in measured if (span := _spans(model, n)) is not None}
     if not spans:
         return Landings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
-    ends = {n: known[n][0] + AFTERWARDS for n in spans}
-    paths = [_fly(model, theta, {n: both[k] for n, both in spans.items()}, ends) for k in range(2)]
-    return Landings(np.array(list(spans)), np.array([known[n][1] for n in spans]), *paths)
+    ends = {n: measured[n][0] + AFTERWARDS for n in spans}
+    paths = [
+        _fly(model, theta, {n: spans_of[k] for n, spans_of in spans.items()}, ends)
+        for k in range(2)
+    ]
+    return Landings(np.array(list(spans)), np.array([measured[n][1] for n in spans]), *paths)
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -121,15 +124,15 @@ def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, f
     """
     flight = model.flights.flights[number]
     separation = flight.latch + model.setting.plant.release.lag
-    own = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
-    if not own:
+    cuts = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
+    if not cuts:
         return None
-    slack = [(c.start, c.end) for c in own if not c.retained]
+    slack = [(c.start, c.end) for c in cuts if not c.retained]
     end = min(
         [separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]]
     )
-    last = max([separation - BEFORE, own[0].start, *[last for _, last in slack]])
-    head = max(end - HEAD, own[0].start), end
+    last = max([separation - BEFORE, cuts[0].start, *[last for _, last in slack]])
+    head = max(end - HEAD, cuts[0].start), end
     return (
         (head, (last, separation))
         if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT
@@ -154,14 +157,14 @@ def _fly(
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
     onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
-    seen = onward.fly(model.simulation(setting), states, lanes).seen
+    measured = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):
         first, count = (
             2 * int(onward.windows["vehicle_count"][i]),
             int(onward.windows["payload_count"][i]),
         )
-        time, path = onward.samples["payload"][i].time, seen[first : first + count, i]
+        time, path = onward.samples["payload"][i].time, measured[first : first + count, i]
         out[i] = _crossing(
             path[time > looked[c.flight].latch + release.lag], release.landing_height
         )
@@ -173,8 +176,8 @@ def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
     over.
     """
     before = [c for c in model.flights.cuts if c.flight == number and c.start < begin - 1e-3]
-    through = [replace(c, end=min(c.end, begin), retained=False) for c in before]
-    return [*through, Cut(number, "throw", begin, end, ATTACHED)]
+    cuts = [replace(c, end=min(c.end, begin), retained=False) for c in before]
+    return [*cuts, Cut(number, "throw", begin, end, ATTACHED)]
 
 
 def _with_path(flight: Recorded, end: float | None) -> Recorded:

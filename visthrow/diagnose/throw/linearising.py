@@ -82,29 +82,29 @@ class Plan:
     latents: tuple[tuple[int, int], ...]  # axis and knot
 
     def slopes(
-        self, rows: int, steps: np.ndarray, directions: Sequence[Direction], seen: torch.Tensor
+        self, rows: int, steps: np.ndarray, directions: Sequence[Direction], measured: torch.Tensor
     ) -> list[torch.Tensor]:
         """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows,
         columns) each.
 
-        ``seen``: what all lanes of the run saw, shape (rows or more, lanes, 3).
+        ``measured``: what all lanes of the run saw, shape (rows or more, lanes, 3).
         """
         sizes = [
             *steps,
             *[directions[d].step for d in self.nuisances],
             *[LATENT_SIZES[axis] for axis, _ in self.latents],
         ]
-        own = (
-            seen[:rows, self.first : self.first + len(self.order) + 2]
+        columns = (
+            measured[:rows, self.first : self.first + len(self.order) + 2]
             .transpose(1, 2)
             .reshape(3 * rows, -1)
         )
-        for part in (own[:, : self.fine], own[:, self.fine :]):
+        for part in (columns[:, : self.fine], columns[:, self.fine :]):
             part -= part[:, :1].clone()
         K, D = len(steps), len(self.nuisances)
-        order, sizes = torch.from_numpy(self.order).to(own.device), own.new_tensor(sizes)
+        order, sizes = torch.from_numpy(self.order).to(columns.device), columns.new_tensor(sizes)
         return [
-            own[:, order[part]].div_(sizes[part])
+            columns[:, order[part]].div_(sizes[part])
             for part in (slice(K), slice(K, K + D), slice(K + D, None))
         ]
 
@@ -126,7 +126,7 @@ class Plan:
         prior has its middle, shape (W, directions): there the residual is taken."""
         w, f = self.window, flights
         c, (effects, states, latents) = f.cuts[w], slopes
-        own = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
+        values = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
             c.flight,
             c.phase,
@@ -141,7 +141,7 @@ class Plan:
             np.array([axis // 3 for axis, _ in self.latents]),
             np.array([axis % 3 for axis, _ in self.latents]),
             np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]),
-            at_knots(f, setting, w, own),
+            at_knots(f, setting, w, values),
             c.after_slack,
         )
 

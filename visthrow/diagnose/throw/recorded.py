@@ -122,16 +122,16 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     Source: Savitzky and Golay 1964.
     """
     steps = np.diff(time)
-    every = int(1.0 / (ENOUGH * np.median(steps)) + 0.1)  # clocks are some per cent off
-    if every < 2:
+    stride = int(1.0 / (ENOUGH * np.median(steps)) + 0.1)  # clocks are some per cent off
+    if stride < 2:
         return time, values
-    weights, parts = savgol_coeffs(2 * every + 1, 2), []
+    weights, parts = savgol_coeffs(2 * stride + 1, 2), []
     for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 / ENOUGH) + 1):
         if len(stretch) >= len(weights):
-            near = sliding_window_view(
+            averaged = sliding_window_view(
                 np.column_stack((time, values))[stretch], len(weights), axis=0
-            )[::every]
-            parts.append(near @ weights)
+            )[::stride]
+            parts.append(averaged @ weights)
     thinned = np.concatenate(parts) if parts else np.zeros((0, 1 + values.shape[1]))
     return thinned[:, 0], thinned[:, 1:]
 
@@ -144,8 +144,8 @@ def resolution(values: np.ndarray) -> float:
     left at which a step was just taken: half a step ahead of what was measured."""
     changes = np.abs(np.diff(values, axis=0))
     changes = changes[changes > 0.0]
-    least = float(np.min(changes, initial=np.inf))
-    return least if len(changes) and np.median(changes) < 1.5 * least else 0.0
+    smallest = float(np.min(changes, initial=np.inf))
+    return smallest if len(changes) and np.median(changes) < 1.5 * smallest else 0.0
 
 
 def record_of(log: FlightLog, number: int = 0) -> Recorded:
@@ -195,19 +195,19 @@ def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]
         return Samples(time, pos.values[at_pos], pos.sigma), Samples(
             time, quat.values[at_quat], quat.sigma
         )
-    at = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
-    near = (
-        (quat.time[at] - quat.time[at - 1] < BETWEEN)
+    index = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
+    close = (
+        (quat.time[index] - quat.time[index - 1] < BETWEEN)
         & (pos.time >= quat.time[0])
         & (pos.time <= quat.time[-1])
     )
-    if np.count_nonzero(near) < 5:
+    if np.count_nonzero(close) < 5:
         raise DiagnoseError(
             f"flight {number}: positions and attitudes of the vehicle were never measured at one"
             " time"
         )
-    time = pos.time[near]
-    return Samples(time, pos.values[near], pos.sigma), Samples(
+    time = pos.time[close]
+    return Samples(time, pos.values[close], pos.sigma), Samples(
         time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma
     )
 
@@ -220,11 +220,11 @@ def carriers(flights: Sequence[Recorded]) -> list[bool]:
     """
     measured_somewhere = any(f.payload is not None for f in flights)
     released_somewhere = any(f.latch != NEVER for f in flights)
-    seen = [
+    hanging = [
         f.payload is not None or f.latch != NEVER if measured_somewhere else released_somewhere
         for f in flights
     ]
-    return [own if f.hanging is None else f.hanging for f, own in zip(flights, seen)]
+    return [measured if f.hanging is None else f.hanging for f, measured in zip(flights, hanging)]
 
 
 def _hanging(log: FlightLog) -> bool | None:
@@ -238,8 +238,8 @@ def _latch(log: FlightLog) -> float:
     if "release_command" not in log:
         return NEVER
     channel = log["release_command"]
-    asked = np.flatnonzero(channel.valid & (channel.values > 0.5))
-    return float(channel.time[asked[0]]) if len(asked) else NEVER
+    requested = np.flatnonzero(channel.valid & (channel.values > 0.5))
+    return float(channel.time[requested[0]]) if len(requested) else NEVER
 
 
 def _landing(log: FlightLog) -> tuple[float, np.ndarray | None]:

@@ -129,7 +129,7 @@ class Flights:
         counts = dict.fromkeys(parts, 0)
         for w, c in enumerate(self.cuts):
             f = self.flights[c.flight]
-            given = {
+            arrays = {
                 "start": c.start,
                 "end": c.end,
                 "first_knot": c.start,
@@ -147,13 +147,13 @@ class Flights:
                 f.gyro,
             )
             for name, source, delay in zip(parts, sources, (delays[0], *delays)):
-                own = source or Samples(np.zeros(0), np.zeros((0, 3)), 1.0)
-                span = own.between(c.start + delay + EARLY, c.end + delay)
-                parts[name].append(Samples(own.time[span], own.values[span], own.sigma))
-                given |= {f"{name}_first": counts[name], f"{name}_count": len(own.time[span])}
-                counts[name] += len(own.time[span])
+                samples = source or Samples(np.zeros(0), np.zeros((0, 3)), 1.0)
+                span = samples.between(c.start + delay + EARLY, c.end + delay)
+                parts[name].append(Samples(samples.time[span], samples.values[span], samples.sigma))
+                arrays |= {f"{name}_first": counts[name], f"{name}_count": len(samples.time[span])}
+                counts[name] += len(samples.time[span])
             for name in self.windows:
-                self.windows[name][w] = given[name]
+                self.windows[name][w] = arrays[name]
         self.windows = {
             k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()
         }
@@ -171,29 +171,31 @@ class Flights:
         self.time = self._of_samples("time", ("vehicle", "vehicle", "payload", "gyro"))
         self.sigma = self._of_samples("sigma", ("vehicle", "attitude", "payload", "gyro"))
         pairs = [
-            np.stack((own.values, np.zeros_like(own.values)), axis=1).reshape(-1, 3)
-            for own in parts["vehicle"]
+            np.stack((samples.values, np.zeros_like(samples.values)), axis=1).reshape(-1, 3)
+            for samples in parts["vehicle"]
         ]
         self._measured = [
-            np.concatenate((own, p.values, g.values))
-            for own, p, g in zip(pairs, parts["payload"], parts["gyro"])
+            np.concatenate((samples, p.values, g.values))
+            for samples, p, g in zip(pairs, parts["payload"], parts["gyro"])
         ]
 
     def _of_samples(self, what: str, names: Sequence[str]) -> list[np.ndarray]:
-        groups = zip(*([getattr(own, what) for own in self.samples[name]] for name in names))
-        return [self.spread(w, *own) for w, own in enumerate(groups)]
+        groups = zip(
+            *([getattr(channel, what) for channel in self.samples[name]] for name in names)
+        )
+        return [self.spread(w, *channel) for w, channel in enumerate(groups)]
 
     def like(self, w: int) -> tuple[int, bool]:
         """Return what :meth:`alike` depends on: the same of two windows, the same answer."""
         c = self.cuts[w]
         return c.payload, self.flights[c.flight].latch >= c.end
 
-    def alike(self, w: int, setting: Setting, other: Setting) -> bool:
+    def alike(self, w: int, setting: Setting, second: Setting) -> bool:
         """Whether a window is flown alike in two settings, which may be seen otherwise: what
         differs does nothing in it.
         """
-        c, plant = self.cuts[w], other.plant
-        if setting.step_square != other.step_square:
+        c, plant = self.cuts[w], second.plant
+        if setting.step_square != second.step_square:
             return False
         if c.payload == NO_PAYLOAD and not plant.laws:
             plant = replace(plant, rope=setting.plant.rope, release=setting.plant.release)
@@ -214,14 +216,16 @@ class Flights:
         counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
         if pairs.size == 2:
             pairs = np.tile(pairs, counts[0])
-        rest = [np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])]
-        return np.repeat(np.concatenate((pairs, *rest)), 3)
+        remaining = [
+            np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])
+        ]
+        return np.repeat(np.concatenate((pairs, *remaining)), 3)
 
-    def residual(self, seen: np.ndarray, w: int, lane: int) -> np.ndarray:
+    def residual(self, measured: np.ndarray, w: int, lane: int) -> np.ndarray:
         """Measured minus simulated, shape (N,); of an attitude the rotation vector from the
         simulated to the measured.
         """
-        return (self._measured[w] - seen[: int(self.rows[w]), lane]).ravel()
+        return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
 
     def fly(
         self,
@@ -238,24 +242,26 @@ class Flights:
             lanes: at most some thousand, for the memory's sake.
             recording: the windows, if not as they are.
         """
-        given = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
-        given["substep"] = (
-            simulation.steps[given["plant"], given.pop("rough").astype(int)]
-            * self._fineness[given["window"]]
+        columns = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
+        columns["substep"] = (
+            simulation.steps[columns["plant"], columns.pop("rough").astype(int)]
+            * self._fineness[columns["window"]]
         )
-        kept = given["keep"] >= 0
-        knots = max(1, int(np.max((given["keep"] + self.knots[given["window"]])[kept], initial=1)))
+        retained = columns["keep"] >= 0
+        knots = max(
+            1, int(np.max((columns["keep"] + self.knots[columns["window"]])[retained], initial=1))
+        )
         return simulation.replay.run(
-            states, recording or self.recording, given, KNOT_SPACING, knots
+            states, recording or self.recording, columns, KNOT_SPACING, knots
         )
 
     def repeated(self, windows: np.ndarray) -> "Flights":
         """Return the flights as they concern :meth:`fly`, with windows that stand there more than
         once.
         """
-        other = copy.copy(self)
-        other.knots, other._fineness = self.knots[windows], self._fineness[windows]
-        return other
+        flights = copy.copy(self)
+        flights.knots, flights._fineness = self.knots[windows], self._fineness[windows]
+        return flights
 
     def ended(self, ends: Sequence[float]) -> Recording:
         """The windows that end earlier [s]; what is seen afterwards says nothing."""
@@ -276,8 +282,8 @@ def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
     states: list[States | None] = [None] * len(flights.cuts)
     ends: list[States | None] = [None] * len(flights.cuts)
     for k in range(max(map(len, by_flight.values()))):
-        now = [ws[k] for ws in by_flight.values() if k < len(ws)]
-        for w in now:
+        windows = [ws[k] for ws in by_flight.values() if k < len(ws)]
+        for w in windows:
             c = flights.cuts[w]
             flight, before = flights.flights[c.flight], by_flight[c.flight][k - 1] if k else None
             gap = (
@@ -287,9 +293,9 @@ def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
             states[w] = measured_state(flight, c.start, setting, c.payload, inner)
             if gap:
                 states[w]["gyro"] = states[w]["rate_b"].copy()
-        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(now)]
-        flown = flights.fly(simulation, stacked([states[w] for w in now]), lanes)
-        for row, w in enumerate(now):
+        lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(windows)]
+        flown = flights.fly(simulation, stacked([states[w] for w in windows]), lanes)
+        for row, w in enumerate(windows):
             ends[w] = {
                 name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()
             }

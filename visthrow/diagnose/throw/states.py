@@ -78,25 +78,25 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
     """Directions, vague in whatever a sensing effect can move."""
     hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
     gain = plant.vehicle.controller.i_gain
-    found = [Direction("pos_w", i, 0.1, 1e-4) for i in range(3)]
-    found += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
-    found += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
-    found += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
+    listed = [Direction("pos_w", i, 0.1, 1e-4) for i in range(3)]
+    listed += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
+    listed += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
+    listed += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
     if plant.vehicle.controller.kind != "geometric":
-        found += [
+        listed += [
             Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i])
             for i in range(3)
             if gain[i] > 0.0
         ]
     if plant.vehicle.motor.kind != "instant":
-        found += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
-    found += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
-    found += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
+        listed += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
+    listed += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
+    listed += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
     for part in ("last", *range(1, MODES + 1))[: plant.rope.segments - 1]:
-        found += [Direction("cable_dir_w", i, SHAKEN[0], 1e-4, part, BENT[0]) for i in range(2)]
-        found += [Direction("cable_vel_w", i, SHAKEN[1], 1e-3, part, BENT[1]) for i in range(2)]
-    found += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
-    return (*found, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
+        listed += [Direction("cable_dir_w", i, SHAKEN[0], 1e-4, part, BENT[0]) for i in range(2)]
+        listed += [Direction("cable_vel_w", i, SHAKEN[1], 1e-3, part, BENT[1]) for i in range(2)]
+    listed += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
+    return (*listed, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 
 
 def concerns(direction: Direction, c: Cut) -> bool:
@@ -110,8 +110,8 @@ def concerns(direction: Direction, c: Cut) -> bool:
 
 def _tangents(n: np.ndarray) -> np.ndarray:
     """Two unit vectors normal to each direction, shape (..., 2, 3)."""
-    away = np.where(np.abs(n[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
-    first = np.cross(n, away)
+    axis = np.where(np.abs(n[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    first = np.cross(n, axis)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack((first, np.cross(n, first)), axis=-2)
 
@@ -122,8 +122,12 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
     """
     out = dict(states)
     for field in dict.fromkeys(direction.field for direction in directions):
-        own = [d for d, direction in enumerate(directions) if direction.field == field]
-        axes, size, value = [directions[d].axis for d in own], sizes[:, own], states[field].copy()
+        members = [d for d, direction in enumerate(directions) if direction.field == field]
+        axes, size, value = (
+            [directions[d].axis for d in members],
+            sizes[:, members],
+            states[field].copy(),
+        )
         if field == "quat_wb":
             turn = np.zeros((len(value), 3))
             turn[:, axes] = size
@@ -133,9 +137,9 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
             frame = _tangents(n[:, -1])[
                 :, axes
             ]  # one plane for the whole rope: that of its mean direction
-            shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in own])
-            across = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
-            value = out[field] + across - np.sum(across * n, axis=-1, keepdims=True) * n
+            shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in members])
+            displacement = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
+            value = out[field] + displacement - np.sum(displacement * n, axis=-1, keepdims=True) * n
             if field == "cable_dir_w":
                 value /= np.linalg.norm(value, axis=-1, keepdims=True)
                 u = states["cable_vel_w"]
@@ -170,8 +174,8 @@ def resampled(states: States, segments: int) -> States:
     n = states["cable_dir_w"]
     if n.shape[1] == segments:
         return states
-    at = (np.arange(segments) + 0.5) / segments * n.shape[1]
-    rows = np.minimum(at.astype(int), n.shape[1] - 1)
+    positions = (np.arange(segments) + 0.5) / segments * n.shape[1]
+    rows = np.minimum(positions.astype(int), n.shape[1] - 1)
     if segments == 1:
         chord = np.mean(n, axis=1, keepdims=True)
         out = {"cable_dir_w": chord / np.linalg.norm(chord, axis=-1, keepdims=True)}
@@ -182,23 +186,23 @@ def resampled(states: States, segments: int) -> States:
 
 
 def smoothed(
-    samples: Samples, at: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
+    samples: Samples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Value and derivative at a time from a local cubic through the samples about it; None without
     enough of them.
     """
-    if (at, before, after) not in samples.near:
-        samples.near[at, before, after] = _smoothed(samples, at, before, after)
-    return samples.near[at, before, after]
+    if (time, before, after) not in samples.near:
+        samples.near[time, before, after] = _smoothed(samples, time, before, after)
+    return samples.near[time, before, after]
 
 
 def _smoothed(
-    samples: Samples, at: float, before: float, after: float
+    samples: Samples, instant: float, before: float, after: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
-        span = samples.between(at - reach * before, at + reach * after)
+        span = samples.between(instant - reach * before, instant + reach * after)
         if span.stop - span.start >= LEAST_SAMPLES:
-            time, values = samples.time[span] - at, samples.values[span]
+            time, values = samples.time[span] - instant, samples.values[span]
             if values.shape[1] == 4:
                 return _smoothed_turn(time, values)
             fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
@@ -215,7 +219,7 @@ def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def measured_state(
-    flight: Recorded, at: float, setting: Setting, payload: int, inner: States
+    flight: Recorded, time: float, setting: Setting, payload: int, inner: States
 ) -> States:
     """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one
     state).
@@ -228,26 +232,29 @@ def measured_state(
         Rotation.from_rotvec(x.frame_tilt).inv(),
         Rotation.from_rotvec(x.marker_rotation),
     )
-    pos, vel = smoothed(flight.vehicle, at + x.vehicle_delay) or (
+    pos, vel = smoothed(flight.vehicle, time + x.vehicle_delay) or (
         flight.vehicle.values[0],
         np.zeros(3),
     )
-    quat, rate = smoothed(flight.attitude, at + x.vehicle_delay) or (
+    quat, rate = smoothed(flight.attitude, time + x.vehicle_delay) or (
         flight.attitude.values[0],
         np.zeros(3),
     )
     attitude = level * Rotation.from_quat(quat) * marker.inv()
     rate = marker.apply(rate)
-    if flight.gyro is not None and (seen := smoothed(flight.gyro, at + x.gyro_delay)) is not None:
-        rate = seen[0] - np.array(x.gyro_bias)
+    if (
+        flight.gyro is not None
+        and (turn_rate := smoothed(flight.gyro, time + x.gyro_delay)) is not None
+    ):
+        rate = turn_rate[0] - np.array(x.gyro_bias)
     off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
     pos, vel = level.apply([pos, vel]) / (1.0 + x.scale)
     out["pos_w"][0], out["quat_wb"][0] = pos - attitude.apply(off), attitude.as_quat()
     out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(cross(rate, off)), rate
     if payload in (ATTACHED, LOOSE) and flight.payload is not None:
-        seen = smoothed(flight.payload, at + x.payload_delay)
-        if seen is not None:
-            point, speed = level.apply(seen) / (1.0 + x.scale)
+        turn_rate = smoothed(flight.payload, time + x.payload_delay)
+        if turn_rate is not None:
+            point, speed = level.apply(turn_rate) / (1.0 + x.scale)
             point = point - np.array(x.payload_offset)
             out["payload_pos_w"][0], out["payload_vel_w"][0] = point, speed
             if payload == ATTACHED:

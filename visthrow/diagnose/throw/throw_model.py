@@ -172,27 +172,27 @@ class ThrowModel:
         ]
         graded, begun = len(self._graded), perturbed(states, self._directions)
         simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
-        found: list[Window] = []
+        listed: list[Window] = []
         for batch in self._batches():
-            found += self._linearised(simulation, steps[:graded], begun, batch)
+            listed += self._linearised(simulation, steps[:graded], begun, batch)
         self._before[self._switches(theta)] = [
-            x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, found)
+            x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)
         ]
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
-                self._secants[e.name] = self._secant(e, theta, found)
-        blank = [np.zeros(len(w.residual)) for w in found]  # of effects that a camera alone shows
+                self._secants[e.name] = self._secant(e, theta, listed)
+        blank = [np.zeros(len(w.residual)) for w in listed]  # of effects that a camera alone shows
         columns = [*(self._secants[e.name] for e in self._switched), *[blank] * len(self._sighted)]
         if columns:
-            found = [
+            listed = [
                 dataclasses.replace(
                     w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1)))
                 )
-                for i, w in enumerate(found)
+                for i, w in enumerate(listed)
             ]
         return [
             with_direct(w, number, self._direct, self.channels, settings, steps)
-            for number, w in zip(self._retained, found)
+            for number, w in zip(self._retained, listed)
         ]
 
     def _secant(
@@ -205,13 +205,13 @@ class ThrowModel:
         would be taken for its effect."""
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
-        other = apply(self.entries, self.setting, elsewhere)
-        start = self._latest[self._switches(elsewhere)] = self._settled(other)
+        perturbed = apply(self.entries, self.setting, elsewhere)
+        start = self._latest[self._switches(elsewhere)] = self._settled(perturbed)
         sign = -1.0 if on else 1.0
         before = self._before[self._switches(theta)]
         return [
-            sign * (x.residual - own - there)
-            for x, own, there in zip(windows, before, self._flown(other, start))
+            sign * (x.residual - before_row - after_row)
+            for x, before_row, after_row in zip(windows, before, self._flown(perturbed, start))
         ]
 
     def _moved(self, states: States, w: int) -> np.ndarray:
@@ -222,13 +222,13 @@ class ThrowModel:
 
     def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
-        seen = self.flights.fly(
+        measured = self.flights.fly(
             self.simulation(setting), states, [Lane(w, 0, w) for w in self._retained]
         ).seen
-        return [self.flights.residual(seen, w, lane) for lane, w in enumerate(self._retained)]
+        return [self.flights.residual(measured, w, lane) for lane, w in enumerate(self._retained)]
 
     def residuals(
-        self, theta: Mapping[str, float], about: Linearised | None = None
+        self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
         """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled
         last with the same kinds of blocks.
@@ -237,19 +237,19 @@ class ThrowModel:
         the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
         states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
-        if about is not None:
-            states, moves = self._following(setting, theta, about)
+        if linearised is not None:
+            states, moves = self._following(setting, theta, linearised)
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
-        if about is None and (before := self._before.get(self._switches(theta))) is not None:
-            flown = [r + own for r, own in zip(flown, before)]
-        held = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
+        if linearised is None and (before := self._before.get(self._switches(theta))) is not None:
+            flown = [r + offset for r, offset in zip(flown, before)]
+        direct_of = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
         direct = [
-            [kind.samples(w)[1] - kind.predicted(w, setting) for kind in own]
-            for w, own in zip(self._retained, held)
+            [kind.samples(w)[1] - kind.predicted(w, setting) for kind in offset]
+            for w, offset in zip(self._retained, direct_of)
         ]
-        full = [np.concatenate((r, *own)) for r, own in zip(flown, direct)]
+        full = [np.concatenate((r, *offset)) for r, offset in zip(flown, direct)]
         return [
-            r + about.windows[i].nuisance @ moves[i] if i in moves else r
+            r + linearised.windows[i].nuisance @ moves[i] if i in moves else r
             for i, r in enumerate(full)
         ]
 
@@ -262,55 +262,59 @@ class ThrowModel:
         ``theta``: sizes of the effects, at which :meth:`windows` was asked for before; ``windows``:
         numbers among those that came."""
         setting = apply(self.entries, self.setting, theta)
-        states, known = (
+        states, slopes = (
             self._settled_at.get(_key(theta), self._fitted()[0]),
             self.setting.plant.vehicle.queue.delay,
         )
         return without_each_command(
-            self.flights, self._retained[list(windows)], known, self.simulation(setting), states
+            self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
         )
 
     def _following(
-        self, setting: Setting, theta: Mapping[str, float], about: Linearised
+        self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
     ) -> tuple[States, dict[int, np.ndarray]]:
         """States that belong to other sizes of the effects by the derivatives, and how each
         window's were moved.
         """
         names = list(self.entries)
-        change = np.array([theta.get(name, 0.0) - about.theta.get(name, 0.0) for name in names])
-        found = directions(setting.plant)
+        change = np.array(
+            [theta.get(name, 0.0) - linearised.theta.get(name, 0.0) for name in names]
+        )
+        ways = directions(setting.plant)
         with self._lock:
-            if self._follows is None or self._follows[0] is not about:
-                self._follows = about, *self._ways(found, about, len(names))
+            if self._follows is None or self._follows[0] is not linearised:
+                self._follows = linearised, *self._ways(ways, linearised, len(names))
             _, owns, by_effect = self._follows
         sizes = by_effect @ change
-        states = moved_along(self._settled_at[_key(about.theta)], found, sizes)
-        moved = sizes + self._settled_at[_key(about.theta)][MOVED]
-        return states, {i: moved[self._retained[i], own] for i, own in owns.items()}
+        states = moved_along(self._settled_at[_key(linearised.theta)], ways, sizes)
+        moved = sizes + self._settled_at[_key(linearised.theta)][MOVED]
+        return states, {
+            i: moved[self._retained[i], window_slopes] for i, window_slopes in owns.items()
+        }
 
     def _ways(
-        self, found: Sequence[Direction], about: Linearised, effects: int
+        self, directions_of: Sequence[Direction], linearised: Linearised, effects: int
     ) -> tuple[dict[int, list[int]], np.ndarray]:
         """Which directions each window's state has, and how it follows the effects in them, shape
         (W, directions, K).
         """
         cuts = self.flights.cuts
         owns = {
-            i: [d for d, x in enumerate(found) if concerns(x, cuts[self._retained[i]])]
-            for i in about.windows
+            i: [d for d, x in enumerate(directions_of) if concerns(x, cuts[self._retained[i]])]
+            for i in linearised.windows
         }
 
         def way(i: int) -> np.ndarray:
-            free = np.array([found[d].follows for d in owns[i]], dtype=bool)
+            free = np.array([directions_of[d].follows for d in owns[i]], dtype=bool)
             return following(
                 self.flights,
                 self._retained[i],
-                about.windows[i],
+                linearised.windows[i],
                 free,
                 self.setting.plant.release.lag,
             )
 
-        by_effect = np.zeros((len(cuts), len(found), effects))
+        by_effect = np.zeros((len(cuts), len(directions_of), effects))
         for i, moves in zip(owns, each(way, owns)):
             by_effect[self._retained[i], owns[i]] = moves
         return owns, by_effect
@@ -325,10 +329,10 @@ class ThrowModel:
         """
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         worst, states = np.zeros(len(self.channels)), self._fitted()[0]
-        for w, plain, other in zip(
+        for w, plain, halved in zip(
             self._retained, self._flown(self.setting, states), self._flown(fine, states)
         ):
-            np.fmax.at(worst, self._channel(w), np.abs(plain - other) / self.flights.sigma[w])
+            np.fmax.at(worst, self._channel(w), np.abs(plain - halved) / self.flights.sigma[w])
         return dict(zip(self.channels, worst.tolist()))
 
     def landings(
@@ -339,16 +343,16 @@ class ThrowModel:
 
     def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """Return the model of other windows of its flights."""
-        other = copy.copy(self)
-        other._settled_at, other._before, other._follows, other._secants = (
+        model = copy.copy(self)
+        model._settled_at, model._before, model._follows, model._secants = (
             {},
             {},
             None,
             {},
         )  # of other windows
-        other.flights = self._cut(self.flights.flights, cuts)
-        other._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
-        return other
+        model.flights = self._cut(self.flights.flights, cuts)
+        model._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
+        return model
 
     def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
         """The setting with effects at ``theta``, and initial states fitted in it."""
@@ -391,9 +395,9 @@ class ThrowModel:
         flight is fitted by itself.
         """
         flights = {c.flight for c in cuts}
-        for more, (states, slopes) in self._fits.items():
-            rows = [row for row, c in enumerate(more) if c.flight in flights]
-            if cuts == tuple(more[row] for row in rows):
+        for cuts_more, (states, slopes) in self._fits.items():
+            rows = [row for row, c in enumerate(cuts_more) if c.flight in flights]
+            if cuts == tuple(cuts_more[row] for row in rows):
                 return rows_of(states, np.array(rows)), {
                     w: slopes[row] for w, row in enumerate(rows) if row in slopes
                 }
@@ -408,8 +412,8 @@ class ThrowModel:
             return states
         fitter = self._initial_fit(setting)
         ways = [
-            [(x.field, x.axis, x.part) for x in found]
-            for found in (fitter.directions, directions(self.setting.plant))
+            [(x.field, x.axis, x.part) for x in directions_of]
+            for directions_of in (fitter.directions, directions(self.setting.plant))
         ]
         start = dict(resampled(states, setting.plant.rope.segments))
         if ways[0] != ways[1]:
@@ -447,33 +451,41 @@ class ThrowModel:
             simulation.settings,
             np.array([exact(e) for e in self._graded], dtype=bool),
         )
-        plans, lanes, kept = [], [], 0
-        known: dict[tuple, np.ndarray] = {}
+        plans, lanes, rows_kept = [], [], 0
+        computed: dict[tuple, np.ndarray] = {}
         for w in batch:
-            if f.like(w) not in known:
-                known[f.like(w)] = np.array(
-                    [f.alike(w, settings[0], other) for other in settings[1:]], dtype=bool
+            if f.like(w) not in computed:
+                computed[f.like(w)] = np.array(
+                    [f.alike(w, settings[0], setting) for setting in settings[1:]], dtype=bool
                 )
-            plan, own = lanes_of(f, w, known[f.like(w)], needs, self._directions, len(lanes), kept)
+            plan, lanes_of_plan = lanes_of(
+                f, w, computed[f.like(w)], needs, self._directions, len(lanes), rows_kept
+            )
             plans.append(plan)
-            lanes += own
-            kept += 2 * int(f.knots[w])
+            lanes += lanes_of_plan
+            rows_kept += 2 * int(f.knots[w])
         flown = f.fly(simulation, states, lanes)
 
         def slopes(plan: Plan) -> list[torch.Tensor]:
             return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
 
-        found = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
+        windows = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
         nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
         blocks = [e.block for e in self._graded]
 
-        parts = all_to_host([part for own in found for part in own])
+        parts = all_to_host([part for lanes_of_plan in windows for part in lanes_of_plan])
 
         def window(i: int) -> Window:
-            w, own = plans[i].window, parts[3 * i : 3 * i + 3]
-            given = self._channel(w), f.residual(nominal, w, i), own, flown.knots, states[MOVED]
+            w, lanes_of_plan = plans[i].window, parts[3 * i : 3 * i + 3]
+            arguments = (
+                self._channel(w),
+                f.residual(nominal, w, i),
+                lanes_of_plan,
+                flown.knots,
+                states[MOVED],
+            )
             return still(
-                plans[i].window_of(f, settings[0], self._directions, *given),
+                plans[i].window_of(f, settings[0], self._directions, *arguments),
                 blocks,
                 settings[0].plant.air.wind_w,
             )
@@ -481,9 +493,9 @@ class ThrowModel:
         return each(window, range(len(plans)))
 
     def _channel(self, w: int) -> np.ndarray:
-        at = {name: i for i, name in enumerate(self.channels)}
+        index = {name: i for i, name in enumerate(self.channels)}
         return self.flights.spread(
-            w, 0, 1, at.get("payload_pos_w", -1), at.get("rate_b", -1)
+            w, 0, 1, index.get("payload_pos_w", -1), index.get("rate_b", -1)
         ).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
