@@ -127,7 +127,7 @@ def main() -> None:
         seed=args.seed,
         steps=args.steps,
     )
-    print(json.dumps(found.said()), flush=True)
+    print(json.dumps(found.record()), flush=True)
     for i, name in enumerate(names):
         floor = next(e.floor for e in model.effects if e.name == name)
         line = {"effect": name}

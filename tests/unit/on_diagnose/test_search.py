@@ -126,7 +126,7 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     named = [{"effect_03", "effect_07"} & set(step.named.split(", ")) for step in diagnosis.steps]
     assert sorted(map(len, named)) == [*[0] * len(beside), 2]
     last = diagnosis.steps[-1]
-    assert last.nats == last.refitted[last.named] > last.least == selector.AHEAD
+    assert last.nats == last.refitted[last.named] > last.least == selector.EXCHANGE_MARGIN
     assert last.named in list(last.screened)[:3]
 
 

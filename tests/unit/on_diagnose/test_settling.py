@@ -157,11 +157,13 @@ def test_where_vehicle_and_air_hardly_move_speeds_tell_nothing(logs):
     blocks = [e.block for e in model.effects]
     drag = np.array([block == "aerodynamics" for block in blocks])
     window = max(model.windows({}), key=lambda w: np.abs(w.knots["vel_w"]).max())
-    assert linearising.still(window, blocks, (0.0, 0.0, 0.0)) is window
+    assert linearising.without_calm_speeds(window, blocks, (0.0, 0.0, 0.0)) is window
     slow = {name: 0.03 * value for name, value in window.knots.items() if name.endswith("vel_w")}
     hover = dataclasses.replace(window, knots={**window.knots, **slow})
-    calm = linearising.still(hover, blocks, (0.0, 0.0, 0.0))
+    calm = linearising.without_calm_speeds(hover, blocks, (0.0, 0.0, 0.0))
     assert not np.any(calm.effects[:, drag])
     assert not np.any(calm.knots["vel_w"])
     np.testing.assert_array_equal(calm.effects[:, ~drag], window.effects[:, ~drag])
-    assert linearising.still(hover, blocks, (0.5, 0.0, 0.0)) is hover  # hover in a wind
+    assert (
+        linearising.without_calm_speeds(hover, blocks, (0.5, 0.0, 0.0)) is hover
+    )  # hover in a wind

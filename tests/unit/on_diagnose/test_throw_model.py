@@ -252,7 +252,8 @@ def test_rotors_begin_a_window_where_the_commands_left_them(planted):
     _, model = planted
     model.windows({})
     assert np.array_equal(
-        model._latest[frozenset()]["motor_speed"], model._through(model.setting)[0]["motor_speed"]
+        model._latest[frozenset()]["motor_speed"],
+        model._settled_throughout(model.setting)[0]["motor_speed"],
     )
     assert "motor_speed" in {d.field for d in model._directions}
 

@@ -10,7 +10,9 @@ import numpy as np
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.models.interface import Effect
 
-WITHIN = 3.0  # deviations of a measurement beyond which the configured value cannot be off
+CERTAIN_DEVIATIONS = (
+    3.0  # deviations of a measurement beyond which the configured value cannot be off
+)
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected 0 or more")
     deviations = [(e, measured.get(e.name, np.inf) or RIGHT * e.floor) for e in effects]
     limits = [
-        (max(e.bounds[0], -WITHIN * sd), min(e.bounds[1], WITHIN * sd)) for e, sd in deviations
+        (max(e.bounds[0], -CERTAIN_DEVIATIONS * sd), min(e.bounds[1], CERTAIN_DEVIATIONS * sd))
+        for e, sd in deviations
     ]
     return tuple(
         replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd))

@@ -11,7 +11,7 @@ from visthrow.logs.check.run import Checked
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view.parts import png_of
 
-MOST = 10  # channels in a picture
+CHANNELS_DRAWN = 10  # channels in a picture
 _FIRST = (
     "pos_w",
     "vel_w",
@@ -35,7 +35,7 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     names = [name for name in _FIRST if name in log] + [
         name for name in log.channels if name not in _FIRST
     ]
-    names = [name for name in names if len(log[name].time) > 1][:MOST]
+    names = [name for name in names if len(log[name].time) > 1][:CHANNELS_DRAWN]
     figure, axes = plt.subplots(
         max(len(names), 1),
         1,

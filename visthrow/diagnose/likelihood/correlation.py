@@ -90,13 +90,13 @@ def with_correlations(
     ``correlations_of``: of channels, by number.
     """
     return (
-        each(lambda window: _told(window, correlations_of), windows)
+        each(lambda window: _with_correlation(window, correlations_of), windows)
         if correlations_of
         else list(windows)
     )
 
 
-def _told(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
+def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
     factors, sigma = [], window.sigma.copy()
     for channel, correlation in correlations_of.items():
         rows = components(window, channel)
@@ -201,9 +201,9 @@ def _climbed(
         ((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried
     )
     for stride in STRIDES:
-        while tried(better := max(_near(best, stride, times), key=tried, default=best)) > tried(
-            best
-        ):
+        while tried(
+            better := max(_neighbours(best, stride, times), key=tried, default=best)
+        ) > tried(best):
             best = better
     if best[0] == times - 1:  # it would last for still longer
         return scores[best][1], 0.0
@@ -219,7 +219,7 @@ def _climbed(
     return stamps_of, value - white
 
 
-def _near(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
+def _neighbours(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
     """Places beside one: others of so many times, and while these are far apart, other shares and
     the other order.
     """

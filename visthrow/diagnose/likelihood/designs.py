@@ -131,11 +131,11 @@ def _designed(windows: Sequence[Window], floors: np.ndarray, channels: int, devi
         for w in windows
         for a in (w.nuisance, w.latent, w.effects, w.nuisance_sd, w.sigma, w.channel)
     ]
-    return _kept(Same([*arrays, floors]), channels, device)
+    return _cached_design(Same([*arrays, floors]), channels, device)
 
 
 @lru_cache(maxsize=2)
-def _kept(arrays: Same, channels: int, device: str) -> _Design:
+def _cached_design(arrays: Same, channels: int, device: str) -> _Design:
     return _Design(
         [arrays[i : i + 6] for i in range(0, len(arrays) - 1, 6)], arrays[-1], channels, device
     )

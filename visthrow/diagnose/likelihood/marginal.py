@@ -233,12 +233,12 @@ def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.n
         states,
         blocks,
         np.eye(len(blocks)),
-        _shown(inner, states, blocks),
+        _information_by_block(inner, states, blocks),
         float(np.log(window.sigma).sum()) + turned,
     )
 
 
-def _shown(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
+def _information_by_block(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
     """See :class:`Gram`, with ``begin`` the first latent column."""
     squares = np.diagonal(inner, axis1=1, axis2=2)[:, begin : begin + len(blocks)].sum(0)
     return {int(block): float(np.median(squares[blocks == block])) for block in np.unique(blocks)}
@@ -322,7 +322,7 @@ def correlated_with(
     factor[groups_range, :, groups_range] = factors  # of each group, the same
     factor, information = (
         factor.reshape(gram.latents, gram.latents),
-        _shown(inner, gram.nuisances, gram.latent_block),
+        _information_by_block(inner, gram.nuisances, gram.latent_block),
     )
     return replace(
         gram, inner=inner, cross=cross, factor=factor, shown=information, there=device_inner
@@ -346,7 +346,7 @@ def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.n
     """
     weighted = np.zeros((len(residual), len(gram.count)))
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
-    weighted[np.arange(len(residual)), window.channel] = _back(window, white) / window.sigma
+    weighted[np.arange(len(residual)), window.channel] = _unwhitened(window, white) / window.sigma
     by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
     by_latent = (
         (window.latent.T @ weighted).T @ gram.factor
@@ -358,7 +358,7 @@ def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.n
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 
 
-def _back(window: Window, white: np.ndarray) -> np.ndarray:
+def _unwhitened(window: Window, white: np.ndarray) -> np.ndarray:
     """Transpose of :func:`whitened`, of one column, shape (N,)."""
     out = white.copy()
     for rows, factor in window.correlated:

@@ -364,7 +364,10 @@ def without_outliers(
         residuals = designs.left_by(
             starts, floors, len(grams[0].count), widely_fitted(starts, bare, where), where
         )
-        distances = {w: _far(windows[w], residual) for w, residual in zip(windows_left, residuals)}
+        distances = {
+            w: _outlier_distances(windows[w], residual)
+            for w, residual in zip(windows_left, residuals)
+        }
         windows_left = [w for w in windows_left if np.any(distances[w] > 1.0)]
         if not windows_left:
             break
@@ -392,7 +395,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
     return fits
 
 
-def _far(window: Window, residual: np.ndarray) -> np.ndarray:
+def _outlier_distances(window: Window, residual: np.ndarray) -> np.ndarray:
     """Return how far samples lie outside, in the distance at which they are far, shape (N,)."""
     normal = np.abs(residual) / window.sigma
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))

@@ -71,8 +71,8 @@ class _Columns:
         return self._moved(n, n, lambda inner, w: inner[:, : self._sizes[w], : self._sizes[w]])
 
     @cached_property
-    def beside(self) -> torch.Tensor:
-        """Hidden columns with effects, shape (W, C, n, K)."""
+    def hidden_by_effects(self) -> torch.Tensor:
+        """Return inner products of hidden columns with effects, shape (W, C, n, K)."""
         return self._moved(
             max(self._sizes),
             self._effects,
@@ -80,8 +80,8 @@ class _Columns:
         )
 
     @cached_property
-    def own(self) -> torch.Tensor:
-        """Shape (W, C, K, K)."""
+    def among_effects(self) -> torch.Tensor:
+        """Return inner products of effects, shape (W, C, K, K)."""
         return self._moved(
             self._effects,
             self._effects,
@@ -212,7 +212,7 @@ class Stack:
         return self._in_order(
             [
                 part
-                for (part,) in self._each(
+                for (part,) in self._of_batches(
                     lambda batch: (_solved(_shape(batch, noise), batch).value,)
                 )
             ]
@@ -230,7 +230,7 @@ class Stack:
 
         by_window = {
             w: row
-            for members, (rows,) in zip(self._order, self._each(fit))
+            for members, (rows,) in zip(self._order, self._of_batches(fit))
             for w, row in zip(members, rows)
         }
         return [by_window[w][:size] for w, size in enumerate(self._sizes)]
@@ -243,7 +243,7 @@ class Stack:
         DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B blocks'
         deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales share
         with the fitted columns is given to the channels by their part in them."""
-        parts = self._each(lambda batch: _looked(batch, noise, first))
+        parts = self._of_batches(lambda batch: _looked(batch, noise, first))
         return tuple(self._in_order([part[i] for part in parts]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
@@ -255,7 +255,7 @@ class Stack:
             self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches)
         )
 
-    def _each(self, function) -> list[tuple[np.ndarray, ...]]:
+    def _of_batches(self, function) -> list[tuple[np.ndarray, ...]]:
         return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
 
     def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
@@ -456,7 +456,10 @@ class Integrals:
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     shape, columns = _shape(batch, noise), batch.columns
-    right, effects = _weighed(shape.weight, columns.beside), _weighed(shape.weight, columns.own)
+    right, effects = (
+        _weighed(shape.weight, columns.hidden_by_effects),
+        _weighed(shape.weight, columns.among_effects),
+    )
     n = right.shape[1]
     if latents:
         hidden = _weighed(shape.weight, columns.hidden)

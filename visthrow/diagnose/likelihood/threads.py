@@ -19,16 +19,16 @@ from sim.cores import cores as cores
 T = TypeVar("T")
 R = TypeVar("R")
 
-MOST = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
+THREADS = 4  # threads: with 8, a diagnosis on 16 cores waited an eighth longer, for Python itself
 # the same where a GPU does all that is large: with 4 a diagnosis took a tenth longer, with 1 a
 # fifth
-MOST_ASIDE = 2
+THREADS_ASIDE = 2
 PIECES = 4  # of what is to be done, for each thread
 # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth
 # longer
-BESIDE = 3
+THREADS_BESIDE_GPU = 3
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # numbers of glibc's ``malloc.h``
-KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
+BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
 MAPPED = (
     2**30
 )  # bytes from which an array has a mapping of its own, which goes back when it is freed
@@ -50,7 +50,7 @@ def keep() -> None:
     except (AttributeError, OSError, TypeError):  # another C library
         return
     mallopt(MMAP_THRESHOLD, MAPPED)
-    mallopt(TRIM_THRESHOLD, KEPT)
+    mallopt(TRIM_THRESHOLD, BYTES_KEPT)
 
 
 def aside() -> None:
@@ -74,7 +74,7 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
 
 def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, on all cores; no call may wait for another of these."""
-    items, threads = list(items), min(cores(), MOST_ASIDE if _aside.is_set() else MOST)
+    items, threads = list(items), min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
     if min(threads, len(items)) < 2:
         return [function(item) for item in items]
     pieces = min(
@@ -91,4 +91,4 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
 def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, a few at once, each of which may call :func:`each`."""
-    return list(_pool("tasks", BESIDE).map(function, items))
+    return list(_pool("tasks", THREADS_BESIDE_GPU).map(function, items))

@@ -9,7 +9,7 @@ import torch
 
 from visthrow.diagnose.likelihood.threads import each
 
-FEW = 1_000_000  # numbers up to which one thread lays them
+SMALL_ARRAY = 1_000_000  # numbers up to which one thread lays them
 
 
 def to_host(tensor: torch.Tensor) -> np.ndarray:
@@ -56,7 +56,7 @@ def side_by_side(
             row[(slice(None),) * axis + (slice(height, None),)] = 0.0
 
     if (
-        device == "cpu" or out.numel() < FEW
+        device == "cpu" or out.numel() < SMALL_ARRAY
     ):  # batches are laid on all cores already, or it is not worth while
         for i in range(len(parts)):
             lay(i)

@@ -79,7 +79,7 @@ class BallModel(NumericModel):
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
             acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[index]
             if self.laws:
-                acc = acc + exerted(self.laws, _known(state[:, 0], state))["payload force"]
+                acc = acc + exerted(self.laws, _knot_values(state[:, 0], state))["payload force"]
             return np.concatenate([vel, acc], 1)
 
         step = self._span[lanes.owner, None] / STEPS * (1.0 + clock[:, None])
@@ -88,7 +88,7 @@ class BallModel(NumericModel):
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; a law's coefficient is that of a ball of 1 kg."""
         time = np.unique(stretch.latent_time)
-        return _known(time, triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path)
+        return _knot_values(time, triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -102,7 +102,7 @@ class BallModel(NumericModel):
         return (first + (turned - first) * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
 
 
-def _known(time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+def _knot_values(time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities of a law at states, shape (k, 6)."""
     return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
 

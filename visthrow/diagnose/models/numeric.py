@@ -202,7 +202,9 @@ class NumericModel(ABC):
         """See :class:`visthrow.diagnose.models.interface.Model`."""
         size = self.size(theta)
         residuals = self._settle(size, fresh=True)
-        slopes, effects, latent = (self._by(size, name) for name in ("nuisance", "theta", "latent"))
+        slopes, effects, latent = (
+            self._slopes_by(size, name) for name in ("nuisance", "theta", "latent")
+        )
         self._slopes = slopes
         path = self.simulate(self._lanes(size))
         return [
@@ -273,7 +275,7 @@ class NumericModel(ABC):
         if not self._start.shape[1]:
             return residuals
         if self._slopes is None or fresh:
-            self._slopes = self._by(size, "nuisance")
+            self._slopes = self._slopes_by(size, "nuisance")
         costs = self._costs(residuals, self._start)
         for _ in range(SETTLE_STEPS):
             steps = np.array([self._newton(i, residual) for i, residual in enumerate(residuals)])
@@ -316,7 +318,7 @@ class NumericModel(ABC):
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]
         return step if 0.5 * aim @ rows @ step > SETTLED else np.zeros_like(step)
 
-    def _by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
+    def _slopes_by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
         """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central
         differences; (N, directions) a stretch.
         """

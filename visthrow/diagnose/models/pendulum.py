@@ -102,7 +102,8 @@ class PendulumModel(NumericModel):
             force = push[index]
             if self.laws:
                 force = (
-                    force + exerted(self.laws, self._known(angle, state))["payload force"][:, ::2]
+                    force
+                    + exerted(self.laws, self._knot_values(angle, state))["payload force"][:, ::2]
                 )
             pull = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
             return np.stack([rate, -stiffness * sine - spring * angle - friction + pull], 1)
@@ -116,9 +117,9 @@ class PendulumModel(NumericModel):
             np.unique(stretch.latent_time),
             stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path)),
         )
-        return self._known(time, triangles(time, grid) @ path)
+        return self._knot_values(time, triangles(time, grid) @ path)
 
-    def _known(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+    def _knot_values(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
         """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and
         still.
         """

@@ -42,7 +42,7 @@ FADE = 1.0  # in which sweeps begin and end [s]
 YAW_RATE = 1.5  # of the heading's sweep [rad/s]: within what the hover controller asks for
 ABORTED = 1e3  # cost of a flight that is aborted at the limit: above what any other costs [nats/s]
 
-NEAR = 0.5
+SCATTER_SHARE = 0.5
 """Way from the manoeuvre to the corners of the box of numbers that the first look goes at most:
 with all sweeps at once, few fly.
 """
@@ -236,7 +236,7 @@ class Design:
     rate: float
     flights: int  # simulated
 
-    def said(self) -> dict[str, Any]:
+    def record(self) -> dict[str, Any]:
         """For JSON."""
         return {
             "base": self.base.name,
@@ -264,7 +264,7 @@ def optimise(
     ``steps``: generations of the search, of as many flights as the first look.
     """
     count = len(NUMBERS)
-    scattered = START + NEAR * (qmc.Sobol(count, seed=seed).random(SCATTERED) - START)
+    scattered = START + SCATTER_SHARE * (qmc.Sobol(count, seed=seed).random(SCATTERED) - START)
     search = _Search(aim, base, simulate, limits)
     start = search.costs(START[:, None])[0]
 

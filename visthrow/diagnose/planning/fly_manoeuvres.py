@@ -29,7 +29,7 @@ from visthrow.task import Experiment, plant_of
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
 # time given to a dropped payload and to the vehicle before a manoeuvre without payload begins [s]
-AWAY = 1.5
+APPROACH_SECONDS = 1.5
 # swing of the payload from the rotors' axis [deg] beyond which it nears the rotors, or a string
 # hangs slack
 HIGHEST = 75.0
@@ -319,7 +319,7 @@ def fly(
     start = np.array([r.pos_w[0] for r in references])
     sim.place(start)
     pilot = _Pilot(sim, plant, references, np.array([m.payload for m in manoeuvres]))
-    for _ in range(round(AWAY / PERIOD)):
+    for _ in range(round(APPROACH_SECONDS / PERIOD)):
         pilot.step(None)
     sampled = [pilot.step(i) for i in range(max(len(r.time) for r in references))]
     flights = []

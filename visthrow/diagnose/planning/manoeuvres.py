@@ -115,7 +115,7 @@ def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
 
 
-def _at(x=0.0, y=0.0, z=HEIGHT) -> Callable[[np.ndarray], np.ndarray]:
+def _hold_at(x=0.0, y=0.0, z=HEIGHT) -> Callable[[np.ndarray], np.ndarray]:
     def path(t: np.ndarray) -> np.ndarray:
         parts = [part(t) if callable(part) else np.full_like(t, part) for part in (x, y, z)]
         return np.column_stack(parts)
@@ -198,25 +198,27 @@ def catalogue() -> tuple[Manoeuvre, ...]:
             f"throw at {speed:.0f} m/s",
             "when the payload leaves, at several speeds and pulls",
             2.8 + RUN * 1.875 / speed,
-            _at(x=_run(speed), z=1.7),
+            _hold_at(x=_run(speed), z=1.7),
             release=0.5 * RUN * 1.875 / speed,
         )
         for speed in (2.0, 3.0, 4.0)
     )
     return (
-        Manoeuvre("hover", "thrust against weight, battery, frame against gravity", 8.0, _at()),
+        Manoeuvre(
+            "hover", "thrust against weight, battery, frame against gravity", 8.0, _hold_at()
+        ),
         Manoeuvre(
             "hover without payload",
             "thrust against the vehicle's weight alone",
             7.0,
-            _at(),
+            _hold_at(),
             payload=False,
         ),
         Manoeuvre(
             "hover low without payload",
             "ground effect",
             11.0,
-            _at(
+            _hold_at(
                 z=lambda t: (
                     0.6
                     - 0.3 * rise(t, 0.0, 1.5)
@@ -230,7 +232,7 @@ def catalogue() -> tuple[Manoeuvre, ...]:
             "vertical sine",
             "drag and inflow along the rotors' axis, delay against clock",
             8.0,
-            _at(
+            _hold_at(
                 z=lambda t: (
                     HEIGHT
                     + 0.25
@@ -240,51 +242,51 @@ def catalogue() -> tuple[Manoeuvre, ...]:
                 )
             ),
         ),
-        Manoeuvre("thrust steps", "motor lag, thrust curve", 8.0, _at(), thrust=_steps),
+        Manoeuvre("thrust steps", "motor lag, thrust curve", 8.0, _hold_at(), thrust=_steps),
         Manoeuvre(
             "rate doublets",
             "motor lag, rate controller, inertia, delay",
             8.0,
-            _at(),
+            _hold_at(),
             rates=_doublets(3.0, 0.08),
         ),
         Manoeuvre(
             "yaw turns",
             "centre of mass and markers (turn along) against frame and wind (stay)",
             16.0,
-            _at(),
+            _hold_at(),
             yaw=_turns,
         ),
         Manoeuvre(
             "slow passes x",
             "drag along x, both ways: wind against drag",
             2.0 + slow_time,
-            _at(x=slow),
+            _hold_at(x=slow),
         ),
-        Manoeuvre("slow passes y", "drag along y, both ways", 2.0 + slow_time, _at(y=slow)),
+        Manoeuvre("slow passes y", "drag along y, both ways", 2.0 + slow_time, _hold_at(y=slow)),
         Manoeuvre(
             "fast passes x",
             "drag that grows with the square of the speed, lift by translation",
             2.0 + fast_time,
-            _at(x=fast),
+            _hold_at(x=fast),
         ),
         Manoeuvre(
             "circle",
             "drag in all directions, lever arms",
             10.0,
-            _at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t))),
+            _hold_at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t))),
         ),
         Manoeuvre(
             "swing and decay",
             "rope length by period, damping by decay, payload drag",
             9.0,
-            _at(x=lambda t: 0.35 * rise(t, 0.0, 0.8)),
+            _hold_at(x=lambda t: 0.35 * rise(t, 0.0, 0.8)),
         ),
         Manoeuvre(
             "stop after speed",
             "rope mass and bending, payload's second mode, mount",
             9.0,
-            _at(x=_stop),
+            _hold_at(x=_stop),
         ),
         *runs,
     )

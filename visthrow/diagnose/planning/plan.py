@@ -100,7 +100,7 @@ class Aim:
         and the number of these.
         """
         if self.pairs:
-            return _most(
+            return _fewest_flights(
                 lambda count: [
                     pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE
                 ],
@@ -108,7 +108,7 @@ class Aim:
             )
         able = np.array([self.priors.slab[j] for j in self.vague]) * NAMEABLE
         unknown = able < self._deviations(0.0 * new)
-        return _most(
+        return _fewest_flights(
             lambda count: [
                 (j,)
                 for j, shows in zip(self.vague, unknown & (self._deviations(count * new) < able))
@@ -287,7 +287,7 @@ def expected_information(
     return total * np.outer(ratio, ratio)
 
 
-def _most(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
+def _fewest_flights(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
     """Return the most that the fewest flights settle, and their number."""
     best: tuple[list, int] = [], 0
     for count in range(1, MOST_REPEATS + 1):

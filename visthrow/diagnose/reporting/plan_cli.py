@@ -104,7 +104,7 @@ def run(args: argparse.Namespace) -> int:
     extra = {
         "proposals": [dataclasses.asdict(p) for p in ranked],
         "session": [p.name for p in session],
-        "optimised": designed.said() if designed else None,
+        "optimised": designed.record() if designed else None,
     }
     value = report.to_json(diagnosis, extra=extra)
     write_json(Path(args.out) / "plan.json", value)

@@ -343,7 +343,9 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     if diagnosis.overall == result.UNKNOWN or not unexplained:
         return after
     return replace(
-        after, overall=result.IN_PART, reasons=tuple(_left(c, diagnosis.work) for c in unexplained)
+        after,
+        overall=result.IN_PART,
+        reasons=tuple(_remaining(c, diagnosis.work) for c in unexplained),
     )
 
 
@@ -377,7 +379,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
         key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf),
         default=None,
     )
-    reasons = tuple(_left(c, work) for c in gains if c.channel in firm)
+    reasons = tuple(_remaining(c, work) for c in gains if c.channel in firm)
     return replace(
         diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons
     )
@@ -474,7 +476,7 @@ def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
     return f"fly once more{f', such as: {manoeuvres[0]}' if manoeuvres else ' like these'}"
 
 
-def _left(c: ChannelGain, work: Work) -> str:
+def _remaining(c: ChannelGain, work: Work) -> str:
     """Return a sentence on what remains of a channel's error, and of which kind it is."""
     factor, unit = READABLE.get(c.unit, (1.0, c.unit))
     text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()

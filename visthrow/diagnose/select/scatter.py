@@ -36,7 +36,9 @@ FORM = "_by_"
 LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
 REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
-FAR = 3.0  # floors of a flight's own estimate from which its derivative is not relied upon
+UNRELIABLE_FLOORS = (
+    3.0  # floors of a flight's own estimate from which its derivative is not relied upon
+)
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at
@@ -237,7 +239,7 @@ def straightened(
     reach = np.abs(
         np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
     ).max(initial=0.0)
-    if reach < FAR:
+    if reach < UNRELIABLE_FLOORS:
         return statistics
     sizes, simulated = [], []
     for size in np.unique(
@@ -306,7 +308,7 @@ def _verdict(
                 judged(
                     v,
                     reach,
-                    _ahead(statistics, columns, reach, priors, selected, active, group),
+                    _nats_of_sizes(statistics, columns, reach, priors, selected, active, group),
                     threshold,
                     int(informed),
                     group,
@@ -368,7 +370,7 @@ def judged(
     )
 
 
-def _ahead(
+def _nats_of_sizes(
     statistics: Statistics,
     columns: Sequence[int],
     sizes: np.ndarray,
@@ -421,7 +423,7 @@ def disagreement(
         reach = least_sd * np.geomspace(
             1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK])
         )
-        nats = _ahead(statistics, [j], reach * priors.floor[j], priors, selected, active)
+        nats = _nats_of_sizes(statistics, [j], reach * priors.floor[j], priors, selected, active)
         return bool(nats.max() - nats[0] > threshold)
 
     if not all(
@@ -481,7 +483,9 @@ def _one_alone(v: RandomEffect, statistics: Statistics, columns: Sequence[int], 
     """Whether it is one flight alone that differs: that is an event there."""
     flights = np.arange(len(statistics.flights))
     return any(
-        _ahead(statistics.only(flights != f), columns, REACH[::LOOK] * v.prior_sd, *context).max()
+        _nats_of_sizes(
+            statistics.only(flights != f), columns, REACH[::LOOK] * v.prior_sd, *context
+        ).max()
         <= 0.0
         for f in flights
     )

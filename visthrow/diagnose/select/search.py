@@ -121,7 +121,7 @@ def explain(
         if not (windows_lost := lost(nominal)):
             break
         problem, nominal = _left_out(problem, nominal, windows_lost, say)
-    threshold_nats = _least(nominal, priors, seed, say)
+    threshold_nats = _threshold(nominal, priors, seed, say)
     search = Selector(problem, nominal, threshold_nats, say, laws)
     for further in range(
         ROUNDS - 1, -1, -1
@@ -131,7 +131,7 @@ def explain(
         if not windows_lost:
             break
         problem, nominal = _left_out(problem, nominal, windows_lost, say)
-        threshold_nats = _least(nominal, priors, seed, say)
+        threshold_nats = _threshold(nominal, priors, seed, say)
         if not search.stands_without(windows_lost, problem, nominal, threshold_nats):
             search = Selector(problem, nominal, threshold_nats, say, laws)
     diagnosis = held_out.judged(conclude(search))
@@ -197,7 +197,7 @@ def ahead(model: Model, rival: Model) -> float:
     return value[0] - value[1]
 
 
-def _least(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
+def _threshold(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
     """The threshold [nats]."""
     least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
     say(

@@ -55,8 +55,8 @@ DOUBT = 15.0
 
 # nats by which an exchange must be ahead: less is not worth more than a bare mention (Kass and
 # Raftery 1995)
-AHEAD = 1.0
-SHOWN = 10  # sets that a step keeps for the report
+EXCHANGE_MARGIN = 1.0
+SETS_REPORTED = 10  # sets that a step keeps for the report
 
 HOPELESS = 0.5
 """Of what the best or what stands there brings, by the linear statistics, that another must bring
@@ -132,7 +132,7 @@ class Selector(SearchState):
         short = [j for j in short if frozenset([*self.active, j]) not in self.visited]
         listed = {
             (*self.active, j): float(max(screened[j], under_free[j]))
-            for j in np.argsort(-under_free)[:SHOWN].tolist()
+            for j in np.argsort(-under_free)[:SETS_REPORTED].tolist()
         }
         several = self._several(free, usable)
         for move in several:
@@ -254,11 +254,11 @@ class Selector(SearchState):
         ranked = [move for move in self._rivals() if frozenset(move.active) not in visited]
         tried = self._tried(self.point, [move.active for move in ranked])
         listed = {move.active: move.nats for move in ranked}
-        if self._best(tried, listed, AHEAD):
+        if self._best(tried, listed, EXCHANGE_MARGIN):
             return True
         self.sets = [
             Move(tuple(self.active), 0.0),
-            *(move for move in tried if -STRONG < move.nats <= AHEAD),
+            *(move for move in tried if -STRONG < move.nats <= EXCHANGE_MARGIN),
         ]
         self.rivalled = self.point
         return False
@@ -374,7 +374,7 @@ class Selector(SearchState):
                 tell(s): float(n)
                 for s, n in sorted(
                     listed.items(), key=lambda item: -simulated.get(tell(item[0]), -np.inf)
-                )[:SHOWN]
+                )[:SETS_REPORTED]
             }
             self.steps.append(Step(tell(move.active), move.nats, margin, screened, simulated))
             self.origin = (
@@ -589,7 +589,9 @@ class Selector(SearchState):
         """
         if self.disagreement_on(point, active, j, 1.0):
             return False
-        if any(terms.beyond(point, self.priors, active, j, k) < terms.LAW for k in self.names):
+        if any(
+            terms.unexplained_nats(point, self.priors, active, j, k) < terms.LAW for k in self.names
+        ):
             return False
         return terms.matters(
             self.problem, point, j, float(self.sizes(active, point)[j] * self.priors.floor[j])

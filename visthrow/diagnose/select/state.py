@@ -193,7 +193,7 @@ class SearchState:
         point = self.point if point is None else point
         return estimate(point.information, point.score, self.priors, list(active))
 
-    def _again(self, theta: np.ndarray) -> Statistics | None:
+    def _resimulated(self, theta: np.ndarray) -> Statistics | None:
         simulated = moved(self.problem, self.point, theta)
         return None if simulated is None else simulated.plain
 
@@ -205,7 +205,7 @@ class SearchState:
         """
         statistics, theta = self.point.plain, self.sizes(active)
         for j in sorted(set(varies.effects) & set(active)):
-            statistics = straightened(statistics, theta, self.priors, j, self._again)
+            statistics = straightened(statistics, theta, self.priors, j, self._resimulated)
         return freed(statistics, varies)
 
     def scatter(self, active: Sequence[int], *, every: bool = False) -> tuple[Scatter, ...]:
@@ -237,7 +237,7 @@ class SearchState:
                     self.priors,
                     [e.name for e in effects],
                     self.least,
-                    self._again,
+                    self._resimulated,
                     further,
                     active,
                     self.problem.varies.days,

@@ -200,14 +200,16 @@ def gains(
     """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach``
     strong at the knots.
     """
-    information, score = _beside(point, priors.deviation(list(active)), screened)
+    information, score = _conditional(point, priors.deviation(list(active)), screened)
     prior = reach / np.maximum(screened.size, 1e-12 * screened.size.max() + 1e-300)
     gain = -0.5 * np.log1p(prior**2 * information) + 0.5 * score**2 / (information + prior**-2.0)
     gain[screened.size <= 1e-9 * screened.size.max()] = -np.inf
     return gain, prior
 
 
-def _beside(point: Point, deviation: np.ndarray, screened: Screen) -> tuple[np.ndarray, np.ndarray]:
+def _conditional(
+    point: Point, deviation: np.ndarray, screened: Screen
+) -> tuple[np.ndarray, np.ndarray]:
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
     information = np.maximum(
@@ -222,11 +224,11 @@ def _unsaid(
     point: Point, priors: Priors, active: Sequence[int], screened: Screen, name: int
 ) -> np.ndarray:
     """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see
-    :func:`beyond`.
+    :func:`unexplained_nats`.
     """
     deviation = priors.deviation(list(active))
     deviation[name] = priors.slab[name] / NARROW
-    information, score = _beside(point, deviation, screened)
+    information, score = _conditional(point, deviation, screened)
     return 0.5 * score**2 / np.maximum(information, 1e-300)
 
 
@@ -449,7 +451,9 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
     )
 
 
-def beyond(point: Point, priors: Priors, active: Sequence[int], term: int, name: int) -> float:
+def unexplained_nats(
+    point: Point, priors: Priors, active: Sequence[int], term: int, name: int
+) -> float:
     """Nats that a term explains and a name, whatever its size, does not; none where both are the
     same form.
 

@@ -9,7 +9,7 @@ from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
 from visthrow.diagnose.throw.recorded import NEVER, Recorded
 
 LENGTH = 1.0  # of a window, about [s]
-LEAST = 0.25  # of a window [s]
+SHORTEST = 0.25  # of a window [s]
 BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
@@ -20,7 +20,7 @@ LEAST_TAUT = 0.05  # before the separation, without which the release cannot be 
 # that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows
 # may
 RINGING = 1.5
-MOST = 400  # windows; of longer flights these are spread evenly over all
+WINDOW_LIMIT = 400  # windows; of longer flights these are spread evenly over all
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
 
@@ -40,7 +40,7 @@ class Cut:
 
 def _split(first: float, last: float) -> list[tuple[float, float]]:
     """Equal pieces of about :data:`LENGTH`."""
-    if last - first < LEAST:
+    if last - first < SHORTEST:
         return []
     edges = np.linspace(first, last, max(round((last - first) / LENGTH), 1) + 1)
     return list(pairwise(edges))
@@ -90,11 +90,13 @@ def cut(
         cuts[max(i - 1, 0)].phase for i in range(len(cuts))
     ]  # the first window's own: nothing is known of before
     return [
-        replace(c, at_rest=phase == "hover") for c, phase in zip(cuts, until) if _seen(flight, c)
+        replace(c, at_rest=phase == "hover")
+        for c, phase in zip(cuts, until)
+        if _is_visible(flight, c)
     ]
 
 
-def thinned(cuts: list[Cut], count: int = MOST) -> list[Cut]:
+def thinned(cuts: list[Cut], count: int = WINDOW_LIMIT) -> list[Cut]:
     """Thin hours of flight out to all throws and what follows them, and so many of the other
     windows that ``count`` are left.
     """
@@ -121,12 +123,12 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
     pieces = [before, replace(c, start=first, end=last, retained=False), quiet]
     return [
-        replace(p, retained=p.retained and p.end - p.start > LEAST)
+        replace(p, retained=p.retained and p.end - p.start > SHORTEST)
         for p in pieces
         if p.end - p.start > 1e-6
     ]
 
 
-def _seen(flight: Recorded, c: Cut) -> bool:
+def _is_visible(flight: Recorded, c: Cut) -> bool:
     span = flight.vehicle.between(c.start, c.end)
     return span.stop - span.start >= POSES_LEAST

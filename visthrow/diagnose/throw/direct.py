@@ -28,7 +28,7 @@ LANDING, KEYPOINTS = "landing", "keypoints"
 LANDING_SIGMA = 2e-3
 GRID = 0.02  # between the smoothed poses that a camera's views are predicted from [s]
 # reach of that smoothing [s]: attitudes change within 50 ms, which a wider one would show late
-NEAR = 0.025
+SMOOTHING_SECONDS = 0.025
 # over which the speed of a keypoint is taken [s]: its row differs from the others' by a few
 # milliseconds at most
 SHORT = 1e-3
@@ -218,9 +218,11 @@ class CameraView:
             row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
             middle = row.mean(axis=1)
             time = view["time"] - x.camera_delay + x.camera_line_time * middle
-            points = _seen(view, setting, self._nominal, time)
+            points = _visible_keypoints(view, setting, self._nominal, time)
             if x.camera_line_time != 0.0:
-                slope = (_seen(view, setting, self._nominal, time + SHORT) - points) / SHORT
+                slope = (
+                    _visible_keypoints(view, setting, self._nominal, time + SHORT) - points
+                ) / SHORT
                 points = points + slope * (x.camera_line_time * (row - middle[:, None]))[..., None]
         except ValueError:
             return np.full(np.count_nonzero(view["valid"]), np.nan)
@@ -266,7 +268,10 @@ def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | 
     sources = {
         name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()
     }  # at the times that they show
-    table = {name: [smoothed(s, t, NEAR, NEAR) for t in grid] for name, s in sources.items()}
+    table = {
+        name: [smoothed(s, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
+        for name, s in sources.items()
+    }
     if any(row is None for rows in table.values() for row in rows):
         return None
     visible = visible[..., None] & MEASURED
@@ -295,7 +300,7 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
     return float(np.median(sigmas)) if sigmas else 0.0
 
 
-def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
+def _interpolated(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     """A smoothed track at times: points [m], or rotations from xyzw."""
     grid, (values, slopes) = view["grid"], view[name]
     k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
@@ -319,7 +324,9 @@ def _at(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     return (rotation * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
 
 
-def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> np.ndarray:
+def _visible_keypoints(
+    view: dict, setting: Setting, nominal: Setting, time: np.ndarray
+) -> np.ndarray:
     """Keypoints that the setting's camera sees at times, in the nominal lens's normalised
     coordinates, shape (T, 8, 2).
     """
@@ -330,13 +337,15 @@ def _seen(view: dict, setting: Setting, nominal: Setting, time: np.ndarray) -> n
     x, camera = setting.sensing, setting.camera
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
-    turned = frame.inv() * Rotation.from_quat(_at(view, "attitude", vehicle)) * marker.inv()
+    turned = (
+        frame.inv() * Rotation.from_quat(_interpolated(view, "attitude", vehicle)) * marker.inv()
+    )
     # The mount is stated from the centre of mass as it was believed: where the weight really lies
     # moves no lens.
     off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
-    pos = _origin(x, _at(view, "vehicle", vehicle)) - turned.apply(off)
+    pos = _origin(x, _interpolated(view, "vehicle", vehicle)) - turned.apply(off)
     ball = _origin(
-        x, _at(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))
+        x, _interpolated(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))
     ) - np.array(x.payload_offset)
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))

@@ -59,7 +59,7 @@ derivatives to be used further.
 """
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
-SEEN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
+FITTED_SPAN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
 TRUSTED = ("motor_speed",)
 """Fields that are linearised about where the commands left them.
 
@@ -348,7 +348,7 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
     few are left."""
     c, time = flights.cuts[w], flights.time[w]
     time_left = flights.flights[c.flight].latch + lag - EARLIER
-    if c.payload != ATTACHED or not c.start + SEEN < time_left < c.end:
+    if c.payload != ATTACHED or not c.start + FITTED_SPAN < time_left < c.end:
         return np.ones(len(time)), c.end
     return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
 

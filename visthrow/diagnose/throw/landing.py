@@ -150,7 +150,7 @@ def _fly(
     shape (F, 3).
     """
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
-    setting, states = model.beside(cuts).begun(theta)
+    setting, states = model.with_cuts(cuts).begun(theta)
     release, x = setting.plant.release, model.setting.sensing
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]

@@ -32,7 +32,7 @@ than a fifth. In throws, where a rope whips, those by all effects and states do;
 differ by 2 %.
 """
 
-STILL = 0.1
+CALM_SPEED = 0.1
 """Root mean square speed of a window [m/s] up to which the vehicle's motion against the air is the
 air's own doing: rooms have draughts of that speed, and a gust brings a hovering vehicle a velocity
 that goes with it, as if drag were negative.
@@ -45,7 +45,7 @@ def exact(e: SettingEffect) -> bool:
     return any(key.path in EXACT for key in e.changes)
 
 
-def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
+def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Window:
     """A window in which vehicle and air hardly move against each other, without what speeds would
     tell there; others as they are.
 
@@ -54,13 +54,13 @@ def still(window: Window, blocks: Sequence[str], wind_w: Sequence[float]) -> Win
     knots = window.knots
     if (
         "vel_w" not in knots
-        or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > STILL
+        or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > CALM_SPEED
     ):
         return window
     calm = {"vel_w": np.zeros_like(knots["vel_w"])}
     if (
         "payload_vel_w" in knots
-        and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < STILL
+        and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < CALM_SPEED
     ):
         calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
     unaffected = np.array([block != AERODYNAMIC for block in blocks])

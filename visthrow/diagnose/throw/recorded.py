@@ -23,7 +23,7 @@ LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 
 
 UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
 BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
-ENOUGH = (
+SUFFICIENT_RATE = (
     250.0  # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
 )
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
@@ -112,8 +112,8 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
 
 
 def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Samples that come at twice :data:`ENOUGH` or faster, shape (T,) and (T, N), as fewer that say
-    as much: every n-th of them smoothed.
+    """Thin samples that come at twice :data:`SUFFICIENT_RATE` or faster, shape (T,) and (T, N), out
+    to fewer that say as much: every n-th of them smoothed.
 
     A parabola through 2 n + 1 samples keeps a motion of 20 Hz to 0.03 %, and leaves the noise as
     white as it was: neighbours correlate by at most 0.07. Times are smoothed alike, so that single
@@ -122,11 +122,13 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     Source: Savitzky and Golay 1964.
     """
     steps = np.diff(time)
-    stride = int(1.0 / (ENOUGH * np.median(steps)) + 0.1)  # clocks are some per cent off
+    stride = int(1.0 / (SUFFICIENT_RATE * np.median(steps)) + 0.1)  # clocks are some per cent off
     if stride < 2:
         return time, values
     weights, parts = savgol_coeffs(2 * stride + 1, 2), []
-    for stretch in np.split(np.arange(len(time)), np.flatnonzero(steps > 1.5 / ENOUGH) + 1):
+    for stretch in np.split(
+        np.arange(len(time)), np.flatnonzero(steps > 1.5 / SUFFICIENT_RATE) + 1
+    ):
         if len(stretch) >= len(weights):
             averaged = sliding_window_view(
                 np.column_stack((time, values))[stretch], len(weights), axis=0

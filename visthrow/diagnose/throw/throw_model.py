@@ -32,7 +32,7 @@ from visthrow.diagnose.throw.direct import (
 from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.landing import Landings, landings
-from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, still
+from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, without_calm_speeds
 from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
 from visthrow.diagnose.throw.replay import (
     BATCH,
@@ -118,10 +118,10 @@ class ThrowModel:
         self._choose(concerned)
         self._directions = directions(self.setting.plant)
         self.flights = self._cut(flights, cuts)
-        states, ends = self._through(self.setting)
+        states, ends = self._settled_throughout(self.setting)
         if (without_slack := self._without_slack(ends)) != cuts:
             self.flights = self._cut(flights, without_slack)
-            states, _ = self._through(self.setting)
+            states, _ = self._settled_throughout(self.setting)
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
@@ -341,7 +341,7 @@ class ThrowModel:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
-    def beside(self, cuts: Sequence[Cut]) -> "ThrowModel":
+    def with_cuts(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """Return the model of other windows of its flights."""
         model = copy.copy(self)
         model._settled_at, model._before, model._follows, model._secants = (
@@ -365,7 +365,7 @@ class ThrowModel:
         """Settings ready to be flown in, with this model's steps."""
         return Simulation(settings, self.substep, self.device, download)
 
-    def _through(self, setting: Setting) -> tuple[States, States]:
+    def _settled_throughout(self, setting: Setting) -> tuple[States, States]:
         """See :func:`visthrow.diagnose.throw.replay.carried`."""
         states, ends = carried(self.flights, self.simulation(setting))
         states[MOVED] = np.zeros((len(self.flights.cuts), len(directions(setting.plant))))
@@ -386,7 +386,9 @@ class ThrowModel:
             if states is None and (among := self._among_more(cuts)) is not None:
                 return among
             fitter = self._initial_fit(self.setting)
-            fitted = fitter.fit([self._through(self.setting)[0] if states is None else states])
+            fitted = fitter.fit(
+                [self._settled_throughout(self.setting)[0] if states is None else states]
+            )
             self._fits[cuts] = fitted, fitter.slopes
         return self._fits[cuts]
 
@@ -422,7 +424,7 @@ class ThrowModel:
                 [moved.get(way, np.zeros(len(states[MOVED]))) for way in ways[0]], axis=1
             )
         return fitter.fit(
-            [start, self._through(setting)[0]], slopes if ways[0] == ways[1] else None
+            [start, self._settled_throughout(setting)[0]], slopes if ways[0] == ways[1] else None
         )
 
     @staticmethod
@@ -484,7 +486,7 @@ class ThrowModel:
                 flown.knots,
                 states[MOVED],
             )
-            return still(
+            return without_calm_speeds(
                 plans[i].window_of(f, settings[0], self._directions, *arguments),
                 blocks,
                 settings[0].plant.air.wind_w,
