@@ -27,7 +27,7 @@ from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.planning.design import Limits, optimise
 from visthrow.diagnose.planning.fly_manoeuvres import carried, fly, simulator_of, vehicle_of
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
-from visthrow.diagnose.planning.plan import Aim
+from visthrow.diagnose.planning.plan import PlanningGoal
 from visthrow.diagnose.select import search
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import Experiment, plant_of
@@ -110,7 +110,7 @@ def main() -> None:
     )
     model = flown({}, [HOVER] * 2, 0)
     diagnosis = search.explain(model, laws=False)
-    aim = Aim(diagnosis, names)
+    aim = PlanningGoal(diagnosis, names)
     made = (lambda logs: FlyerModel(logs, model.params)) if args.setup else None
     simulate, flies = simulator_of(model, diagnosis, made, seed=args.seed)
     able = [m for m in map(flies, catalogue()) if m is not None]

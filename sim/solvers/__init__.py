@@ -55,7 +55,7 @@ class Solver(Protocol):
 
 @dataclass(frozen=True)
 class World:
-    """What a solver is built for, and the arrays that it shares with the exchange."""
+    """The inputs of a solver, and the arrays that it shares with the exchange."""
 
     params: PlantParams
     count: int  # E

@@ -131,7 +131,7 @@ def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(
     looked_at = selector.Selector(
         problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal
     )
-    looked_at._closer(state.Move((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
+    looked_at._closer(state.SetMove((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
     assert len(taken) == (points.ROUNDS + (begin == 0.0) if sure else begin == 0.0)
     assert looked_at.origin is nominal  # a candidate that is refused leaves no derivatives behind
 

@@ -53,7 +53,7 @@ def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
     optimiser that returns its start fails.
     """
     diagnosis, simulate, flown = quadrotor
-    aim = plan.Aim(diagnosis, ABOUT)
+    aim = plan.PlanningGoal(diagnosis, ABOUT)
     chosen = [flown(BASES[name]) for name in ("vertical sine", "circle")]
     rates = [
         aim.nats(aim.information(s.model)) / m.seconds for m, s in zip(chosen, simulate(chosen))

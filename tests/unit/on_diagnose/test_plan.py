@@ -29,13 +29,15 @@ def test_a_session_holds_what_separates_more_than_what_stands_before_it():
         ("hover", ()),
         ("weigh", (("a", "d"),)),
     )
-    proposals = [plan.Proposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in said]
+    proposals = [
+        plan.FlightProposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in said
+    ]
     assert [p.name for p in plan.session(proposals)] == ["circle", "weigh"]
 
 
 def test_a_member_that_is_far_behind_is_no_truth_to_plan_for(degenerate):
     """Flights that show only the other member promise what they show of it."""
-    names, aim = [f.name for f in degenerate.findings], plan.Aim(degenerate)
+    names, aim = [f.name for f in degenerate.findings], plan.PlanningGoal(degenerate)
     pair = names.index("effect_03"), names.index("effect_07")
     base, new = (
         np.diag(np.isin(np.arange(len(names)), which).astype(float)) for which in (pair, pair[:1])

@@ -17,7 +17,12 @@ from visthrow.diagnose.likelihood.correlation import Correlation, with_correlati
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain, report
 from visthrow.diagnose.select import held_out, point, result, search
+<<<<<<< HEAD
 from visthrow.diagnose.throw.landing import Landings
+=======
+from visthrow.diagnose.throw.landing import PredictedLandings
+from visthrow.logs.flightlog import FlightLog
+>>>>>>> a9ab1605 (Give each class of the diagnosis a name of its own)
 from visthrow.view import page
 
 SWING = str(
@@ -51,7 +56,7 @@ class Throwing(SyntheticModel):
         )
         scatter = np.array([np.random.default_rng(int(n)).normal(0.0, 2e-3, 3) for n in numbers])
         off = np.tile([*missing, 0.0], (len(numbers), 1)) + scatter
-        return Landings(numbers, np.zeros_like(off), off, 0.1 * off)
+        return PredictedLandings(numbers, np.zeros_like(off), off, 0.1 * off)
 
 
 @pytest.fixture(scope="module")
@@ -308,7 +313,7 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     alike = SyntheticModel(
         effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9
     )
-    aim = plan.Aim(degenerate)
+    aim = plan.PlanningGoal(degenerate)
     models = {"hover": alike, "circle": apart}
     told = [
         (m, aim.information(models[m.name])) for m in manoeuvres.catalogue() if m.name in models
@@ -341,12 +346,12 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     floor = {e.name: e.floor for e in EFFECTS}
     scale = measures.Measurement("weigh", "effect_07", floor["effect_07"], 60.0)
     monkeypatch.setattr(plan, "MEASUREMENTS", (scale,))
-    (proposal,) = plan.propose(plan.Aim(degenerate, ("effect_03",)), [])
+    (proposal,) = plan.propose(plan.PlanningGoal(degenerate, ("effect_03",)), [])
     assert proposal.name == "weigh"
     assert {frozenset(pair) for pair in proposal.separates} == {
         frozenset(("effect_03", "effect_07"))
     }
-    assert not plan.propose(plan.Aim(degenerate, ("effect_00",)), [])
+    assert not plan.propose(plan.PlanningGoal(degenerate, ("effect_00",)), [])
     model = SyntheticModel(
         effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
     )
@@ -408,7 +413,7 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
     degrees; upright it is 90.
     """
 
-    def level(turn: float) -> fly_manoeuvres.Flight:
+    def level(turn: float) -> fly_manoeuvres.SimulatedFlight:
         chosen = next(m for m in manoeuvres.catalogue() if m.name == "throw at 2 m/s")
         reference = chosen.reference()
         rows = 4 * len(reference.time)
@@ -420,7 +425,7 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
         )  # then let go
         quat = np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (rows, 1))
         truth = {"pos_w": place, "payload_pos_w": place + hangs, "quat_wb": quat}
-        return fly_manoeuvres.Flight(chosen, reference, None, truth, None, None)
+        return fly_manoeuvres.SimulatedFlight(chosen, reference, None, truth, None, None)
 
     flights = [level(0.0), level(0.2 * np.pi)]
     assert [flight.swing for flight in flights] == pytest.approx([90.0, 54.0])

@@ -14,7 +14,7 @@ from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import laws
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
-from visthrow.diagnose.reporting.blackbox import Table, table_of, train, unexplained
+from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
 from visthrow.diagnose.select import result, search, selector, terms, verdicts
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
@@ -41,7 +41,7 @@ KNOTS = (
 
 
 def table(terms_: list, knots: dict) -> np.ndarray:
-    return laws.Layout.of(terms_).table(knots)
+    return laws.TermLayout.of(terms_).table(knots)
 
 
 def turned(knots: dict, angle: float) -> dict:
@@ -106,9 +106,9 @@ def test_the_table_of_terms_holds_each_term(block):
     values = table(terms, knots)
     assert values.shape == (len(knots["time"]), 3, len(terms))
     for i, term in enumerate(terms):
-        own = laws.VECTORS[block][term.vector].read(laws.Known(knots))
+        own = laws.VECTORS[block][term.vector].read(laws.KnotValues(knots))
         for factor in term.factors:
-            own = own * laws.SCALARS[factor].read(laws.Known(knots))[:, None]
+            own = own * laws.SCALARS[factor].read(laws.KnotValues(knots))[:, None]
         np.testing.assert_array_equal(values[:, :, i], own)
         assert values[:, :, i].tobytes() == table([term], knots)[:, :, 0].tobytes()
 
@@ -117,7 +117,7 @@ def test_what_follows_from_knots_is_computed_once(monkeypatch):
     calls = []
     swing = laws.DERIVED["swing"]
     monkeypatch.setitem(laws.DERIVED, "swing", lambda k: calls.append(1) or swing(k))
-    known = laws.Known(random_knots())
+    known = laws.KnotValues(random_knots())
     for block in laws.BLOCKS:
         table(laws.terms_of(block, KNOTS), known)
     assert len(calls) == 1
@@ -269,7 +269,7 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     at = beside_a_law(
         SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )
-    known = [laws.Known(w.knots) for w in at.point.windows]
+    known = [laws.KnotValues(w.knots) for w in at.point.windows]
     of = terms.screen(
         at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known
     )
@@ -371,7 +371,7 @@ def test_the_table_takes_up_what_no_name_explains():
     truth = -0.02 * np.linalg.norm(velocity, axis=1)[:, None] * velocity
     assert np.linalg.norm(asked - truth) < LEFT * np.linalg.norm(truth)
     data = unexplained(point, 0)
-    again = Table(
+    again = ForceTable(
         *(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"])
     )
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
@@ -399,7 +399,9 @@ def test_terms_are_screened_beside_what_varies(days):
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
     calm, parts = terms.calmed(replace(linearise(problem, np.zeros(12)), varies=varies))
-    screen = terms.screen(calm, parts, "payload force", [laws.Known(w.knots) for w in calm.windows])
+    screen = terms.screen(
+        calm, parts, "payload force", [laws.KnotValues(w.knots) for w in calm.windows]
+    )
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
         _, (wide,) = terms.extended(problem, [calm], [own])

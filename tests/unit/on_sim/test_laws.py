@@ -81,7 +81,7 @@ def kernels_factors():
 
 def test_factors_are_the_grammars():
     scalars, vectors, k = kernels_factors()
-    known = grammar.Known(k)
+    known = grammar.KnotValues(k)
     assert set(scalars) == set(grammar.SCALARS)
     for name, factor in grammar.SCALARS.items():
         assert scalars[name] == pytest.approx(factor.read(known)[0], rel=1e-12), name

@@ -45,7 +45,7 @@ UNKNOWN_SHARE = (
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FitResult:
     """Sizes of effects, with what is known of them."""
 
     names: tuple[str, ...]
@@ -63,7 +63,7 @@ class Fitted:
         return float(self.theta[i]) - half, float(self.theta[i]) + half
 
 
-def fit(model: Model, free: Sequence[str]) -> Fitted:
+def fit(model: Model, free: Sequence[str]) -> FitResult:
     """Fit effects of a model jointly.
 
     ``model``: linearisable; its windows' latent forces and noise levels are estimated on the way.
@@ -110,7 +110,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
         }
         for value in map(np.concatenate, measured)
     ]
-    return Fitted(
+    return FitResult(
         tuple(free),
         units,
         sizes,
@@ -121,7 +121,7 @@ def fit(model: Model, free: Sequence[str]) -> Fitted:
     )
 
 
-def vehicle_of(setup: Setup, result: Fitted, base: VehicleParams) -> VehicleParams:
+def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleParams:
     """A simulated vehicle with what was found; everything else as in ``base``.
 
     A map from commands to thrust tells no speed: the thrust coefficient then stays, and the largest
@@ -198,7 +198,7 @@ def write(
     folder: str | Path,
     name: str,
     setup: Setup,
-    result: Fitted,
+    result: FitResult,
     logs: Sequence[FlightLog],
     base: VehicleParams,
 ) -> list[Path]:
@@ -230,7 +230,7 @@ def write(
     return [folder / "vehicle.toml", folder / "fit.json"]
 
 
-def _head(name: str, result: Fitted, sources: Mapping[str, str]) -> str:
+def _head(name: str, result: FitResult, sources: Mapping[str, str]) -> str:
     lines = [
         f"# Fitted by `visthrow diagnose fit` with the setup '{name}'; covariance and provenance"
         " also in fit.json."

@@ -75,7 +75,7 @@ class Group:
 
 
 @dataclass
-class Proposal:
+class MappingProposal:
     """A mapping, why, and what is left to ask."""
 
     mapping: TableMap | None
@@ -90,7 +90,7 @@ class Proposal:
 
 def propose(
     table: Table, source: str, mass: float | None = None, time_unit: str | None = None
-) -> Proposal:
+) -> MappingProposal:
     """Propose a mapping of the columns of a table, or of the tables of a recording.
 
     ``source``: what messages call it; ``mass``: of the vehicle alone [kg], where it was weighed;
@@ -103,7 +103,7 @@ def propose(
     numbers = {name: np.where(np.isfinite(cells), cells, np.nan) for name, cells in numbers.items()}
     if not any(_moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
-    proposal, channels, clocks = Proposal(None), {}, {}
+    proposal, channels, clocks = MappingProposal(None), {}, {}
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
@@ -155,7 +155,7 @@ def _tables(numbers: Table) -> dict[str, Table]:
 
 
 def _clock(
-    numbers: Table, proposal: Proposal, stated_unit: str | None
+    numbers: Table, proposal: MappingProposal, stated_unit: str | None
 ) -> tuple[TimeColumn, np.ndarray]:
     """The column of stamps and its unit, or evenly spaced rows."""
     rising = [name for name, cells in numbers.items() if _rises(cells)]
@@ -319,7 +319,11 @@ class _Chooser:
     """Decides which group is which channel."""
 
     def __init__(
-        self, time: np.ndarray, groups: list[Group], proposal: Proposal, settings: dict[str, str]
+        self,
+        time: np.ndarray,
+        groups: list[Group],
+        proposal: MappingProposal,
+        settings: dict[str, str],
     ) -> None:
         self.time, self.found, self.settings = time, proposal, settings
         for group in groups:
@@ -924,7 +928,7 @@ class _Chooser:
                 self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
 
 
-def _corrected(table: Table, source: str, proposal: Proposal, weighed: float | None) -> None:
+def _corrected(table: Table, source: str, proposal: MappingProposal, weighed: float | None) -> None:
     """Read the table by the proposal, hold it against physics, and turn axes that another set
     explains; mirrors are asked about.
     """
@@ -958,7 +962,7 @@ def _corrected(table: Table, source: str, proposal: Proposal, weighed: float | N
         )
 
 
-def _weighed(log: FlightLog, proposal: Proposal, weighed: float | None) -> FlightLog:
+def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> FlightLog:
     """Hold the thrust against the mass.
 
     Returns the log with its thrust in the unit in which it carries what was weighed.
@@ -1037,7 +1041,7 @@ def _usual(total: np.ndarray) -> float:
     return float(np.median(total[total > 0.5 * np.percentile(total, 90)]))
 
 
-def _driving(log: FlightLog, proposal: Proposal) -> str:
+def _driving(log: FlightLog, proposal: MappingProposal) -> str:
     """The input that the force follows best, "" where that cannot be told."""
     inputs = [name for name in thrust.INPUTS if name in log]
     scores = {name: s for name in inputs if (s := thrust.follows(log, name)) is not None}
@@ -1052,7 +1056,7 @@ def _driving(log: FlightLog, proposal: Proposal) -> str:
     return best
 
 
-def _flyer(log: FlightLog, proposal: Proposal, weighed: float | None) -> dict | None:
+def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> dict | None:
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """

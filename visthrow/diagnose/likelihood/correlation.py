@@ -25,7 +25,7 @@ import numpy as np
 from visthrow.diagnose.likelihood import designs, noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
 from visthrow.diagnose.likelihood.marginal import hidden_gram, left_of
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.interface import Window
 
 T = TypeVar("T")
@@ -90,7 +90,7 @@ def with_correlations(
     ``correlations_of``: of channels, by number.
     """
     return (
-        each(lambda window: _with_correlation(window, correlations_of), windows)
+        parallel_map(lambda window: _with_correlation(window, correlations_of), windows)
         if correlations_of
         else list(windows)
     )
@@ -115,8 +115,10 @@ def correlations(
     ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the
     model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
-    bare = each(lambda window: hidden_gram(window, channels), free)
-    residuals = each(lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu")))
+    bare = parallel_map(lambda window: hidden_gram(window, channels), free)
+    residuals = parallel_map(
+        lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu"))
+    )
     suspects = {
         c: scale for c in range(channels) if (scale := _suspected(free, residuals, c)) is not None
     }
@@ -240,7 +242,7 @@ def _likelihood(
     from.
     """
     correlated = with_correlations(windows, correlations_of)
-    grams = each(lambda window: hidden_gram(window, channels), correlated)
+    grams = parallel_map(lambda window: hidden_gram(window, channels), correlated)
     shaped = designs.correlated_of(grams, correlated, noise.CORRELATION_TIMES[1], "cpu")
     levels, value = noise.roughly(shaped, start)
     return value, levels

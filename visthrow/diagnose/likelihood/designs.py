@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from visthrow.diagnose.likelihood.marginal import (
+    DeviceArray,
     Gram,
-    There,
     check,
     correlated,
     correlated_with,
@@ -25,7 +25,7 @@ from visthrow.diagnose.likelihood.marginal import (
     with_products,
     with_residual,
 )
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side, to_host
 from visthrow.diagnose.models.interface import Window
 
@@ -79,7 +79,7 @@ class _Design:
         columns = side_by_side([own[:3] for own in windows], (shape[1], width), device)
         self._columns = columns.mul_(scales[:, None]).div_(self._sigma[:, :, None])
 
-    def inner(self) -> list[There]:
+    def inner(self) -> list[DeviceArray]:
         """Inner products of each window's columns by channel, shape (C, P, P)."""
         count, _, channels = self._member.shape
         products = self._columns.new_empty(
@@ -151,8 +151,8 @@ def grams_of(
     Raises DiagnoseError: a window's arrays do not fit together, or hold NaN or infinity.
     """
     if device == "cpu" or not windows or _correlated(windows):
-        return each(lambda w: gram_of(w, floors, channels), windows)
-    each(lambda w: check(w, len(floors), channels), windows)
+        return parallel_map(lambda w: gram_of(w, floors, channels), windows)
+    parallel_map(lambda w: check(w, len(floors), channels), windows)
     design = _designed(windows, floors, channels, device)
     products = zip(windows, design.inner(), design.products([w.residual for w in windows]))
     return [
@@ -166,16 +166,16 @@ def _correlated(windows: Sequence[Window]) -> bool:
     return any(window.correlated for window in windows)
 
 
-def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[There]:
+def _on_both(values: torch.Tensor, widths: Sequence[int]) -> list[DeviceArray]:
     """Square matrices of some channels, shape (W, C, P, P), as far as they are not padded."""
     return [
-        There(device_values[:, :n, :n], host[:, :n, :n])
+        DeviceArray(device_values[:, :n, :n], host[:, :n, :n])
         for device_values, host, n in zip(values, to_host(values), widths)
     ]
 
 
 def padded(
-    inner: Sequence[There | np.ndarray],
+    inner: Sequence[DeviceArray | np.ndarray],
     part: Callable[[T, int], T],
     shape: tuple[int, ...],
     device: str,
@@ -185,13 +185,13 @@ def padded(
 
     ``inner``: of the grams, see :attr:`Gram.placed`; ``part``: of one gram's, given its number;
     ``shape``: to pad to."""
-    if not any(isinstance(product, There) for product in inner):
+    if not any(isinstance(product, DeviceArray) for product in inner):
         return side_by_side([[part(product, i)] for i, product in enumerate(inner)], shape, device)
     out = torch.zeros((len(inner), *shape), dtype=torch.float64, device=device)
     for i, product in enumerate(inner):
         values = (
             part(product.values, i)
-            if isinstance(product, There)
+            if isinstance(product, DeviceArray)
             else torch.tensor(part(product, i), device=device)
         )
         out[(i, *map(slice, values.shape))] = values
@@ -207,7 +207,7 @@ def correlated_of(
     ``grams``: of the windows, with ``factor`` the identity; ``windows``: for the knots; ``time``:
     correlation time [s]."""
     if device == "cpu" or not all(gram.latents for gram in grams):
-        return each(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
+        return parallel_map(lambda w: correlated(grams[w], windows[w], time), range(len(grams)))
     factors, widths = (
         [knot_factor(window, time) for window in windows],
         [gram.cross.shape[1] for gram in grams],
@@ -245,7 +245,7 @@ def left_by(
     deviations and its latents at the knots, shape (D + L,). Returns for each window, shape (N,).
     """
     if device == "cpu":
-        return each(lambda pair: left_of(*pair), zip(windows, fits))
+        return parallel_map(lambda pair: left_of(*pair), zip(windows, fits))
     return _designed(windows, floors, channels, device).left([w.residual for w in windows], fits)
 
 
@@ -262,7 +262,7 @@ def with_residuals(
     ``grams``: of the windows; ``floors``: of the effects, shape (K,); ``residuals``: of each
     window, shape (N,)."""
     if device == "cpu" or _correlated(windows):
-        return each(
+        return parallel_map(
             lambda w: with_residual(grams[w], windows[w], floors, residuals[w]), range(len(grams))
         )
     design = _designed(windows, floors, len(grams[0].count), device)

@@ -11,18 +11,20 @@ from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.models.laws import JOINT, Known, Layout, Term, carries, loads
+from visthrow.diagnose.models.laws import JOINT, KnotValues, Term, TermLayout, carries, loads
 
 FINE = 8  # points between two knots at which a curve is looked at
 
 
-def joined(knots: Sequence[Known], names: Sequence[str]) -> Known:
+def joined(knots: Sequence[KnotValues], names: Sequence[str]) -> KnotValues:
     """The knots of several windows after one another, of quantities that all of them have.
 
     What follows from them follows at each knot by itself, but for the thrust's slope, which is
     taken within windows."""
     taken = [*names, "slope"] if {"thrust", "time"} <= set(names) else names
-    return Known({name: np.concatenate([knots_of[name] for knots_of in knots]) for name in taken})
+    return KnotValues(
+        {name: np.concatenate([knots_of[name] for knots_of in knots]) for name in taken}
+    )
 
 
 @lru_cache(maxsize=64)
@@ -40,7 +42,7 @@ def between(count: int) -> np.ndarray:
     return np.linalg.lstsq(hats, curve, rcond=None)[0]
 
 
-def through_latents(window: Window, quantities: Known, block: str) -> np.ndarray:
+def through_latents(window: Window, quantities: KnotValues, block: str) -> np.ndarray:
     """Latent-force coefficients that what a block exerts at the knots stands for.
 
     Returns shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
@@ -77,9 +79,9 @@ def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
     T).
     """
-    out, quantities = np.zeros((len(window.latent_block), len(terms_))), Known(window.knots)
+    out, quantities = np.zeros((len(window.latent_block), len(terms_))), KnotValues(window.knots)
     for i, effect in enumerate(terms_):
         if carries(window.latent_block, effect.term.block):
-            values = Layout.of([effect.term]).table(quantities).ravel()
+            values = TermLayout.of([effect.term]).table(quantities).ravel()
             out[:, i] = through_latents(window, quantities, effect.term.block) @ values
     return out

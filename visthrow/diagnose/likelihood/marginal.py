@@ -45,7 +45,7 @@ some 1e-13 of an effect's squares, of which `ROUNDING` are left at least.
 """
 
 
-class There(NamedTuple):
+class DeviceArray(NamedTuple):
     """An array on a GPU, where it was calculated."""
 
     values: Any  # torch.Tensor
@@ -75,10 +75,10 @@ class Gram:
         int, float
     ]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
-    there: There | None = None  # of an ``inner``, which may have been replaced since
+    there: DeviceArray | None = None  # of an ``inner``, which may have been replaced since
 
     @property
-    def placed(self) -> "There | np.ndarray":
+    def placed(self) -> "DeviceArray | np.ndarray":
         """``inner``, with the same on a GPU where it was calculated there."""
         return self.there if self.there is not None and self.there.of is self.inner else self.inner
 
@@ -188,9 +188,9 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 def without_effects(gram: Gram) -> Gram:
     """Return a Gram matrix of nuisances and latents alone."""
     size = gram.nuisances + gram.latents
-    if not isinstance(gram.placed, There):
+    if not isinstance(gram.placed, DeviceArray):
         return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
-    device_inner = There(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
+    device_inner = DeviceArray(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
     return replace(gram, inner=device_inner.of, cross=gram.cross[:, :size], there=device_inner)
 
 
@@ -310,7 +310,7 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
 
 
 def correlated_with(
-    gram: Gram, inner: np.ndarray, factors: np.ndarray, device_inner: There | None = None
+    gram: Gram, inner: np.ndarray, factors: np.ndarray, device_inner: DeviceArray | None = None
 ) -> Gram:
     """The gram into which a factor of each group's knots was multiplied, with the inner products
     that came of it.

@@ -16,7 +16,7 @@ from scipy.linalg import lapack
 from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
 from visthrow.diagnose.likelihood.stack import Stack
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
 
@@ -374,7 +374,7 @@ def without_outliers(
         for w in windows_left:
             sigmas[w] = windows[w].sigma * np.maximum(distances[w], 1.0)
         starts = [replace(windows[w], sigma=sigmas[w]) for w in windows_left]
-        bare = each(lambda window: hidden_gram(window, len(grams[0].count)), starts)
+        bare = parallel_map(lambda window: hidden_gram(window, len(grams[0].count)), starts)
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 

@@ -17,14 +17,14 @@ from scipy.linalg import lapack
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.designs import Same, padded
 from visthrow.diagnose.likelihood.marginal import (
+    DeviceArray,
     Gram,
     Noise,
     Share,
     Statistics,
-    There,
     WindowStatistics,
 )
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host
 from visthrow.diagnose.models.interface import LATENT_BLOCKS
 
@@ -41,17 +41,19 @@ BEGUN = 4
 BLOCKS = len(LATENT_BLOCKS)
 
 
-class _Columns:
+class _HiddenColumns:
     """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded
     columns are 0.
     """
 
-    def __init__(self, inner: Sequence[There | np.ndarray], sizes: Sequence[int], device: str):
+    def __init__(
+        self, inner: Sequence[DeviceArray | np.ndarray], sizes: Sequence[int], device: str
+    ):
         """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its
         hidden columns.
         """
         self._inner, self._sizes, self._device = inner, sizes, device
-        whole = inner[0].of if isinstance(inner[0], There) else inner[0]
+        whole = inner[0].of if isinstance(inner[0], DeviceArray) else inner[0]
         self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
         self._begun, self._lock = {}, Lock()
 
@@ -92,7 +94,7 @@ class _Columns:
         return padded(self._inner, part, (self._channels, height, width), self._device)
 
 
-_ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_Columns) for most in (2, 32))
+_ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_HiddenColumns) for most in (2, 32))
 """Columns that are laid side by side already: residuals and noise levels change far more often than
 derivatives do.
 """
@@ -105,7 +107,7 @@ class _Batch:
     windows: np.ndarray  # rows of the noise's shares, shape (W,)
     phases: tuple[list[str], np.ndarray]  # that occur, and each window's among them
     grams: list[Gram]
-    columns: _Columns
+    columns: _HiddenColumns
     cross: torch.Tensor  # shape (W, C, n)
     square: torch.Tensor  # shape (W, C)
     count: torch.Tensor  # shape (W, C)
@@ -142,7 +144,7 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
     were effects.
     """
     whole = Stack(grams, device).integrals(noise, latents=True)
-    return each(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
+    return parallel_map(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
 
 
 def _of_latents(share: Share, gram: Gram) -> WindowStatistics:
@@ -175,7 +177,7 @@ class Stack:
         self._sizes = [gram.nuisances + gram.latents for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
-        self._batches = each(
+        self._batches = parallel_map(
             lambda members: self._padded([grams[w] for w in members], rows[members]), self._order
         )
         self._count = len(grams)
@@ -252,11 +254,12 @@ class Stack:
         Raises DiagnoseError: as :meth:`values`.
         """
         return Integrals(
-            self._order, each(lambda batch: _integrated(batch, noise, latents), self._batches)
+            self._order,
+            parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches),
         )
 
     def _of_batches(self, function) -> list[tuple[np.ndarray, ...]]:
-        return each(lambda batch: tuple(all_to_host(function(batch))), self._batches)
+        return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self._batches)
 
     def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
         out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)

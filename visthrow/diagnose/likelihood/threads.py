@@ -72,7 +72,7 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, name, single)
 
 
-def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, on all cores; no call may wait for another of these."""
     items, threads = list(items), min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
     if min(threads, len(items)) < 2:
@@ -89,6 +89,8 @@ def each(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     return results
 
 
-def beside(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """The function of every item, in order, a few at once, each of which may call :func:`each`."""
+def run_concurrently(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Return the function of every item, in order, a few at once; each may call
+    :func:`parallel_map`.
+    """
     return list(_pool("tasks", THREADS_BESIDE_GPU).map(function, items))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 
 SMALL_ARRAY = 1_000_000  # numbers up to which one thread lays them
 
@@ -61,5 +61,5 @@ def side_by_side(
         for i in range(len(parts)):
             lay(i)
     else:
-        each(lay, range(len(parts)))
+        parallel_map(lay, range(len(parts)))
     return out.to(device)

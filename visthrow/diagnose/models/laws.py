@@ -36,7 +36,7 @@ JOINT = (  # block of the torque between vehicle and rope, which acts in all lat
 BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
 
 
-class Known(dict):
+class KnotValues(dict):
     """Quantities at the knots, and what follows from them, computed when it is first asked for."""
 
     def __missing__(self, name: str) -> np.ndarray:
@@ -53,7 +53,7 @@ class Factor:
     unit: Unit
     needs: tuple[str, ...]  # keys of Window.knots
     read: Callable[
-        [Known], np.ndarray
+        [KnotValues], np.ndarray
     ]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
 
 
@@ -132,7 +132,7 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
     """Return the forces and torques of laws in each latent block at states with these quantities,
     shape (k, 3); empty without laws.
     """
-    values, total = Known(values), {}
+    values, total = KnotValues(values), {}
     for law in laws:
         value = law.coefficient * VECTORS[law.block][law.vector].read(values)
         for factor in law.factors:
@@ -153,30 +153,30 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("ki,ki->k", a, b)
 
 
-def _axis(i: int) -> Callable[[Known], np.ndarray]:
+def _axis(i: int) -> Callable[[KnotValues], np.ndarray]:
     return lambda k: rotate(k["quat_wb"], np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
 
 
-def _fixed(i: int) -> Callable[[Known], np.ndarray]:
+def _fixed(i: int) -> Callable[[KnotValues], np.ndarray]:
     return lambda k: np.tile(np.eye(3)[i], (len(k["time"]), 1))
 
 
-def _slope(k: Known) -> np.ndarray:
+def _slope(k: KnotValues) -> np.ndarray:
     return np.gradient(k["thrust"], k["time"]) if len(k["time"]) > 1 else np.zeros(len(k["time"]))
 
 
-def _swing(k: Known) -> np.ndarray:
+def _swing(k: KnotValues) -> np.ndarray:
     """Velocity of the payload against the vehicle, across the rope."""
     relative, n = k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]
     return relative - _dot(relative, n)[:, None] * n
 
 
-def _reach(k: Known) -> np.ndarray:
+def _reach(k: KnotValues) -> np.ndarray:
     """Return the vector from the mount to the payload's centre [m], world frame."""
     return k["payload_pos_w"] - k["pos_w"] - rotate(k["quat_wb"], k["mount_b"])
 
 
-def _joint_rate(k: Known) -> np.ndarray:
+def _joint_rate(k: KnotValues) -> np.ndarray:
     """Rate of the rope against the vehicle [1/s], body frame; 0 where nothing hangs on it."""
     reach = k["reach_w"]
     mount_vel = k["vel_w"] + rotate(k["quat_wb"], cross(k["rate_b"], k["mount_b"]))
@@ -184,12 +184,12 @@ def _joint_rate(k: Known) -> np.ndarray:
     return (k["tension"] > 0.0)[:, None] * (rotate_back(k["quat_wb"], rope_rate) - k["rate_b"])
 
 
-def _friction(k: Known) -> np.ndarray:
+def _friction(k: KnotValues) -> np.ndarray:
     """Direction of that rate, and less than a unit vector where it is slow."""
     return k["joint_rate_b"] / np.hypot(_size(k["joint_rate_b"]), SLOWEST)[:, None]
 
 
-def _spring(k: Known) -> np.ndarray:
+def _spring(k: KnotValues) -> np.ndarray:
     """Return the direction that turns the vehicle's axis against the rope, body frame; 0 where
     nothing hangs on it.
     """
@@ -202,7 +202,7 @@ def _size(vector: np.ndarray) -> np.ndarray:
 
 _EZ = np.array([0.0, 0.0, 1.0])
 
-DERIVED: dict[str, Callable[[Known], np.ndarray]] = {
+DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "quat_wb": (
         lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat()
     ),
@@ -219,7 +219,7 @@ DERIVED: dict[str, Callable[[Known], np.ndarray]] = {
     "reach_w": _reach,
     "joint_rate_b": _joint_rate,
 }
-"""What :class:`Known` computes of the quantities at the knots."""
+"""What :class:`KnotValues` computes of the quantities at the knots."""
 
 _POSE, _MOVES = ("quat_wb",), ("vel_w", "quat_wb")
 _PAIR = ("payload_vel_w", "vel_w", "cable_dir_w")
@@ -355,7 +355,7 @@ def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
 
 
 @dataclass(frozen=True)
-class Layout:
+class TermLayout:
     """Which factors many terms of one block consist of; the scalar before the first is 1."""
 
     block: str
@@ -365,7 +365,7 @@ class Layout:
     vector: np.ndarray  # shape (T,)
 
     @staticmethod
-    def of(terms_: Sequence[Term]) -> "Layout":
+    def of(terms_: Sequence[Term]) -> "TermLayout":
         """Sort out the factors of terms."""
         scalars = tuple(dict.fromkeys(f for t in terms_ for f in t.factors))
         vectors = tuple(dict.fromkeys(t.vector for t in terms_))
@@ -377,7 +377,7 @@ class Layout:
             ([scalar_index[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS]
             for t in terms_
         ]
-        return Layout(
+        return TermLayout(
             terms_[0].block,
             scalars,
             vectors,
@@ -385,7 +385,7 @@ class Layout:
             np.array([place[t.vector] for t in terms_]),
         )
 
-    def factors(self, values: Known) -> tuple[np.ndarray, np.ndarray]:
+    def factors(self, values: KnotValues) -> tuple[np.ndarray, np.ndarray]:
         """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors);
         each is computed once.
         """
@@ -399,7 +399,9 @@ class Layout:
 
     def table(self, knots: Knots) -> np.ndarray:
         """Values of the terms, shape (k, 3, T)."""
-        scalars, vectors = self.factors(knots if isinstance(knots, Known) else Known(knots))
+        scalars, vectors = self.factors(
+            knots if isinstance(knots, KnotValues) else KnotValues(knots)
+        )
         values = vectors[:, :, self.vector]
         for which in self.scalar:
             values *= scalars[:, None, which]
@@ -415,7 +417,7 @@ def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]
     """
     if block != JOINT:
         return {block: values}
-    quantities = knots if isinstance(knots, Known) else Known(knots)
+    quantities = knots if isinstance(knots, KnotValues) else KnotValues(knots)
     torque_b, reach = np.swapaxes(values, 1, 2), quantities["reach_w"][:, None, :]
     turn = np.stack([quantities[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
     torque_w = np.einsum("kij,ktj->kti", turn, torque_b)

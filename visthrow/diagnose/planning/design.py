@@ -7,10 +7,11 @@ frequencies that no path follows. A sweep moves as far at each of its frequencie
 the limits lets, and all are made smaller until the path keeps within them, so that every design
 does.
 
-The objective is that of :class:`visthrow.diagnose.planning.plan.Aim` for the Fisher information of
-the simulated flight, by the linearised model that the selection uses, over its seconds. The search
-is differential evolution from a Sobol sequence about the manoeuvre: where the rope goes slack, how
-near a flight comes to being aborted has no derivative. A generation's flights are one batch.
+The objective is that of :class:`visthrow.diagnose.planning.plan.PlanningGoal` for the Fisher
+information of the simulated flight, by the linearised model that the selection uses, over its
+seconds. The search is differential evolution from a Sobol sequence about the manoeuvre: where the
+rope goes slack, how near a flight comes to being aborted has no derivative. A generation's flights
+are one batch.
 
 Source: Bayesian optimal designs: Chaloner and Verdinelli 1995; inputs for flight vehicles: Morelli
 2021, multisines."""
@@ -26,7 +27,7 @@ from scipy.stats import qmc
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.planning.fly_manoeuvres import Simulate, Simulated
 from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, rise
-from visthrow.diagnose.planning.plan import Aim
+from visthrow.diagnose.planning.plan import PlanningGoal
 
 SLOWEST, FASTEST = 0.08, 2.0
 """Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop
@@ -249,7 +250,7 @@ class Design:
 
 
 def optimise(
-    aim: Aim,
+    aim: PlanningGoal,
     base: Manoeuvre,
     simulate: Simulate,
     limits: Limits,
@@ -304,7 +305,9 @@ def optimise(
 class _Search:
     """The cost of designs, and the best that can be flown."""
 
-    def __init__(self, aim: Aim, base: Manoeuvre, simulate: Simulate, limits: Limits) -> None:
+    def __init__(
+        self, aim: PlanningGoal, base: Manoeuvre, simulate: Simulate, limits: Limits
+    ) -> None:
         self.aim, self.base, self.simulate, self.limits = aim, base, simulate, limits
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
         self.flights = 0

@@ -85,7 +85,7 @@ def simulator_of(
             {e.name for e in model.effects},
         )
 
-        def model_of_flight(flight: "Flight") -> Model:
+        def model_of_flight(flight: "SimulatedFlight") -> Model:
             log, carries = flight.log(noise), flight.manoeuvre.payload
             effects = effects_for(
                 model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
@@ -108,7 +108,7 @@ def simulator_of(
             "cpu",
         )
 
-        def model_of_flight(flight: "Flight") -> Model:
+        def model_of_flight(flight: "SimulatedFlight") -> Model:
             return build(
                 [flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)]
             )
@@ -181,7 +181,7 @@ def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Flight:
+class SimulatedFlight:
     """A simulated manoeuvre; arrays of :data:`SAMPLED`, without noise, every ``SAMPLE_PERIOD``."""
 
     manoeuvre: Manoeuvre
@@ -196,7 +196,7 @@ class Flight:
         """Return the times of the samples [s]."""
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
-    def simulated(self, model_of: Callable[["Flight"], Model]) -> Simulated:
+    def simulated(self, model_of: Callable[["SimulatedFlight"], Model]) -> Simulated:
         """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
         it if it was not.
         """
@@ -309,7 +309,7 @@ class Flight:
 
 def fly(
     plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu"
-) -> list[Flight]:
+) -> list[SimulatedFlight]:
     """Fly all manoeuvres at once; those without payload drop it first."""
     from sim.hybrid import HybridSim
 
@@ -327,7 +327,9 @@ def fly(
         rows = len(r.time)
         truth = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in SAMPLED}
         commands = np.array([row[e] for row in pilot.sent[:rows]])
-        flights.append(Flight(m, r, plant, truth, commands, np.random.default_rng([seed, e])))
+        flights.append(
+            SimulatedFlight(m, r, plant, truth, commands, np.random.default_rng([seed, e]))
+        )
     return flights
 
 

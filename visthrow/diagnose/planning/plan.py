@@ -33,7 +33,7 @@ MOST_REPEATS = 10
 
 
 @dataclass(frozen=True)
-class Proposal:
+class FlightProposal:
     """One manoeuvre, or one measurement on the ground, and what it promises."""
 
     name: str
@@ -48,7 +48,7 @@ class Proposal:
     reference: str = ""  # file of its reference
 
 
-class Aim:
+class PlanningGoal:
     """The question that the flights to come are to settle, and the worth of one flight's
     information for it.
     """
@@ -151,11 +151,11 @@ class Aim:
             ]
         )
 
-    def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> Proposal:
+    def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> FlightProposal:
         """Return the promise of a manoeuvre of this information."""
         separated, repeats = self.settled(new)
         separates = tuple(tuple(self.names[j] for j in group) for group in separated)
-        return Proposal(
+        return FlightProposal(
             manoeuvre.name,
             manoeuvre.purpose,
             manoeuvre.seconds,
@@ -167,7 +167,9 @@ class Aim:
         )
 
 
-def propose(aim: Aim, informed: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[Proposal]:
+def propose(
+    aim: PlanningGoal, informed: Sequence[tuple[Manoeuvre, np.ndarray]]
+) -> list[FlightProposal]:
     """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
     the expected information of each.
     """
@@ -178,7 +180,7 @@ def propose(aim: Aim, informed: Sequence[tuple[Manoeuvre, np.ndarray]]) -> list[
     )
 
 
-def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
+def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
     """Return the flights of one session: of ranked proposals, each that separates what none before
     it does.
     """
@@ -190,14 +192,14 @@ def session(proposals: Sequence[Proposal]) -> tuple[Proposal, ...]:
     return tuple(chosen)
 
 
-def _worth(p: Proposal) -> tuple[float, float]:
+def _worth(p: FlightProposal) -> tuple[float, float]:
     """Return the sort key of a proposal: settling most comes first, soonest; one that settles
     nothing counts by its nats a second.
     """
     return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
 
 
-def _measured(aim: Aim) -> list[Proposal]:
+def _measured(aim: PlanningGoal) -> list[FlightProposal]:
     """Measurements on the ground that settle members of classes."""
     diagnosis, names, pairs = aim.diagnosis, aim.names, aim.pairs
     findings = {f.name: f for f in diagnosis.findings}
@@ -215,7 +217,7 @@ def _measured(aim: Aim) -> list[Proposal]:
             (names[a], names[b]) for (a, b), gap in zip(pairs_of, gaps) if gap > DECISIVE
         )
         out.append(
-            Proposal(
+            FlightProposal(
                 m.name,
                 f"settles {m.effect}",
                 m.seconds,

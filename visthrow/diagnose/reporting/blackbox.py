@@ -39,7 +39,7 @@ def _inputs(window: Window) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Table:
+class ForceTable:
     """A force table: ``force_b = weights' radial(inputs)``; torques likewise."""
 
     mean: np.ndarray  # of the inputs, shape (I,)
@@ -55,7 +55,7 @@ class Table:
 
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
-        basis, parts, values = self.radial(_inputs(window)), [], laws.Known(window.knots)
+        basis, parts, values = self.radial(_inputs(window)), [], laws.KnotValues(window.knots)
         for block in self.blocks:
             turned = block != "vehicle torque" and "quat_wb" in values
             axes = np.stack(
@@ -72,7 +72,7 @@ class Table:
         return np.hstack(parts)
 
 
-def table_of(point: Point, rng: np.random.Generator) -> Table | None:
+def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
     """Choose the basis from the states that were flown; None where windows carry no knots, or no
     latent force acts.
     """
@@ -86,7 +86,7 @@ def table_of(point: Point, rng: np.random.Generator) -> Table | None:
     blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
     if not blocks:
         return None
-    return Table(mean, deviation, ((inputs - mean) / deviation)[chosen], blocks)
+    return ForceTable(mean, deviation, ((inputs - mean) / deviation)[chosen], blocks)
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ class Trained:
 
 
 def train(
-    point: Point, table: Table, groups: Sequence[int], theta: np.ndarray | None = None
+    point: Point, table: ForceTable, groups: Sequence[int], theta: np.ndarray | None = None
 ) -> Trained:
     """Gather what the windows say about the table's weights.
 

@@ -21,7 +21,7 @@ from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, r
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.diagnose.select.state import Work
-from visthrow.diagnose.throw.landing import Landings
+from visthrow.diagnose.throw.landing import PredictedLandings
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def landing_gain(
     parts = (
         [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
     )
-    held_landings = Landings(
+    held_landings = PredictedLandings(
         *(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts)))
     )
     good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)

@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     print(report.summary(diagnosis) + "\n")
     if diagnosis.work is None:
         raise DiagnoseError(f"{diagnosis.overall}: {'; '.join(diagnosis.reasons)}")
-    aim = plan.Aim(diagnosis, tuple(name for name in args.about.split(",") if name))
+    aim = plan.PlanningGoal(diagnosis, tuple(name for name in args.about.split(",") if name))
     simulate, flown = simulator_of(
         opened.model,
         diagnosis,

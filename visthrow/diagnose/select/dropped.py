@@ -35,7 +35,7 @@ From half of it as a deviation 0 and 1 are told apart: half way is two from both
 
 
 @dataclass(frozen=True)
-class Told:
+class CommandStatistics:
     """Statistics of windows of K effects and T commands each, about 0; windows of fewer commands
     have columns of 0.
     """
@@ -51,7 +51,7 @@ class Told:
         windows: Sequence[Window],
         columns: Sequence[np.ndarray],
         rows: Sequence[int],
-    ) -> "Told":
+    ) -> "CommandStatistics":
         """Ask windows under a point's noise levels.
 
         Args:
@@ -87,7 +87,7 @@ class Told:
         noise = levels.only(point.noise, grams, rows)
         shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
         information = np.array([columns_of.information for columns_of in shares])
-        return Told(
+        return CommandStatistics(
             information,
             np.array([columns_of.score for columns_of in shares])
             + information[:, :, :effect_count] @ point.theta,
@@ -139,7 +139,9 @@ def verdict(
     windows_all = range(len(problem.kept))
     for rows, shares in ((few_of(windows_all), reach[::LOOK]), (windows_all, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
-        statistics = Told.of(problem, point, [point.windows[w] for w in rows], columns, rows)
+        statistics = CommandStatistics.of(
+            problem, point, [point.windows[w] for w in rows], columns, rows
+        )
         nats = np.minimum(*(statistics.ahead(shares, priors, named) for named in sets))
         if nats.max() <= 0.0:
             return None
@@ -154,7 +156,7 @@ def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
 
     ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these
     leave; ``scatter``: the verdict before."""
-    statistics = Told.of(
+    statistics = CommandStatistics.of(
         problem,
         point,
         [point.about.windows[i] for i in problem.kept],

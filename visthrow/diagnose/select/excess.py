@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood.grammar import through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.models.laws import JOINT, JOINT_NEEDS, Known
+from visthrow.diagnose.models.laws import JOINT, JOINT_NEEDS, KnotValues
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import Level
 from visthrow.logs.flightlog import STANDARD_CHANNELS
@@ -176,7 +176,7 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
     """Latents of a gram that torques in the rope's joint about each axis at each knot stand for,
     shape (L, 3k); None without.
     """
-    values = Known(window.knots)
+    values = KnotValues(window.knots)
     if not set(JOINT_NEEDS) <= set(values) or len(np.unique(gram.latent_block)) < len(
         LATENT_BLOCKS
     ):

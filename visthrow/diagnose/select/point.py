@@ -23,7 +23,7 @@ from visthrow.diagnose.likelihood.evidence import (
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, gather, rescored
-from visthrow.diagnose.likelihood.threads import beside, each
+from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
 from visthrow.diagnose.models.interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
@@ -213,7 +213,7 @@ def linearise(
     extended = (
         windows_of
         if not problem.terms
-        else each(
+        else parallel_map(
             lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta),
             windows_of,
         )
@@ -525,7 +525,7 @@ def candidates(problem: Problem, point: Point, sets: Sequence[Sequence[int]]) ->
     turned = [i for i, active in enumerate(sets) if _off(problem, point, active)]
     plain = [i for i in range(len(sets)) if i not in turned]
     simulated = {i: candidate(problem, point, sets[i]) for i in turned}
-    simulated |= zip(plain, beside(lambda i: candidate(problem, point, sets[i]), plain))
+    simulated |= zip(plain, run_concurrently(lambda i: candidate(problem, point, sets[i]), plain))
     return [simulated[i] for i in range(len(sets))]
 
 

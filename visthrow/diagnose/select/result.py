@@ -69,7 +69,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Step:
+class SelectionStep:
     """One addition of the search, of one cause or of several at once, or an exchange of all names
     for a set that says more.
     """
@@ -163,7 +163,7 @@ class Diagnosis:
     ]
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
-    steps: tuple[Step, ...] = ()
+    steps: tuple[SelectionStep, ...] = ()
     sets: tuple[
         tuple[tuple[str, ...], float], ...
     ] = ()  # sets of causes within 3 nats of the best, with their distance

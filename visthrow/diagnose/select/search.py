@@ -10,7 +10,7 @@ from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.likelihood.threads import each, keep
+from visthrow.diagnose.likelihood.threads import keep, parallel_map
 from visthrow.diagnose.models.interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
@@ -105,7 +105,7 @@ def explain(
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
-    simulated = each(finite, windows)
+    simulated = parallel_map(finite, windows)
     usable = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in without)
     if len(usable) < 0.5 * sum(w.flight not in without for w in windows) or not usable:
         return out_of_domain(model, windows, sum(simulated), seed)

@@ -39,9 +39,9 @@ from visthrow.diagnose.select.point import (
     with_floors_noise,
     with_varying,
 )
-from visthrow.diagnose.select.result import Step
+from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
-from visthrow.diagnose.select.state import Move, SearchState
+from visthrow.diagnose.select.state import SearchState, SetMove
 
 MOST_NAMES = 3 * CHAIN  # a longer list of causes is a wrong form, not a finding
 SHORTLIST = (
@@ -153,7 +153,7 @@ class Selector(SearchState):
         )[usable]
         return gain - (self.prices - self.least)
 
-    def _several(self, free: Point, usable: np.ndarray) -> list[Move]:
+    def _several(self, free: Point, usable: np.ndarray) -> list[SetMove]:
         """The additions that forward selection comes to, where there are several, simulated at
         once.
 
@@ -193,7 +193,7 @@ class Selector(SearchState):
         """Nats beyond its price that a name needs while flights contradict another."""
         return max(0.0, 0.5 * max(self.refused.values(), default=0.0) - self.least)
 
-    def _closer(self, move: Move, listed: Mapping[tuple[int, ...], float]) -> bool:
+    def _closer(self, move: SetMove, listed: Mapping[tuple[int, ...], float]) -> bool:
         """An addition with derivatives and initial states of its own, where it leads: those of the
         model as it is may fall short.
 
@@ -215,7 +215,7 @@ class Selector(SearchState):
             self.ahead((point, move.active), rival)
             for rival in ((self.point, self.active), (alike, self.active))
         )
-        if self._best([Move(move.active, nats, point)], listed, self._contradicted()):
+        if self._best([SetMove(move.active, nats, point)], listed, self._contradicted()):
             return True
         self.origin = origin
         return False
@@ -257,13 +257,13 @@ class Selector(SearchState):
         if self._best(tried, listed, EXCHANGE_MARGIN):
             return True
         self.sets = [
-            Move(tuple(self.active), 0.0),
+            SetMove(tuple(self.active), 0.0),
             *(move for move in tried if -STRONG < move.nats <= EXCHANGE_MARGIN),
         ]
         self.rivalled = self.point
         return False
 
-    def _rivals(self) -> list[Move]:
+    def _rivals(self) -> list[SetMove]:
         """Sets within reach of one move, by the linear statistics, best first."""
         singles, pairs, active = {}, {}, self.active
         usable, present = self._usable(), self.linear(active, self.point)
@@ -298,7 +298,7 @@ class Selector(SearchState):
         ranked = _ranked(singles, DOUBT)
         ranked = [m for i, m in enumerate(ranked) if i < 2 * SHORTLIST or abs(m.nats) < STRONG]
         single = (
-            [] if self.terms else [Move((k,), 0.0) for k in usable.tolist() if self.is_term(k)]
+            [] if self.terms else [SetMove((k,), 0.0) for k in usable.tolist() if self.is_term(k)]
         )  # not to be told from here
         return [
             *ranked,
@@ -319,11 +319,11 @@ class Selector(SearchState):
         for removed in range(min(2, len(self.active)) + 1):
             yield from combinations(self.active, len(self.active) - removed)
 
-    def _tried(self, point: Point, sets: Sequence[Sequence[int]]) -> list[Move]:
+    def _tried(self, point: Point, sets: Sequence[Sequence[int]]) -> list[SetMove]:
         """Simulate sets from a point."""
         present = self.point, self.active
         moves = [
-            Move(tuple(s), self.ahead((simulated, s), present), simulated)
+            SetMove(tuple(s), self.ahead((simulated, s), present), simulated)
             for s, simulated in zip(sets, candidates(self.problem, point, sets))
         ]
         bare = [
@@ -334,12 +334,12 @@ class Selector(SearchState):
         ):
             nats = self.ahead((simulated, sets[i]), present)
             moves[i] = max(
-                moves[i], Move(tuple(sets[i]), nats, simulated), key=lambda move: move.nats
+                moves[i], SetMove(tuple(sets[i]), nats, simulated), key=lambda move: move.nats
             )
         return moves
 
     def _best(
-        self, tried: Sequence[Move], listed: Mapping[tuple[int, ...], float], margin: float
+        self, tried: Sequence[SetMove], listed: Mapping[tuple[int, ...], float], margin: float
     ) -> bool:
         """Go over to the best of some sets that may be named; False where none is worth enough
         more.
@@ -376,7 +376,9 @@ class Selector(SearchState):
                     listed.items(), key=lambda item: -simulated.get(tell(item[0]), -np.inf)
                 )[:SETS_REPORTED]
             }
-            self.steps.append(Step(tell(move.active), move.nats, margin, screened, simulated))
+            self.steps.append(
+                SelectionStep(tell(move.active), move.nats, margin, screened, simulated)
+            )
             self.origin = (
                 self.nominal if all(map(self.is_term, move.active)) and move.active else self.origin
             )
@@ -391,7 +393,7 @@ class Selector(SearchState):
         """Names of a set."""
         return ", ".join(map(self.name, active)) or "nothing"
 
-    def _believed(self, move: Move) -> bool:
+    def _believed(self, move: SetMove) -> bool:
         """Whether the new names of a set could be named: two at once if they leave nothing to
         explain.
 
@@ -422,7 +424,7 @@ class Selector(SearchState):
         )
         return not any(level.excessive for level in levels_left)
 
-    def _differing(self, move: Move, j: int) -> bool:
+    def _differing(self, move: SetMove, j: int) -> bool:
         """Whether flights disagree on an addition, which is then refused, or is an event of the one
         flight that is left out.
         """
@@ -598,8 +600,8 @@ class Selector(SearchState):
         )
 
 
-def _ranked(sets: Mapping[tuple[int, ...], float], doubt: float) -> list[Move]:
+def _ranked(sets: Mapping[tuple[int, ...], float], doubt: float) -> list[SetMove]:
     """Best first, of those that are not too far behind."""
     return sorted(
-        (Move(s, float(v)) for s, v in sets.items() if v > -doubt), key=lambda move: -move.nats
+        (SetMove(s, float(v)) for s, v in sets.items() if v > -doubt), key=lambda move: -move.nats
     )

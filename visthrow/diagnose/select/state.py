@@ -31,7 +31,7 @@ from visthrow.diagnose.select.point import (
     linearise,
     moved,
 )
-from visthrow.diagnose.select.result import Law, Step
+from visthrow.diagnose.select.result import Law, SelectionStep
 from visthrow.diagnose.select.scatter import (
     Scatter,
     Varies,
@@ -56,7 +56,7 @@ class Work:
 
 
 @dataclass(frozen=True)
-class Move:
+class SetMove:
     """A set that may take the place of the one that a search stands at."""
 
     active: tuple[int, ...]
@@ -78,12 +78,12 @@ class SearchState:
     active: list[int] = field(default_factory=list)
     point: Point | None = None
     origin: Point | None = None  # where the derivatives were taken last
-    steps: list[Step] = field(default_factory=list)
+    steps: list[SelectionStep] = field(default_factory=list)
     refused: dict[int, float] = field(
         default_factory=dict
     )  # effects that are not the same in all flights, with their nats
     events: list[int] = field(default_factory=list)
-    sets: list[Move] = field(default_factory=list)  # that are possible as well
+    sets: list[SetMove] = field(default_factory=list)  # that are possible as well
     rivalled: Point | None = None  # where all sets were simulated that may be worth as much
     proposed: set[frozenset[int]] = field(
         default_factory=set

@@ -20,10 +20,18 @@ from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.models.laws import JOINT, Known, Layout, Term, carries, loads, terms_of
+from visthrow.diagnose.models.laws import (
+    JOINT,
+    KnotValues,
+    Term,
+    TermLayout,
+    carries,
+    loads,
+    terms_of,
+)
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law
@@ -44,9 +52,9 @@ WEIGHED = 6
 
 
 @lru_cache(maxsize=32)
-def _laid(block: str, quantities: tuple[str, ...]) -> tuple[tuple[Term, ...], Layout | None]:
+def _laid(block: str, quantities: tuple[str, ...]) -> tuple[tuple[Term, ...], TermLayout | None]:
     terms = tuple(terms_of(block, quantities))
-    return terms, Layout.of(terms) if terms else None
+    return terms, TermLayout.of(terms) if terms else None
 
 
 @dataclass
@@ -91,7 +99,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
 
 
 def screen(
-    point: Point, parts: Sequence[WindowStatistics], block: str, quantities: Sequence[Known]
+    point: Point, parts: Sequence[WindowStatistics], block: str, quantities: Sequence[KnotValues]
 ) -> Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
     carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
@@ -112,7 +120,7 @@ def screen(
             for values in layout.factors(joined([quantities[w] for w in carriers], shared))
         )
     )
-    exerted = each(
+    exerted = parallel_map(
         lambda w: _exerted(point, parts[w], w, block, quantities[w], latent_block), carriers
     )
     at_windows = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
@@ -128,7 +136,7 @@ def screen(
         for first in range(0, len(own_rows), size)
     ]
     row_of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
-    shares = zip(*each(lambda batch: _products(batch, layout, point.device), batches))
+    shares = zip(*parallel_map(lambda batch: _products(batch, layout, point.device), batches))
     square, information, score, cross = (_summed(values, row_of, len(rows)) for values in shares)
     information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
     count = sum(int((point.grams[w].latent_block == latent_block).sum()) // 3 for w in carriers)
@@ -143,7 +151,7 @@ def _summed(values: Sequence[np.ndarray], row_of: np.ndarray, rows: int) -> np.n
 
 
 def _exerted(
-    point: Point, part: WindowStatistics, w: int, block: str, values: Known, latent_block: int
+    point: Point, part: WindowStatistics, w: int, block: str, values: KnotValues, latent_block: int
 ) -> tuple[np.ndarray, ...]:
     """Return square and information, score and cross information of what is exerted at a window's
     knots.
@@ -160,7 +168,7 @@ def _exerted(
 
 
 def _products(
-    windows: Sequence[tuple[np.ndarray, ...]], layout: Layout, device: str
+    windows: Sequence[tuple[np.ndarray, ...]], layout: TermLayout, device: str
 ) -> tuple[np.ndarray, ...]:
     """Square, information, score and cross information of all terms, of these windows together.
 
@@ -269,7 +277,9 @@ def extended(
             [a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)]
         )
         if key not in columns_of:
-            columns_of[key] = each(lambda pair: laid(*pair), zip(point.windows, point.grams))
+            columns_of[key] = parallel_map(
+                lambda pair: laid(*pair), zip(point.windows, point.grams)
+            )
         windows = [
             replace(w, effects=effects)
             for w, (effects, _, _) in zip(point.windows, columns_of[key])
@@ -345,7 +355,7 @@ def shortlist(
     nats that a term must bring beyond its price; ``names``: that are not in the set: a term that
     one of these says as well is none."""
     calm, parts = calmed(point)
-    values = [Known(window.knots) for window in point.windows]
+    values = [KnotValues(window.knots) for window in point.windows]
     screens = {
         block: screened
         for block in strongest
@@ -412,11 +422,11 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
     ``j``: number of the term among the effects.
     """
     term = problem.effects[j].term
-    layout = Layout.of([term])
+    layout = TermLayout.of([term])
     square: dict[tuple[int, str], list[float]] = {}
     for window, gram in zip(point.windows, point.grams):
         if carries(gram.latent_block, term.block):
-            quantities = Known(window.knots)
+            quantities = KnotValues(window.knots)
             for block, values in loads(term.block, quantities, layout.table(quantities)).items():
                 square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(
                     float((values**2).sum((1, 2)).mean())

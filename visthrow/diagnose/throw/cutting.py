@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
-from visthrow.diagnose.throw.recorded import NEVER, Recorded
+from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight
 
 LENGTH = 1.0  # of a window, about [s]
 SHORTEST = 0.25  # of a window [s]
@@ -46,7 +46,7 @@ def _split(first: float, last: float) -> list[tuple[float, float]]:
     return list(pairwise(edges))
 
 
-def _phase(flight: Recorded, first: float, last: float) -> str:
+def _phase(flight: RecordedFlight, first: float, last: float) -> str:
     pos = flight.vehicle.values[flight.vehicle.between(first, last)]
     if len(pos) < 2:
         return "flight"
@@ -54,7 +54,7 @@ def _phase(flight: Recorded, first: float, last: float) -> str:
     return "hover" if np.linalg.norm(reach) < QUIET_SPEED else "flight"
 
 
-def payload_down(flight: Recorded, landing_height: float) -> float:
+def payload_down(flight: RecordedFlight, landing_height: float) -> float:
     """Return when the payload is about to come down, or NEVER [s]."""
     if flight.payload is None or flight.latch == NEVER:
         return flight.landing
@@ -66,7 +66,7 @@ def payload_down(flight: Recorded, landing_height: float) -> float:
 
 
 def cut(
-    flight: Recorded, number: int, lag: float, landing_height: float, carries: bool
+    flight: RecordedFlight, number: int, lag: float, landing_height: float, carries: bool
 ) -> list[Cut]:
     """Cut one flight.
 
@@ -129,6 +129,6 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
     ]
 
 
-def _is_visible(flight: Recorded, c: Cut) -> bool:
+def _is_visible(flight: RecordedFlight, c: Cut) -> bool:
     span = flight.vehicle.between(c.start, c.end)
     return span.stop - span.start >= POSES_LEAST

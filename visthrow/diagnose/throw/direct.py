@@ -18,7 +18,7 @@ from sim.effects.setting import Setting
 from sim.params import SensingParams
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import NEVER, Recorded, measured
+from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight, measured
 from visthrow.diagnose.throw.states import smoothed
 from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
@@ -62,7 +62,7 @@ class DirectMeasurement(Protocol):
 
 
 def channels_of(
-    logs: Sequence[FlightLog], flights: Sequence[Recorded], camera: CameraParams | None
+    logs: Sequence[FlightLog], flights: Sequence[RecordedFlight], camera: CameraParams | None
 ) -> list[str]:
     """Channels of the direct measurements that the logs hold."""
     landed = any(f.landing_point is not None and f.latch != NEVER for f in flights)
@@ -73,7 +73,10 @@ def channels_of(
 
 
 def direct_measurements(
-    logs: Sequence[FlightLog], flights: Sequence[Recorded], cuts: Sequence[Cut], setting: Setting
+    logs: Sequence[FlightLog],
+    flights: Sequence[RecordedFlight],
+    cuts: Sequence[Cut],
+    setting: Setting,
 ) -> list[DirectMeasurement]:
     """All that the logs hold of windows that count."""
     channels = channels_of(logs, flights, setting.camera)
@@ -151,7 +154,7 @@ class LandingHeight:
 
     channel = LANDING
 
-    def __init__(self, flights: Sequence[Recorded], cuts: Sequence[Cut]):
+    def __init__(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]):
         """Give each landing to the last window of its flight that counts."""
         self.windows: dict[int, tuple[float, np.ndarray]] = {}
         for n, flight in enumerate(flights):
@@ -185,7 +188,7 @@ class CameraView:
     def __init__(
         self,
         logs: Sequence[FlightLog],
-        flights: Sequence[Recorded],
+        flights: Sequence[RecordedFlight],
         cuts: Sequence[Cut],
         setting: Setting,
     ):
@@ -238,7 +241,7 @@ def _reach(camera) -> np.ndarray:
     )
 
 
-def _view(log: FlightLog, flight: Recorded, c: Cut, x: SensingParams) -> dict | None:
+def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> dict | None:
     """Views of one window: stamps, points, what is valid of them, goal, and smoothed poses on a
     grid about them.
     """

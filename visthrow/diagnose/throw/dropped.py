@@ -10,12 +10,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim.kernels.replay.lanes import Recording
-from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Flights, Lane, Simulation
+from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Lane, ReplayedFlights, Simulation
 from visthrow.diagnose.throw.states import States
 
 
 def without_each_command(
-    flights: Flights, windows: Sequence[int], count: float, simulation: Simulation, states: States
+    flights: ReplayedFlights,
+    windows: Sequence[int],
+    count: float,
+    simulation: Simulation,
+    states: States,
 ) -> list[np.ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
@@ -39,7 +43,7 @@ def without_each_command(
     return columns
 
 
-def _acting(flights: Flights, w: int, delay: float) -> np.ndarray:
+def _acting(flights: ReplayedFlights, w: int, delay: float) -> np.ndarray:
     """Numbers of the commands that act in a window and differ from the one before."""
     c, f = flights.cuts[w], flights.flights[flights.cuts[w].flight]
     acts = f.command_time + delay
@@ -49,7 +53,7 @@ def _acting(flights: Flights, w: int, delay: float) -> np.ndarray:
 
 
 def _flown(
-    flights: Flights,
+    flights: ReplayedFlights,
     windows: Sequence[int],
     commands: Sequence[np.ndarray],
     simulation: Simulation,

@@ -12,9 +12,9 @@ from itertools import groupby
 import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED
-from visthrow.diagnose.likelihood.threads import each
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.interface import Window
-from visthrow.diagnose.throw.replay import Flights, Lane, Simulation
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation
 from visthrow.diagnose.throw.states import (
     MOVED,
     Direction,
@@ -83,7 +83,9 @@ class _Trial:
 class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
-    def __init__(self, flights: Flights, retained: np.ndarray, simulation: Simulation, lag: float):
+    def __init__(
+        self, flights: ReplayedFlights, retained: np.ndarray, simulation: Simulation, lag: float
+    ):
         """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far
         as known [s].
         """
@@ -216,7 +218,7 @@ class InitialFit:
         rungs = np.where(doubtful[windows], len(LADDER), 1)
         which, first = np.repeat(windows, rungs), np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(windows, rungs)]
-        each(self._scaled, windows)
+        parallel_map(self._scaled, windows)
         trials = [
             self._increments(w, residuals[w], states[MOVED][w], its)
             for w, its in zip(windows, dampings)
@@ -333,7 +335,7 @@ class InitialFit:
         return out, step @ slope - 0.5 * np.sum(step @ bend * step, axis=1)
 
 
-def drift(flights: Flights, w: int) -> np.ndarray:
+def drift(flights: ReplayedFlights, w: int) -> np.ndarray:
     """Return how far gusts may have moved a window's samples by their time, as a deviation, shape
     (N,).
     """
@@ -341,7 +343,7 @@ def drift(flights: Flights, w: int) -> np.ndarray:
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
 
-def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray, float]:
+def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[np.ndarray, float]:
     """Which samples tell of a window's start, and how long it is flown for their sake [s].
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
@@ -353,7 +355,9 @@ def sensitive_samples(flights: Flights, w: int, lag: float) -> tuple[np.ndarray,
     return (time < time_left).astype(float), min(time_left + ONWARD, c.end)
 
 
-def following(flights: Flights, w: int, window: Window, free: np.ndarray, lag: float) -> np.ndarray:
+def following(
+    flights: ReplayedFlights, w: int, window: Window, free: np.ndarray, lag: float
+) -> np.ndarray:
     """Return how a window's initial state follows its effects, so that the flight stays as near to
     where it was as it can.
 

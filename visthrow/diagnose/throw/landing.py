@@ -16,13 +16,13 @@ from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.throw.cutting import (
     BEFORE,
     GROUND_MARGIN,
-    LEAST,
     LEAST_TAUT,
+    SHORTEST,
     Cut,
     payload_down,
 )
-from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
-from visthrow.diagnose.throw.replay import Flights, Lane
+from visthrow.diagnose.throw.recorded import NEVER, ChannelSamples, RecordedFlight
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -33,7 +33,7 @@ TICK = 5e-3  # between the points of a simulated path [s]; a chord is 0.03 mm of
 
 
 @dataclass(frozen=True)
-class Landings:
+class PredictedLandings:
     """Throws of which the landing was seen; points [m] on the plane of the landing, in the measured
     frame.
     """
@@ -58,7 +58,7 @@ class Landings:
         return np.linalg.norm((self.released - self.measured)[:, :2], axis=1)
 
 
-def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | None:
+def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, np.ndarray] | None:
     """Time [s] and point [m] at which a payload came down; None where nobody saw it.
 
     Without a logged landing the track just above the ground is carried on to ``height`` by a
@@ -94,7 +94,7 @@ def seen_landing(flight: Recorded, height: float) -> tuple[float, np.ndarray] | 
 
 def landings(
     model: Any, theta: Mapping[str, float], flights: Iterable[int] | None = None
-) -> Landings:
+) -> PredictedLandings:
     """Predict the landings of throws of a :class:`visthrow.diagnose.throw.throw_model.ThrowModel`
     with effects at ``theta``.
 
@@ -109,13 +109,15 @@ def landings(
     }
     spans = {n: span for n in measured if (span := _spans(model, n)) is not None}
     if not spans:
-        return Landings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
+        return PredictedLandings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
     ends = {n: measured[n][0] + AFTERWARDS for n in spans}
     paths = [
         _fly(model, theta, {n: spans_of[k] for n, spans_of in spans.items()}, ends)
         for k in range(2)
     ]
-    return Landings(np.array(list(spans)), np.array([measured[n][1] for n in spans]), *paths)
+    return PredictedLandings(
+        np.array(list(spans)), np.array([measured[n][1] for n in spans]), *paths
+    )
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -135,7 +137,7 @@ def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, f
     head = max(end - HEAD, cuts[0].start), end
     return (
         (head, (last, separation))
-        if head[1] - head[0] > LEAST and separation - last > LEAST_TAUT
+        if head[1] - head[0] > SHORTEST and separation - last > LEAST_TAUT
         else None
     )
 
@@ -155,7 +157,7 @@ def _fly(
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
-    onward = Flights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+    onward = ReplayedFlights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     measured = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
@@ -180,12 +182,12 @@ def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
     return [*cuts, Cut(number, "throw", begin, end, ATTACHED)]
 
 
-def _with_path(flight: Recorded, end: float | None) -> Recorded:
+def _with_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
     """The flight with stamps of a payload all the way down in place of the measured ones."""
     if end is None:
         return flight
     time = np.arange(flight.latch, end + 1.0, TICK)
-    return replace(flight, payload=Samples(time, np.zeros((len(time), 3)), 1.0), gyro=None)
+    return replace(flight, payload=ChannelSamples(time, np.zeros((len(time), 3)), 1.0), gyro=None)
 
 
 def _crossing(path: np.ndarray, height: float) -> np.ndarray:

@@ -17,7 +17,7 @@ from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.models.interface import Window
 from visthrow.diagnose.throw.recorded import NEVER
-from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Flights, Lane
+from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Lane, ReplayedFlights
 from visthrow.diagnose.throw.states import Direction, concerns
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
@@ -110,7 +110,7 @@ class Plan:
 
     def window_of(
         self,
-        flights: Flights,
+        flights: ReplayedFlights,
         setting: Setting,
         directions: Sequence[Direction],
         channel: np.ndarray,
@@ -147,7 +147,7 @@ class Plan:
 
 
 def lanes_of(
-    flights: Flights,
+    flights: ReplayedFlights,
     w: int,
     alike: np.ndarray,
     needs: np.ndarray,
@@ -211,7 +211,7 @@ def lanes_of(
 
 
 def at_knots(
-    flights: Flights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]
+    flights: ReplayedFlights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]

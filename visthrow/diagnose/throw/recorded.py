@@ -30,7 +30,7 @@ AT_START = 0.25  # of a log, whose voltages tell how much charge was used before
 
 
 @dataclass(frozen=True)
-class Samples:
+class ChannelSamples:
     """Valid samples of one measured channel."""
 
     time: np.ndarray  # [s], shape (T,)
@@ -46,17 +46,17 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Recorded:
+class RecordedFlight:
     """One flight."""
 
     command_time: np.ndarray  # [s], shape (C,)
     command: np.ndarray  # [N, rad/s], shape (C, 4)
     latch: float  # of the release, or NEVER [s]
     landing: float  # of the payload, or NEVER [s]
-    vehicle: Samples  # positions [m]; attitudes at the same stamps in ``attitude``
-    attitude: Samples  # quaternions xyzw
-    payload: Samples | None
-    gyro: Samples | None
+    vehicle: ChannelSamples  # positions [m]; attitudes at the same stamps in ``attitude``
+    attitude: ChannelSamples  # quaternions xyzw
+    payload: ChannelSamples | None
+    gyro: ChannelSamples | None
     voltage: float | None  # at the start [V]
     hanging: bool | None = (
         None  # whether the log says that a payload hung below at its start; None where it does not
@@ -87,7 +87,7 @@ def measured(log: FlightLog, name: str) -> Channel | None:
     return None
 
 
-def _samples(log: FlightLog, name: str) -> Samples | None:
+def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     channel = measured(log, name)
     if channel is None:
         return None
@@ -108,7 +108,7 @@ def _samples(log: FlightLog, name: str) -> Samples | None:
     noise = np.hypot(highpass_sigma(values), step * UNIFORM)
     # An angle moves three of four numbers of an attitude by its half.
     sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0) if name == "quat_wb" else np.median(noise)
-    return Samples(time, values, max(float(sigma), LEAST_SIGMA[name]))
+    return ChannelSamples(time, values, max(float(sigma), LEAST_SIGMA[name]))
 
 
 def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -150,7 +150,7 @@ def resolution(values: np.ndarray) -> float:
     return smallest if len(changes) and np.median(changes) < 1.5 * smallest else 0.0
 
 
-def record_of(log: FlightLog, number: int = 0) -> Recorded:
+def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
     """Take from a log what a replay needs.
 
     Raises DiagnoseError: no commands, or no poses of the vehicle.
@@ -169,7 +169,7 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)
-    return Recorded(
+    return RecordedFlight(
         *log["command"].samples(),
         _latch(log),
         landing,
@@ -183,7 +183,9 @@ def record_of(log: FlightLog, number: int = 0) -> Recorded:
     )
 
 
-def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]:
+def _paired(
+    pos: ChannelSamples, quat: ChannelSamples, number: int
+) -> tuple[ChannelSamples, ChannelSamples]:
     """Positions and attitudes of the same times: of common stamps, else attitudes between their
     samples.
 
@@ -194,7 +196,7 @@ def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]
     )
     if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:
         time = pos.time[at_pos]
-        return Samples(time, pos.values[at_pos], pos.sigma), Samples(
+        return ChannelSamples(time, pos.values[at_pos], pos.sigma), ChannelSamples(
             time, quat.values[at_quat], quat.sigma
         )
     index = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
@@ -209,12 +211,12 @@ def _paired(pos: Samples, quat: Samples, number: int) -> tuple[Samples, Samples]
             " time"
         )
     time = pos.time[close]
-    return Samples(time, pos.values[close], pos.sigma), Samples(
+    return ChannelSamples(time, pos.values[close], pos.sigma), ChannelSamples(
         time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma
     )
 
 
-def carriers(flights: Sequence[Recorded]) -> list[bool]:
+def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
     """Whether each flight carries a payload: as its log says, else if it was measured or released
     there.
 
@@ -263,13 +265,13 @@ def _voltage(log: FlightLog) -> float | None:
     return float(np.median(volts[time < time[0] + AT_START]))
 
 
-def _payload(log: FlightLog, landing: float) -> Samples | None:
+def _payload(log: FlightLog, landing: float) -> ChannelSamples | None:
     samples = _samples(log, "payload_pos_w")
     if samples is None:
         return None
     keep = samples.time < landing - 1e-3
     return (
-        Samples(samples.time[keep], samples.values[keep], samples.sigma)
+        ChannelSamples(samples.time[keep], samples.values[keep], samples.sigma)
         if np.count_nonzero(keep) >= 5
         else None
     )

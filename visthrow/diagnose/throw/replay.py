@@ -15,7 +15,7 @@ from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
 from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import NEVER, Recorded, Samples
+from visthrow.diagnose.throw.recorded import NEVER, ChannelSamples, RecordedFlight
 from visthrow.diagnose.throw.states import States, hover_state, measured_state, rows_of, stacked
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
@@ -102,7 +102,7 @@ class Lane(NamedTuple):
     rough: bool = False  # whether it flies with longer steps
 
 
-class Flights:
+class ReplayedFlights:
     """Windows of recorded flights as the replay's arrays.
 
     Attributes:
@@ -112,7 +112,10 @@ class Flights:
     """
 
     def __init__(
-        self, flights: Sequence[Recorded], cuts: Sequence[Cut], delays: tuple[float, float, float]
+        self,
+        flights: Sequence[RecordedFlight],
+        cuts: Sequence[Cut],
+        delays: tuple[float, float, float],
     ):
         """Lay out flights and windows.
 
@@ -125,7 +128,12 @@ class Flights:
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
         self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
-        parts: dict[str, list[Samples]] = {"vehicle": [], "attitude": [], "payload": [], "gyro": []}
+        parts: dict[str, list[ChannelSamples]] = {
+            "vehicle": [],
+            "attitude": [],
+            "payload": [],
+            "gyro": [],
+        }
         counts = dict.fromkeys(parts, 0)
         for w, c in enumerate(self.cuts):
             f = self.flights[c.flight]
@@ -147,9 +155,11 @@ class Flights:
                 f.gyro,
             )
             for name, source, delay in zip(parts, sources, (delays[0], *delays)):
-                samples = source or Samples(np.zeros(0), np.zeros((0, 3)), 1.0)
+                samples = source or ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
                 span = samples.between(c.start + delay + EARLY, c.end + delay)
-                parts[name].append(Samples(samples.time[span], samples.values[span], samples.sigma))
+                parts[name].append(
+                    ChannelSamples(samples.time[span], samples.values[span], samples.sigma)
+                )
                 arrays |= {f"{name}_first": counts[name], f"{name}_count": len(samples.time[span])}
                 counts[name] += len(samples.time[span])
             for name in self.windows:
@@ -203,9 +213,9 @@ class Flights:
             plant = replace(plant, release=setting.plant.release)
         return plant == setting.plant
 
-    def _joined(self, name: str) -> Samples:
+    def _joined(self, name: str) -> ChannelSamples:
         parts = self.samples[name]
-        return Samples(
+        return ChannelSamples(
             np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0
         )
 
@@ -255,7 +265,7 @@ class Flights:
             states, recording or self.recording, columns, KNOT_SPACING, knots
         )
 
-    def repeated(self, windows: np.ndarray) -> "Flights":
+    def repeated(self, windows: np.ndarray) -> "ReplayedFlights":
         """Return the flights as they concern :meth:`fly`, with windows that stand there more than
         once.
         """
@@ -268,7 +278,7 @@ class Flights:
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
 
 
-def carried(flights: Flights, simulation: Simulation) -> tuple[States, States]:
+def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, States]:
     """Initial states of all windows: smoothed measurements and, for what nobody measures, what
     flying through the windows before gives.
 

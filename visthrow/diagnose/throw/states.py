@@ -13,7 +13,7 @@ from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from sim.params import GRAVITY, PlantParams, VehicleParams
 from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import Recorded, Samples
+from visthrow.diagnose.throw.recorded import ChannelSamples, RecordedFlight
 
 SMOOTH_BEFORE, SMOOTH_AFTER = (
     0.06,
@@ -186,7 +186,7 @@ def resampled(states: States, segments: int) -> States:
 
 
 def smoothed(
-    samples: Samples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
+    samples: ChannelSamples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Value and derivative at a time from a local cubic through the samples about it; None without
     enough of them.
@@ -197,7 +197,7 @@ def smoothed(
 
 
 def _smoothed(
-    samples: Samples, instant: float, before: float, after: float
+    samples: ChannelSamples, instant: float, before: float, after: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
         span = samples.between(instant - reach * before, instant + reach * after)
@@ -219,7 +219,7 @@ def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def measured_state(
-    flight: Recorded, time: float, setting: Setting, payload: int, inner: States
+    flight: RecordedFlight, time: float, setting: Setting, payload: int, inner: States
 ) -> States:
     """One state at a time of a flight: measured where it is measured, the rest from ``inner`` (one
     state).
@@ -287,7 +287,7 @@ def _hang(
     state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u + np.cross(spin, n)
 
 
-def hover_state(flight: Recorded, plant: PlantParams, payload: int) -> States:
+def hover_state(flight: RecordedFlight, plant: PlantParams, payload: int) -> States:
     """A state in hover at the flight's start: what the first window's measurements do not tell."""
     v, rope, L = plant.vehicle, plant.rope, plant.rope.segments
     thrust = max(float(flight.command[0, 0]), 0.05)
@@ -324,7 +324,7 @@ def _power(v: VehicleParams, thrust: float) -> float:
     )
 
 
-def _charge(flight: Recorded, v: VehicleParams, power: float) -> float:
+def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
     """Fraction of the charge used at the start, from the first voltage and the power [W] drawn
     then. Where none was logged: from that of the hover in which throttle was calibrated, where the
     controller makes up for no other; else a fifth.

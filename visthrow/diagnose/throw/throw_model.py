@@ -19,7 +19,7 @@ from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.threads import aside, each
+from visthrow.diagnose.likelihood.threads import aside, parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.interface import Linearised, Window
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
@@ -31,14 +31,14 @@ from visthrow.diagnose.throw.direct import (
 )
 from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
-from visthrow.diagnose.throw.landing import Landings, landings
+from visthrow.diagnose.throw.landing import PredictedLandings, landings
 from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, without_calm_speeds
-from visthrow.diagnose.throw.recorded import NEVER, Recorded, carriers, record_of
+from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight, carriers, record_of
 from visthrow.diagnose.throw.replay import (
     BATCH,
     CUDA_BATCH,
-    Flights,
     Lane,
+    ReplayedFlights,
     Simulation,
     carried,
     downloaded,
@@ -135,10 +135,10 @@ class ThrowModel:
         )
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
-    def _cut(self, flights: Sequence[Recorded], cuts: Sequence[Cut]) -> Flights:
+    def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
         """Return these windows of flights, in the time of their sensors."""
         x = self.setting.sensing
-        return Flights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+        return ReplayedFlights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
 
     def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
         """Take these effects: first those that are simulated by degrees, then switches, then what
@@ -315,7 +315,7 @@ class ThrowModel:
             )
 
         by_effect = np.zeros((len(cuts), len(directions_of), effects))
-        for i, moves in zip(owns, each(way, owns)):
+        for i, moves in zip(owns, parallel_map(way, owns)):
             by_effect[self._retained[i], owns[i]] = moves
         return owns, by_effect
 
@@ -337,7 +337,7 @@ class ThrowModel:
 
     def landings(
         self, theta: Mapping[str, float], flights: Sequence[int] | None = None
-    ) -> Landings:
+    ) -> PredictedLandings:
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
@@ -471,7 +471,9 @@ class ThrowModel:
         def slopes(plan: Plan) -> list[torch.Tensor]:
             return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
 
-        windows = [slopes(plan) for plan in plans] if flown.seen.is_cuda else each(slopes, plans)
+        windows = (
+            [slopes(plan) for plan in plans] if flown.seen.is_cuda else parallel_map(slopes, plans)
+        )
         nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
         blocks = [e.block for e in self._graded]
 
@@ -492,7 +494,7 @@ class ThrowModel:
                 settings[0].plant.air.wind_w,
             )
 
-        return each(window, range(len(plans)))
+        return parallel_map(window, range(len(plans)))
 
     def _channel(self, w: int) -> np.ndarray:
         index = {name: i for i, name in enumerate(self.channels)}
@@ -551,7 +553,7 @@ def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
     return frozenset((name, float(value)) for name, value in theta.items() if value)
 
 
-def _measured(flights: Sequence[Recorded], carries: bool) -> list[str]:
+def _measured(flights: Sequence[RecordedFlight], carries: bool) -> list[str]:
     """Return the channels of poses and rates that these flights have."""
     payload = ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
     return ["pos_w", "quat_wb", *payload, *(["rate_b"] if any(f.gyro for f in flights) else [])]
