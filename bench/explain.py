@@ -14,7 +14,7 @@ from pathlib import Path
 from bench import start
 from bench.report import Report, Table, add_arguments_of_measurements, finish
 from sim.cores import cores
-from visthrow.diagnose.inputs import opening
+from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.reporting import explain_cli
 from visthrow.diagnose.select import search
 from visthrow.training.device import resolve

@@ -29,7 +29,7 @@ from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.diagnose.reporting import report
+from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.search import diagnose

@@ -6,7 +6,7 @@ python examples/diagnose_csv.py tests/data/real/jugglebot_throws/session7.csv.gz
 import argparse
 
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.reporting.report import summary
+from visthrow.diagnose.reporting.diagnosis_report import summary
 from visthrow.diagnose.select.search import explain
 from visthrow.logs import read
 from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn

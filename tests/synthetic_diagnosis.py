@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visthrow.diagnose.models.interface import Effect, Linearised, Window
+from visthrow.diagnose.models.model_interface import Effect, Linearised, Window
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
@@ -63,7 +63,7 @@ def catalogue(count: int = 20) -> tuple[Effect, ...]:
 
 @dataclass
 class SyntheticModel:
-    """Implements :class:`visthrow.diagnose.models.interface.Model`; ``truth`` is in floors."""
+    """A synthetic :class:`visthrow.diagnose.models.model_interface.Model`; ``truth`` in floors."""
 
     effects: tuple[Effect, ...] = field(default_factory=catalogue)
     truth: dict[str, float] = field(default_factory=dict)

@@ -112,7 +112,7 @@ class Flipped:
         return (self._sign[window.flight] - 1.0) * base
 
     def windows(self, theta):
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         self._last = self.model.windows(theta)
         return [
             replace(w, residual=w.residual + self._shift(w, b))
@@ -120,7 +120,7 @@ class Flipped:
         ]
 
     def residuals(self, theta, about=None):
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         return [
             r + self._shift(w, b)
             for w, r, b in zip(self._last, self.model.residuals(theta, about), self._base)

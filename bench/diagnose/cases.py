@@ -227,7 +227,7 @@ def scramble(recipe: Recipe, folder: Path) -> dict:
 def flip(recipe: Recipe, _: Path) -> dict:
     """Residuals of every other flight turned around: what is common to all flights is gone."""
     from visthrow import config
-    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.select import search
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of

@@ -23,7 +23,7 @@ from sim.params import PlantParams
 from visthrow import config
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.planning.design import Limits, optimise
 from visthrow.diagnose.planning.fly_manoeuvres import carried, fly, simulator_of, vehicle_of
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue

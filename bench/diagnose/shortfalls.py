@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 
 from visthrow.diagnose.likelihood import designs
-from visthrow.diagnose.likelihood import noise as levels
+from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import gram_of
 from visthrow.diagnose.likelihood.stack import integrals
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.model_interface import Model
 
 
 def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list[float], int]:

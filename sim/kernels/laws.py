@@ -3,8 +3,9 @@ times one vector.
 
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of
 its factors into the kernel that is built for it; its coefficient is a number of the run, so that
-one kernel serves every size of a law. The names are those of ``visthrow.diagnose.models.laws``. A
-law's force is taken at the start of an integration step and held over it.
+one kernel serves every size of a law. The names are those of
+``visthrow.diagnose.models.law_terms``. A law's force is taken at the start of an integration step
+and held over it.
 
 A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that
 does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its

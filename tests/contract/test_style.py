@@ -41,7 +41,7 @@ KNOWN = {
     "long: visthrow.diagnose.planning.fly_manoeuvres.simulator_of",
     "long: visthrow.diagnose.planning.manoeuvres.catalogue",
     "long: visthrow.diagnose.reporting.plan_cli.run",
-    "long: visthrow.diagnose.reporting.report.sections",
+    "long: visthrow.diagnose.reporting.diagnosis_report.sections",
     "long: visthrow.diagnose.select.scatter.varying",
     "long: visthrow.diagnose.select.verdicts.conclude",
     "long: visthrow.diagnose.throw.linearising.lanes_of",

@@ -16,7 +16,7 @@ from bench.worlds.follow import ALONE, follow, table_of
 from bench.worlds.world import Recipe
 from visthrow.diagnose.planning.manoeuvres import catalogue
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
-from visthrow.diagnose.throw.recorded import carriers, record_of
+from visthrow.diagnose.throw.recorded_flight import carriers, record_of
 from visthrow.logs.flightlog import FlightLog
 
 SMALL = dict(free=1, free_seconds=1.0, throws=2)
@@ -127,7 +127,7 @@ def test_added_rates_and_thrust_reach_the_commands():
 
 def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
     """A frame's tilt that was found and applied must not be found again."""
-    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.throw import throw_model
 
     monkeypatch.setattr(

@@ -20,7 +20,7 @@ from visthrow import config
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.throw.cutting import cut
 from visthrow.diagnose.throw.direct import MEASURED, CameraView, _noise
-from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.task import Experiment, plant_of
 
 BOX = 0.5

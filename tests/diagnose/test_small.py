@@ -21,7 +21,7 @@ from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.models.ball import BallModel
 from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.models.flyer_params import TorqueParams
-from visthrow.diagnose.models.laws import term_of
+from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import search

@@ -9,7 +9,8 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.select import point as points
-from visthrow.diagnose.select import result, search, selector, state
+from visthrow.diagnose.select import result, search, selector
+from visthrow.diagnose.select import search_state as state
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = catalogue(12)

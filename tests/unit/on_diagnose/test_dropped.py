@@ -12,7 +12,8 @@ from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow.diagnose.likelihood.correlation import LOOKED_AT
-from visthrow.diagnose.select import dropped, search
+from visthrow.diagnose.select import lost_commands as dropped
+from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, linearise, moved
 from visthrow.diagnose.throw.replay import Lane
 from visthrow.diagnose.throw.throw_model import ThrowModel

@@ -8,7 +8,7 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.reporting.report import instead, landing_sentence
+from visthrow.diagnose.reporting.diagnosis_report import instead, landing_sentence
 from visthrow.diagnose.select import held_out, result, search
 
 EFFECTS = catalogue(12)

@@ -13,8 +13,8 @@ from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow.diagnose.select.search import put_right
-from visthrow.diagnose.throw import interface
-from visthrow.diagnose.throw.interface import suspected
+from visthrow.diagnose.throw import command_mistakes as interface
+from visthrow.diagnose.throw.command_mistakes import suspected
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 

@@ -10,11 +10,11 @@ import pytest
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.models.laws import Term
+from visthrow.diagnose.models.law_terms import Term
 from visthrow.diagnose.select import result, search, selector, terms
 from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
 from visthrow.diagnose.throw.cutting import RINGING
-from visthrow.diagnose.throw.states import HUNG
+from visthrow.diagnose.throw.initial_states import HUNG
 from visthrow.diagnose.throw.throw_model import ThrowModel
 
 EFFECTS = catalogue(12)

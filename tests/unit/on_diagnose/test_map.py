@@ -17,8 +17,8 @@ from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
 from visthrow.diagnose.inputs.proposal import propose
-from visthrow.diagnose.throw.interface import commanded
-from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.command_mistakes import commanded
+from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs import read, table_of
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog

@@ -10,10 +10,20 @@ import pytest
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
+<<<<<<< HEAD
 from visthrow.diagnose.likelihood import marginal, noise
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
 from visthrow.diagnose.models.interface import Window
+=======
+from visthrow.diagnose.likelihood import designs, marginal
+from visthrow.diagnose.likelihood import noise_levels as noise
+from visthrow.diagnose.likelihood import stack as stacks
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
+from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.select.point import Problem, linearise, only
+>>>>>>> b49c3828 (Give each file of the diagnosis a name of its own)
 from visthrow.logs.check.signals import highpass_sigma
 
 EFFECTS = catalogue(6)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
 SWING = [0.1, 0.2, 0.3]

@@ -20,14 +20,14 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.designs import correlated_of
 from visthrow.diagnose.likelihood.marginal import hidden_gram
-from visthrow.diagnose.likelihood.noise import roughly
+from visthrow.diagnose.likelihood.noise_levels import roughly
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import initial_fit
 from visthrow.diagnose.throw.initial_fit import InitialFit
-from visthrow.diagnose.throw.recorded import record_of
+from visthrow.diagnose.throw.initial_states import hover_state
+from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.replay import STABLE, rough_step
-from visthrow.diagnose.throw.states import hover_state
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 

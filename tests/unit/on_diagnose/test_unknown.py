@@ -12,8 +12,8 @@ from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.models import laws
-from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.models import law_terms as laws
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
 from visthrow.diagnose.select import result, search, selector, terms, verdicts
 from visthrow.diagnose.select.excess import acts_on

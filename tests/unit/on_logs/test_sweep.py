@@ -7,7 +7,7 @@ import pytest
 
 from tests.logfiles import ATT, write_bin
 from visthrow import logs
-from visthrow.diagnose.planning import excitation
+from visthrow.diagnose.planning import manoeuvre_excitation as excitation
 
 IMU = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
 RATE = ("Qffffff", "TimeUS,RDes,R,PDes,P,YDes,Y")

@@ -15,7 +15,7 @@ from sim.kernels.structs import make_struct, types
 from sim.params import LawParams
 from tests.plants import paper_plant
 from visthrow import config
-from visthrow.diagnose.models import laws as grammar
+from visthrow.diagnose.models import law_terms as grammar
 from visthrow.task import Experiment
 
 SWIRL = LawParams("payload force", (), "vertical_cross_vel", 0.02)

@@ -13,7 +13,7 @@ HARM = 0.02  # share by which a channel may get worse on held-out flights
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.opening import DEFAULT_PLANT
+    from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
 
     parser.epilog = (
         "examples:\n  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a"
@@ -83,7 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.extend import patch
     from visthrow.diagnose.inputs import setup
-    from visthrow.diagnose.inputs.opening import DEFAULT_PLANT, THROW
+    from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT, THROW
     from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
 

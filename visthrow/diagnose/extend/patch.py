@@ -18,10 +18,10 @@ from visthrow import config
 from visthrow.common.errors import DiagnoseError, suggest
 from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
-from visthrow.diagnose.inputs.opening import THROW
+from visthrow.diagnose.inputs.model_arguments import THROW
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.catalogue import effects_of
-from visthrow.diagnose.models.laws import term_of
+from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import ROUNDED
 from visthrow.diagnose.select.scatter import variances
 from visthrow.logs.readers.blackbox.decoder import read_blackbox

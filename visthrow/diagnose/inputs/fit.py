@@ -19,7 +19,7 @@ from sim.params import VehicleParams
 from visthrow import config
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_FREE = {

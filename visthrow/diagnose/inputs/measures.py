@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.model_interface import Effect
 
 CERTAIN_DEVIATIONS = (
     3.0  # deviations of a measurement beyond which the configured value cannot be off

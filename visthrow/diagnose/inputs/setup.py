@@ -12,8 +12,8 @@ from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
-from visthrow.diagnose.models.interface import Model
-from visthrow.diagnose.models.laws import term_of
+from visthrow.diagnose.models.law_terms import term_of
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams

@@ -22,11 +22,12 @@ from typing import TypeVar
 
 import numpy as np
 
-from visthrow.diagnose.likelihood import designs, noise
+from visthrow.diagnose.likelihood import designs
+from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
 from visthrow.diagnose.likelihood.marginal import hidden_gram, left_of
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 
 T = TypeVar("T")
 

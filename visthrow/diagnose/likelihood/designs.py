@@ -27,7 +27,7 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side, to_host
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 
 T = TypeVar("T", np.ndarray, torch.Tensor)
 

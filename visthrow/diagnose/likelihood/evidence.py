@@ -18,7 +18,7 @@ from scipy.special import log_ndtr
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.models.interface import Effect
+from visthrow.diagnose.models.model_interface import Effect
 
 SPIKE = 0.5
 """Deviation of an effect that is not named, in its floor: the floor is the limit of what may go

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.likelihood.marginal import Noise
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 HEAD = 0.4  # share of a window, at most HEAD_SECONDS, in which the initial state is fitted

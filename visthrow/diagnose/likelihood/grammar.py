@@ -1,5 +1,5 @@
-"""Terms of laws (:mod:`visthrow.diagnose.models.laws`) as coefficients of latent forces, which are
-hats at the knots.
+"""Terms of laws (:mod:`visthrow.diagnose.models.law_terms`) as coefficients of latent forces,
+which are hats at the knots.
 """
 
 from collections.abc import Sequence
@@ -10,8 +10,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.models.laws import JOINT, KnotValues, Term, TermLayout, carries, loads
+from visthrow.diagnose.models.law_terms import JOINT, KnotValues, Term, TermLayout, carries, loads
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
 FINE = 8  # points between two knots at which a curve is looked at
 

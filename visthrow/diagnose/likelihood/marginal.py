@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
 TAIL = 6.0
 """Degrees of freedom of the latent forces' scale mixture: from window to window their deviation

@@ -26,7 +26,7 @@ from visthrow.diagnose.likelihood.marginal import (
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host
-from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 T = TypeVar("T")
 

@@ -16,7 +16,7 @@ from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, spare, stretches_of
-from visthrow.diagnose.models.laws import exerted
+from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,

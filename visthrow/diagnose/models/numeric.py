@@ -15,8 +15,8 @@ import numpy as np
 
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
-from visthrow.diagnose.models.interface import Effect, Linearised, Window
-from visthrow.diagnose.models.laws import carries, term_of
+from visthrow.diagnose.models.law_terms import carries, term_of
+from visthrow.diagnose.models.model_interface import Effect, Linearised, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel
 
@@ -71,7 +71,7 @@ class Lanes:
 
 
 class NumericModel(ABC):
-    """Implements :class:`visthrow.diagnose.models.interface.Model` on :meth:`simulate` and
+    """Implements :class:`visthrow.diagnose.models.model_interface.Model` on :meth:`simulate` and
     :meth:`measure`.
     """
 
@@ -199,7 +199,7 @@ class NumericModel(ABC):
         )
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         size = self.size(theta)
         residuals = self._settle(size, fresh=True)
         slopes, effects, latent = (
@@ -230,7 +230,7 @@ class NumericModel(ABC):
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; initial states are fitted anew."""
+        """See :class:`.model_interface.Model`; initial states are fitted anew."""
         return self._settle(self.size(theta))
 
     def _lanes(self, size: np.ndarray, start: np.ndarray | None = None) -> Lanes:
@@ -433,7 +433,7 @@ def latent_layout(
         start: [s].
         end: [s].
         count: Of the knots, the same in all stretches.
-        blocks: Indices into :data:`visthrow.diagnose.models.interface.LATENT_BLOCKS`.
+        blocks: Indices into :data:`visthrow.diagnose.models.model_interface.LATENT_BLOCKS`.
         axes: Of each block.
     """
     times = np.linspace(start, end, count)

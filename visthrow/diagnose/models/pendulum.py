@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.models.catalogue import effects_of
-from visthrow.diagnose.models.laws import exerted
+from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.diagnose.models.catalogue import effects_of
-from visthrow.diagnose.models.laws import exerted
+from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog

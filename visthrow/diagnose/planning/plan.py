@@ -15,7 +15,7 @@ from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowe
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, log_evidence
 from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
 from visthrow.diagnose.likelihood.stack import integrals
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Model
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis

@@ -13,8 +13,8 @@ import numpy as np
 from visthrow.common.rotations import rotate_back
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.stack import statistics
-from visthrow.diagnose.models import laws
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models import law_terms as laws
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import Point
 
 CENTRES = 20

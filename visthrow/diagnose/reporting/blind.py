@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import STRONG, additions
-from visthrow.diagnose.models.interface import Linearised, Model, Window
+from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.select.result import Diagnosis
 
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
@@ -138,7 +138,7 @@ class Hidden:
         self._shift = [a - b for a, b in zip(model.residuals({}), model.residuals(truth))]
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         return [
             replace(w, residual=w.residual + s)
             for w, s in zip(self.model.windows(theta), self._shift)
@@ -147,7 +147,7 @@ class Hidden:
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.interface.Model`."""
+        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         return [r + s for r, s in zip(self.model.residuals(theta, linearised), self._shift)]
 
 

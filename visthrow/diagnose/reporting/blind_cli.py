@@ -11,7 +11,7 @@ from visthrow.common.errors import DiagnoseError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.opening import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
 
     parser.epilog = (
         "examples:\n  visthrow diagnose blind flights/*.npz                 detection limits of"
@@ -37,7 +37,7 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place, write_json
-    from visthrow.diagnose.inputs import opening
+    from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.reporting import blind, pictures
 
     check_place(Path(args.out) / "blind.json")

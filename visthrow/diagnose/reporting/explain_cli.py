@@ -9,7 +9,7 @@ from visthrow.common.arguments import add_out
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
 
 if TYPE_CHECKING:
-    from visthrow.diagnose.inputs.opening import Opened
+    from visthrow.diagnose.inputs.model_arguments import Opened
 
 # exit status where no cause can be named: the data contradict themselves, or the simulation does
 # not follow them
@@ -18,7 +18,7 @@ REFUSED = 1
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.opening import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
 
     parser.epilog = (
         "examples:\n  visthrow diagnose explain flights/*.npz                      throws of ours,"
@@ -48,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import check_place, write_json
-    from visthrow.diagnose.inputs import opening
-    from visthrow.diagnose.reporting import report
+    from visthrow.diagnose.inputs import model_arguments as opening
+    from visthrow.diagnose.reporting import diagnosis_report as report
 
     if not args.no_report:
         check_place(Path(args.out) / "report.html")
@@ -84,7 +84,7 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
     extensions, by that with all that was found, and of noise alone; print them.
     """
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
-    from visthrow.diagnose.models.laws import term_of
+    from visthrow.diagnose.models.law_terms import term_of
     from visthrow.diagnose.reporting.gain import on_others
     from visthrow.diagnose.select.search import refused_of
     from visthrow.logs.check.run import check, contradictions
@@ -130,11 +130,12 @@ def write_report(
 ):
     """Write page, JSON, pictures and recording; returns the gain on held-out flights.
 
-    ``made_with``: see :func:`visthrow.diagnose.inputs.opening.made_with`.
+    ``made_with``: see :func:`visthrow.diagnose.inputs.model_arguments.made_with`.
     """
     from visthrow.common import provenance
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.reporting import blackbox, blind, gain, recording, report
+    from visthrow.diagnose.reporting import blackbox, blind, gain, recording
+    from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.select import result
     from visthrow.view import page
 

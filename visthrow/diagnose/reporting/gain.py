@@ -14,13 +14,13 @@ from visthrow.diagnose.likelihood.correlation import with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of
 from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.likelihood.noise import without_outliers
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.likelihood.noise_levels import without_outliers
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
 from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
-from visthrow.diagnose.select.state import Work
+from visthrow.diagnose.select.search_state import Work
 from visthrow.diagnose.throw.landing import PredictedLandings
 
 

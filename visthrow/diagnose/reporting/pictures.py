@@ -11,13 +11,13 @@ from visthrow.common import style
 from visthrow.diagnose.likelihood.evidence import covariance
 from visthrow.diagnose.likelihood.forms import READABLE, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.state import Work
+from visthrow.diagnose.select.search_state import Work
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # [inch]

@@ -12,7 +12,7 @@ from visthrow.common.errors import DiagnoseError, expect_known
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.opening import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
 
     parser.epilog = (
         "examples:\n  visthrow diagnose plan flights/*.npz                                the next"
@@ -54,10 +54,13 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place, write_json
-    from visthrow.diagnose.inputs import opening, setup
-    from visthrow.diagnose.planning import design, excitation, plan
+    from visthrow.diagnose.inputs import model_arguments as opening
+    from visthrow.diagnose.inputs import setup
+    from visthrow.diagnose.planning import design, plan
+    from visthrow.diagnose.planning import manoeuvre_excitation as excitation
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
-    from visthrow.diagnose.reporting import pictures, report
+    from visthrow.diagnose.reporting import diagnosis_report as report
+    from visthrow.diagnose.reporting import pictures
 
     check_place(Path(args.out) / "plan.json")
     limits, chosen = _limits(args), _chosen(args.manoeuvres)

@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from visthrow.common import style
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.reporting.pictures import AFTER, BEFORE, left_over
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog

@@ -32,14 +32,14 @@ from visthrow.diagnose.likelihood.forms import (
     unit_of,
 )
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
-from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
 from visthrow.diagnose.select.scatter import allowed, between_flights, deviations, freed
+from visthrow.diagnose.select.search_state import Work
 from visthrow.diagnose.select.selector import MOST_NAMES
-from visthrow.diagnose.select.state import Work
 
 MOST_FOLDS = 12
 PARTS = 3

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from visthrow.diagnose.likelihood import noise as levels
+from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
@@ -24,7 +24,7 @@ from visthrow.diagnose.likelihood.evidence import (
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, gather, rescored
 from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
-from visthrow.diagnose.models.interface import Effect, Linearised, Model, Window
+from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
 
 ROUNDS = 3

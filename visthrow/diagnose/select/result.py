@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from visthrow.diagnose.select.scatter import Scatter
-from visthrow.diagnose.throw.interface import Mistake
+from visthrow.diagnose.throw.command_mistakes import Mistake
 
 FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
 CANDIDATE = "CANDIDATE"
@@ -99,9 +99,9 @@ class Law:
     """A term outside the catalogue: coefficient times scalar factors times a vector."""
 
     formula: str
-    block: str  # of visthrow.diagnose.models.laws.BLOCKS
-    factors: tuple[str, ...]  # keys of visthrow.diagnose.models.laws.SCALARS
-    vector: str  # key of visthrow.diagnose.models.laws.VECTORS
+    block: str  # of visthrow.diagnose.models.law_terms.BLOCKS
+    factors: tuple[str, ...]  # keys of visthrow.diagnose.models.law_terms.SCALARS
+    vector: str  # key of visthrow.diagnose.models.law_terms.VECTORS
     coefficient: float
     sd: float
     unit: str

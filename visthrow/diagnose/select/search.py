@@ -11,14 +11,14 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
 from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep, parallel_map
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
-from visthrow.diagnose.throw import interface
-from visthrow.diagnose.throw.interface import Mistake
+from visthrow.diagnose.throw import command_mistakes as interface
+from visthrow.diagnose.throw.command_mistakes import Mistake
 from visthrow.logs.check.rows import NOTHING as UNKNOWN_VEHICLE
 from visthrow.logs.check.rows import Known
 from visthrow.logs.check.run import Checked, check, contradictions, copies

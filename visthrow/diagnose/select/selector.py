@@ -23,7 +23,8 @@ from visthrow.diagnose.likelihood.evidence import (
     log_evidence,
     pair_additions,
 )
-from visthrow.diagnose.select import dropped, terms
+from visthrow.diagnose.select import lost_commands as dropped
+from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.excess import compares_phases, levels
 from visthrow.diagnose.select.point import (
     Point,
@@ -41,7 +42,7 @@ from visthrow.diagnose.select.point import (
 )
 from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
-from visthrow.diagnose.select.state import SearchState, SetMove
+from visthrow.diagnose.select.search_state import SearchState, SetMove
 
 MOST_NAMES = 3 * CHAIN  # a longer list of causes is a wrong form, not a finding
 SHORTLIST = (

@@ -22,8 +22,7 @@ from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
-from visthrow.diagnose.models.laws import (
+from visthrow.diagnose.models.law_terms import (
     JOINT,
     KnotValues,
     Term,
@@ -32,6 +31,7 @@ from visthrow.diagnose.models.laws import (
     loads,
     terms_of,
 )
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
 from visthrow.diagnose.select.result import Law

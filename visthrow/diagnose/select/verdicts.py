@@ -19,7 +19,7 @@ from visthrow.diagnose.likelihood.evidence import (
     estimate,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL
-from visthrow.diagnose.models.interface import Effect, Model, Window
+from visthrow.diagnose.models.model_interface import Effect, Model, Window
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.excess import acts_on, levels, too_strong
 from visthrow.diagnose.select.held_out import sized
@@ -33,8 +33,8 @@ from visthrow.diagnose.select.point import (
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, allowed, deviations, freed
+from visthrow.diagnose.select.search_state import Work
 from visthrow.diagnose.select.selector import Selector
-from visthrow.diagnose.select.state import Work
 from visthrow.diagnose.select.terms import bare
 
 BIT = 0.5

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
-from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight
+from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight
 
 LENGTH = 1.0  # of a window, about [s]
 SHORTEST = 0.25  # of a window [s]

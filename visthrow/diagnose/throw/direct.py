@@ -16,10 +16,10 @@ from camera.params import CameraParams
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.params import SensingParams
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight, measured
-from visthrow.diagnose.throw.states import smoothed
+from visthrow.diagnose.throw.initial_states import smoothed
+from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, measured
 from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
 

@@ -13,9 +13,8 @@ import numpy as np
 
 from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.interface import Window
-from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation
-from visthrow.diagnose.throw.states import (
+from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.throw.initial_states import (
     MOVED,
     Direction,
     States,
@@ -25,6 +24,7 @@ from visthrow.diagnose.throw.states import (
     rows_of,
     stacked,
 )
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation
 
 DAMPING, DAMPING_MOST = (
     1e-3,

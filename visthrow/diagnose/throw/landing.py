@@ -21,7 +21,7 @@ from visthrow.diagnose.throw.cutting import (
     Cut,
     payload_down,
 )
-from visthrow.diagnose.throw.recorded import NEVER, ChannelSamples, RecordedFlight
+from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
 from visthrow.diagnose.throw.replay import Lane, ReplayedFlights
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]

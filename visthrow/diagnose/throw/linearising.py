@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
-from visthrow.diagnose.models.interface import Window
-from visthrow.diagnose.throw.recorded import NEVER
+from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.throw.initial_states import Direction, concerns
+from visthrow.diagnose.throw.recorded_flight import NEVER
 from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Lane, ReplayedFlights
-from visthrow.diagnose.throw.states import Direction, concerns
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N].

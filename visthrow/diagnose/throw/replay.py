@@ -15,8 +15,14 @@ from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
 from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import NEVER, ChannelSamples, RecordedFlight
-from visthrow.diagnose.throw.states import States, hover_state, measured_state, rows_of, stacked
+from visthrow.diagnose.throw.initial_states import (
+    States,
+    hover_state,
+    measured_state,
+    rows_of,
+    stacked,
+)
+from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]

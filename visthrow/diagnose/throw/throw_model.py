@@ -21,7 +21,8 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.threads import aside, parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
-from visthrow.diagnose.models.interface import Linearised, Window
+from visthrow.diagnose.models.model_interface import Linearised, Window
+from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import (
     channels_of,
@@ -29,21 +30,8 @@ from visthrow.diagnose.throw.direct import (
     needs_no_flight,
     with_direct,
 )
-from visthrow.diagnose.throw.dropped import without_each_command
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
-from visthrow.diagnose.throw.landing import PredictedLandings, landings
-from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, without_calm_speeds
-from visthrow.diagnose.throw.recorded import NEVER, RecordedFlight, carriers, record_of
-from visthrow.diagnose.throw.replay import (
-    BATCH,
-    CUDA_BATCH,
-    Lane,
-    ReplayedFlights,
-    Simulation,
-    carried,
-    downloaded,
-)
-from visthrow.diagnose.throw.states import (
+from visthrow.diagnose.throw.initial_states import (
     MOVED,
     Direction,
     States,
@@ -52,6 +40,18 @@ from visthrow.diagnose.throw.states import (
     moved_along,
     resampled,
     rows_of,
+)
+from visthrow.diagnose.throw.landing import PredictedLandings, landings
+from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, without_calm_speeds
+from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, carriers, record_of
+from visthrow.diagnose.throw.replay import (
+    BATCH,
+    CUDA_BATCH,
+    Lane,
+    ReplayedFlights,
+    Simulation,
+    carried,
+    downloaded,
 )
 from visthrow.logs.flightlog import FlightLog
 
@@ -154,7 +154,7 @@ class ThrowModel:
         ] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; with what was seen
+        """See :class:`visthrow.diagnose.models.model_interface.Model`; with what was seen
         besides poses.
         """
         setting = apply(self.entries, self.setting, theta)
@@ -230,8 +230,8 @@ class ThrowModel:
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.interface.Model`; by default from the states settled
-        last with the same kinds of blocks.
+        """See :class:`.model_interface.Model`; by default from the states settled last
+        with the same kinds of blocks.
 
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""

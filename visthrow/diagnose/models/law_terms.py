@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from sim.params import LOWEST, SLOWEST, LawParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import cross, rotate, rotate_back
-from visthrow.diagnose.models.interface import LATENT_BLOCKS
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 Unit = tuple[int, int, int]  # exponents of kg, m and s
 

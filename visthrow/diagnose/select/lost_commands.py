@@ -16,12 +16,12 @@ import numpy as np
 from scipy.stats import beta
 
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood import noise as levels
+from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import few_of
 from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
 from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
-from visthrow.diagnose.models.interface import Window
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judged
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from visthrow.common.arguments import WHOLE, add_common
 from visthrow.common.errors import ConfigError, DiagnoseError
-from visthrow.diagnose.models.interface import Model
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.check.rows import Known
 from visthrow.logs.check.run import label

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim.kernels.replay.lanes import Recording
+from visthrow.diagnose.throw.initial_states import States
 from visthrow.diagnose.throw.replay import BATCH, KNOT_SPACING, Lane, ReplayedFlights, Simulation
-from visthrow.diagnose.throw.states import States
 
 
 def without_each_command(

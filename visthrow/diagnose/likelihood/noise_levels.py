@@ -17,7 +17,7 @@ from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
 
 CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)

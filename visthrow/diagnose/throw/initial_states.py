@@ -13,7 +13,7 @@ from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from sim.params import GRAVITY, PlantParams, VehicleParams
 from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.recorded import ChannelSamples, RecordedFlight
+from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
 SMOOTH_BEFORE, SMOOTH_AFTER = (
     0.06,
