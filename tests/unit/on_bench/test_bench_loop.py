@@ -7,12 +7,7 @@ import pytest
 
 from bench import ablations, loop
 from visthrow import config
-<<<<<<< HEAD
-from visthrow.diagnose.throw import recorded
-=======
-from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.throw import recorded_flight as recorded
->>>>>>> b49c3828 (Give each file of the diagnosis a name of its own)
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
 from visthrow.throws.loading import load_policy

@@ -10,20 +10,11 @@ import pytest
 from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
-<<<<<<< HEAD
-from visthrow.diagnose.likelihood import marginal, noise
-from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
-from visthrow.diagnose.models.interface import Window
-=======
-from visthrow.diagnose.likelihood import designs, marginal
+from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
-from visthrow.diagnose.likelihood import stack as stacks
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.select.point import Problem, linearise, only
->>>>>>> b49c3828 (Give each file of the diagnosis a name of its own)
 from visthrow.logs.check.signals import highpass_sigma
 
 EFFECTS = catalogue(6)
@@ -142,82 +133,6 @@ def test_windows_side_by_side_are_what_they_are_alone(fitted):
             assert share.square == pytest.approx(single.square, rel=1e-9)
 
 
-<<<<<<< HEAD
-=======
-def test_grams_and_other_residuals_are_the_same_side_by_side(fitted):
-    """Of windows of different lengths and numbers of columns, as a GPU has them padded."""
-    _, windows, floors, _, _ = fitted
-    mixed = [
-        *windows[:4],
-        replace(windows[4], latent=np.zeros((0, 0)), latent_block=np.zeros(0, dtype=int)),
-    ]
-    cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
-    mixed.append(replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}))
-    grams = [marginal.gram_of(w, floors, 2) for w in mixed]
-    drawn = np.random.default_rng(5)
-    for found, single in zip(designs.grams_of(mixed, floors, 2, "cpu:0"), grams, strict=True):
-        for name in ("inner", "cross", "square", "count", "log_sigma"):
-            value = getattr(single, name)
-            np.testing.assert_allclose(
-                getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max()
-            )
-        assert found.shown == pytest.approx(single.shown)
-    for _ in range(2):  # what stays on the device is not what the residuals were
-        residuals = [drawn.normal(size=len(w.residual)) for w in mixed]
-        alone = [
-            marginal.with_residual(gram, *given)
-            for gram, *given in zip(grams, mixed, [floors] * len(mixed), residuals)
-        ]
-        for found, single in zip(
-            designs.with_residuals(grams, mixed, floors, residuals, "cpu:0"), alone, strict=True
-        ):
-            np.testing.assert_allclose(
-                found.cross, single.cross, rtol=1e-9, atol=1e-9 * np.abs(single.cross).max()
-            )
-            np.testing.assert_allclose(found.square, single.square, rtol=1e-9)
-
-
-def test_latents_are_correlated_the_same_side_by_side(fitted):
-    """Where the inner products stay for what comes next, unless they were replaced since."""
-    _, windows, floors, levels, _ = fitted
-    cut = ("time", "channel", "residual", "sigma", "effects", "nuisance", "latent")
-    mixed = [
-        *windows[:4],
-        replace(windows[5], **{name: getattr(windows[5], name)[:-7] for name in cut}),
-    ]
-    few = mixed[1].latent_time < mixed[1].latent_time.max()
-    knots = {
-        name: getattr(mixed[1], name)[few]
-        for name in ("latent_block", "latent_axis", "latent_time")
-    }
-    mixed[1] = replace(mixed[1], latent=mixed[1].latent[:, few], **knots)
-    raw = designs.grams_of(mixed, floors, 2, "cpu:0")
-    raw[2] = marginal.gram_of(mixed[2], floors, 2)  # as one of few whose outliers were mended
-    there, alone = (designs.correlated_of(raw, mixed, 0.3, device) for device in ("cpu:0", "cpu"))
-    for found, single in zip(there, alone, strict=True):
-        assert isinstance(found.placed, marginal.DeviceArray)
-        assert not isinstance(single.placed, marginal.DeviceArray)
-        for name in ("inner", "cross", "factor"):
-            value = getattr(single, name)
-            np.testing.assert_allclose(
-                getattr(found, name), value, rtol=1e-9, atol=1e-9 * np.abs(value).max()
-            )
-        assert found.shown == pytest.approx(single.shown)
-    np.testing.assert_allclose(
-        Stack(there, "cpu:0").values(levels), Stack(alone).values(levels), rtol=1e-9
-    )
-    bare = [
-        Stack([marginal.without_effects(g) for g in own], device)
-        for own, device in ((there, "cpu:0"), (alone, "cpu"))
-    ]
-    np.testing.assert_allclose(
-        bare[0].look(levels)[1], bare[1].look(levels)[1], rtol=1e-6, atol=1e-6
-    )
-    changed = replace(there[0], inner=2.0 * there[0].inner)
-    assert changed.placed is changed.inner
-
-
->>>>>>> a9ab1605 (Give each class of the diagnosis a name of its own)
 def test_other_residuals_leave_the_information(fitted):
     _, _, floors, levels, grams = fitted
     theta = np.linspace(-1.0, 1.0, len(floors))

@@ -15,19 +15,10 @@ from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-<<<<<<< HEAD
-from visthrow.diagnose.reporting import blackbox, blind, gain, report
-=======
-from visthrow.diagnose.reporting import blackbox, blind, gain, pictures
+from visthrow.diagnose.reporting import blackbox, blind, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
->>>>>>> b49c3828 (Give each file of the diagnosis a name of its own)
 from visthrow.diagnose.select import held_out, point, result, search
-<<<<<<< HEAD
-from visthrow.diagnose.throw.landing import Landings
-=======
 from visthrow.diagnose.throw.landing import PredictedLandings
-from visthrow.logs.flightlog import FlightLog
->>>>>>> a9ab1605 (Give each class of the diagnosis a name of its own)
 from visthrow.view import page
 
 SWING = str(
@@ -442,7 +433,7 @@ def test_the_report_holds_sentences_pictures_and_numbers(
 ):
     _, diagnosis = found
     made = report.sections(
-        diagnosis, measured, hidden, step_check={"pos_w": 0.03}, provenance={"logs": 7}
+        diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7}
     )
     paths = page.write(tmp_path, "A report", report.sentence_of(diagnosis), made)
     written = paths[0].read_text(encoding="utf-8")
@@ -584,21 +575,3 @@ def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, ar
     printed = capsys.readouterr()
     assert said in printed.err
     assert printed.out == "", "before the search"
-<<<<<<< HEAD
-=======
-
-
-def test_flights_are_numbers():
-    from visthrow.common.errors import DiagnoseError
-    from visthrow.diagnose.inputs.model_arguments import numbers
-
-    logs = [FlightLog({}, {"source": f"runs/{name}.npz"}) for name in "abcd"]
-    assert numbers("0, 3", logs) == (0, 3)
-    assert numbers("", logs) == ()
-    with pytest.raises(DiagnoseError, match="such as 0,3"):
-        numbers("first", logs)
-    with pytest.raises(DiagnoseError, match=r"no flight 7; there are 0 \(a\.npz\), 1 \(b\.npz\)"):
-        numbers("1,7", logs)
-    with pytest.raises(DiagnoseError, match="leaves no flight"):
-        numbers("0,1,2,3", logs)
->>>>>>> b49c3828 (Give each file of the diagnosis a name of its own)

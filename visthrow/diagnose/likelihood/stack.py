@@ -279,7 +279,7 @@ def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
 
 def _shape(batch: _Batch, noise: Noise) -> _Shape:
     by_block = batch.square.new_tensor(_levels(batch, noise))
-    level = batch.known + (batch.member @ by_block[:, :, None])[..., 0]
+    level = batch.initial + (batch.member @ by_block[:, :, None])[..., 0]
     scale = batch.square.new_tensor(noise.scale)
     weight = scale**-2.0
     normal = _weighed(weight, batch.columns.hidden)
