@@ -433,7 +433,7 @@ def test_the_report_holds_sentences_pictures_and_numbers(
 ):
     _, diagnosis = found
     made = report.sections(
-        diagnosis, measured, hidden, step_check={"pos_w": 0.03}, about={"logs": 7}
+        diagnosis, measured, hidden, step_check={"pos_w": 0.03}, provenance={"logs": 7}
     )
     paths = page.write(tmp_path, "A report", report.sentence_of(diagnosis), made)
     written = paths[0].read_text(encoding="utf-8")
