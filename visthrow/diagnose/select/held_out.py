@@ -324,6 +324,14 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             names,
             reason,
         )
+    return _agreed(diagnosis, measured, uncompared)
+
+
+def _agreed(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Diagnosis:
+    """Keep the names that searches without a flight name again; ``uncompared``: no calm phase tells
+    what gusts are.
+    """
+    names = list(diagnosis.theta)
     alike = {
         name: (name, *diagnosis[name].partners) for name in names
     }  # what names one of a class names it
