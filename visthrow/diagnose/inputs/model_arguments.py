@@ -10,7 +10,7 @@ from visthrow.common.arguments import WHOLE, add_common
 from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.logs.check.rows import Known
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import label
 from visthrow.logs.flightlog import FlightLog
 
@@ -106,7 +106,7 @@ class Opened:
         return model
 
     @property
-    def known(self) -> Known:
+    def known(self) -> KnownVehicle:
         """Return what is known of the vehicle."""
         from visthrow.diagnose.inputs import setup
 

@@ -20,7 +20,7 @@ from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 from visthrow.diagnose.throw import command_mistakes as interface
 from visthrow.diagnose.throw.command_mistakes import Mistake
 from visthrow.logs.check.rows import NOTHING as UNKNOWN_VEHICLE
-from visthrow.logs.check.rows import Known
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import Checked, check, contradictions, copies
 from visthrow.logs.flightlog import FlightLog
 
@@ -31,7 +31,7 @@ def diagnose(
     flights: Sequence[FlightLog],
     model: Model | Callable[[], Model],
     *,
-    vehicle: Known = UNKNOWN_VEHICLE,
+    vehicle: KnownVehicle = UNKNOWN_VEHICLE,
     seed: int = 0,
     without: Sequence[int] = (),
     laws: bool = True,

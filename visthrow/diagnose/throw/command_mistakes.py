@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from visthrow.diagnose.throw.recorded import measured
+from visthrow.diagnose.throw.recorded_flight import measured
 from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust
 from visthrow.logs.flightlog import Channel, FlightLog
