@@ -68,13 +68,13 @@ class Response:
         self._speed = self._height = 0.0  # expected from the commands, upwards [m/s], [m]
         self._heights: list[float] = []  # above the expected ones [m]
         tried = (len(LAGS), DEADS, 3)
-        # of changes of rates that were reported and those that commands lead to: their product,
-        # the squares
+        # of changes of rates that were reported and those that commands lead to, and of turned
+        # angles likewise: their product, the squares
         self._sums = np.full((3, *tried), 1e-9)
-        self._angle = np.zeros(3)  # turned since the beginning, by poses [rad]
+        self._angle_sums = np.zeros((3, *tried))
+        self._drift_sums = np.zeros((2, *tried))  # of ticks with commanded and turned angles
+        self._angle = np.zeros(3)  # turned since the first tick, by poses [rad]
         self._commanded_angles = np.zeros(tried)  # that commands lead to [rad]
-        self._angles: list[np.ndarray] = []
-        self._all_commanded_angles: list[np.ndarray] = []
         self._before = deque(maxlen=HOVERED)  # reported rates of the autopilot's own hover
         self._reported: np.ndarray | None = None
         self.reported = 0
@@ -167,24 +167,25 @@ class Response:
         return np.maximum((changes**2).mean(axis=0), RATE_NOISE**2)
 
     def _judge_turns(self, vehicle: BodyState) -> None:
-        """Judge by poses, whenever all of a doublet was answered: by the angle that the vehicle has
-        turned, in which the noise of each pose counts once.
+        """Judge by poses, whenever all of a doublet was answered: by the angle turned since the
+        first tick. A doublet turns to one side and back, whatever its delay.
         """
         self._angle = self._angle + turn_between(self._last.quat, vehicle.quat)
         turn = self._period * self._responses[..., 1:]
         self._commanded_angles = self._commanded_angles + turn
-        self._angles.append(self._angle)
-        self._all_commanded_angles.append(self._commanded_angles)
+        commanded = self._commanded_angles
+        angle = self._angle + 0.0 * commanded
+        self._angle_sums += [angle * commanded, commanded**2, angle**2]
+        tick = float(self._ticks)
+        self._drift_sums += [tick * commanded, tick * angle]
         if self._ticks not in self._ends:
             return
-        # the attitude at the beginning is as noisy as any: only differences from the mean count
-        angles = np.array(self._angles)
-        angles = (angles - angles.mean(axis=0))[:, None, None, :]
-        commanded = np.array(self._all_commanded_angles)
-        commanded = commanded - commanded.mean(axis=0)
-        squares = [angles * commanded, commanded**2, angles**2 + 0.0 * commanded]
-        sums = np.array([part.sum(axis=0) for part in squares])
-        self._judge(_scores(sums, np.full(3, ANGLE_NOISE**2), len(angles)))
+        # without a steady drift, which no command has asked for
+        along, drifted = self._drift_sums
+        ticks = sum(k * k for k in range(1, self._ticks + 1))
+        drift = np.array([along * drifted, along**2, drifted**2]) / ticks
+        variance = np.full(3, ANGLE_NOISE**2)
+        self._judge(_scores(self._angle_sums - drift, variance, self._ticks))
         if self.running and self._ticks == self._ends[-1]:
             self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
@@ -199,8 +200,8 @@ class Response:
 
 
 def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
-    """Return how much better the commanded sign explains each axis than the reverse, in deviations,
-    shape (3,).
+    """Return how much better the commanded sign explains each axis than the reverse or no turn
+    does, in deviations, shape (3,); negative where the reverse explains it best.
 
     Args:
         sums: over what was measured and what commands lead to, of their product, of the commanded
@@ -210,8 +211,11 @@ def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
     """
     right = _misfit(sums, GAINS)
     reverse = _misfit(sums, -GAINS)
-    noise = np.maximum(variance, np.minimum(right, reverse) / count)
-    better = (reverse - right) / noise
+    still = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn leaves all
+    best = np.minimum(right, reverse)
+    second = np.minimum(np.maximum(right, reverse), still)
+    noise = np.maximum(variance, best / count)
+    better = np.sign(reverse - right) * np.maximum(second - best, 0.0) / noise
     return np.sign(better) * np.sqrt(np.abs(better))
 
 
