@@ -12,7 +12,10 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
+
+from bench import start
 
 THROWING = 90.0  # time kept for the throws after a training [s]
 KEEPING = 45.0  # between two policies that are kept on the way [s]
@@ -100,7 +103,8 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
             return
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, default=540.0, help="for all of it")
@@ -113,7 +117,11 @@ def main() -> int:
     parser.add_argument("--reports", type=Path, help="folder of the job's report")
     parser.add_argument("--until", type=float, help="end of the job's work [s since 1970]")
     parser.add_argument("--eager", action="store_true", help="without CUDA graphs")
-    args = parser.parse_args()
+    return start.main(parser, run, argv)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all jobs, or one job's work."""
     args.out.mkdir(parents=True, exist_ok=True)
     if args.config:
         train_and_throw(args)

@@ -281,7 +281,7 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
     """Lines come bit by bit, cut anywhere; all ticks are played back and the run's end ends the
     view.
     """
-    monkeypatch.setattr(view, "EVERY", 0.01)
+    monkeypatch.setattr(view, "POLL_INTERVAL", 0.01)
     source, folder = run[0], tmp_path / "live"
     folder.mkdir()
     for name in ("config.toml", "policy.npz", "provenance.json"):
@@ -297,7 +297,7 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
                 files[name].write(text[places[name] : places[name] + step])
                 files[name].flush()
                 places[name] += step
-                time.sleep(0.004)
+                time.sleep(0.02)
         for file in files.values():
             file.close()
         (folder / "summary.json").write_text("{}")
