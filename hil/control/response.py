@@ -1,10 +1,10 @@
 """Compares a vehicle's response in its first hover with the commands.
 
-A vehicle of another weight, another thrust line, or with the sign of a rate turned is told from the
-policy's before it has sunk. A doublet of all three body rates makes it turn, so that signs are seen
-where it hovers calmly. An autopilot that reports its body rates is judged by them within a tenth of
-a second, against how they wander in its own hover. By poses alone that is not possible: in this
-time it turns by less than they scatter, so a doublet is judged when it was answered.
+It recognises another weight, another thrust line or a reversed rate before the vehicle has sunk. A
+doublet of all three body rates makes the vehicle turn, so that signs show in a calm hover. An
+autopilot that reports its body rates is judged by them within a tenth of a second, against how they
+wander in its own hover. Poses alone do not suffice for that: in this time the vehicle turns by less
+than they scatter. By poses a doublet is judged once it was answered, by the angle turned.
 
 An axis may be slower than the training's: it is judged by the time constant that explains its
 answer best, and doublets grow longer until it is known."""
@@ -180,17 +180,17 @@ class Response:
         self._drift_sums += [tick * commanded, tick * angle]
         if self._ticks not in self._ends:
             return
-        # without a steady drift, which no command has asked for
-        along, drifted = self._drift_sums
-        ticks = sum(k * k for k in range(1, self._ticks + 1))
-        drift = np.array([along * drifted, along**2, drifted**2]) / ticks
+        # a steady drift of either angle explains nothing: take its part out of the sums
+        commanded_drift, turned_drift = self._drift_sums
+        products = [commanded_drift * turned_drift, commanded_drift**2, turned_drift**2]
+        drift = np.array(products) / sum(k * k for k in range(1, self._ticks + 1))
         variance = np.full(3, ANGLE_NOISE**2)
         self._judge(_scores(self._angle_sums - drift, variance, self._ticks))
         if self.running and self._ticks == self._ends[-1]:
             self.problem = f"{_names(~self._confirmed)}: the vehicle does not turn as commanded"
 
     def _judge(self, scores: np.ndarray) -> None:
-        """Take how surely each axis turns as it is told, in deviations, shape (3,)."""
+        """Confirm or reject axes by their scores, in deviations, shape (3,)."""
         self._confirmed |= scores > CERTAIN_SIGN
         wrong = (scores < -CERTAIN_SIGN) & ~self._confirmed
         if self.problem is None and wrong.any():
@@ -211,7 +211,7 @@ def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
     """
     right = _misfit(sums, GAINS)
     reverse = _misfit(sums, -GAINS)
-    still = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn leaves all
+    still = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn explains nothing
     best = np.minimum(right, reverse)
     second = np.minimum(np.maximum(right, reverse), still)
     noise = np.maximum(variance, best / count)
