@@ -222,7 +222,7 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
         for path in root.glob(f"{kind}/*.toml")
     }
     short = [
-        path_ for path_ in sorted(shipped) if Path(path_).stem == name
+        candidate for candidate in sorted(shipped) if Path(candidate).stem == name
     ]  # a name as the command line takes it
     meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
     _schema.fail(

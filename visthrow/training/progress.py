@@ -111,10 +111,10 @@ class TrainLog:
         elif figures["iteration"] % 25 == 0:
             print(text, flush=True)
 
-    def _remaining(self, iteration: int, elapsed_: float) -> float:
+    def _remaining(self, iteration: int, elapsed: float) -> float:
         """Time to the last iteration or the end of the minutes at the speed so far [s]."""
-        remaining = (self.last - iteration) * elapsed_ / max(iteration - self.done, 1)
-        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed_)
+        remaining = (self.last - iteration) * elapsed / max(iteration - self.done, 1)
+        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed)
 
 
 class ProgressPicture:
@@ -142,10 +142,10 @@ class ProgressPicture:
             self._thrown.append((figures["wall_s"], figures["error_2m"]))
             self._last = throws
             self._said = figures_text(figures)
-        time_ = time.perf_counter()
-        if throws is None and time_ - self._drawn < REDRAWN:
+        drawn_at = time.perf_counter()
+        if throws is None and drawn_at - self._drawn < REDRAWN:
             return
-        self._drawn = time_
+        self._drawn = drawn_at
         lines = [text, *self.lines()]
         up = f"\x1b[{self._lines}A" if self._lines else ""
         print(up + "".join(f"\x1b[2K{line}\n" for line in lines), end="", flush=True)

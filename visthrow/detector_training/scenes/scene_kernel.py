@@ -387,7 +387,7 @@ def render(
                 ball[e, 1] + ball[e, 5] * time,
                 ball[e, 2] + ball[e, 6] * time,
             )
-            radiance_ = radiance(
+            incoming = radiance(
                 e,
                 eye,
                 ray,
@@ -403,7 +403,7 @@ def render(
                 things,
                 textures,
             )
-            total += radiance_ * wp.pow(wp.max(wp.cos(0.5 * theta), 0.0), lens[e, 9])
+            total += incoming * wp.pow(wp.max(wp.cos(0.5 * theta), 0.0), lens[e, 9])
     colour = total * (sensor[e, 0] / float(samples))
     for c in range(3):
         value = (

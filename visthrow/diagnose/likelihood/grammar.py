@@ -75,12 +75,12 @@ class TermEffect(Effect):
     price: float = 0.0  # of its name, beyond the threshold [nats]
 
 
-def forces(window: Window, terms_: Sequence[TermEffect]) -> np.ndarray:
+def forces(window: Window, effects: Sequence[TermEffect]) -> np.ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
     T).
     """
-    out, quantities = np.zeros((len(window.latent_block), len(terms_))), KnotValues(window.knots)
-    for i, effect in enumerate(terms_):
+    out, quantities = np.zeros((len(window.latent_block), len(effects))), KnotValues(window.knots)
+    for i, effect in enumerate(effects):
         if carries(window.latent_block, effect.term.block):
             values = TermLayout.of([effect.term]).table(quantities).ravel()
             out[:, i] = through_latents(window, quantities, effect.term.block) @ values

@@ -359,8 +359,8 @@ def without_outliers(
         list(windows),
         [without_effects(gram) for gram in grams],
     )
-    for round_ in range(CLEANINGS):
-        where = "cpu" if round_ else device  # few are looked at once more
+    for cleaning in range(CLEANINGS):
+        where = "cpu" if cleaning else device  # few are looked at once more
         residuals = designs.left_by(
             starts, floors, len(grams[0].count), widely_fitted(starts, bare, where), where
         )

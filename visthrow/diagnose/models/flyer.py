@@ -94,13 +94,13 @@ class FlyerModel(NumericModel):
             np.empty((2, *position.shape, self._told.shape[2])),
         )
         for lag in np.unique(tau):
-            keep, lanes_ = np.exp(-fine / lag), np.flatnonzero(tau == lag)
+            keep, members = np.exp(-fine / lag), np.flatnonzero(tau == lag)
             after, _ = lfilter([1.0 - keep], [1.0, -keep], self._told, 1, keep * self._told[:, :1])
             thrust = np.concatenate([self._told[:, :1], after], 1)
             whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
-            which, rows, part = lanes.owner[lanes_], index[:, lanes_], share[:, lanes_]
+            which, rows, part = lanes.owner[members], index[:, members], share[:, members]
             begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
-            out[:, :, lanes_] = (
+            out[:, :, members] = (
                 begin + part * rise,
                 whole[which, rows] + part * (begin + 0.5 * part * rise),
             )

@@ -365,24 +365,24 @@ class TermLayout:
     vector: np.ndarray  # shape (T,)
 
     @staticmethod
-    def of(terms_: Sequence[Term]) -> "TermLayout":
+    def of(members: Sequence[Term]) -> "TermLayout":
         """Sort out the factors of terms."""
-        scalars = tuple(dict.fromkeys(f for t in terms_ for f in t.factors))
-        vectors = tuple(dict.fromkeys(t.vector for t in terms_))
+        scalars = tuple(dict.fromkeys(f for t in members for f in t.factors))
+        vectors = tuple(dict.fromkeys(t.vector for t in members))
         scalar_index, place = (
             {f: i + 1 for i, f in enumerate(scalars)},
             {v: i for i, v in enumerate(vectors)},
         )
         rows = [
             ([scalar_index[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS]
-            for t in terms_
+            for t in members
         ]
         return TermLayout(
-            terms_[0].block,
+            members[0].block,
             scalars,
             vectors,
             np.array(rows).T,
-            np.array([place[t.vector] for t in terms_]),
+            np.array([place[t.vector] for t in members]),
         )
 
     def factors(self, values: KnotValues) -> tuple[np.ndarray, np.ndarray]:

@@ -301,7 +301,7 @@ def _channel(
     channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
     notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
     if np.any(bad):
-        notes["flagged"] = ", ".join(range_[0] for range_ in tap.good if range_[0] in fields)
+        notes["flagged"] = ", ".join(bounds[0] for bounds in tap.good if bounds[0] in fields)
     resets = [int(np.sum(np.diff(fields[name]) != 0)) for name in RESETS if name in fields]
     if sum(resets):
         notes["resets"] = sum(resets)
@@ -343,7 +343,7 @@ def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
         ranges = {tap.only[0] for tap in taps if tap.message == message}
         fields = log.first(message)
         if fields is not None and not any(
-            np.any(_in_range(fields, (range_,))) for range_ in ranges
+            np.any(_in_range(fields, (bounds,))) for bounds in ranges
         ):
             name = next(iter(ranges))[0]
             received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))

@@ -71,9 +71,9 @@ def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.nd
     bx = 2.0 * (x * z + w * y)
     thrust_y = 2.0 * (y * z - w * x)
     bz = 1.0 - 2.0 * (x * x + y * y)
-    tension_ = thrust * (qx * bx + qy * thrust_y + qz * bz)
+    along_cable = thrust * (qx * bx + qy * thrust_y + qz * bz)
     inward = model.vehicle_mass * model.length * (wx * wx + wy * wy + wz * wz)
-    pull = (tension_ - inward) / (model.vehicle_mass + model.payload_mass)
+    pull = (along_cable - inward) / (model.vehicle_mass + model.payload_mass)
     turn = -thrust / (model.vehicle_mass * model.length)
     out = np.empty_like(state)
     out[0:3] = state[3:6]

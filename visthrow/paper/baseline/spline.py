@@ -168,13 +168,13 @@ def _coefficients(
     right[:, 0] = start
     row = SMOOTH
     for i in range(SEGMENTS - 1):
-        left_ = slice(i * ORDER, (i + 1) * ORDER)
-        right_ = slice((i + 1) * ORDER, (i + 2) * ORDER)
-        matrix[:, row, left_] = ENDS[0]
+        before = slice(i * ORDER, (i + 1) * ORDER)
+        after = slice((i + 1) * ORDER, (i + 2) * ORDER)
+        matrix[:, row, before] = ENDS[0]
         right[:, row] = waypoints[:, i]
-        matrix[:, row + 1 : row + 1 + SMOOTH, left_] = ENDS
+        matrix[:, row + 1 : row + 1 + SMOOTH, before] = ENDS
         ratio = (times[:, i] / times[:, i + 1])[:, None] ** np.arange(SMOOTH)
-        matrix[:, row + 1 : row + 1 + SMOOTH, right_] = -ratio[:, :, None] * BEGINS
+        matrix[:, row + 1 : row + 1 + SMOOTH, after] = -ratio[:, :, None] * BEGINS
         row += 1 + SMOOTH
     matrix[:, row:, -ORDER:] = ENDS[:END]
     right[:, row] = end

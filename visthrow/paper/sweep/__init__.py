@@ -61,8 +61,8 @@ class SweepList:
 
     def __post_init__(self) -> None:
         for name, group in self.runs.items():
-            for throws_ in group.throws:
-                if throws_ not in self.throws:
+            for label in group.throws:
+                if label not in self.throws:
                     raise ConfigError(
-                        f"runs.{name}: no throws '{throws_}'; {suggest(throws_, self.throws)}"
+                        f"runs.{name}: no throws '{label}'; {suggest(label, self.throws)}"
                     )

@@ -176,12 +176,12 @@ class ProcessPool:
 
     def _fill(self, remaining: float | None) -> None:
         """Start what there is room for."""
-        time_ = time.monotonic()
+        clock = time.monotonic()
         used = [device for _, device, _ in self._running.values()]
         free = [device for device in self.starter.devices if device not in used]
         cores = self.starter.jobs - used.count("cpu core")
         for task in self._todo:
-            if task.name in self._running or self._wait.get(task.name, 0.0) > time_:
+            if task.name in self._running or self._wait.get(task.name, 0.0) > clock:
                 continue
             if task.gpu and free:
                 self._start(task, free.pop(0), remaining)

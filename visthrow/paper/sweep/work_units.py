@@ -208,13 +208,13 @@ def expand(name: str, params: SweepList) -> SweepWork:
         for source in [*(ResultSource(str(policy)) for policy in group.policies), *trained]:
             sources.setdefault(source.id, source)
             listed = throws.setdefault(source.id, [])
-            for throws_ in group.throws:
-                throw = params.throws[throws_]
+            for label in group.throws:
+                throw = params.throws[label]
                 if params.most_throws is None:
                     count = throw.count
                 else:
                     count = min(throw.count, params.most_throws)
-                fresh = _throws(source, throws_, replace(throw, count=count))
+                fresh = _throws(source, label, replace(throw, count=count))
                 listed.extend(unit for unit in fresh if unit not in listed)
     return SweepWork(
         name,

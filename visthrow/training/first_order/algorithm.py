@@ -62,14 +62,14 @@ class FirstOrder:
             )
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag = int(lag + 1e-6)
-        remainder_ = max(lag - int(lag + 1e-6), 0.0)
+        remainder = max(lag - int(lag + 1e-6), 0.0)
         if self.p.horizon < self.lag + NODES[-1]:
             raise ConfigError(
                 f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2}"
                 " for a release"
             )
         self._shares = [
-            math.prod((remainder_ - b) / (a - b) for b in NODES if b != a) for a in NODES
+            math.prod((remainder - b) / (a - b) for b in NODES if b != a) for a in NODES
         ]
         blind = dataclasses.replace(
             experiment, ppo=dataclasses.replace(p, privileged=())

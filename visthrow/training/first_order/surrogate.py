@@ -64,11 +64,11 @@ def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Cour
     kernels.
     """
     x = {}
-    course_ = Course()
+    arrays = Course()
     for name, field in Course.vars.items():
         x[name] = torch.zeros(steps + 1, count, field.type.dtype._length_, device=device)
-        setattr(course_, name, wp.from_torch(x[name], dtype=field.type.dtype))
-    return x, course_
+        setattr(arrays, name, wp.from_torch(x[name], dtype=field.type.dtype))
+    return x, arrays
 
 
 class FlightBatch:
