@@ -56,7 +56,7 @@ def diagnose(
     refused, reasons = refused_of(checked), contradictions(checked)
     if len(refused) > MOST_REFUSED * len(flights):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
-    model = model if hasattr(model, "windows") else model()
+    model = model() if callable(model) else model
     say(f"{len(flights)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
     copied = {i: original for i, original in copies(checked).items() if i not in refused}
     reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in copied]
