@@ -8,6 +8,7 @@ at which they miss by the paper's 0.10 m.
 """
 
 import argparse
+import contextlib
 import dataclasses
 import json
 import math
@@ -21,6 +22,7 @@ import torch
 
 from bench import start
 from bench.report import Report, Table, finish
+from bench.world_held import held_in_world
 from sim.effects.setting import Setting, generalised, specialised
 from visthrow.common.arguments import add_out
 from visthrow.common.workers import status
@@ -36,8 +38,12 @@ MISS = 0.10
 SWEEPS = {
     "rope.rope_mass": (0.002, 0.003, 0.004, 0.006, 0.010, 0.015, 0.020),
     "rope.joint_damping": (0.0, 1e-6, 1e-5, 3e-5, 1e-4),
+    "rope.payload_inertia": (0.0, 2.1e-5, 4.2e-5, 8.4e-5, 1.68e-4),
 }
-"""Key of the plant that the paper does not give -> values [kg, N m s]."""
+"""Key of the plant that the paper does not give -> values [kg, N m s, kg m^2]."""
+
+AXES = ("body", "world")
+"""Axes in which the wrench of the blocks is held between two exchanges, 2 ms apart."""
 
 BLOCKS = ("sensing", "integrator")
 """Blocks whose effects change logs or numerics, not the plant."""
@@ -124,6 +130,7 @@ def run(args: argparse.Namespace) -> int:
         loaded = load_policy(name)
         figures[name] = {
             "sweeps": _sweeps(name, points),
+            "wrench": {axes: _held(name, axes, points) for axes in AXES},
             "effects": _effects(name, loaded.experiment, loaded.policy, points),
         }
     status("")
@@ -144,6 +151,17 @@ def _sweeps(name: str, points: Points) -> dict[str, list[tuple[float, float]]]:
             rows.append((value, points.get((name, key, value), throw)["error"]))
         found[key] = rows
     return found
+
+
+def _held(name: str, axes: str, points: Points) -> float:
+    """Landing error with the wrench held in these axes."""
+
+    def throw() -> dict[str, float]:
+        loaded = load_policy(name, None, ["sim.solver=exchanged_chain"])
+        with held_in_world() if axes == "world" else contextlib.nullcontext():
+            return thrown(loaded.experiment, loaded.policy)
+
+    return points.get((name, f"wrench held in {axes}", 0.0), throw)["error"]
 
 
 def _effects(
@@ -182,6 +200,13 @@ def _report(figures: dict[str, Any]) -> Report:
             for name, found in figures.items()
         ]
         tables.append(Table(key, head, tuple(rows)))
+    rows = [
+        (name, *(f"{found['wrench'][axes]:.4f}" for axes in AXES))
+        for name, found in figures.items()
+    ]
+    tables.append(
+        Table("Axes in which the wrench is held for 2 ms", ("policy", *AXES), tuple(rows))
+    )
     for name, found in figures.items():
         rows = []
         for effect, row in found["effects"].items():
