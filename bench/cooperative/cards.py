@@ -1,5 +1,5 @@
-"""Train state and vision policies of a pair, a seed of each on every card, side by side, and throw
-them under every condition of :data:`visthrow.cooperative.team.FAULTS`.
+"""Train policies of a pair, each with a drawn seed on the card that is named for it, side by side,
+and throw them under every condition of :data:`visthrow.cooperative.team.FAULTS`.
 
 Writes a policy for each and ``results.json``, with curves and figures, into a folder."""
 
@@ -17,7 +17,7 @@ from pathlib import Path
 
 from bench import start
 
-THROWING = 90.0  # time kept for the throws after a training [s]
+THROWING = 60.0  # time kept for the throws after a training [s]
 KEEPING = 45.0  # between two policies that are kept on the way [s]
 TALKING = 10.0  # between two lines of progress [s]
 EARLY = 150.0  # a job that fails by then is begun again without CUDA graphs [s]
@@ -85,6 +85,7 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
     """Run one card's work in a process of its own, and once more where it fails early."""
     env = {**os.environ, "CUDA_VISIBLE_DEVICES": str(card), "PYTHONUNBUFFERED": "1"}
     begin = time.time()
+    print(f"card {card}: {config}, seed {seed}", flush=True)
     for extra in ([], ["--eager"]):
         words = [str(args.out), "--config", config, "--seed", str(seed), "--until", str(until)]
         words += ["--seconds", str(args.seconds), "--device", args.device, *extra]
@@ -103,12 +104,27 @@ def job(args: argparse.Namespace, card: int, config: str, seed: int, until: floa
             return
 
 
+def placed(text: str) -> tuple[str, int]:
+    """Read ``CONFIG:CARD``. Raises ArgumentTypeError: other text."""
+    config, _, card = text.rpartition(":")
+    if not config or not card.isdigit():
+        raise argparse.ArgumentTypeError(f"{text!r}; expected CONFIG:CARD, as in pair:0")
+    return config, int(card)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seconds", type=float, default=540.0, help="for all of it")
-    parser.add_argument("--cards", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument(
+        "--jobs",
+        type=placed,
+        nargs="+",
+        metavar="CONFIG:CARD",
+        default=[("pair", 0), ("pair_vision", 1)],
+        help="configurations to train, a seed each, and their cards; one may be named again",
+    )
     parser.add_argument("--device", default="cuda:0")
     parser.add_argument("--throws", type=int, default=THROWS)
     parser.add_argument("--set", dest="overrides", action="append", default=[])
@@ -130,10 +146,9 @@ def run(args: argparse.Namespace) -> int:
     with tempfile.TemporaryDirectory() as folder:
         args.reports = Path(folder)
         jobs = []
-        for card in args.cards:
-            for config in ("pair", "pair_vision"):
-                seed = int.from_bytes(os.urandom(3), "big") % SEED
-                jobs.append(threading.Thread(target=job, args=(args, card, config, seed, until)))
+        for config, card in args.jobs:
+            seed = int.from_bytes(os.urandom(3), "big") % SEED
+            jobs.append(threading.Thread(target=job, args=(args, card, config, seed, until)))
         for one in jobs:
             one.start()
         for one in jobs:

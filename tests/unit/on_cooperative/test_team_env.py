@@ -6,6 +6,7 @@ import torch
 from visthrow import config
 from visthrow.cooperative.team import TeamExperiment, as_flown, members
 from visthrow.cooperative.team_env import TeamEnv
+from visthrow.onboard.observations import rotation_from_quat
 
 
 def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
@@ -76,6 +77,21 @@ def test_a_camera_sees_keypoints_in_place_of_load_and_goal():
     observed = env.get_observations()["actor"]
     assert observed.shape == (4, env.layout.dimension)
     assert torch.isfinite(observed).all()
+
+
+def test_a_camera_locates_goal_and_load_by_their_keypoints():
+    quiet = [f"task.noise.{name}=0.0" for name in ("observation_step", "observation_bias")]
+    quiet += [f"camera.noise.{name}=0.0" for name in ("step_std", "bias_std")]
+    env = TeamEnv(experiment("pair_located", *quiet, "task.observation.latency=[0.0,0.0]"), count=8)
+    columns = env.layout.columns("located")
+    goal, direction, known = env.get_observations()["actor"][:, columns].split((2, 3, 1), dim=1)
+    pos = env.views.state["pos_w"]
+    assert known.all()
+    torch.testing.assert_close(goal, (env.views.goal_w - pos)[:, :2], atol=5e-3, rtol=0.0)
+    lens = torch.tensor(env.cfg.camera.mount.position_b)
+    load = env._rows(env.load_w) - pos - rotation_from_quat(env.views.state["quat_wb"]) @ lens
+    straight = load / load.norm(dim=-1, keepdim=True)
+    torch.testing.assert_close(direction, straight, atol=0.02, rtol=0.0)
 
 
 def test_rows_that_are_no_whole_worlds_are_refused():
