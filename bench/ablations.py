@@ -32,7 +32,7 @@ from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
 from visthrow.throws.recorded import LogRecorder
 from visthrow.throws.reference_protocol import place_in_hover
-from visthrow.training.device import resolve
+from visthrow.training.compute_device import resolve
 
 LACKS = {
     "no_aerodynamics": "aerodynamics",

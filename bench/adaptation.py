@@ -28,7 +28,7 @@ from visthrow.common.storage import write_json
 from visthrow.diagnose.extend.patch import extended
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training import device
+from visthrow.training import compute_device
 from visthrow.training.protocol import throw
 from visthrow.training.trainer import ADAPTATION, Trainer, fitted
 
@@ -127,7 +127,7 @@ def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
 
 def run(args: argparse.Namespace) -> int:
     """Measure every alteration and report."""
-    args.device, found = device.resolve(args.device), []
+    args.device, found = compute_device.resolve(args.device), []
     for hidden in [record["hidden"] for record in loop.read()]:
         if not args.only or set(hidden) & set(args.only):
             found.append(

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Train, throw, print, write."""
     from visthrow.onboard.policy import Policy, find_policy
     from visthrow.throws.loading import trained_in
-    from visthrow.training.device import resolve
+    from visthrow.training.compute_device import resolve
 
     device, folder, rows = resolve(args.device), Path(args.out), []
     paths = {

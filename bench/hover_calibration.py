@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from camera.keypoints import KeypointCamera, keypoints
-from sim.reference.extras import ReferenceExtras
+from sim.reference.reference_extras import ReferenceExtras
 from visthrow import config
 from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
@@ -23,7 +23,7 @@ from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
-from visthrow.training.device import cores, resolve
+from visthrow.training.compute_device import cores, resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import hover_start
 

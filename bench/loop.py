@@ -44,7 +44,7 @@ from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.recorded import fly
 from visthrow.throws.reference_protocol import Throwing
 from visthrow.throws.results import DIGITS
-from visthrow.training.device import cores, resolve
+from visthrow.training.compute_device import cores, resolve
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""

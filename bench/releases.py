@@ -25,7 +25,7 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.paper.commands.sweep_command import DEFAULT_OUT
 from visthrow.paper.sweep.work_units import load_list
 from visthrow.throws.loading import Loaded, load_policy
-from visthrow.training.device import resolve
+from visthrow.training.compute_device import resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import throw
 

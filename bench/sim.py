@@ -365,9 +365,9 @@ def run(args: argparse.Namespace) -> int:
             )
     else:
         from bench import sim_gpu
-        from visthrow.training import device
+        from visthrow.training import compute_device
 
-        name = device.resolve(args.device)
+        name = compute_device.resolve(args.device)
         if name == "cpu":
             raise VisthrowError(
                 f"--device {args.device}: no GPU here; measure the CPU with --device cpu"

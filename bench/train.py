@@ -24,7 +24,7 @@ from bench.report import (
 from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.training.device import rounded_products
+from visthrow.training.compute_device import rounded_products
 
 WARM_UP = (
     3  # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
@@ -154,11 +154,11 @@ def run(args: argparse.Namespace) -> int:
             " numbers"
         )
     from visthrow.task import Experiment
-    from visthrow.training import device
+    from visthrow.training import compute_device
 
     paths = [config.find("train", name) for name in args.configs]
     experiments = {path.stem: config.load(Experiment, path, args.overrides) for path in paths}
-    name = device.resolve(args.device)
+    name = compute_device.resolve(args.device)
     if args.until:
         from bench import time_to_error
 

@@ -18,7 +18,7 @@ from hil.errors import RunError
 from hil.fly_run import key_of, params_of
 from hil.links.backends import make_backend
 from hil.links.backends.base import FOLLOW, DryRun, Status
-from hil.links.backends.thrust import LEAST_SHARES, HoverMeter
+from hil.links.backends.thrust_curve import LEAST_SHARES, HoverMeter
 from hil.links.clock import Clock, ManualClock, MonotonicClock
 from hil.links.roster import Roster
 from hil.params import HilParams

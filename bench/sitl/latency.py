@@ -46,7 +46,7 @@ class Wire(threading.Thread):
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         self.poses, self.commands = [], []
-        self._mavlink, self._msp = mav.MAVLink(None), msp.Parser()
+        self._mavlink, self._msp = mav.MAVLink(None), msp.FrameParser()
         self._mavlink.robust_parsing = True
 
     def run(self) -> None:

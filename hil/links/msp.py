@@ -77,7 +77,7 @@ def xor(data: bytes) -> int:
     return reduce(operator.xor, data, 0)
 
 
-class Parser:
+class FrameParser:
     """Bytes of a stream to frames.
 
     No byte string makes it raise; ``errors`` counts what looked like a frame and was none.

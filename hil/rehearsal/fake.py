@@ -12,7 +12,7 @@ from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from hil.links.backends.thrust import ThrustParams
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -34,7 +34,7 @@ ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm`
 # set-point of a landing below the vehicle, and at least; height that counts as down [m]
 DESCENT, LOWEST, TOUCH = 0.4, 0.05, 0.12
 # of the policy's vehicle: weight [N], its share of 14 N, straight, tolerance, no voltage
-THRUST = ThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
+THRUST = HoverThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
 GOES_ON = 1.5  # periods after which an event that comes again is a new one
 COVARIANCES = 21  # numbers of a covariance in ODOMETRY
 
@@ -207,7 +207,7 @@ class Fake(ABC):
         followed, ignored: set-points. release_time: when the mechanism's output moved.
     """
 
-    thrust_map: ThrustParams
+    thrust_map: HoverThrustParams
     paced = False  # whether a firmware's clock runs the plant now: it waits for the firmware's time
     # The real autopilots took 70 to 79 ms (ArduPilot), 86 to 98 ms (PX4) and 55 to 90 ms
     # (Betaflight) from a set-point to half of a step of 1.5 rad/s; the training simulator's own

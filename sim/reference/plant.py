@@ -10,8 +10,7 @@ from dataclasses import MISSING, fields, replace
 import numpy as np
 
 from sim.params import GRAVITY, PlantParams
-from sim.reference import blocks
-from sim.reference.extras import ReferenceExtras
+from sim.reference import vehicle_blocks
 from sim.reference.quadrotor import (
     BLOCKS,
     BODY,
@@ -20,9 +19,10 @@ from sim.reference.quadrotor import (
     rigid_body_rates,
     vehicle_rates,
 )
+from sim.reference.reference_extras import ReferenceExtras
 from sim.reference.rope import RopeDynamics
-from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned, turned_back
-from sim.reference.state import PayloadLandings, Snapshot
+from sim.reference.rotation_arrays import cross, quat_dot, rotation_from_quat, turned, turned_back
+from sim.reference.snapshot import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
 LARGEST_DECAY = 2.2
@@ -294,7 +294,7 @@ class ReferencePlant:
         body = state[:, :BODY]
         rate_b = state[:, 10:13]
         air_b = turned_back(rotation, body[:, 7:10] - wind_w)
-        near_ground = blocks.near_ground(
+        near_ground = vehicle_blocks.near_ground(
             self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
         )
         force_b, torque_b, rates[:, BODY : BODY + BLOCKS], thrust = vehicle_rates(
@@ -311,7 +311,7 @@ class ReferencePlant:
         rope = self._rope_of(state)
         root = self._upper_end(state, rotation)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
-        drag_w = blocks.payload_force(
+        drag_w = vehicle_blocks.payload_force(
             self.params.rope,
             self.extras.payload_drag,
             self._ropes.payload_velocity(root[1], rope),
@@ -368,7 +368,7 @@ class ReferencePlant:
         """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
         acceleration.
         """
-        command = blocks.command_queue(
+        command = vehicle_blocks.command_queue(
             np.array(self._queue_times),
             np.array(self._queue_commands),
             np.full(self.count, self.time),
@@ -402,7 +402,7 @@ class ReferencePlant:
         )
         lag = self.params.release.lag
         if self.params.release.lag_tension:
-            lag = blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
+            lag = vehicle_blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
         lag = lag + extras.release_lag_jitter * rng.uniform(-1.0, 1.0, self.count)
         tripped = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,)) & ~self._latched
         self._separation = np.where(tripped, start + np.maximum(lag, 0.0), self._separation)
@@ -439,7 +439,7 @@ class ReferencePlant:
             self._separate(clock)
             moving = column > 0.0
             middle = clock + 0.5 * column
-            command = blocks.command_queue(times, commands, middle)
+            command = vehicle_blocks.command_queue(times, commands, middle)
             share = ((middle - start) / (end - start))[:, None]
             wind_w = self._wind + share * (self._next_wind - self._wind)
             before = self._state
@@ -452,7 +452,7 @@ class ReferencePlant:
             self._normalise()
             self._land(before, clock, column)
             clock = clock + column
-            reached = moving & (np.abs(clock - sample) < blocks.TIME_TOLERANCE)
+            reached = moving & (np.abs(clock - sample) < vehicle_blocks.TIME_TOLERANCE)
             if np.any(reached):
                 self._keep_sample(sample, reached)
         self._separate(clock)
@@ -461,10 +461,10 @@ class ReferencePlant:
         """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's
         velocity.
         """
-        due = self._attached & (self._separation <= clock + blocks.TIME_TOLERANCE)
+        due = self._attached & (self._separation <= clock + vehicle_blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
-            vel = vel + blocks.release_kick(
+            vel = vel + vehicle_blocks.release_kick(
                 self.params.release, self._rope_of(self._state)[0][:, -1]
             )
             self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
@@ -522,7 +522,8 @@ class ReferencePlant:
             del self._queue_times[0], self._queue_commands[0]
         while (
             len(self._samples) > 1
-            and self._samples[1][0] <= time - self.extras.mocap_latency + blocks.TIME_TOLERANCE
+            and self._samples[1][0]
+            <= time - self.extras.mocap_latency + vehicle_blocks.TIME_TOLERANCE
         ):
             del self._samples[0]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim.params import GRAVITY, VehicleParams
-from sim.reference import blocks
-from sim.reference.rotations import cross, quat_dot
+from sim.reference import vehicle_blocks
+from sim.reference.rotation_arrays import cross, quat_dot
 
 # columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate
 # 10:13 (body)
@@ -66,8 +66,8 @@ def initial_blocks(
         if cell.kind == "ideal":
             break
         torque = np.full((count, 4), thrust.torque_ratio) * weight[:, None] / 4.0
-        power = blocks.electrical_power(cell, np.repeat(speed[:, None], 4, 1), torque)
-        source = blocks.open_circuit_voltage(cell, used)
+        power = vehicle_blocks.electrical_power(cell, np.repeat(speed[:, None], 4, 1), torque)
+        source = vehicle_blocks.open_circuit_voltage(cell, used)
         voltage = (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0
     state[:, 9:13] = speed[:, None]
     if cell.kind != "ideal":
@@ -104,26 +104,28 @@ def vehicle_rates(
     voltage = state[:, 14]
     rates = np.zeros_like(state)
     if vehicle.controller.kind == "geometric":
-        setpoint = blocks.geometric(vehicle, command, rate_b)
+        setpoint = vehicle_blocks.geometric(vehicle, command, rate_b)
     elif vehicle.controller.kind == "motor_mixing":
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.motor_mixing(
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = vehicle_blocks.motor_mixing(
             vehicle, state[:, 0:9], command, rate_b, voltage
         )
     else:
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = blocks.betaflight(
+        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = vehicle_blocks.betaflight(
             vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage
         )
     speed = setpoint if vehicle.motor.kind == "instant" else state[:, 9:13]
-    rates[:, 9:13] = blocks.motor(vehicle.motor, speed, setpoint)
-    thrust, torque = blocks.thrust_map(
+    rates[:, 9:13] = vehicle_blocks.motor(vehicle.motor, speed, setpoint)
+    thrust, torque = vehicle_blocks.thrust_map(
         vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
     )
     thrust, torque = (np.reshape(near_ground, (-1, 1)) * part for part in (thrust, torque))
-    rates[:, 13], rates[:, 14] = blocks.battery(vehicle.battery, used, voltage, speed, torque)
+    rates[:, 13], rates[:, 14] = vehicle_blocks.battery(
+        vehicle.battery, used, voltage, speed, torque
+    )
     arms = rotor_arms(vehicle, errors)
-    ratio = blocks.drag_torque_ratio(vehicle.thrust)
-    aero = blocks.aerodynamics(vehicle.aero, arms, ratio, thrust, air_velocity_b, rate_b)
-    force_b, torque_b = blocks.composer(
+    ratio = vehicle_blocks.drag_torque_ratio(vehicle.thrust)
+    aero = vehicle_blocks.aerodynamics(vehicle.aero, arms, ratio, thrust, air_velocity_b, rate_b)
+    force_b, torque_b = vehicle_blocks.composer(
         vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero
     )
     return force_b, torque_b, rates, thrust

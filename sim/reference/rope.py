@@ -13,7 +13,7 @@ from mujoco.batch import Batch
 
 from sim.params import BodyParams, RopeParams
 from sim.reference.model import build_attached, build_free
-from sim.reference.rotations import (
+from sim.reference.rotation_arrays import (
     cross,
     length,
     quat_wxyz_from_matrix,

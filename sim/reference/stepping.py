@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sim.reference.blocks import TIME_TOLERANCE
-from sim.reference.rotations import length
+from sim.reference.rotation_arrays import length
+from sim.reference.vehicle_blocks import TIME_TOLERANCE
 
 LARGEST_PHASE = (
     0.9  # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83

@@ -18,7 +18,7 @@ from sim.kernels.structs import Types
 from sim.params import PlantParams, RopeParams, VehicleParams
 
 SOLVERS = {
-    "exchanged_chain": "sim.solvers.chain:ChainSolver",
+    "exchanged_chain": "sim.solvers.chain_engine:ChainSolver",
     "physx": "sim.solvers.physx:PhysxSolver",
     "mujoco_warp": "sim.solvers.mujoco:MujocoSolver",
 }

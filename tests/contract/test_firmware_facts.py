@@ -32,7 +32,7 @@ CHOICES = {
     " ARM_LOW POLLS READ_BACK",
     "hil/links/backends/crazyflie.py": "ASK ARM_PERIOD HOLDS DESCENT SHORTEST",
     "hil/links/backends/px4.py": "MARGIN GAP",
-    "hil/links/backends/thrust.py": "LEAST_SHARES VOLTAGE_RANGE",
+    "hil/links/backends/thrust_curve.py": "LEAST_SHARES VOLTAGE_RANGE",
     "hil/links/device.py": "MOST_CHUNKS MOST_SHUT_OUT",
     "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT IDS MOST_PENDING ASK_EVERY EARLY LATE",
     "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH BEHIND LEAST_WORD",

@@ -21,7 +21,7 @@ MOST = 13
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
-    "long: visthrow.training.first_order.algorithm.__init__",
+    "long: visthrow.training.first_order.first_order_training.__init__",
     "long: sim.effects.firmware.controller_of",
     "long: sim.hybrid.__init__",
     "long: sim.kernels.replay.lanes.run",

@@ -67,7 +67,7 @@ class FakeBetaflight(PortFake):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        self.parser = msp.Parser()
+        self.parser = msp.FrameParser()
         if self.options.all_channels:
             self.armed = False
         tuning = {

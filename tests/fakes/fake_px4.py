@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hil.links.backends import px4
-from hil.links.backends.thrust import ThrustParams
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.pymav import mav
 from hil.rehearsal.fake_mavlink import FakeMavlink
 
@@ -40,7 +40,7 @@ class FakePx4(FakeMavlink):
     usual_mode = pilots_mode = POSCTL
     usual_delay = 0.017
     usually_prompt, tells_unknown = False, True
-    thrust_map = ThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
+    thrust_map = HoverThrustParams(2.668, 0.1585, 0.8, 0.1, 0.0)
     defaults = {  # noqa: RUF012 - copied by each instance
         "COM_OF_LOSS_T": 0.5,
         "COM_OBL_RC_ACT": float(FACTS["loss_hold"]),

@@ -9,7 +9,7 @@ import functools
 import numpy as np
 
 from sim.reference.rope import RopeDynamics
-from sim.reference.rotations import cross, quat_dot, rotation_from_quat, turned
+from sim.reference.rotation_arrays import cross, quat_dot, rotation_from_quat, turned
 from sim.reference.stepping import halving_rk4
 from tests.oracle.start import vehicle_and_rope
 from tests.scenes import Scene, wrench_at

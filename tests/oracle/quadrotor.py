@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from sim.params import GRAVITY, VehicleParams
-from sim.reference import blocks
+from sim.reference import vehicle_blocks
 from sim.reference.quadrotor import (
     BODY,
     VehicleErrors,
@@ -16,7 +16,7 @@ from sim.reference.quadrotor import (
     rigid_body_rates,
     vehicle_rates,
 )
-from sim.reference.rotations import rotation_from_quat, turned, turned_back
+from sim.reference.rotation_arrays import rotation_from_quat, turned, turned_back
 
 
 def rk4(
@@ -98,13 +98,15 @@ class ReferenceQuadrotor:
             *[
                 t
                 for t, _ in self._queue
-                if self.time + blocks.TIME_TOLERANCE < t < end - blocks.TIME_TOLERANCE
+                if self.time + vehicle_blocks.TIME_TOLERANCE
+                < t
+                < end - vehicle_blocks.TIME_TOLERANCE
             ],
             end,
         ]
         state = np.hstack((self.body, self.blocks))
         for start, stop in pairwise(edges):
-            acting = [c for t, c in self._queue if t <= start + blocks.TIME_TOLERANCE][-1]
+            acting = [c for t, c in self._queue if t <= start + vehicle_blocks.TIME_TOLERANCE][-1]
             count = int(np.ceil((stop - start) / self.step_size - 1e-6))
             for _ in range(count):
                 state = rk4(

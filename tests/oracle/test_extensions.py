@@ -13,8 +13,8 @@ from sim import hybrid
 from sim.hybrid import HybridSim
 from sim.kernels.structs import EXTENSIONS, extensions_of
 from sim.params import GRAVITY, AirParams
-from sim.reference.extras import ReferenceExtras
 from sim.reference.plant import ReferencePlant
+from sim.reference.reference_extras import ReferenceExtras
 from sim.standalone import QuadSim
 from tests.plants import EVERYTHING, paper_plant, plain_vehicle
 from visthrow.throws.plants import flown

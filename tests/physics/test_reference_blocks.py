@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sim.params import GRAVITY
-from sim.reference import blocks
+from sim.reference import vehicle_blocks
 from sim.reference.quadrotor import (
     VehicleErrors,
     initial_blocks,
@@ -54,7 +54,7 @@ def test_queue_switches_at_the_delay_exactly(vehicle):
 def test_queue_takes_the_latest_that_is_due():
     times = np.array([[-np.inf, -np.inf], [1.0, 2.0], [3.0, 3.0]])
     commands = np.arange(24.0).reshape(3, 2, 4)
-    picked = blocks.command_queue(times, commands, np.array([1.0, 1.999]))
+    picked = vehicle_blocks.command_queue(times, commands, np.array([1.0, 1.999]))
     np.testing.assert_array_equal(picked, [commands[1, 0], commands[0, 1]])
 
 
@@ -68,7 +68,7 @@ def test_battery_settles_where_source_and_load_meet(vehicle):
     state = np.array([[0.2, 16.0]])
 
     def rates(x):
-        return np.stack(blocks.battery(cell, x[:, 0], x[:, 1], speed, torque), -1)
+        return np.stack(vehicle_blocks.battery(cell, x[:, 0], x[:, 1], speed, torque), -1)
 
     for _ in range(2000):
         state = rk4(rates, state, 5e-4)
@@ -86,7 +86,7 @@ def test_battery_settles_where_source_and_load_meet(vehicle):
 def test_mixer_delivers_what_fits(vehicle):
     rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
     torque = np.array([[0.02, -0.03, 0.004]])
-    thrusts, tilt_share, yaw_share = blocks.mixer(
+    thrusts, tilt_share, yaw_share = vehicle_blocks.mixer(
         np.array([4.0]), torque, rotors, ratio, 0.03, np.array([3.5])
     )
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
@@ -99,7 +99,7 @@ def test_mixer_delivers_what_fits(vehicle):
 @pytest.mark.parametrize("torque", [(0.0, 0.0, 0.1), (0.3, 0.1, 0.3), (0.05, 0.15, -0.1)])
 def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
     rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
-    thrusts, tilt_share, yaw_share = blocks.mixer(
+    thrusts, tilt_share, yaw_share = vehicle_blocks.mixer(
         np.array([2.0]), np.array([torque]), rotors, ratio, 0.03, np.array([3.5])
     )
     assert thrusts.min() > 0.03 - EXACT
@@ -119,7 +119,9 @@ def test_gyroscopic_torque_does_no_work(vehicle):
     nothing = np.zeros((5, 4))
     still = np.zeros((5, 3)), np.zeros((5, 3)), nothing, nothing
     arms = rotor_arms(vehicle, VehicleErrors.none(5))
-    _, torque = blocks.composer(vehicle.rotors, arms, nothing, nothing, speed, nothing, rate, still)
+    _, torque = vehicle_blocks.composer(
+        vehicle.rotors, arms, nothing, nothing, speed, nothing, rate, still
+    )
     assert np.abs(torque).max() > 1e-3
     np.testing.assert_allclose(np.sum(torque * rate, axis=1), 0.0, atol=1e-15)
 
@@ -133,7 +135,7 @@ def test_rotors_and_body_keep_their_angular_momentum(vehicle):
     speed_dot = np.array([[100.0, -50.0, 20.0, 400.0]])
     arms = rotor_arms(frictionless, VehicleErrors.none(1))
     still, nothing = np.zeros((1, 3)), np.zeros((1, 4))
-    _, torque = blocks.composer(
+    _, torque = vehicle_blocks.composer(
         vehicle.rotors,
         arms,
         nothing,
@@ -151,7 +153,7 @@ def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
     rng = np.random.default_rng(1)
     velocity = rng.normal(size=(20, 3)) * 4.0
     arms = rotor_arms(vehicle, VehicleErrors.none(20))
-    force, torque, thrust_change, torque_change = blocks.aerodynamics(
+    force, torque, thrust_change, torque_change = vehicle_blocks.aerodynamics(
         vehicle.aero, arms, 0.0075, np.zeros((20, 4)), velocity, np.zeros((20, 3))
     )
     assert np.all(np.sum(force * velocity, axis=1) < 0.0)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sim.params import GRAVITY
-from sim.reference.extras import ReferenceExtras
 from sim.reference.plant import ReferencePlant
+from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import paper_plant, plain_plant
 from visthrow import config
 

@@ -15,7 +15,7 @@ import torch
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training.first_order.algorithm import FirstOrder
+from visthrow.training.first_order.first_order_training import FirstOrder
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
 SMALL = [

@@ -14,8 +14,8 @@ from tensordict import TensorDict
 
 from visthrow import config
 from visthrow.task import PPOParams
-from visthrow.training.ppo.algorithm import rsl_rl_config
 from visthrow.training.ppo.network import CapturableGaussian
+from visthrow.training.ppo.ppo_training import rsl_rl_config
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
 

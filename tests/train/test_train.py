@@ -25,7 +25,7 @@ from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import trainer
-from visthrow.training.ppo.algorithm import PPOTraining
+from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import CHECKPOINT, Trainer
 

@@ -49,7 +49,7 @@ COMMANDS = {
         "make a camera configuration from a calibration, check it, look at what it sees",
         "visthrow.cli.camera",
     ),
-    "policy": ("export a policy's network as ONNX or C", "visthrow.cli.policy"),
+    "policy": ("export a policy's network as ONNX or C", "visthrow.cli.policy_command"),
     "bench": (
         "print what was measured, with command, commit and machine",
         "visthrow.paper.commands.bench_command",

@@ -2,8 +2,8 @@
 
 import argparse
 
+from camera.calibrate import BOARD
 from visthrow.common.arguments import ABOVE_ZERO, NUMBER
-from visthrow.view.camera import BOARD
 
 TOOLS = (
     "Kalibr, OpenVINS, EuRoC, camodocal, VINS-Fusion, SVO, ORB-SLAM, basalt, ROS, OpenCV, OCamCalib"
@@ -119,8 +119,10 @@ def _add_show(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Do what was asked."""
-    from visthrow.view.camera import actions
+    from visthrow.view import camera_actions
 
-    return {"calibrate": actions.calibrate, "check": actions.check, "show": actions.show}[
-        args.action
-    ](args)
+    return {
+        "calibrate": camera_actions.calibrate,
+        "check": camera_actions.check,
+        "show": camera_actions.show,
+    }[args.action](args)

@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
             find_policy(name)  # said before anything heavy is imported
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import known_plant
-    from visthrow.training.device import resolve
+    from visthrow.training.compute_device import resolve
 
     known_plant(args.plant)
     if args.calibrate and args.plant != "hybrid":

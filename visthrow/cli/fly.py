@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.throws.loading import load_policy
     from visthrow.throws.plants import known_plant
     from visthrow.throws.recorded import check_goal, fly
-    from visthrow.training.device import resolve
+    from visthrow.training.compute_device import resolve
 
     known_plant(args.plant)
     if len(args.target) > 2:

@@ -45,7 +45,7 @@ PORT = checked(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
     """Add the options that commands share:
 
-    ``--set``, ``--device`` (see ``visthrow.training.device.resolve``) and ``--json``.
+    ``--set``, ``--device`` (see ``visthrow.training.compute_device.resolve``) and ``--json``.
     """
     parser.add_argument(
         "--set",

@@ -17,12 +17,12 @@ SCHEMAS = {
     "start": "sim.params:RandomizationParams",
     "train": "visthrow.task:Experiment",
     "cooperative": "visthrow.cooperative.team:TeamExperiment",
-    "fleet": "sim.fleet:FleetParams",
+    "fleet": "sim.vehicle_class:FleetParams",
     "ppo": "visthrow.task:PPOParams",
     "sweep": "visthrow.paper.sweep:SweepList",
     "hil": "hil.params:HilParams",
     "diagnose": "visthrow.diagnose.inputs.setup:Setup",
-    "vehicle/reference_realistic": "sim.reference.extras:ReferenceExtras",
+    "vehicle/reference_realistic": "sim.reference.reference_extras:ReferenceExtras",
 }
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
 

@@ -23,7 +23,7 @@ from visthrow.onboard import observations as ob
 from visthrow.onboard.goal_motion import SUMS, fitted_goal
 from visthrow.task import plant_of
 from visthrow.training import rewards, terminations
-from visthrow.training.device import rounded_products
+from visthrow.training.compute_device import rounded_products
 
 RESULTS = ("episodes", "released", "landing_error", "duration", "contact")
 """Sums over finished worlds; landing error [m] and duration [s] over the released ones."""

@@ -14,8 +14,8 @@ from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.onboard import actions as act
 from visthrow.onboard.policy import Policy
-from visthrow.training.device import rounded_products
-from visthrow.training.ppo.algorithm import PPOTraining, rsl_rl_config
+from visthrow.training.compute_device import rounded_products
+from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
 from visthrow.training.ranks import Ranks
 
 ASKING = 1.0

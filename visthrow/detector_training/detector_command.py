@@ -17,7 +17,7 @@ import numpy as np
 from visthrow import config
 from visthrow.common.arguments import ABOVE_ZERO, NUMBER, WHOLE, add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.training.device import resolve
+from visthrow.training.compute_device import resolve
 
 LEVELS = {
     "clean": {},

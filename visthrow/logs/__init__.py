@@ -47,7 +47,7 @@ def read(path: str | Path, mapping: TableMap | None = None) -> list[FlightLog]:
 
         return logs_of_blackbox(path)
     if ending in AUTOPILOTS:
-        from visthrow.logs.readers.autopilot import log_of_autopilot
+        from visthrow.logs.readers.autopilot_logs import log_of_autopilot
 
         return [log_of_autopilot(path)]
     return _of_table(path, mapping)

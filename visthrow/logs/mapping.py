@@ -8,7 +8,7 @@ from typing import Literal
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.logs.axes import turn_of
 from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
-from visthrow.logs.units import to_si
+from visthrow.logs.unit_names import to_si
 
 _ORDERS = ("xyzw", "wxyz")
 _WIDTH = {"quaternion": (4,), "euler": (3,), "rotvec": (3,), "matrix": (9,), "vector": None}

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
-from sim.fleet import FleetParams
 from sim.params import (
     GRAVITY,
     AirParams,
@@ -24,6 +23,7 @@ from sim.params import (
     SimParams,
     VehicleParams,
 )
+from sim.vehicle_class import FleetParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from sim.fleet import draw
 from sim.params import GRAVITY, PlantParams
 from sim.units import FORCE, LENGTH, NONE, PLANT, RATE, TIME, Dimension, Units, in_units
+from sim.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act

@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from sim.params import AirParams, RandomizationParams, RopeParams
-from sim.reference.state import PayloadLandings as PayloadLandings
-from sim.reference.state import Snapshot as Snapshot
+from sim.reference.snapshot import PayloadLandings as PayloadLandings
+from sim.reference.snapshot import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.free_fall import GRAVITY, free_flight
@@ -344,8 +344,8 @@ class ReferenceAdapter:
         """Build the plant; a realistic one has the extras of
         ``configs/vehicle/reference_realistic.toml``.
         """
-        from sim.reference.extras import ReferenceExtras
         from sim.reference.plant import ReferencePlant
+        from sim.reference.reference_extras import ReferenceExtras
 
         latency = float(np.mean(experiment.task.observation.latency))
         trained = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)

@@ -22,7 +22,7 @@ from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.throws.flight import Decision, Flight, Policies, Scores, Sight, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
-from visthrow.training.device import cores
+from visthrow.training.compute_device import cores
 
 BATCH = 100  # throws that share one plant: about 12 s of one core a batch and 1 s a throw
 

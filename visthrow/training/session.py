@@ -26,7 +26,7 @@ from visthrow.common.storage import write_json
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws
-from visthrow.training import device
+from visthrow.training import compute_device
 from visthrow.training.progress import TrainLog
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, fitted
@@ -68,7 +68,7 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
     """Train; returns the exit status of the command."""
     _check(args)
     experiment, policy, folder, seed = _resumed(args) if args.resume else _begun(args)
-    name = device.resolve(args.device)
+    name = compute_device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
     trainer = Trainer(

@@ -19,7 +19,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.task.measurement import TARGETS, Throws
 from visthrow.training import protocol
-from visthrow.training.device import rounded_products
+from visthrow.training.compute_device import rounded_products
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ranks import Ranks
 
@@ -90,14 +90,14 @@ class Algorithm(Protocol):
 def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algorithm:
     """Algorithm that the experiment names; imported only when chosen."""
     if experiment.algorithm == "first_order":
-        from visthrow.training.first_order.algorithm import FirstOrder
+        from visthrow.training.first_order.first_order_training import FirstOrder
 
         return FirstOrder(experiment, device, seed, ranks)
     if experiment.algorithm == "distillation":
         from visthrow.training.distillation import Distillation
 
         return Distillation(experiment, device, seed, ranks)
-    from visthrow.training.ppo.algorithm import PPOTraining
+    from visthrow.training.ppo.ppo_training import PPOTraining
 
     return PPOTraining(experiment, device, seed, ranks)
 

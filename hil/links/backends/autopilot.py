@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from hil.links.backends.audit import Audit, Rule, equal
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Release
-from hil.links.backends.thrust import ThrustParams
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from hil.links.roster import MavlinkId, Party
@@ -49,7 +49,7 @@ class AutopilotParams(Bounded):
 
     system: MavlinkId  # MAVLink id of the vehicle
     component: MavlinkId  # of its autopilot
-    thrust: ThrustParams
+    thrust: HoverThrustParams
     mechanism_lag: NotNegative  # from the release command to separation [s]
     release_timeout: Positive  # without a final answer the release has failed [s]
     heartbeat_timeout: Positive  # silence after which the autopilot counts as lost [s]

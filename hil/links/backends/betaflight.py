@@ -23,7 +23,7 @@ from hil.links import msp
 from hil.links.backends.audit import Audit, Rule, equal
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
-from hil.links.backends.thrust import ThrustParams
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import values
 from visthrow.common.errors import ConfigError
@@ -72,7 +72,7 @@ class BetaflightParams(Bounded):
 
     device: str  # of MSP, see hil.links.device
     remote: bool  # whether the device may leave this machine
-    thrust: ThrustParams
+    thrust: HoverThrustParams
     rates: RatesParams
     minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
     arm_channel: Annotated[
@@ -110,7 +110,7 @@ class Betaflight(OnPort):
         written or not.
         """
         super().__init__(port, params.silence)
-        self.params, self.parser = params, msp.Parser()
+        self.params, self.parser = params, msp.FrameParser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self.audit = Audit(
@@ -407,7 +407,7 @@ class Betaflight(OnPort):
 
 
 @dataclass(frozen=True)
-class Setting:
+class AnswerField:
     """The place of a setting in an answer."""
 
     command: int
@@ -417,7 +417,7 @@ class Setting:
 
 
 SETTINGS = {
-    name.removeprefix("tells_"): Setting(FACTS[row[0]], *row[1:])
+    name.removeprefix("tells_"): AnswerField(FACTS[row[0]], *row[1:])
     for name, row in FACTS.items()
     if name.startswith("tells_")
 }

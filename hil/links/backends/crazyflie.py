@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from hil.links import crtp
 from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, equal
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
-from hil.links.backends.thrust import ThrustParams
+from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import facts, values
 from hil.poses.body_track import Track
@@ -49,7 +49,7 @@ class CrazyflieParams(Bounded):
     # radio://0/80/2M/E7E7E7E7E7, usb://0, or udpout:127.0.0.1:19850 of its software in the loop
     device: str
     remote: bool  # whether a network device may leave this machine
-    thrust: ThrustParams
+    thrust: HoverThrustParams
     release_parameter: (
         str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
     )

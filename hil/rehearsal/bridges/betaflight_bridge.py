@@ -65,7 +65,7 @@ class BetaflightSitl(Bridge):
         super().__init__(plant, link, mocap, seed, options)
         self.params, self.armed = params, False
         self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
-        self._parser, self._asked = msp.Parser(), dict.fromkeys(ASK, -1e9)
+        self._parser, self._asked = msp.FrameParser(), dict.fromkeys(ASK, -1e9)
         self._boxes: tuple[int, ...] = ()
         self.motors = np.zeros(4)
         self.answered = 0

@@ -23,7 +23,7 @@ from visthrow.logs import read, table_of
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
-from visthrow.logs.units import UNITS
+from visthrow.logs.unit_names import UNITS
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 SETS = {

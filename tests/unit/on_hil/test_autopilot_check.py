@@ -14,7 +14,7 @@ from hil.errors import RunError
 from hil.fly_run import autopilot_record
 from hil.links.backends.base import DryRun
 from hil.links.backends.betaflight import Betaflight
-from hil.links.backends.thrust import LEAST_SHARES
+from hil.links.backends.thrust_curve import LEAST_SHARES
 from hil.params import HilParams
 from hil.poses.pose import VEHICLE
 from tests.hil_flight import simple_policy

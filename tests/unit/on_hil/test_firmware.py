@@ -268,7 +268,7 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
         params,
         -1,
     )
-    parser, channels = msp.Parser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
+    parser, channels = msp.FrameParser(), [1500, 1500, 1500, 1000, LOW, LOW, LOW, LOW]
     flags = [0]
 
     def answer(frame):
@@ -307,7 +307,7 @@ class Listening:
     """A port that counts commands, and never answers."""
 
     def __init__(self):
-        self.parser, self.commands = msp.Parser(), []
+        self.parser, self.commands = msp.FrameParser(), []
 
     def write(self, data):
         self.commands += [frame.command for frame in self.parser.parse(data)]

@@ -27,7 +27,7 @@ def test_there_and_back_in_any_pieces(payload):
     frame = msp.Frame(105, payload, msp.ANSWER)
     data = b"noise$" + msp.pack(frame) + b"$M>" + msp.pack(frame)
     for size in (1, 2, 3, 7, len(data)):
-        parser, found = msp.Parser(), []
+        parser, found = msp.FrameParser(), []
         for at in range(0, len(data), size):
             found += parser.parse(data[at : at + size])
         assert frame in found
@@ -40,7 +40,7 @@ def test_a_flipped_bit_is_noticed():
         for bit in range(8):
             data = bytearray(good)
             data[at] ^= 1 << bit
-            assert HELLO not in msp.Parser().parse(bytes(data))
+            assert HELLO not in msp.FrameParser().parse(bytes(data))
 
 
 def test_what_does_not_fit_is_not_packed():
@@ -63,7 +63,7 @@ def fuzz(count: int, seed: int) -> None:
     """
     here, there = pipe()
     backend = Betaflight(here, PARAMS)
-    rng, sent, parsed = np.random.default_rng(seed), [], msp.Parser()
+    rng, sent, parsed = np.random.default_rng(seed), [], msp.FrameParser()
     seeds = [
         msp.pack(msp.Frame(int(c), rng.bytes(int(rng.integers(0, 60))), msp.ANSWER))
         for c in range(256)

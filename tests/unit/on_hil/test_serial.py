@@ -39,7 +39,7 @@ def wire():
 
 def asked(controller, command):
     """Whether a command comes to the flight controller."""
-    parser, end = msp.Parser(), time.monotonic() + 30.0
+    parser, end = msp.FrameParser(), time.monotonic() + 30.0
     while time.monotonic() < end:
         try:
             if any(frame.command == command for frame in parser.parse(os.read(controller, 65536))):

@@ -6,14 +6,14 @@ import pytest
 
 from hil.errors import RunError
 from hil.links.backends import require_reach
-from hil.links.backends.thrust import LEAST_SHARES, HoverMeter, ThrustParams
+from hil.links.backends.thrust_curve import LEAST_SHARES, HoverMeter, HoverThrustParams
 from hil.params import HilParams
 from tests.hil_flight import simple_policy
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.hover import GRAVITY
 
-BENT = ThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
+BENT = HoverThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
 
 
 def test_there_and_back():
@@ -28,7 +28,7 @@ def test_there_and_back():
 
 
 def test_a_lower_battery_gets_more_share():
-    params = ThrustParams(2.668, 0.2, 1.0, 0.08, 12.0)
+    params = HoverThrustParams(2.668, 0.2, 1.0, 0.08, 12.0)
     assert params.share(2.668, 12.0) == pytest.approx(0.2)
     assert params.share(2.668, 10.8) == pytest.approx(0.2 / 0.81)
     assert params.share(2.668, None) == pytest.approx(0.2), "unknown: not corrected"
@@ -50,7 +50,7 @@ def test_a_lower_battery_gets_more_share():
 )
 def test_calibrations_that_are_none(wrong):
     with pytest.raises(ConfigError, match=r"weight|hover|slope|tolerance|voltage"):
-        ThrustParams(*wrong)
+        HoverThrustParams(*wrong)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +140,7 @@ def test_a_curve_of_the_rotors_is_inverted_exactly():
     """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the
     motors' command.
     """
-    params = ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, 2.0, 0.055)
+    params = HoverThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, 2.0, 0.055)
     motors = 0.055 + 0.945 * 0.36
     double = (2 * motors - 0.055) / 0.945
     assert params.thrust(double) == pytest.approx(4 * 2.668)
@@ -157,4 +157,4 @@ def test_curves_that_no_rotor_has_are_refused(wrong):
         ConfigError,
         match=r"exponent is 0.5; expected 1 to 3|idle is .*; expected 0 or more and below 0.5",
     ):
-        ThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, *wrong)
+        HoverThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, *wrong)

@@ -12,9 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as dialect
 from tests import logfiles
 from visthrow.common.errors import ConfigError
 from visthrow.logs import read
-from visthrow.logs.readers import autopilot
+from visthrow.logs.readers import autopilot_logs
 from visthrow.logs.readers.blackbox import channels as blackbox
-from visthrow.logs.units import UNITS, to_si
+from visthrow.logs.unit_names import UNITS, to_si
 
 IN_OURS = {
     "s": {"s": 1, "ms": 0.001, "us": 0.000001, "ns": 0.000000001, "min": 60},
@@ -192,7 +192,11 @@ def test_a_field_of_an_autopilot(ending, message, fields, values, channel, expec
 
 @pytest.mark.parametrize(
     ("ending", "taps"),
-    [("ulg", autopilot.ULOG), ("BIN", autopilot.DATAFLASH), ("tlog", autopilot.TELEMETRY)],
+    [
+        ("ulg", autopilot_logs.ULOG),
+        ("BIN", autopilot_logs.DATAFLASH),
+        ("tlog", autopilot_logs.TELEMETRY),
+    ],
 )
 def test_no_field_is_untested(ending, taps):
     written = {(row[0], row[3]) for row in ROWS[ending]}

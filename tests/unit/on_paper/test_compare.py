@@ -32,7 +32,7 @@ def test_a_unit_knows_its_plant():
 
 def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.training.device.cores", lambda: 1)
+    monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     out = tmp_path / "rows.json"
     words = ["compare", "state", "baseline", "--throws", "2", "--targets", "1.5", "--device", "cpu"]
     assert cli.main([*words, "--out", str(tmp_path), "--json", str(out)]) == 0

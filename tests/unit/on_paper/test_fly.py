@@ -263,7 +263,7 @@ def test_the_record_holds_the_sweep_that_is_stated():
 
 def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.training.device.cores", lambda: 1)
+    monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     packed = tmp_path / "all.json"
     words = [
         "baseline",

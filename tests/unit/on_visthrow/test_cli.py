@@ -14,7 +14,7 @@ from visthrow import cli
 from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
 from visthrow.config import kinds
-from visthrow.training import device
+from visthrow.training import compute_device
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -258,10 +258,10 @@ def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, caps
 
 
 def test_devices_that_are_not_there_are_refused():
-    assert device.resolve("cpu") == "cpu"
-    assert device.resolve("auto") in ("cpu", "cuda:0")
+    assert compute_device.resolve("cpu") == "cpu"
+    assert compute_device.resolve("auto") in ("cpu", "cuda:0")
     with pytest.raises(DeviceError, match=r"'cuda:99' is not there; expected auto or one of cpu"):
-        device.resolve("cuda:99")
+        compute_device.resolve("cuda:99")
 
 
 def test_suggestions():

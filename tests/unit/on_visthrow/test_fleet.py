@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import torch
 
-from sim.fleet import draw
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY
 from sim.units import Units, in_units
+from sim.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act

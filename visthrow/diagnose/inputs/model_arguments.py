@@ -163,7 +163,7 @@ def throw_model(
     from visthrow.diagnose.select.search import put_right
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
-    from visthrow.training.device import resolve
+    from visthrow.training.compute_device import resolve
 
     threads.keep()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)

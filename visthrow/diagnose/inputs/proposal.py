@@ -15,13 +15,13 @@ import numpy as np
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import unit_evidence
 from visthrow.logs.axes import turn_of
-from visthrow.logs.check import physics, relations, thrust
+from visthrow.logs.check import physics, relations, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 from visthrow.logs.readers.layout import unit_of
 from visthrow.logs.readers.table import Table, logs_of, lost_rows, make_channel
-from visthrow.logs.units import UNITS
+from visthrow.logs.unit_names import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
 _TIME = re.compile(
@@ -1029,7 +1029,7 @@ def _carried(log: FlightLog) -> float | None:
     """Return the mass that a thrust in newtons carries, by the accelerometer or at the usual thrust
     of the flight [kg]; None without a thrust.
     """
-    if (mass := thrust.mass_of(log)) is not None or "thrust_command" not in log:
+    if (mass := thrust_checks.mass_of(log)) is not None or "thrust_command" not in log:
         return mass
     total = log["thrust_command"].samples()[1]
     usual = _usual(total) if len(total) else 0.0
@@ -1043,8 +1043,8 @@ def _usual(total: np.ndarray) -> float:
 
 def _driving(log: FlightLog, proposal: MappingProposal) -> str:
     """The input that the force follows best, "" where that cannot be told."""
-    inputs = [name for name in thrust.INPUTS if name in log]
-    scores = {name: s for name in inputs if (s := thrust.follows(log, name)) is not None}
+    inputs = [name for name in thrust_checks.INPUTS if name in log]
+    scores = {name: s for name in inputs if (s := thrust_checks.follows(log, name)) is not None}
     if len(inputs) < 2 or not scores:
         return ""
     best = max(scores, key=scores.__getitem__)
@@ -1060,7 +1060,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     """A flying model to begin with: thrust scaled so that it carries the vehicle, the rest as of a
     small quadrotor at rest air.
     """
-    applied = thrust.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
+    applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
     if (
         applied is None
         or "quat_wb" not in log
@@ -1068,7 +1068,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         or np.median(applied[2]) <= 0.0
     ):
         return None
-    mass, gap = thrust.mass_of(log), None
+    mass, gap = thrust_checks.mass_of(log), None
     if "payload_pos_w" in log:
         (time, pos), (time_p, pos_p) = log["pos_w"].samples(), log["payload_pos_w"].samples()
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))

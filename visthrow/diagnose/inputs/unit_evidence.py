@@ -8,9 +8,9 @@ import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.check import physics, relations
-from visthrow.logs.check.thrust import MASS_BAD
+from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel
-from visthrow.logs.units import UNITS
+from visthrow.logs.unit_names import UNITS
 
 LENGTHS = ("m", "mm", "cm")
 """Units of a path, the usual ones first."""

@@ -16,7 +16,7 @@ import numpy as np
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded_flight import measured
 from visthrow.logs.axes import EXCHANGES, matrix_of
-from visthrow.logs.check import relations, thrust
+from visthrow.logs.check import relations, thrust_checks
 from visthrow.logs.flightlog import Channel, FlightLog
 
 # correlation of commanded and measured rates, with whichever axes, from which a log tells of its
@@ -75,7 +75,9 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
         if mistake is not None:
             mistakes.append(mistake)
             logs = [mistake.mended(log) for log in logs]
-    units = thrust.UNITS | {"shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust}
+    units = thrust_checks.UNITS | {
+        "shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust
+    }
     mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
     return mistakes if mistake is None else [*mistakes, mistake]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import Row
-from visthrow.logs.check.thrust import IDLE_SHARE, IDLE_SPEED
+from visthrow.logs.check.thrust_checks import IDLE_SHARE, IDLE_SPEED
 from visthrow.logs.flightlog import FlightLog
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.logs.check import excitation, physics, relations, signals, thrust
+from visthrow.logs.check import excitation, physics, relations, signals, thrust_checks
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, Verdict, worst
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers.vehicles import Vehicle
@@ -105,7 +105,7 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     return (
         rows
         + physics.look(usable, vehicle)
-        + thrust.look(usable, vehicle)
+        + thrust_checks.look(usable, vehicle)
         + excitation.look(usable)
     )
 
@@ -192,7 +192,9 @@ def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[
     vehicle, payload or map.
     """
     masses = {
-        i: mass for i, log in enumerate(logs) if (mass := thrust.mass_of(log, vehicle)) is not None
+        i: mass
+        for i, log in enumerate(logs)
+        if (mass := thrust_checks.mass_of(log, vehicle)) is not None
     }
     if len(masses) < 2:
         return {}

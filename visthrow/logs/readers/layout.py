@@ -49,7 +49,7 @@ UNIT_OF_LENGTH = "Length Units"
 
 
 @dataclass
-class Layout:
+class TextTable:
     """A text table, its cells still text."""
 
     names: list[str]  # of the columns, with their unit in brackets where it is known
@@ -72,7 +72,7 @@ def unit_of(word: str) -> str | None:
     return word if word in _UNITS else None
 
 
-def layout_of(text: str, name: str = "") -> Layout:
+def layout_of(text: str, name: str = "") -> TextTable:
     """Lay out a text table that messages call by a name; without a line of numbers its rows are
     empty.
     """
@@ -94,7 +94,7 @@ def layout_of(text: str, name: str = "") -> Layout:
             last = reader.line_num
     widths = Counter(len(cells) for _, cells in rows[-1000:] if _holds_numbers(cells))
     if not widths:
-        return Layout(rows[0][1] if rows else [], [], False)
+        return TextTable(rows[0][1] if rows else [], [], False)
     width = widths.most_common(1)[0][0]
     good = [_holds_numbers(cells) for _, cells in rows]
     fits = [len(cells) == width and valid for (_, cells), valid in zip(rows, good)]
@@ -116,7 +116,7 @@ def layout_of(text: str, name: str = "") -> Layout:
         body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
         width -= 1
     names = _names(named, width, settings)
-    return Layout(names, body, _commas(mark, body), settings, rate)
+    return TextTable(names, body, _commas(mark, body), settings, rate)
 
 
 def _separator(lines: list[str]) -> str:

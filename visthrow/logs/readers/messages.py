@@ -3,8 +3,8 @@
 PX4's ULog, ArduPilot's DataFlash (.BIN) and MAVLink telemetry (.tlog). Onboard-safe.
 
 The one place that opens these files. Names, units and axes stay those of the autopilot;
-``visthrow.logs.readers.autopilot`` makes flight logs of them, ``hil.poses.sources`` poses. Files
-are read as bytes: no device string, no condition, nothing is evaluated.
+``visthrow.logs.readers.autopilot_logs`` makes flight logs of them, ``hil.poses.sources`` poses.
+Files are read as bytes: no device string, no condition, nothing is evaluated.
 
 Source: PX4 ULog file format; ArduPilot, AP_Logger/LogStructure.h; MAVLink's .tlog (big-endian
 microseconds before each message)."""

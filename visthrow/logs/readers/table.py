@@ -22,7 +22,7 @@ from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 from visthrow.logs.readers.layout import is_number, layout_of
-from visthrow.logs.units import to_si
+from visthrow.logs.unit_names import to_si
 
 Table = dict[str, np.ndarray]
 """Column -> values; numbers as float64 (NaN where the cell is empty), anything else as text."""

@@ -19,7 +19,7 @@ from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
-from visthrow.training import device
+from visthrow.training import compute_device
 
 IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
     "pendulum"
@@ -152,7 +152,7 @@ def fly_unit(unit: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any
         flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
     else:
         delays = delays_of(experiment, unit["compensation"])
-        where = device.resolve("auto") if unit["plant"] == "hybrid" else "cpu"
+        where = compute_device.resolve("auto") if unit["plant"] == "hybrid" else "cpu"
         flown = fly_plant(
             plan, unit["plant"], experiment, delays, count, seed, unit["batch"], where
         )
@@ -184,7 +184,7 @@ def flown(
         folder,
         fly_unit,
         None,
-        device.cores(),
+        compute_device.cores(),
         lambda text: say(f"TO+MPC: {text}"),
     )
     return [join(found[key_of(u)] for u in part)[0] for part in sets]

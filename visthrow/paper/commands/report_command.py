@@ -58,14 +58,14 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.storage import writable
     from visthrow.paper import RECORDS
     from visthrow.paper.report import result_set
-    from visthrow.training import device
+    from visthrow.training import compute_device
     from visthrow.view import page
 
     begin = time.perf_counter()
     if args.jobs is not None and args.jobs < 1:
         raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
     out = Path(args.out)
-    jobs = args.jobs or device.cores()
+    jobs = args.jobs or compute_device.cores()
     records = _records(args.records) if args.records else RECORDS
     folders = [_folder(name) for name in args.results]
     writable(out)

@@ -102,10 +102,10 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     from visthrow.common.arguments import EXIT_INTERRUPTED
     from visthrow.paper.sweep.pool import Local, ProcessPool
-    from visthrow.training import device
+    from visthrow.training import compute_device
 
     changes = tuple(args.overrides)
-    jobs = args.jobs or device.cores()
+    jobs = args.jobs or compute_device.cores()
     begin = time.monotonic()
 
     def say(text: str) -> None:
@@ -121,7 +121,7 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
             starter = Local(
                 args.list,
                 out,
-                [device.resolve(name) for name in args.devices.split(",")],
+                [compute_device.resolve(name) for name in args.devices.split(",")],
                 jobs,
                 changes,
             )

@@ -154,7 +154,7 @@ def fly(unit: ThrowUnit, out: Path, device: str) -> None:
 
 def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
     from visthrow.throws.reference_protocol import Job, fly_batch
-    from visthrow.training.device import resolve
+    from visthrow.training.compute_device import resolve
     from visthrow.training.protocol import throw
 
     loaded = load(unit, out)

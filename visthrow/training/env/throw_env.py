@@ -2,7 +2,7 @@
 
 A step is a chain of device operations without branches on data, allocations on the simulator's side
 or copies to the host, so a whole rollout can be captured in one CUDA graph
-(:mod:`visthrow.training.ppo.algorithm`). Every observation is a fresh tensor."""
+(:mod:`visthrow.training.ppo.ppo_training`). Every observation is a fresh tensor."""
 
 import torch
 import warp as wp
@@ -20,7 +20,7 @@ from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, drawn_plants, plant_of
 from visthrow.task.fleet import Member, members
 from visthrow.training import rewards, terminations
-from visthrow.training.device import rounded_products
+from visthrow.training.compute_device import rounded_products
 from visthrow.training.env.options import (
     DetectorView,
     FleetSetup,

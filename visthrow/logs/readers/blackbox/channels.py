@@ -14,7 +14,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.readers.table import Table, make_channel
-from visthrow.logs.units import G
+from visthrow.logs.unit_names import G
 
 MOTOR_ORDER = (
     3,

@@ -33,7 +33,7 @@ VOLTAGE_RANGE = (
 
 
 @dataclass(frozen=True)
-class ThrustParams(Bounded):
+class HoverThrustParams(Bounded):
     """The calibration of one vehicle."""
 
     weight: Positive  # thrust of the hover that was measured [N]
@@ -86,7 +86,7 @@ class ThrustParams(Bounded):
 class HoverMeter:
     """Mean share of thrust while the vehicle hovers by itself."""
 
-    def __init__(self, params: ThrustParams) -> None:
+    def __init__(self, params: HoverThrustParams) -> None:
         self.params = params
         self._shares: deque[float] = deque(maxlen=20 * LEAST_SHARES)
 

@@ -21,7 +21,7 @@ from sim.params import (
     ThrustParams,
     VehicleParams,
 )
-from sim.reference.rotations import cross, length
+from sim.reference.rotation_arrays import cross, length
 
 _QUARTER_TURN = np.array(
     [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import torch
 
+from camera.calibrate import BOARD
 from camera.calibrate.boards import (
     BoardParams,
     BoardReport,
@@ -28,7 +29,6 @@ from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write
-from visthrow.view.camera import BOARD
 
 BLUE = (230, 120, 40)
 YELLOW = (60, 210, 240)
