@@ -11,7 +11,7 @@ import warp as wp
 
 from sim import solvers
 from sim.solvers import World
-from sim.solvers.chain import ChainSolver
+from sim.solvers.chain_engine import ChainSolver
 
 
 class WorldHeldChain(ChainSolver):
