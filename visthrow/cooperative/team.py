@@ -42,6 +42,12 @@ class TeamParams(Bounded):
     weak: Range = (1.0, 1.0)  # [-]
     late: Range = (0.0, 0.0)  # [s]
     faulty: Annotated[float, Bound(0.0, 1.0)] = 0.0  # share of the worlds with each of the two
+    central: bool = False  # whether one policy sees with all members and commands all
+
+    @property
+    def flown(self) -> int:
+        """Vehicles that a call of the policy flies."""
+        return self.vehicles if self.central else 1
 
 
 @dataclass(frozen=True)
@@ -122,5 +128,6 @@ def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
 def team_contract(experiment: TeamExperiment) -> dict[str, Any]:
     """Conditions that a throw shares with the training of its policy."""
     contract = contract_of(experiment)
-    contract["observation"]["dimension"] = layout_of(experiment).dimension
+    contract["observation"]["dimension"] = experiment.team.flown * layout_of(experiment).dimension
+    contract["action"]["dimension"] *= experiment.team.flown
     return contract | {"team": config.to_dict(experiment.team)}

@@ -62,7 +62,8 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
         )
     policy = Policy.load(file)
     vision = policy.contract["observation"]["layout"] == "vision"
-    path = config.find("cooperative", POLICIES[vision])
+    central = policy.contract["team"].get("central")
+    path = config.find("cooperative", "pair_central" if central else POLICIES[vision])
     experiment = config.load(TeamExperiment, path)
     policy.require(team_contract(experiment), allow=("team",))
     if solver == "tree":

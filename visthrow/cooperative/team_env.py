@@ -1,7 +1,8 @@
 """TeamEnv: the cooperative task as rsl_rl's vectorised environment, a row a vehicle.
 
-All rows are flown by one policy, each from its own view; a world's rows end together. As in
-:class:`visthrow.training.env.ThrowEnv`, nothing branches on data: a rollout can be captured."""
+All rows are flown by one policy, each from its own view, or a world's rows at once from all views;
+they end together. As in :class:`visthrow.training.env.ThrowEnv`, nothing branches on data: a
+rollout can be captured."""
 
 import math
 
@@ -56,14 +57,15 @@ class TeamEnv(VecEnv):
         Args:
             experiment, device: plant, camera, task; "cpu" or "cuda:0".
             seed: of the simulator's resets; torch's own generator draws the rest.
-            count: number of rows; default the experiment's.
+            count: number of vehicles; default the experiment's.
             build: another solver of the bodies, as of :class:`TeamSim`.
         """
         self.cfg, self.device, task, team = experiment, device, experiment.task, experiment.team
-        self.num_envs, self.num_actions = count or experiment.ppo.environments, act.ACTIONS
-        self.team, self.worlds = team.vehicles, self.num_envs // team.vehicles
-        if self.num_envs % self.team:
-            raise ValueError(f"{self.num_envs} rows; expected a multiple of {self.team}")
+        self.rows = count or experiment.ppo.environments
+        self.num_envs, self.num_actions = self.rows // team.flown, team.flown * act.ACTIONS
+        self.team, self.worlds = team.vehicles, self.rows // team.vehicles
+        if self.rows % self.team:
+            raise ValueError(f"{self.rows} rows; expected a multiple of {self.team}")
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
         options = members(experiment) | ({} if build is None else {"build": build})
         plant = plant_of(experiment)
@@ -76,7 +78,7 @@ class TeamEnv(VecEnv):
         self.camera = KeypointCamera(experiment.camera, device)
         make = {"device": device, "dtype": torch.float32}
         ropes = torch.tensor([r.segment_length for r in options["ropes"]], **make)
-        rows = torch.arange(self.num_envs, device=device)
+        rows = torch.arange(self.rows, device=device)
         self._segment = ropes[rows % len(ropes)]
         self._mount = torch.tensor(plant.rope.mount, **make)
         hover = act.hover_action(GRAVITY * plant.total_mass, task.action.max_thrust)
@@ -87,7 +89,7 @@ class TeamEnv(VecEnv):
         self._fractions = torch.linspace(0.0, 1.0, samples, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
         self._change_weights = torch.tensor(task.reward.command_change, **make)
-        self.episode_length_buf = torch.zeros(self.num_envs, device=device, dtype=torch.long)
+        self.episode_length_buf = torch.zeros(self.rows, device=device, dtype=torch.long)
         self._memory = self._remembered()
         self.earliest = torch.zeros((), device=device, dtype=torch.long)
         self.last: dict[str, Tensor] = {}
@@ -96,7 +98,7 @@ class TeamEnv(VecEnv):
 
     def _remembered(self) -> dict[str, Tensor]:
         """The buffers that an episode carries beside the simulator's state."""
-        rows, worlds, make = self.num_envs, self.worlds, {"device": self.device}
+        rows, worlds, make = self.rows, self.worlds, {"device": self.device}
         steps = 2 + math.ceil(self.cfg.team.age[1] / self.cfg.sim.control_period)
         history, payload = 1 + self.layout.history, self.layout.payload
         shapes = {
@@ -125,6 +127,10 @@ class TeamEnv(VecEnv):
     def _worlds(self, of_rows: Tensor) -> Tensor:
         """Values of rows as (W, V, ...)."""
         return of_rows.unflatten(0, (self.worlds, self.team))
+
+    def _joined(self, of_rows: Tensor) -> Tensor:
+        """Values of rows, a line an actor: of all members side by side where one flies them all."""
+        return of_rows.reshape(self.num_envs, -1).float()
 
     def _neighbour(self, of_rows: Tensor, k: int) -> Tensor:
         """Values of the k-th vehicle after each row's own in its world."""
@@ -158,10 +164,10 @@ class TeamEnv(VecEnv):
         return self._observations.clone()
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
-        """Apply unclipped actions, shape (E, 5), for one control period; worlds that end start
-        anew.
+        """Apply unclipped actions, shape (E, 5) or (W, V 5), for one control period; worlds that
+        end start anew.
         """
-        action = self._apply(actions)
+        action = self._apply(actions.reshape(-1, act.ACTIONS))
         reward, done = self._judge(action)
         hit = self.last["released"].float()
         parts = [done.float(), hit, self.last["landing_error"] * hit, self.last["duration"] * hit]
@@ -171,7 +177,7 @@ class TeamEnv(VecEnv):
         self._start(done)
         rows = self._rows(done)
         self._observations = self._observe(rows)
-        return self._observations, reward, rows.float(), {}
+        return self._observations, self._joined(reward).mean(1), self._joined(rows).amax(1), {}
 
     def _apply(self, actions: Tensor) -> Tensor:
         """Fly one control period; returns the clipped actions.
@@ -331,7 +337,7 @@ class TeamEnv(VecEnv):
         spread = math.radians(team.across_deg) * (2.0 * draw[:, 2] - 1.0)
         low, high = (math.radians(degree) for degree in team.tilt_deg)
         tilt = self._rows(low + (high - low) * draw[:, 3])
-        rows = torch.arange(self.num_envs, device=self.device)
+        rows = torch.arange(self.rows, device=self.device)
         turn = 2.0 * math.pi / self.team * (rows % self.team)
         azimuth = self._rows(heading + spread) + 0.5 * math.pi + turn
         side = -tilt.sin()
@@ -395,7 +401,7 @@ class TeamEnv(VecEnv):
         )
         memory["history"].copy_(history)
         critic = self._privileged(vehicle, load, attached, fresh)
-        observed = {"actor": actor, "critic": critic}
+        observed = {"actor": self._joined(actor), "critic": self._joined(critic)}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
     def _messages(self, poses: Tensor, pos_w: Tensor) -> Tensor:

@@ -40,7 +40,7 @@ class TeamTraining(PPOTraining):
             )
         self.alg.train_mode()
         with torch.no_grad():
-            self.alg.actor.mlp[-1].bias[act.COMMANDS] += ASKING
+            self.alg.actor.mlp[-1].bias[act.COMMANDS :: act.ACTIONS] += ASKING
         self._obs = self.env.get_observations()
         self._graph: torch.cuda.CUDAGraph | None = None
         self._rollouts, self._eager = 0, eager

@@ -4,6 +4,7 @@ import json
 
 import pytest
 
+from bench.cooperative import split
 from visthrow.cli import main
 
 
@@ -16,6 +17,15 @@ def test_the_shipped_policy_lands_under_every_fault(tmp_path, capsys):
     assert rows["none"]["error_mean"] < 0.06
     assert max(row["error_mean"] for row in rows.values()) < 0.12
     assert rows["late"]["apart_mean"] == pytest.approx(0.03, abs=1e-3)
+
+
+def test_the_load_in_halves_takes_two_throws_of_time(tmp_path):
+    file = tmp_path / "split.json"
+    assert split.main(["--throws", "10", "--json", str(file)]) == 0
+    pair, halves = json.loads(file.read_text())
+    assert 1.7 < halves["duration_mean"] / pair["duration_mean"] < 2.5
+    assert halves["error_mean"] < 0.05
+    assert halves["landed"] == 1.0
 
 
 @pytest.mark.parametrize(

@@ -94,6 +94,20 @@ def test_a_camera_locates_goal_and_load_by_their_keypoints():
     torch.testing.assert_close(direction, straight, atol=0.02, rtol=0.0)
 
 
+def test_one_policy_of_both_sees_with_both_and_releases_at_once():
+    env = TeamEnv(experiment("pair_central"), seed=3, count=8)
+    observed = env.get_observations()["actor"]
+    assert observed.shape == (4, 2 * env.layout.dimension)
+    places = observed.unflatten(1, (2, -1))[:, :, :3].flatten(0, 1)
+    torch.testing.assert_close(places, env.views.state["pos_w"], atol=0.2, rtol=0.0)
+    actions = env._start_action.tile(4, 2)
+    actions[:, 4::5] = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    _, reward, done, _ = env.step(actions)
+    tripped = env._worlds(env.views.state["release_timer"] >= 0.0)
+    assert tripped.tolist() == [[True] * 2, [False] * 2, [False] * 2, [False] * 2]
+    assert reward.shape == done.shape == (4,)
+
+
 def test_rows_that_are_no_whole_worlds_are_refused():
     with pytest.raises(ValueError, match="7 rows; expected a multiple of 2"):
         TeamEnv(experiment(), count=7)
