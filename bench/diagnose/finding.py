@@ -125,12 +125,12 @@ def kinds(rng: np.random.Generator) -> list[Kind]:
 
 
 def draw_few(rng: np.random.Generator) -> list[Kind]:
-    """Draw some of the kinds: two single effects, one of them on the string, either the law or the
-    pair and lost commands, and one with nothing hidden.
+    """Draw three of the kinds: a single effect; one on the string, the pair, the law or lost
+    commands; and one with nothing hidden.
     """
     *singles, pair, law, lost, nothing, _ = kinds(rng)
-    either = [[law], [pair, lost]][rng.integers(2)]
-    return [singles[0], singles[-1], *either, nothing]
+    second = [singles[-1], pair, law, lost][rng.integers(4)]
+    return [singles[0], second, nothing]
 
 
 def right(recipe: Recipe, verdict: dict) -> bool:

@@ -14,7 +14,6 @@ from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import ReferenceAdapter
-from visthrow.throws.reference_protocol import Job, fly_batch
 from visthrow.training import protocol
 from visthrow.training.env import ThrowEnv
 
@@ -100,18 +99,6 @@ def test_throws_at_moving_goals_keep_where_the_goal_was():
     )
     assert throws.summary()["error_mean"] > 0.2, (
         "a policy for goals that stand still throws to where it saw them"
-    )
-
-
-@pytest.mark.slow
-def test_goals_move_on_the_reference_plant_too():
-    loaded = load_policy("state", overrides=["task.target.speed=[0.5,0.5]"])
-    result = fly_batch([loaded], "reference", Job((0,), 1.5, 0, 2, 0))
-    assert result["success"].all()
-    moved = np.linalg.norm(result["goal_w"] - [1.5, 0.0], axis=1)
-    np.testing.assert_allclose(moved, 0.5 * result["duration"], rtol=1e-6)
-    np.testing.assert_allclose(
-        np.linalg.norm(result["landing_w"] - result["goal_w"], axis=1), result["error"]
     )
 
 

@@ -3,15 +3,12 @@ are made of.
 """
 
 import argparse
-import os
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from bench.diagnose import altered, cases
-from bench.diagnose.bad import BAD
-from bench.diagnose.degenerate import PAIRS
+from bench.diagnose import cases
 from bench.worlds.follow import ALONE, follow, table_of
 from bench.worlds.world import Recipe
 from visthrow.diagnose.planning.manoeuvres import catalogue
@@ -43,45 +40,6 @@ def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
     assert (
         np.abs(logs[0]["pos_w"].values - again[0]["pos_w"].values).max() > 1e-3
     )  # another seed is another flight
-
-
-def test_a_mirror_undoes_itself_and_turns_rotations_around(logs):
-    once = altered.mirrored(logs[1])
-    twice = altered.mirrored(once)
-    for name, channel in logs[1].channels.items():
-        np.testing.assert_allclose(twice[name].values, channel.values)
-    rate = lambda log: np.gradient(2.0 * log["quat_wb"].values[:, :3], log["quat_wb"].time, axis=0)  # noqa: E731
-    level = np.abs(logs[1]["quat_wb"].values[:, 3]) > 0.99
-    np.testing.assert_allclose(
-        rate(once)[level], (rate(logs[1]) * [-1.0, 1.0, -1.0])[level], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        once["command"].values, logs[1]["command"].values * [1.0, -1.0, 1.0, -1.0]
-    )
-    assert altered.mirrored_theta({"com_y": 1.0, "motor_1": 2.0, "com_x": 3.0}) == {
-        "com_y": -1.0,
-        "motor_2": 2.0,
-        "com_x": 3.0,
-    }
-
-
-def test_a_turned_hall_keeps_distances_and_heights(logs):
-    turned = altered.turned(logs[1], 0.5 * np.pi, (2.0, -1.0, 0.0))
-    p, q = (log["pos_w"].values - log["payload_pos_w"].values for log in (logs[1], turned))
-    np.testing.assert_allclose(
-        q, p @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), atol=1e-12
-    )
-    back = altered.turned(turned, -0.5 * np.pi, (1.0, 2.0, 0.0))
-    np.testing.assert_allclose(back["pos_w"].values, logs[1]["pos_w"].values, atol=1e-12)
-    alike = np.abs(np.sum(back["quat_wb"].values * logs[1]["quat_wb"].values, axis=1))
-    np.testing.assert_allclose(alike, np.sum(logs[1]["quat_wb"].values ** 2, axis=1), atol=1e-12)
-
-
-def test_scrambled_logs_keep_their_poses_and_exchange_their_commands(logs):
-    mixed = altered.scrambled(logs)
-    np.testing.assert_array_equal(mixed[1]["pos_w"].values, logs[1]["pos_w"].values)
-    np.testing.assert_array_equal(mixed[1]["command"].values, logs[2]["command"].values)
-    np.testing.assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
 
 
 def test_the_tool_is_asked_apart(tmp_path):
@@ -147,44 +105,3 @@ def test_of_hours_of_flight_all_throws_are_looked_at():
     assert [c for c in kept if c.flight == 1] == throws
     assert max(b.start - a.start for a, b in pairwise(kept[:370])) < 25.0
     assert thinned(throws) == throws
-
-
-def run_cases(kinds: list[str], count: int = 1) -> list[dict]:
-    """Cases of worlds drawn now; the seeds are printed."""
-    first = int.from_bytes(os.urandom(4), "little")
-    print(f"first seed {first}")
-    tasks = [
-        cases.Task(kind, cases.draw(kind, first + 100 * k + i), np.inf)
-        for k, kind in enumerate(kinds)
-        for i in range(count)
-    ]
-    return [cases.run_case(task) for task in tasks]
-
-
-def told(line: dict) -> str:
-    """Why a case failed."""
-    return (
-        f"{line['kind']} {line['recipe']}: {line.get('said')} {line.get('error', '')}"
-        f" {line.get('output', '')}"
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(cases.KINDS))
-def test_symmetries_hold(kind):
-    (line,) = run_cases([kind])
-    assert line["passed"], told(line)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(PAIRS))
-def test_pairs_are_a_class_and_the_plan_separates_them(kind):
-    (line,) = run_cases([kind])
-    assert line["passed"], f"{told(line)}; done: {line.get('done')}"
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(BAD))
-def test_bad_logs_get_no_name(kind):
-    (line,) = run_cases([kind])
-    assert line["passed"], told(line)

@@ -23,7 +23,6 @@ from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.models.flyer_params import TorqueParams
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
-from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -182,23 +181,6 @@ def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_p
     ((before, after, noise),) = again["tested"].values()
     assert before > 3.0 * noise
     assert before - after > 0.8 * (before - noise)
-
-
-@pytest.mark.slow
-def test_a_swirl_on_a_slung_load_is_won_back():
-    name, hidden, world = foreign.drawn(7340017)
-    assert hidden == "swirl"
-    logs = [foreign.flown(world, np.random.default_rng([7340017, i])) for i in range(6)]
-    diagnosis = search.explain(FlyerModel(logs[:4], foreign.known(name)))
-    assert diagnosis.overall == "UNKNOWN"
-    assert [law.formula for law in diagnosis.explanations[0]] == ["F = c (e_z x v)"]
-    others = FlyerModel(logs[4:], foreign.known(name))
-    written = [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
-    for before, after, noise in on_others(
-        others, others.with_laws(written), {}, diagnosis
-    ).errors.values():
-        assert before > 10.0 * noise
-        assert before - after > 0.8 * (before - noise)
 
 
 def test_what_cannot_act_is_refused():

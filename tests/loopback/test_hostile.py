@@ -15,7 +15,7 @@ import pytest
 from bench.processes import free_port
 from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
-from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
+from tests.fuzz import any_message, mutated, noise
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import HERE, cut, peers, throw
@@ -64,13 +64,7 @@ def flood(count: int, kind: str, seed: int) -> None:
 
 @pytest.mark.parametrize("kind", ["ardupilot", "px4"])
 def test_messages_of_every_kind_command_nothing(kind):
-    flood(10_000, kind, 0)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_messages_command_nothing(seed):
-    flood(EACH, ("ardupilot", "px4")[seed % 2], seed)
+    flood(5_000, kind, 0)
 
 
 STRANGERS = tuple(("127.0.0.1", 2 + i) for i in range(5)) + (("10.0.0.9", 14550),)
@@ -206,15 +200,9 @@ def unmoved(seed: int, count: int) -> None:
     raise AssertionError(f"{left} of {count} packets were not sent")
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3])
+@pytest.mark.parametrize("seed", [0, 3])
 def test_forged_packets_change_no_bit_of_a_throw(seed):
-    unmoved(seed, 10_000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
-    unmoved(seed, EACH)
+    unmoved(seed, 6_000)
 
 
 def test_a_flood_in_mid_throw_neither_commands_nor_releases():
@@ -281,18 +269,3 @@ def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
     assert "Traceback" not in err
     assert process.returncode == 1
     assert (tmp_path / "run" / "summary.json").is_file()
-
-
-def test_what_the_runner_imports_is_enough_on_board():
-    """The whole command starts where neither simulator nor trainer can be imported."""
-    code = (
-        "import sys\nclass Blocker:\n    def find_spec(self, name, path=None, target=None):\n     "
-        "   if name.split('.')[0] in ('sim', 'warp', 'rsl_rl', 'tensordict', 'mujoco',"
-        " 'visthrow.training.env'):\n            raise ImportError('blocked: ' +"
-        " name)\nsys.meta_path.insert(0, Blocker())\nfrom visthrow.cli import"
-        " main\nsys.exit(main(['hil', 'check', '--seconds', '0.1', '--set',"
-        f" 'link.device=\"udp:127.0.0.1:{free_port()}\"']))\n"
-    )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 1, result.stderr
-    assert "FAIL  no good pose of the vehicle" in result.stdout

@@ -94,16 +94,10 @@ def require_refused(runner, said, sunk):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_the_policys_own_vehicle_throws(kind):
-    runner, said, sunk = fly(kind)
+def test_the_policys_vehicle_throws_even_with_a_slow_yaw(kind):
+    runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=SLOW))
     assert runner.machine.state is State.THROW, said
     assert sunk < SUNK
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_slow_yaw_is_not_a_dead_one(kind):
-    runner, said, _ = fly(kind, plant=PointPlant(yaw_lag=SLOW))
-    assert runner.machine.state is State.THROW, said
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -124,23 +118,24 @@ def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, tim
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("times", [0.5, 2.0])
 def test_another_weight_than_the_configuration_says(kind, times):
     runner, said, sunk = fly(kind, times)
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("share", [0.8, 1.2])
+@pytest.mark.parametrize(("kind", "share"), zip(KINDS, (0.8, 1.2, 0.8, 1.2), strict=True))
 def test_another_thrust_line(kind, share):
     runner, said, sunk = fly(kind, spoil=bend(share))
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(
+    ("kind", "axis"),
+    [(kind, axis) for kind in KINDS for axis in range(3) if axis == 2 or kind in KINDS[::3]],
+)
 def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)

@@ -7,7 +7,6 @@ import json
 import os
 import pty
 import re
-import resource
 import signal
 import socket
 import subprocess
@@ -45,9 +44,6 @@ before; the last one counts as it is.
 
 START = 5.0
 """After which a run whose output is not read has begun to listen [s]."""
-
-FULL_DISK = 20_000
-"""Bytes that a file may still grow by: some forty ticks."""
 
 
 def free_port(kind=socket.SOCK_DGRAM) -> int:
@@ -213,39 +209,6 @@ def never(tmp_path):
     return path
 
 
-OWN = {
-    "ardupilot": "levelled: no set-points",
-    "px4": "left OFFBOARD: no set-points",
-    "betaflight": "override: the pilot's sticks count again",
-}
-"""What the vehicle does by itself when nobody speaks any more."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
-def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
-    def fly(folder, speed):
-        with Pair(folder, kind, never, overrides=QUICK, both=("--speed", str(speed))) as pair:
-            pair.wait_for("throw")
-            pair.wait_for_actions(10)
-            os.kill(pair.runner.pid, signal.SIGKILL)
-            pair.runner.wait(PATIENCE)
-            time.sleep(2.5 / speed)
-            report = pair.report()
-        return report, report["late_periods"] > MOST_LATE
-
-    report, folder = kept_up(tmp_path, fly)
-    assert OWN[kind] in [text for _, text in report["events"]]
-    happened = next(
-        at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"]
-    )
-    assert 0.29 < happened - report["last_command"] < 0.6
-    assert (report["breaches"], report["releases"]) == ([], 0)
-    found = replay(folder / "run")
-    assert found["differences"] == [], "what was written until then runs again to the bit"
-    assert found["actions"] > 5
-
-
 def test_sigterm_in_mid_throw(tmp_path, never):
     """What systemd, `timeout` and a shutdown send; `bench.runner --faults` flies the others,
     in hover and with each kind. Signed.
@@ -292,22 +255,6 @@ def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["reason"] == "the process was told to end (SIGHUP)"
     assert (tmp_path / "run" / "throw-01.npz").is_file()
-
-
-@pytest.mark.slow
-def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
-    """The throw is flown to its end, the next one is not armed, the end of the run says so."""
-    overrides = (*QUICK[:3], "states.throw=4.0", "states.ready=2.0", "states.land=1.0", "throws=2")
-    with Pair(tmp_path, "ardupilot", never, overrides=overrides) as pair:
-        pair.wait_for("throw")
-        room = (tmp_path / "run" / "ticks.jsonl").stat().st_size + FULL_DISK
-        resource.prlimit(pair.runner.pid, resource.RLIMIT_FSIZE, (room, room))
-        out, err = pair.runner.communicate(timeout=PATIENCE)
-        report = pair.report()
-    assert "the policy did not release in time" in err
-    assert "nobody armed a throw" in err, "the next one is not armed"
-    assert "File too large" in out + err + (tmp_path / "run" / "summary.json").read_text()
-    assert (report["breaches"], report["releases"]) == ([], 0)
 
 
 @pytest.mark.slow

@@ -3,14 +3,12 @@ is judged.
 """
 
 import importlib
-import json
 import shlex
 from pathlib import Path
 
 import pytest
 
 from bench import camera as bench_camera
-from bench import mujoco_warp as bench_mujoco_warp
 from bench import report, start, train
 from bench import sim as sim_cpu
 from visthrow import cli, config
@@ -24,67 +22,6 @@ from visthrow.task import Experiment
 def kept(tmp_path, monkeypatch) -> Path:
     monkeypatch.setattr(measurements, "FOLDER", tmp_path)
     return tmp_path
-
-
-def test_bench_sim_against_mujoco_writes_a_record(kept, tmp_path, capsys):
-    out = tmp_path / "figures.json"
-    arguments = [
-        "--batch",
-        "4",
-        "--seconds",
-        "1e-3",
-        "--repeats",
-        "1",
-        "--json",
-        str(out),
-        "--record",
-        "tiny",
-    ]
-    assert sim_cpu.main(arguments) == 0
-    figures = json.loads(out.read_text())["figures"]
-    assert figures["errors_m"]["ours"][0] < 1e-3
-    assert figures["errors_m"]["RK4"][0] <= 1e-3 < figures["errors_m"]["implicitfast"][0]
-    assert "MuJoCo C, RK4" in capsys.readouterr().out
-    assert cli.main(["bench", "records"]) == 0
-    printed = capsys.readouterr().out
-    assert "## tiny" in printed
-    assert "hard throw" in printed
-
-
-@pytest.mark.slow  # MuJoCo Warp's kernels compile for half a minute
-def test_mujoco_warp_runs_the_same_rope_as_c():
-    pytest.importorskip("mujoco_warp")
-    found = bench_mujoco_warp.measure("cpu", 1, 0.02, batches=(2,), stretch=2)
-    assert found["off_from_c_m"] < 1e-5  # float32 against float64 over 20 steps
-    assert found["best"]["substeps_per_s"] == pytest.approx(10 * found["best"]["env_steps_per_s"])
-
-
-def test_bench_camera_runs(kept, capsys):
-    assert (
-        bench_camera.main(
-            ["--environments", "16", "--repeats", "1", "--device", "cpu", "--record", "c"]
-        )
-        == 0
-    )
-    exact = measurements.load(kept / "c.json")["figures"]["accuracy"]
-    assert max(exact["kornia_px"], exact["opencv_px"]) < 1e-9  # px; the bar of the camera
-    assert "OpenCV" in capsys.readouterr().out
-
-
-def test_bench_train_splits_an_iteration(kept, capsys):
-    small = ["ppo.environments=8", "ppo.steps=2", "ppo.hidden=[8]", "ppo.minibatches=2"]
-    arguments = ["state", "--device", "cpu", "--iterations", "1", "--repeats", "1", "--record", "t"]
-    assert train.main([*arguments, *(word for s in small for word in ("--set", s))]) == 0
-    figures = measurements.load(kept / "t.json")["figures"]
-    assert figures["samples"] == 16
-    assert set(figures["seconds"]) == {
-        "simulation",
-        "environment",
-        "inference",
-        "storage",
-        "learning",
-    }
-    capsys.readouterr()
 
 
 def test_shipped_records_are_well_formed():

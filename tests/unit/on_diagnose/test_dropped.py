@@ -11,7 +11,6 @@ import pytest
 from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.likelihood.correlation import LOOKED_AT
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, linearise, moved
@@ -91,21 +90,6 @@ def test_lost_commands_are_found_beside_a_cause():
     found = told(diagnosis)[0]
     assert found.low < SHARE < found.high
     assert found.nats > 50.0
-
-
-def test_commands_that_all_come_late_are_not_lost_and_few_windows_say_so(monkeypatch):
-    model, asked = model_of(0.0, cmd_delay=0.015), []
-    plain = model.without_commands
-    monkeypatch.setattr(
-        model,
-        "without_commands",
-        lambda theta, windows: asked.append(len(windows)) or plain(theta, windows),
-    )
-    diagnosis = search.explain(model)
-    assert not told(diagnosis)
-    assert diagnosis.named == ("cmd_delay",)
-    assert len(asked) <= 2
-    assert max(asked) <= LOOKED_AT < diagnosis.windows
 
 
 def test_another_model_without_commands_is_not_asked():

@@ -60,12 +60,12 @@ def test_what_is_drawn_anew_each_day_drifts():
     assert np.mean([w.found for w in worlds]) > 0.8
     assert "drifts, a value for each day" in worlds[0].sentence
     assert "5 days" in worlds[0].sentence
-    assert not any(on_days(rng, 0.0, 0.0).found for _ in range(100))
+    assert not any(on_days(rng, 0.0, 0.0).found for _ in range(40))
 
 
 def test_what_is_drawn_anew_each_flight_does_not_drift():
     rng = np.random.default_rng(9)
-    worlds = [on_days(rng, 0.0, 0.012) for _ in range(40)]
+    worlds = [on_days(rng, 0.0, 0.012) for _ in range(20)]
     assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
     assert "15 flights" in worlds[0].sentence
 
@@ -101,19 +101,19 @@ def told(rng, **deviation):
 
 def test_deviations_are_found_with_their_size():
     rng = np.random.default_rng(5)
-    worlds = [told(rng, release_lag=0.012) for _ in range(60)]
+    worlds = [told(rng, release_lag=0.012) for _ in range(40)]
     assert np.mean([w["lag_jitter"].found for w in worlds]) > 0.9
     assert not any(w["gust"].found for w in worlds)
     inside = np.mean([w["lag_jitter"].low <= 0.012 <= w["lag_jitter"].high for w in worlds])
-    assert inside > 0.85, inside  # 95 %, less three and a half deviations of 60 draws
-    gusts = [told(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25) for _ in range(25)]
+    assert inside > 0.85, inside  # 95 %, less three deviations of 40 draws
+    gusts = [told(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25) for _ in range(15)]
     assert np.mean([w["gust"].found for w in gusts]) > 0.9
     assert abs(np.median([w["gust"].size for w in gusts]) - 0.25) < 0.06
 
 
 def test_equal_flights_do_not_vary():
     rng = np.random.default_rng(6)
-    worlds = [told(rng) for _ in range(150)]
+    worlds = [told(rng) for _ in range(60)]
     assert not any(s.found for w in worlds for s in w.values())
 
 

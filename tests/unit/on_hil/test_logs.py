@@ -3,10 +3,7 @@ and wrong files.
 """
 
 import math
-import random
-import struct
 
-import numpy as np
 import pytest
 
 from hil.control.recording.record import lines
@@ -14,7 +11,6 @@ from hil.errors import SourceError
 from hil.params import HilParams
 from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
-from tests.unit.on_logs.test_fuzz import damaged, dataflash, patience, ulog
 from visthrow import config
 from visthrow.cli import main
 from visthrow.common.errors import ConfigError
@@ -258,94 +254,6 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     files.write_ulg(path, topics)
     with pytest.raises(SourceError, match="gives no attitude"):
         read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
-
-
-def spoiled(data: bytes, rng) -> bytes:
-    """A file with some bytes changed, cut out or doubled."""
-    out = bytearray(data)
-    for _ in range(rng.integers(1, 8)):
-        at = int(rng.integers(0, len(out) - 1))
-        kind = rng.integers(3)
-        if kind == 0:
-            out[at] = int(rng.integers(256))
-        elif kind == 1:
-            del out[at : at + int(rng.integers(1, 30))]
-        else:
-            out[at:at] = out[at : at + int(rng.integers(1, 30))]
-        if len(out) < 2:
-            break
-    return bytes(out)
-
-
-def test_spoiled_logs_raise_nothing_else(tmp_path):
-    """150 damaged copies of each kind: poses, or one kind of error."""
-    pytest.importorskip("pyulog")
-    rng = np.random.default_rng(0)
-    bin_path, ulg_path, copy = tmp_path / "a.BIN", tmp_path / "a.ulg", tmp_path / "copy"
-    files.write_bin(bin_path, {"VISP": files.VISP}, [vision(i) for i in range(20)])
-    files.write_ulg(
-        ulg_path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])}
-    )
-    told = 0
-    for path, read, body in (
-        (bin_path, read_bin, VEHICLE),
-        (ulg_path, read_ulg, (LogBody("vehicle", "vehicle_visual_odometry"),)),
-    ):
-        data = path.read_bytes()
-        for _ in range(150):
-            copy.write_bytes(spoiled(data, rng))
-            try:
-                assert read(copy, body)
-            except SourceError:
-                told += 1
-    assert told > 20, "some are past reading"
-
-
-def test_a_length_that_leads_back_is_no_circle(tmp_path):
-    """A length of 400 where 90 bytes are left: pyulog steps back over them, and over them again."""
-    pytest.importorskip("pyulog")
-    path = tmp_path / "a.ulg"
-    files.write_ulg(
-        path, {("vehicle_visual_odometry", 0): (ODOMETRY, [odometry(i) for i in range(20)])}
-    )
-    data = path.read_bytes()
-    first = data.index(b"A\x00\x00\x00vehicle_visual_odometry") - 2  # the end of the definitions
-    path.write_bytes(data[:first] + data[16:first] * 7 + struct.pack("<HB", 400, 0) + bytes(90))
-    with (
-        patience(),
-        pytest.raises(
-            SourceError, match=r"a\.ulg: cannot be read: .*leads nowhere.*expected a PX4 log"
-        ),
-    ):
-        read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
-
-
-MANY = 300
-READERS = {
-    "a.BIN": (dataflash, read_bin, (LogBody("vehicle", "XKF1"),)),
-    "a.ulg": (ulog, read_ulg, (LogBody("vehicle", "vehicle_local_position"),)),
-}
-"""Kind -> who writes such a log, who reads it, and the bodies in it."""
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(READERS))
-def test_many_damaged_logs_end(name, tmp_path):
-    """Poses, or one error that names the file, and always an end."""
-    pytest.importorskip("pyulog")
-    write, read, bodies = READERS[name]
-    path, chance = tmp_path / name, random.Random(name)
-    write(path)
-    whole, told = path.read_bytes(), []
-    for i in range(MANY):
-        path.write_bytes(damaged(whole, chance) if i else whole)
-        with patience():
-            try:
-                assert read(path, bodies) or i
-            except SourceError as error:
-                told.append(str(error))
-    assert all(name in message for message in told)
-    assert 0 < len(told) < MANY
 
 
 def test_a_topic_without_a_field_says_which(tmp_path):

@@ -3,7 +3,6 @@ what; nothing else, and soon.
 """
 
 import gzip
-import itertools
 import lzma
 import math
 import random
@@ -29,7 +28,6 @@ REAL = Path(__file__).resolve().parents[2] / "data" / "real"
 PATIENCE = 20.0
 """Seconds; the longest of these small files takes one on a busy machine."""
 DAMAGES = 12
-MANY = 300
 SAMPLES = 200
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
@@ -236,27 +234,6 @@ def all_of(name: str, folder: Path, count: int) -> list[bool]:
 def test_damaged_files(name, tmp_path):
     said = all_of(name, tmp_path, DAMAGES)
     assert not said[0]  # nothing at all
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(FORMATS))
-def test_many_damaged_files(name, tmp_path):
-    said = all_of(name, tmp_path, MANY)
-    assert not all(said)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
-def test_cut_at_many_places(name, tmp_path):
-    path = tmp_path / name
-    FORMATS[name](path)
-    whole = path.read_bytes()
-    said = []
-    for end in itertools.chain(range(0, 2000, 37), range(2000, len(whole), 211)):
-        path.write_bytes(whole[:end])
-        said.append(looked_at(path))
-    first = said.index(True)
-    assert all(said[first:])  # what was readable when less was there stays so
 
 
 def test_a_length_that_leads_back_is_no_circle(tmp_path):

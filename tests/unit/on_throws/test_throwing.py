@@ -285,24 +285,6 @@ def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     assert np.ptp(got["landing_w"][:, 0]) > 0.0
 
 
-@pytest.mark.slow
-def test_processes_throw_what_one_process_throws(dropper, tmp_path):
-    pytest.importorskip("mujoco")
-    dropping_policy("vision").save(tmp_path / "other.npz")
-    loaded = [load_policy(dropper), load_policy(tmp_path / "other.npz")]
-    with reference_protocol.Throwing(
-        loaded, (1.0,), 2, "reference-realistic", 7, together=True
-    ) as throwing:
-        rows = throwing.results(show=False)
-    alone = reference_protocol.fly_batch(
-        loaded, "reference-realistic", reference_protocol.Job((0, 1), 1.0, 0, 2, 7)
-    )
-    for policy, row in enumerate(rows):
-        part = slice(2 * policy, 2 * policy + 2)
-        np.testing.assert_array_equal(row[0].landing_w, alone["landing_w"][part])
-        np.testing.assert_array_equal(row[0].duration, alone["duration"][part])
-
-
 def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path)
     for name in compare.DEFAULT_POLICIES:
