@@ -6,6 +6,7 @@ python -m bench.train laptop --until 0.06 0.04  seconds of whole trainings to th
 """
 
 import argparse
+import secrets
 import statistics
 import sys
 import time
@@ -145,13 +146,14 @@ def run(args: argparse.Namespace) -> int:
         args.repeats,
         args.minutes,
         args.evaluate_every or 1,
+        args.fresh,
         *(args.until or ()),
     )
     if min(numbers) <= 0:
         raise VisthrowError(
             f"--iterations {args.iterations}, --repeats {args.repeats}, --minutes {args.minutes},"
-            f" --until {args.until}, --evaluate-every {args.evaluate_every}: expected positive"
-            " numbers"
+            f" --until {args.until}, --evaluate-every {args.evaluate_every}, --fresh {args.fresh}:"
+            " expected positive numbers"
         )
     from visthrow.task import Experiment
     from visthrow.training import compute_device
@@ -164,7 +166,13 @@ def run(args: argparse.Namespace) -> int:
 
         return finish(
             time_to_error.measure(
-                experiments, name, args.until, args.seeds, args.minutes, args.evaluate_every
+                experiments,
+                name,
+                args.until,
+                args.seeds or [secrets.randbelow(10**6) for _ in range(args.fresh)],
+                args.minutes,
+                args.evaluate_every,
+                args.whole,
             ),
             args,
         )
@@ -251,9 +259,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--seeds",
         type=int,
         nargs="+",
-        default=[1, 2, 3, 4, 5],
         metavar="N",
-        help="of the trainings (default: 1 to 5)",
+        help="of the trainings (default: as many as --fresh says, drawn anew and printed)",
+    )
+    add("--fresh", type=int, default=10, metavar="N", help="seeds to draw (default: 10)")
+    add(
+        "--whole",
+        action="store_true",
+        help="go on to the last iteration though an error is reached, and throw at all targets",
     )
     add(
         "--minutes",
