@@ -43,6 +43,8 @@ _MASS_WARN, MASS_BAD = (
     0.15,
     1.0,
 )  # of the logarithm of thrust over weight: a battery's charge; another unit or map
+IDLE_PULSE = 1000.0  # length of a pulse at which a motor stands [us]
+_OUTLIER = 4.0  # robust deviations beyond which a crash or a tumble has its say cut
 IDLE_SPEED, IDLE_SHARE = 100.0, 0.12  # a vehicle whose rotors stay below has not flown [rad/s], [1]
 # of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
 _UNEVEN = 0.4
@@ -70,6 +72,8 @@ def thrust_of(
         values = sum(c * values**i for i, c in enumerate(vehicle.thrust_map))
     elif name == "motor_speed":
         values = values**2
+    elif name in ("motor_output", "pwm") and IDLE_PULSE - 200.0 < np.median(values) < 2300.0:
+        values = np.maximum(values - IDLE_PULSE, 0.0)
     return name, time, np.sum(values, axis=1, keepdims=True)
 
 
@@ -197,8 +201,10 @@ def _correlations(
     grid = np.arange(start, end, 0.01)
     if len(grid) < 200:
         return None
-    x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
-    y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
+    x = _trimmed(relations.mean_over(time, command, grid, _SPAN)[:, 0])
+    y = np.array(
+        [_trimmed(relations.mean_over(*force, grid + delay, _SPAN)[:, 0]) for delay in _DELAYS]
+    )
     x = x / np.mean(x) - 1.0
     varies = y / np.mean(y, axis=1, keepdims=True) - 1.0
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
@@ -207,6 +213,13 @@ def _correlations(
     best = int(np.argmax(np.where((_DELAYS > -0.005) & (_DELAYS < _LATEST), curve, -1.0)))
     independent = float(np.ptp(grid)) / (2.0 * _SPAN)
     return curve, float(0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best])))
+
+
+def _trimmed(values: np.ndarray) -> np.ndarray:
+    """Return values cut to what lies within some robust deviations of their median."""
+    middle = np.median(values)
+    reach = _OUTLIER * 1.4826 * np.median(np.abs(values - middle))
+    return np.clip(values, middle - reach, middle + reach) if reach > 0.0 else values
 
 
 def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
