@@ -1,9 +1,9 @@
 """Calibration files of the field, as our lens: which tool wrote a file is told from its keys.
 
-Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, vikit,
-ORB-SLAM, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's FileStorage,
-OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or several cameras. A box says where the
-numbers of a camera stand; `camera.calibrate.foreign` knows the models.
+Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, OKVIS,
+vikit, ORB-SLAM, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's
+FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or several cameras. A box
+says where the numbers of a camera stand; `camera.calibrate.foreign` knows the models.
 
 Convention: pixel (0, 0) is the centre of the top left pixel, x right, y down, z forward, as in
 `FisheyeParams`. None of the files holds a field of view; it is read from an extra key ``fov_deg``,
@@ -76,7 +76,7 @@ def read(
         (zero where the file holds ours).
     """
     try:
-        cameras = _cameras(_tree(path))
+        cameras = _cameras_of(path)
         if not cameras:
             named = re.findall(r"[\w./-]+\.ya?ml", Path(path).read_text())
             hint = f"; it names {', '.join(dict.fromkeys(named))}: one of these?" if named else ""
@@ -89,7 +89,7 @@ def read(
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if len(cameras) > 1:
-        names = ", ".join(entry[2] or str(i) for i, entry in enumerate(cameras))
+        names = ", ".join(entry[2] for entry in cameras)
         report = replace(
             report,
             remarks=(f"camera {name} of {len(cameras)} in the file ({names})", *report.remarks),
@@ -103,7 +103,7 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
 
     Convention: the IMU sits at the centre of mass, its axes are the body's (x forward, y left, z
     up). Raises ValueError: no 4 x 4 matrix with a rotation."""
-    _, node, _ = _chosen(_cameras(_tree(path)), camera)
+    _, node, _ = _chosen(_cameras_of(path), camera)
     key = next((key for key in ("T_cam_imu", "T_imu_cam") if key in node), None)
     if key is None:
         return None
@@ -134,7 +134,7 @@ def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[st
         return entries[number]
     raise ValueError(
         f"camera {camera} was requested; expected a number below {len(entries)}, the cameras in the"
-        f" file, or one of their names: {', '.join(name or '(no name)' for name in names)}"
+        f" file, or one of their names: {', '.join(names)}"
     )
 
 
@@ -167,6 +167,7 @@ def _tree_of_yaml(text: str) -> Any:
     import yaml
 
     text = re.sub(r"\A%YAML[^\n]*\n|!!opencv-matrix", "", text).replace("\t", "    ")
+    text = re.sub(r"(?m)^(\s*[\w.]+):(?=[\[\d-])", r"\1: ", text)  # OpenCV needs no blank there
     try:
         documents = list(yaml.safe_load_all(text))
     except (yaml.YAMLError, ValueError) as error:
@@ -187,6 +188,16 @@ def _tree_of_xml(text: str) -> Any:
         return tree_of(ElementTree.fromstring(text))
     except ElementTree.ParseError as error:
         raise ValueError(f"is no complete XML (cut short?): {error}") from error
+
+
+def _cameras_of(path: str | Path) -> list[tuple[str, Node, str]]:
+    """Cameras of a file, each by a name of its own or its number."""
+    cameras = _cameras(_tree(path))
+    names = [name for *_, name in cameras]
+    return [
+        (box, node, name if name and names.count(name) == 1 else str(i))
+        for i, (box, node, name) in enumerate(cameras)
+    ]
 
 
 def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
@@ -350,10 +361,21 @@ def _svo(node: Node) -> Camera:
             f"type is {core!r} with {len(numbers)} intrinsics; expected 'pinhole' with 4 or 'omni'"
             " with 24"
         )
+    values = dict(zip(KB4.split(), numbers))
+    if "distortion" not in node and "distortion_coefficients" not in node:
+        return "pinhole", values
     coefficients = _any(node, "distortion.parameters", "distortion_coefficients", "distortion.data")
     label = "fov" if _any(node, "distortion.type") == "fisheye" else _label(node, "distortion.type")
-    values = dict(zip(KB4.split(), numbers))
     return _model(core, label, values, _floats(coefficients, "distortion.parameters"))
+
+
+def _okvis(node: Node) -> Camera:
+    fx, fy = _floats(node["focal_length"], "focal_length", (2,))
+    cx, cy = _floats(_any(node, "principal_point"), "principal_point", (2,))
+    coefficients_node = _any(node, "distortion_coefficients")
+    coefficients = _floats(coefficients_node, "distortion_coefficients")
+    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+    return _model("pinhole", _label(node, "distortion_type"), values, coefficients)
 
 
 VIKIT = {
@@ -382,12 +404,19 @@ def _vikit(node: Node) -> Camera:
     )
 
 
+MATRICES = "camera_matrix cameraMatrix Camera_Matrix K k mtx matrix intrinsic_matrix"
+COEFFICIENTS = (
+    "distortion_coefficients Distortion_Coefficients dist_coeffs dist_coeff distCoeffs D d dist"
+    " distortion"
+)
+"""Keys of a camera matrix and of its coefficients, as OpenCV's samples and ROS write them."""
+
+
 def _matrix(node: Node) -> Camera:
     """ROS camera_info and OpenCV's FileStorage: a camera matrix and coefficients."""
-    matrix = _any(node, "camera_matrix", "cameraMatrix", "K", "k")
+    matrix = _any(node, *MATRICES.split())
     fx, skew, cx, _, fy, cy, *_ = _floats(matrix, "camera_matrix", (9,))
-    matrix = _any(node, "distortion_coefficients", "dist_coeffs", "distCoeffs", "D", "d")
-    coefficients = _floats(matrix, "distortion_coefficients")
+    coefficients = _floats(_any(node, *COEFFICIENTS.split()), "distortion_coefficients")
     flag = node.get("fisheye_model")
     if flag is not None:
         node = {**node, "distortion_model": "fisheye" if int(flag) else "radtan"}
@@ -461,12 +490,10 @@ BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = 
     "kalibr": (_has("camera_model", "intrinsics"), _kalibr),
     "camodocal": (_has("model_type cam_model", "image_width"), _camodocal),
     "svo": (_has("type", "intrinsics"), _svo),
+    "okvis": (_has("focal_length", "principal_point"), _okvis),
     "vikit": (_has("cam_model"), _vikit),
     "ros or opencv": (
-        _has(
-            "camera_matrix cameraMatrix K k distortion_coefficients",
-            "D d distortion_coefficients dist_coeffs distCoeffs camera_matrix",
-        ),
+        _has(f"{MATRICES} distortion_coefficients", f"{COEFFICIENTS} camera_matrix"),
         _matrix,
     ),
     "orb-slam": (_has("Camera.fx Camera1.fx"), _orbslam),
@@ -483,13 +510,20 @@ def _size(node: Node) -> tuple[int, int] | None:
     if "ocam_lines" in node:
         height, width = _floats(node["ocam_lines"][4], "height and width", (2,))
         return int(width), int(height)
-    pair = ("resolution", "cameraResolution", "image_size", "imageSize", "img_size")
+    pair = (
+        "resolution",
+        "cameraResolution",
+        "image_size",
+        "imageSize",
+        "img_size",
+        "image_dimension",
+    )
     value = next((node[name] for name in pair if node.get(name) is not None), None)
     if value is not None:
         width, height = _floats(value, "image size", (2,))
         return int(width), int(height)
-    sides = [("image_width", "width", "cam_width", "Camera.width")]
-    sides.append(("image_height", "height", "cam_height", "Camera.height"))
+    sides = [("image_width", "width", "cam_width", "Camera.width", "image_Width")]
+    sides.append(("image_height", "height", "cam_height", "Camera.height", "image_Height"))
     sizes = [next((node[n] for n in names if n in node), None) for names in sides]
     if None in sizes:
         return None
@@ -512,14 +546,12 @@ def _lens(
             f"the file holds no image size: {size[0]} x {size[1]} px, twice its principal point, is"
             " taken; add image_width and image_height to it"
         )
-    if model == "kb4" and values.pop("skew", 0.0):
-        raise ValueError("a camera matrix with skew, which our model has not")
     model, notes = _contradictions(model, values, size, bool(node.get("asked_model")))
     remarks += notes
     fov = asked_fov
     if node.get("fov_deg") is not None:
         fov = _floats([node["fov_deg"]], "fov_deg")[0]
-    if model != "kb4":
+    if model != "kb4" or values.get("skew", 0.0):
         lens, report = _fitted(model, values, size, fov)
         return lens, replace(report, remarks=(*remarks, *report.remarks))
     fx, fy, cx, cy, k1, k2, k3, k4 = (values[name] for name in KB4.split())

@@ -60,7 +60,7 @@ def test_a_missing_file_is_refused(tmp_path, name):
 @pytest.mark.parametrize(
     ("name", "old", "new", "message"),
     [
-        ("opencv.yaml", "camera_matrix:", "matrix:", "lacks the key 'camera_matrix'.*'matrix'"),
+        ("opencv.yaml", "camera_matrix:", "lens:", "lacks the key 'camera_matrix'.*'lens'"),
         ("kalibr.yaml", "camera_model: pinhole", "camera_model: omni", "intrinsics is.*5 numbers"),
         ("kalibr.yaml", "equidistant", "wavy", "'wavy'.*expected one of .'kb4'"),
         ("kalibr.yaml", "camera_model: pinhole", "camera_model: cube", "'cube'.*'omni'"),

@@ -251,6 +251,17 @@ LENSES = {
         eucm(0.63, 1.04, 190),
     ),
     "basalt ucm": (basalt("ucm", fx=190, fy=190, alpha=0.63), eucm(0.63, 1.0, 190)),
+    "okvis": (
+        f"%YAML:1.0\ncameras:\n     - {{T_SC: [1.0, 0.0],\n        image_dimension: [{W}, {H}],\n"
+        f"        distortion_coefficients: {K},\n        distortion_type: equidistant,\n"
+        f"        focal_length: [{FX}, {FY}],\n        principal_point: [{CX}, {CY}]}}\n",
+        kb(KB),
+    ),
+    "maplab without distortion": (
+        f"cameras:\n- camera:\n    type: pinhole\n    image_width: {W}\n    image_height: {H}\n"
+        f"    intrinsics: {{rows: 4, cols: 1, data: {NARROW}}}\n",
+        pinhole(f=NARROW[:2]),
+    ),
     "ros file": (
         f"{SIDES}camera_name: a\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: {MATRIX}\n"
         f"distortion_model: equidistant\ndistortion_coefficients:\n  rows: 1\n  cols: 5\n"
@@ -273,6 +284,18 @@ LENSES = {
         f"distortion_coefficients: !!opencv-matrix\n   rows: 4\n   cols: 1\n   dt: d\n"
         f"   data: [ -1.32e-02, -4.1e-03,\n       1.7e-03, -5.e-04 ]\n",
         kb(KB),
+    ),
+    "opencv without blanks": (
+        f"%YAML:1.0\nCamera_Matrix:\n   data:{MATRIX}\nDistortion_Coefficients:\n   data:{K}\n"
+        f"image_Width:{W}\nimage_Height:{H}\nfisheye_model:1\n",
+        kb(KB),
+    ),
+    "opencv with skew": (
+        f"{SIDES}fisheye_model: 1\nmtx: [[{FX}, 0.3, {CX}], [0.0, {FY}, {CY}], [0, 0, 1]]\n"
+        f"dist: {K}\n",
+        lambda x, y, z: polynomial(
+            (0, 1, 0, K[0], 0, K[1], 0, K[2], 0, K[3]), (FX, FY), x, y, z, 0.3
+        ),
     ),
     "opencv xml": (
         f"<?xml version='1.0'?>\n<opencv_storage><image_width>{W}</image_width>"
@@ -367,6 +390,13 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
     assert read(path)[1].fx == FX
     assert "of 2 in the file (cam0, cam1)" in read(path)[2].remarks[0]
     assert read(path, camera=1)[1].fx == read(path, camera="cam1")[1].fx == 200.0
+    nameless = "a: {cameras: [X]}\nb: {cameras: [X]}\n".replace(
+        "X",
+        "{camera_model: pinhole, distortion_model: equidistant, resolution: [640, 480],"
+        " intrinsics: [191.2, 191.0, 319.6, 241.1], distortion_coeffs: [0.0, 0.1, 0.0, 0.0]}",
+    )
+    (tmp_path / "rigs.yaml").write_text(nameless)
+    assert "camera 1 of 2 in the file (0, 1)" in read(tmp_path / "rigs.yaml", camera="1")[2].remarks
     with pytest.raises(ValueError, match=r"camera cam7 was requested.*cam0, cam1"):
         read(path, camera="cam7")
 
