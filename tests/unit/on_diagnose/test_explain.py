@@ -8,9 +8,10 @@ import pytest
 from bench.diagnose.altered import with_values
 from bench.diagnose.cases import logs_of
 from bench.worlds.world import Recipe
-from visthrow import cli
+from visthrow import cli, config
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog
+from visthrow.task import Experiment, drawn_plants
 
 MODEL = ("--only", "com_x", "--set", "rope.segments=1", "--device", "cpu", "--no-report")
 
@@ -44,6 +45,20 @@ def test_a_copied_log_counts_once(flights, tmp_path):
     assert (twice["flights"], once["model"], once["plant"]) == (3, "throw", "state")
     assert once["overrides"] == ["rope.segments=1"]
     assert twice["theta"] == pytest.approx(once["theta"])
+
+
+def test_what_was_explained_is_what_training_draws(flights, tmp_path):
+    """From flights to the draws of a training, through the files that users pass on."""
+    explained(flights, tmp_path)
+    out = tmp_path / "mine.toml"
+    assert cli.main(["diagnose", "apply", str(tmp_path / "said.json"), "--out", str(out)]) == 0
+    diagnosed = config.load(Experiment, out).diagnosed
+    assert diagnosed.effects == ("com_x",)
+    (sd,) = np.sqrt(diagnosed.covariance[0])
+    assert 2e-5 < sd < 4e-4, "of 3 mm that three throws show to a few hundredths"
+    centres = [plant.vehicle.body.com[0] for plant in drawn_plants(config.load(Experiment, out), 0)]
+    assert np.mean(centres) == pytest.approx(3e-3, abs=3.0 * sd)
+    assert np.std(centres) == pytest.approx(sd, rel=0.5)
 
 
 def test_one_bad_log_of_three_does_not_refuse_the_others(flights, tmp_path):
