@@ -76,17 +76,6 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
     assert (obs["critic"][alive][:, -2:] == velocity[:, :2]).all()
 
 
-def test_goals_that_stand_still_cost_nothing():
-    """No numbers are drawn, nothing is added to the state: the shipped policies' throws keep their
-    bits.
-    """
-    env = ThrowEnv(experiment("state"), count=4)
-    assert env.goals is None
-    assert "goal_fit" not in env.buffers
-    assert env.get_observations()["critic"].shape == (4, 42)
-    assert "goal_w" not in env.last
-
-
 def test_throws_at_moving_goals_keep_where_the_goal_was():
     loaded = load_policy("state", overrides=["task.target.speed=[0.5,0.5]"])
     throws = protocol.throw(loaded.experiment, loaded.policy.act, 1.5, 8, "cpu", 0)

@@ -9,9 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from sim import hybrid
 from sim.hybrid import HybridSim
-from sim.kernels.structs import EXTENSIONS, extensions_of
 from sim.params import GRAVITY, AirParams
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
@@ -340,50 +338,6 @@ def test_asymmetric_motor_is_first_order_one_way():
     target = np.sqrt(0.5) * before  # of half the thrust
     expected = target + (before - target) * np.exp(-acting / 0.1)
     assert sim.get("motor_speed")[0, 0] == pytest.approx(expected, rel=1e-6)
-
-
-def test_built_in_at_zero_is_the_plain_simulator():
-    plant = fine(paper_plant())
-    plain, extended = HybridSim(plant, 1), HybridSim(plant, 1, extensions=EVERYTHING)
-    for sim in (plain, extended):
-        sim.place(pos_w=np.array([[0.0, 0.0, 1.5]]))
-        for k in range(STEPS):
-            sim.set_command(np.array([[3.0, np.sin(0.3 * k), 1.0, 0.0]]), np.array([k == 4]))
-            sim.step()
-    for name in ("pos_w", "quat_wb", "landing_w", "time_to_impact"):
-        np.testing.assert_allclose(plain.get(name), extended.get(name), atol=1e-8)
-
-
-def test_an_effect_is_compiled_in_only_where_it_is_on():
-    plant = paper_plant()
-    assert extensions_of([plant.vehicle], [plant.rope], [plant.air]) == frozenset()
-
-    def built(plant):
-        return hybrid._kernels(
-            plant, False, False, extensions_of([plant.vehicle], [plant.rope], [plant.air])
-        )
-
-    zero = changed(
-        plant, rope={"payload_drag": 0.0, "mount_damping": 0.0}, air={"wind_w": (0.0, 0.0, 0.0)}
-    )
-    assert HybridSim(zero, 1)._step is built(plant)[1]
-    for part in (
-        {"rope": {"payload_drag": 1e-3}},
-        {"air": {"wind_w": (0.1, 0.0, 0.0)}},
-        {"thrust": {"gain": (1.1,) * 4}},
-        {"air": {"ground_effect": 1.0}},
-        {"rope": {"mount_damping": 1e-5}},
-        {"rope": {"compliance": 1e-3}},
-    ):
-        assert built(changed(plant, **part)) is not built(plant), part
-    assert set(EXTENSIONS) >= {
-        "gain",
-        "wind",
-        "ground_effect",
-        "payload_drag",
-        "mount_damping",
-        "push",
-    }
 
 
 @pytest.mark.parametrize(

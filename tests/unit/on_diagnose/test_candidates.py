@@ -10,8 +10,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.select import point as points
 from visthrow.diagnose.select import result, search, selector
-from visthrow.diagnose.select import search_state as state
-from visthrow.diagnose.select.point import Problem, fitted, linearise
+from visthrow.diagnose.select.point import fitted, linearise
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -107,36 +106,6 @@ def test_what_whips_where_nothing_is_hidden_is_not_named():
     assert explained(0.0).overall == result.NO_EFFECT
 
 
-@pytest.mark.parametrize("begin", [0.0, 2.0])
-@pytest.mark.parametrize("sure", [False, True])
-def test_a_candidate_that_is_not_sure_where_it_leads_is_not_followed_further(
-    begin, sure, monkeypatch
-):
-    """Derivatives of a rope of 24 segments are a fifth of a minute; those of one without a size yet
-    are taken where they point.
-    """
-    model = SyntheticModel(effects=EFFECTS, truth={NAME: SIZE}, seed=5)
-    plain, taken = selector.linearise, []
-    monkeypatch.setattr(state, "curvature", lambda *_: np.inf)
-    for module in (selector, state):
-        monkeypatch.setattr(
-            module, "linearise", lambda *given: (taken.append(given), plain(*given))[1]
-        )
-        monkeypatch.setattr(
-            module, "fitted", lambda problem, point, active: replace(point, theta=point.theta + 2.0)
-        )
-    monkeypatch.setattr(selector.Selector, "sure", lambda *_: sure)
-    monkeypatch.setattr(selector.Selector, "_best", lambda *_: False)
-    problem = Problem(model, tuple(range(len(model.windows({})))))
-    nominal = plain(problem, np.zeros(len(EFFECTS)))
-    looked_at = selector.Selector(
-        problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal
-    )
-    looked_at._closer(state.SetMove((3,), 9.0, replace(nominal, theta=nominal.theta + begin)), {})
-    assert len(taken) == (points.ROUNDS + (begin == 0.0) if sure else begin == 0.0)
-    assert looked_at.origin is nominal  # a candidate that is refused leaves no derivatives behind
-
-
 @pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
 def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
     """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its
@@ -155,52 +124,6 @@ def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypa
     )
     assert diagnosis.named == (NAME,)
     assert {(5,), (7,)} <= set(tried) if alike else not {(5,), (7,)} & set(tried)
-
-
-def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
-    """Here one that explains what the bend of an effect leaves: it is gone where the effect is
-    linearised.
-    """
-    asked, plain = [], selector.Selector.stands
-    monkeypatch.setattr(
-        state, "curvature", lambda *_: 0.0
-    )  # the search stays with its first derivatives
-    monkeypatch.setattr(
-        selector.Selector, "_lawful", lambda hunt, *_: asked.append(hunt.origin.theta[3]) or True
-    )
-    monkeypatch.setattr(
-        selector.Selector,
-        "stands",
-        lambda hunt, point, active, j: hunt.is_term(j) or plain(hunt, point, active, j),
-    )
-    model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={NAME: SIZE}, seed=5)
-    assert search.explain(model).overall == result.UNKNOWN
-    assert asked[-1] == pytest.approx(SIZE, rel=0.1)
-    assert 0.0 not in asked[1:]
-
-
-def test_a_name_that_a_later_one_left_with_hardly_any_size_is_dropped(monkeypatch):
-    """However many nats it brings: they are those of what the derivatives lack."""
-    plain, other = selector.Selector.sure, 6
-
-    def sure(self, point, active, j):
-        return plain(self, point, active, j) and not (
-            j == other and len(active) > 1 and active[-1] != other
-        )
-
-    monkeypatch.setattr(selector.Selector, "sure", sure)
-    monkeypatch.setattr(
-        selector.Selector, "_exchange", lambda _: False
-    )  # alone it would be a better answer than the other alone
-    hidden = {NAME: SIZE, EFFECTS[other].name: 3.0 * SIZE}
-    said = []
-    diagnosis = search.explain(
-        SyntheticModel(effects=EFFECTS, truth=hidden, seed=5), laws=False, progress=said.append
-    )
-    assert said.index(next(s for s in said if "effect_06 named" in s)) < said.index(
-        "effect_06 dropped again"
-    )
-    assert diagnosis.named == (NAME,)
 
 
 class Levered(SyntheticModel):

@@ -7,15 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests.flown import fly, setting_with
-from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.models.law_terms import Term
 from visthrow.diagnose.select import result, search, selector, terms
 from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
-from visthrow.diagnose.throw.cutting import RINGING
-from visthrow.diagnose.throw.initial_states import HUNG
-from visthrow.diagnose.throw.throw_model import ThrowModel
 
 EFFECTS = catalogue(12)
 BAD = 10
@@ -96,42 +91,3 @@ def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(act
     assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands
     assert len(at.point.windows) == len(at.origin.windows) == len(left)
     assert len(at.point.theta) == len(at.priors.floor) == len(EFFECTS)
-
-
-def test_windows_soon_after_slack_are_marked(monkeypatch):
-    """The rope whips for some time: what begins calmly is left with less freedom than it has."""
-    logs = fly(setting_with({}), noise=0.2, free=1, throws=0, seconds=5.0)
-    model = ThrowModel(logs, paper_plant(), only=["rope_length"])
-    cuts = model.flights.cuts
-    never = np.array([c.start - 1.0 for c in cuts])
-    assert not any(
-        c.after_slack for c in model._without_slack({"slack_first": never, "slack_last": never})
-    )
-    last = never.copy()
-    last[1] = cuts[1].start + 0.1
-    first = np.where(np.arange(len(cuts)) == 1, cuts[1].start + 0.05, never)
-    after = model._without_slack({"slack_first": first, "slack_last": last})
-    for c in after:
-        assert c.after_slack == (c.retained and last[1] < c.start < last[1] + RINGING), c
-    assert sum(c.after_slack for c in after) == 2
-
-
-def test_a_rope_that_hung_still_begins_straighter():
-    """In windows after hover, and in a flight's first one if it is hover itself; not where it flew,
-    swung or came taut before.
-    """
-    model = ThrowModel(
-        fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=5.0),
-        paper_plant(),
-        only=["rope_length"],
-    )
-    bend = next(d for d in model._directions if d.calm is not None)
-    before, spreads = None, set()
-    for c in model.flights.cuts:
-        phase = c.phase if before is None or before.flight != c.flight else before.phase
-        assert c.at_rest == (phase == "hover"), c
-        assert bend.spread(c) == pytest.approx((HUNG if c.at_rest else 1.0) * bend.calm)
-        assert bend.spread(replace(c, after_slack=True)) == bend.sd > bend.calm
-        before = c
-        spreads.add(c.at_rest)
-    assert spreads == {True, False}

@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tests import synthetic_diagnosis
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import marginal
@@ -156,26 +155,6 @@ def test_other_residuals_leave_the_information(fitted):
     ):
         np.testing.assert_allclose(getattr(again, name), getattr(plain, name), rtol=1e-12)
     assert not np.allclose(again.score, known.score)
-
-
-@pytest.mark.parametrize("gust_time", [0.15, 0.6, 2.4])
-def test_the_correlation_time_is_the_likeliest_of_all(gust_time, monkeypatch):
-    """It is looked for from the middle, uphill."""
-    monkeypatch.setattr(synthetic_diagnosis, "GUST_TIME", gust_time)
-    model = SyntheticModel(effects=EFFECTS, throws=4)
-    windows, floors = model.windows({}), Priors.of(model.effects, model.channels).floor
-    grams = [marginal.without_effects(marginal.gram_of(w, floors, 2)) for w in windows]
-
-    def value(time: float) -> float:
-        shaped = [marginal.correlated(g, w, time) for g, w in zip(grams, windows)]
-        return noise.maximised(
-            shaped, replace(noise._first_guess(shaped), correlation_time=time), "cpu"
-        )[1]
-
-    found = noise.fit(windows, [marginal.gram_of(w, floors, 2) for w in windows])[
-        0
-    ].correlation_time
-    assert found == max(noise.CORRELATION_TIMES, key=value)
 
 
 def test_broken_derivatives_are_told_with_their_window(fitted):

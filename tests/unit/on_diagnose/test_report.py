@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.diagnose.shortfalls import shortfalls
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
@@ -17,7 +16,7 @@ from visthrow.diagnose.likelihood.correlation import Correlation, with_correlati
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
-from visthrow.diagnose.select import held_out, point, result, search
+from visthrow.diagnose.select import held_out, result, search
 from visthrow.diagnose.throw.landing import PredictedLandings
 from visthrow.view import page
 
@@ -106,22 +105,6 @@ def test_gain_comes_near_what_knowing_the_truth_would_bring(found, measured):
     assert measured.nats_per_sample > 0.0
     assert measured.named_in == {"effect_03": 1.0, "effect_04": 1.0}
     assert measured.left_out == "flights"
-
-
-def test_shortfall_is_the_likelihood_ratio_of_a_linear_model(found):
-    """Moving from the truth by d costs d' I d / 2 less d' s nats; the same by the statistics at the
-    truth.
-    """
-    model, diagnosis = found
-    problem = replace(diagnosis.work.problem, kept=tuple(range(len(model.windows({})))))
-    theta = np.array([TRUTH.get(e.name, 0.0) for e in EFFECTS])
-    there = point.linearise(problem, theta)
-    (nats, same), samples = shortfalls(model, [{}, problem.sizes(theta)])
-    expected = 0.5 * theta @ there.information @ theta + theta @ there.statistics.score.sum(0)
-    assert same == 0.0
-    assert samples == there.statistics.samples.sum()
-    assert nats == pytest.approx(expected, rel=1e-6)
-    assert nats > 100.0
 
 
 def test_errors_grow_with_the_horizon(measured):
@@ -320,21 +303,6 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     assert ranked[0].repeats == 1
     assert ranked[0].separates
     assert ranked[1].repeats == 0
-
-
-def test_the_promise_of_the_plan_is_kept(degenerate):
-    """Flown together with the manoeuvre that separates, the class becomes a name."""
-    first = SyntheticModel(
-        effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
-    )
-    more = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
-    from dataclasses import replace
-
-    first._windows += [replace(w, flight=50) for w in more._windows]
-    again = search.explain(first, laws=False)
-    assert degenerate["effect_03"].verdict == result.CLASS
-    assert again["effect_03"].verdict == result.FOUND
-    assert again.named == ("effect_03",)
 
 
 def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):

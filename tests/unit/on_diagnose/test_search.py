@@ -9,11 +9,10 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood import evidence, grammar
+from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import held_out, result, search, selector, terms
-from visthrow.diagnose.select.point import Problem, linearise, with_all_effects_noise
+from visthrow.diagnose.select import result, search, selector
 from visthrow.diagnose.select.scatter import Varies, disagreement
 
 EFFECTS = catalogue(12)
@@ -85,21 +84,6 @@ def test_three_effects_are_named_at_once_unless_bends_would_fake_one(curvature, 
         assert abs(size - TRIPLE[name]) < 1.5
 
 
-@pytest.mark.parametrize("law", [False, True])
-def test_names_come_one_by_one_where_a_law_is_a_candidate(law):
-    model = world(truth=TRIPLE, seed=1)
-    problem = Problem.of(model, model.windows({}), range(len(model.windows({}))))
-    nominal = linearise(problem, np.zeros(len(EFFECTS)))
-    if law:
-        term = terms.as_effect(grammar.Term("vehicle force", ("speed",), "vel"), 1.0, 0.0)
-        problem, (nominal,) = terms.extended(problem, [nominal], [term])
-    own = selector.Selector(problem, nominal, 5.0, lambda _: None, origin=nominal, point=nominal)
-    several = own._several(with_all_effects_noise(problem, nominal), own._usable())
-    assert [{own.name(j) for j in move.active} for move in several] == (
-        [] if law else [set(TRIPLE)]
-    )
-
-
 def hiding(own: float, **options) -> SyntheticModel:
     """Flights in which effect 7 undoes effect 3, of the same size, but for its ``own`` share."""
 
@@ -128,25 +112,6 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     last = diagnosis.steps[-1]
     assert last.nats == last.refitted[last.named] > last.least == selector.EXCHANGE_MARGIN
     assert last.named in list(last.screened)[:3]
-
-
-def test_a_law_is_not_shared_out_among_two_effects_that_hide_each_other():
-    """They would take what it does in one phase, and leave the rest unexplained."""
-
-    def change(model, window):
-        columns, by_law = (
-            window.effects.copy(),
-            model.by_law[[w is window for w in model._windows].index(True)],
-        )
-        columns[:, 7] = (
-            by_law / (14.0 * EFFECTS[7].floor) if window.phase == "flight" else 0.0
-        ) - columns[:, 3]
-        return replace(window, effects=columns)
-
-    model = altered(change, seed=3, law="swirl", law_size=0.1)
-    diagnosis = search.explain(model, laws=False)
-    assert diagnosis.overall == result.UNKNOWN
-    assert not {"effect_03", "effect_07"} & set(diagnosis.named)
 
 
 def test_idempotence_what_was_found_is_not_found_again():
@@ -460,23 +425,6 @@ def test_evidence_is_the_integral():
     )
 
 
-def test_a_window_that_no_force_explains_is_left_out():
-    rng = np.random.default_rng(0)
-
-    def spoil(model, window):
-        if window is not model._windows[3]:
-            return window
-        return replace(
-            window,
-            residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)),
-        )
-
-    model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
-    diagnosis = search.explain(model, laws=False)
-    assert diagnosis.windows == len(model.windows({})) - 1
-    assert tuple(diagnosis.theta) == ("effect_03",)
-
-
 def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
     sure = selector.Selector.sure
 
@@ -489,21 +437,3 @@ def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
     )
     assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
     assert "effect_03" not in diagnosis.theta  # nor is it exchanged for what was named
-
-
-def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
-    """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that
-    hold it, stay a fifth too small.
-
-    Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
-    """
-    monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
-    model = SyntheticModel(effects=EFFECTS, throws=1, free=2, law="speed", law_size=0.0, seed=4)
-    model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
-    model.law_size = 1.0
-    for w in model._windows:
-        w.effects[:, 1] = w.latent @ model._law(w.knots) if w.phase == "throw" else 0.0
-        w.residual[:] += 0.02 * w.effects[:, 1]
-    diagnosis = search.explain(model, laws=False)
-    assert diagnosis.named == ("effect_01",)
-    assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)

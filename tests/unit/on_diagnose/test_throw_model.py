@@ -24,7 +24,6 @@ from visthrow.diagnose.likelihood.noise_levels import roughly
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import initial_fit
-from visthrow.diagnose.throw.initial_fit import InitialFit
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.replay import STABLE, rough_step
@@ -170,48 +169,6 @@ def test_landings_are_predicted_from_before_the_throw(planted):
     assert len(model.landings({}, [0]).flights) == 0  # a free flight has none
 
 
-def test_dampings_tried_at_once_settle_states_sooner(planted, monkeypatch):
-    """With the same cost in the end: a window that falls short of its promise looks for its damping
-    in one round.
-    """
-    logs, rounds, costs, seen, tried = planted[0], [], [], [], InitialFit._tried
-    monkeypatch.setattr(InitialFit, "_tried", lambda self, *a: seen.append(1) or tried(self, *a))
-    for ladder in (initial_fit.LADDER, initial_fit.LADDER[:1]):
-        seen.clear()
-        monkeypatch.setattr(initial_fit, "LADDER", ladder)
-        model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
-        (states, _), windows = model._fitted(), np.arange(len(model.flights.cuts))
-        fit = model._initial_fit(model.setting)
-        costs.append(
-            sum(
-                fit._cost(w, residual)
-                for w, residual in zip(windows, fit._residuals(states, windows))
-            )
-        )
-        rounds.append(len(seen))
-    assert rounds[0] < 0.8 * rounds[1]
-    assert costs[0] < 1.01 * costs[1]
-
-
-def test_one_throw_s_landing_rests_on_what_was_fitted_to_all(monkeypatch):
-    """The same to the bit as by itself, without its states at theta = 0 fitted a second time."""
-    logs = fly(setting_with(PLANTED), noise=0.2, free=0, throws=2, seconds=2.0)
-    wrong, fits, fit = {"release_lag": 0.01}, [], InitialFit.fit
-    alone = ThrowModel(logs, paper_plant(), only=list(PLANTED)).landings(wrong, [1])
-    model = ThrowModel(logs, paper_plant(), only=list(PLANTED))
-    model.landings({})
-    monkeypatch.setattr(
-        InitialFit,
-        "fit",
-        lambda self, *a: fits.append(self.simulation.settings[0]) or fit(self, *a),
-    )
-    among = model.landings(wrong, [1])
-    assert model.setting not in fits
-    assert len(fits) == 2  # before the throw, and up to the separation
-    np.testing.assert_array_equal(among.predicted, alone.predicted)
-    np.testing.assert_array_equal(among.released, alone.released)
-
-
 def test_windows_are_whole(planted):
     _, model = planted
     windows = model.windows({})
@@ -243,35 +200,6 @@ def test_initial_states_follow_the_effects(planted):
     back = moved(problem, follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
         np.testing.assert_allclose(again.residual, w.residual, atol=1e-9)
-
-
-def test_rotors_begin_a_window_where_the_commands_left_them(planted):
-    """Fitted without gusts they would take the gusts' place; they stay free to be told
-    by the data.
-    """
-    _, model = planted
-    model.windows({})
-    assert np.array_equal(
-        model._latest[frozenset()]["motor_speed"],
-        model._settled_throughout(model.setting)[0]["motor_speed"],
-    )
-    assert "motor_speed" in {d.field for d in model._directions}
-
-
-def test_each_window_begins_with_the_best_of_its_states(planted, monkeypatch):
-    _, model = planted
-    monkeypatch.setattr(initial_fit, "ROUNDS", 0)
-    good = model._fitted()[0]
-    even = np.arange(len(good["pos_w"])) % 2 == 0
-    mixed = [
-        {**good, "pos_w": good["pos_w"] + 0.05 * np.where(rows, 1.0, 0.0)[:, None]}
-        for rows in (even, ~even)
-    ]
-    found = model._initial_fit(model.setting).fit(mixed)
-    told = model._retained
-    assert {0, 1} == set((told % 2).tolist())
-    for name, value in good.items():
-        assert np.array_equal(found[name][told], value[told])
 
 
 def test_what_is_known_of_the_sensors_is_taken_off():

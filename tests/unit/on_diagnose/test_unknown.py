@@ -3,7 +3,6 @@ is asked for.
 """
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,11 +10,10 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood import grammar
-from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
-from visthrow.diagnose.select import result, search, selector, terms, verdicts
+from visthrow.diagnose.select import result, search, selector, terms
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
 from visthrow.diagnose.select.scatter import Varies
@@ -96,31 +94,6 @@ def test_terms_turn_with_the_world(block):
     np.testing.assert_allclose(
         again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max()
     )
-
-
-@pytest.mark.parametrize("block", laws.BLOCKS)
-def test_the_table_of_terms_holds_each_term(block):
-    """All at once, in their order, to the last bit what one product after the other gives."""
-    knots = random_knots()
-    terms = laws.terms_of(block, KNOTS)
-    values = table(terms, knots)
-    assert values.shape == (len(knots["time"]), 3, len(terms))
-    for i, term in enumerate(terms):
-        own = laws.VECTORS[block][term.vector].read(laws.KnotValues(knots))
-        for factor in term.factors:
-            own = own * laws.SCALARS[factor].read(laws.KnotValues(knots))[:, None]
-        np.testing.assert_array_equal(values[:, :, i], own)
-        assert values[:, :, i].tobytes() == table([term], knots)[:, :, 0].tobytes()
-
-
-def test_what_follows_from_knots_is_computed_once(monkeypatch):
-    calls = []
-    swing = laws.DERIVED["swing"]
-    monkeypatch.setitem(laws.DERIVED, "swing", lambda k: calls.append(1) or swing(k))
-    known = laws.KnotValues(random_knots())
-    for block in laws.BLOCKS:
-        table(laws.terms_of(block, KNOTS), known)
-    assert len(calls) == 1
 
 
 def test_a_torque_in_the_joint_acts_on_both_sides():
@@ -327,20 +300,6 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     assert at.law()[0] == {3}
 
 
-def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
-    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is
-    a force on the vehicle.
-    """
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    for w in model._windows:
-        w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
-    at = beside_a_law(model, [6, 8], DRAG)
-    assert acts_on(at.point, at.names) == ["payload force"] * 2
-    blocks = [acts_on(at.point, [j], free_effects=[14 - j])[0] for j in at.names]
-    assert blocks == ["vehicle force"] * 2
-    assert at.law()[0] == {6, 8}
-
-
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(
         effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
@@ -377,17 +336,6 @@ def test_the_table_takes_up_what_no_name_explains():
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
     assert np.linalg.norm(drag - truth) < LEFT * np.linalg.norm(truth)
-
-
-def test_beside_a_law_a_name_must_be_sure_of_its_sign():
-    """The least certain goes first: what it shared with another may make that one sure."""
-    priors = Priors(
-        np.ones(3), np.full(3, 20.0), np.full(3, -np.inf), np.full(3, np.inf), np.ones(3, bool)
-    )
-    information = np.diag([4.0, 0.5, 4.0])
-    point = SimpleNamespace(information=information, score=information @ [8.0, 1.0, 0.3])
-    assert verdicts._sure(point, priors, [0, 1, 2]) == [0]
-    assert verdicts._sure(point, priors, []) == []
 
 
 @pytest.mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])

@@ -2,7 +2,6 @@
 channels.
 """
 
-import dataclasses
 import os
 import shutil
 import socket
@@ -14,8 +13,7 @@ import pytest
 
 from hil.errors import RunError
 from hil.links import msp
-from hil.links.backends.base import FOLLOW
-from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW, Betaflight
+from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.params import HilParams
@@ -301,37 +299,3 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     assert [text for _, text in report["events"]] == ["armed"]
     serial.close()
     fake.close()
-
-
-class Listening:
-    """A port that counts commands, and never answers."""
-
-    def __init__(self):
-        self.parser, self.commands = msp.FrameParser(), []
-
-    def write(self, data):
-        self.commands += [frame.command for frame in self.parser.parse(data)]
-        return True
-
-    def read(self):
-        return None
-
-    def close(self):
-        pass
-
-
-def test_commands_and_questions_after_a_release_fit_into_the_firmwares_turns(params):
-    """It takes one in each of 100 turns a second by its default: 50 frames of sticks leave 50 for
-    everything else.
-    """
-    port = Listening()
-    backend = Betaflight(port, dataclasses.replace(params, release_timeout=5.0, audit=False))
-    backend._order, backend._boxes = [0, 1, 2, 3], (BOX_ARM,)
-    backend.ask(FOLLOW, 0.0)
-    backend.release(0.0)
-    for tick in range(100):
-        backend.service(0.02 * tick)
-        backend.send((2.7, 0.0, 0.0, 0.0), 0.02 * tick)
-    assert port.commands.count(msp.SET_RAW_RC) >= 100
-    assert port.commands.count(msp.RC) > 30, "the release is read back"
-    assert len(port.commands) < 200

@@ -29,8 +29,6 @@ from visthrow.task import Experiment, plant_of
 from visthrow.throws import results
 from visthrow.throws.plants import HybridPlant
 from visthrow.throws.reference_protocol import batch_plant, place_in_hover
-from visthrow.training import protocol
-from visthrow.training.env import ThrowEnv
 
 pytest.importorskip("piqp")
 
@@ -161,38 +159,6 @@ def test_training_simulator_with_and_without_compensation(plan, experiment):
     # processor to processor.
     assert lagging.position_error.mean() > flown.position_error.mean() + 0.05
     assert lagging.landing_w[:, 0].mean() > flown.landing_w[:, 0].mean()
-
-
-def test_throws_in_the_training_simulator_start_as_the_policies_do(experiment):
-    """Vehicles, ropes and states are those of `protocol.throw` with the same count and seed, to the
-    bit.
-    """
-    start = protocol.hover_start(experiment).task.start
-    plant = HybridPlant(experiment, 7, 3, noise=experiment.task.noise, start=start)
-    env = ThrowEnv(protocol.hover_start(experiment), "cpu", 3, 7)
-    env.reset()
-    for name in ("pos_w", "vel_w", "quat_wb", "rate_b", "cable_dir_w", "mass_scale", "voltage"):
-        assert np.array_equal(plant._sim.get(name), env.sim.get(name)), name
-    assert np.array_equal(plant.state.payload_pos_w, env.sim.get("payload_pos_w").astype(float))
-    assert len(np.unique(plant._sim.get("mass_scale"))) == 7
-
-
-def test_commands_in_the_training_simulator_are_disturbed(experiment):
-    """In normalised units, by the training's deviations; the same command otherwise (``_disturbed``
-    alone is asked).
-    """
-    noise = experiment.task.noise
-    plant = HybridPlant(
-        experiment, 2000, noise=noise, start=protocol.hover_start(experiment).task.start
-    )
-    command = np.tile([3.0, 1.0, -1.0, 0.5], (2000, 1))
-    off = (
-        plant._disturbed(command)[:, 1:] / experiment.task.action.max_rate
-        - command[:, 1:] / experiment.task.action.max_rate
-    )
-    expected = np.hypot(noise.command_step, noise.command_bias)
-    assert off.std() == pytest.approx(expected, rel=0.05)
-    assert abs(off.mean()) < 4 * expected / np.sqrt(off.size)
 
 
 def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment):

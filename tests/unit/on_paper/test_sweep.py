@@ -288,14 +288,6 @@ def test_what_another_process_has_is_tried_again(path, tmp_path):
     assert outcome == pool.Outcome()
 
 
-def test_the_time_limit_stops_what_runs(path, tmp_path, monkeypatch):
-    monkeypatch.setattr(FakeRun, "_finish", lambda self: None)
-    starter, outcome = run(path, tmp_path, minutes=0.02)
-    assert outcome.stopped
-    assert not outcome.interrupted, "it was asked to end then: status 0"
-    assert [r.stopped for r in starter.alive] == [True, True]
-
-
 def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     path = tmp_path / "locks" / "a.lock"
     code = "import time; from pathlib import Path; from visthrow.paper.sweep.work import locked\n"

@@ -2,18 +2,14 @@
 says.
 """
 
-import dataclasses
-
 import numpy as np
 import pytest
 import warp as wp
 
-from sim.hybrid import HybridSim
 from sim.kernels import laws
 from sim.kernels.laws import BLOCKS, check_laws, names
 from sim.kernels.structs import make_struct, types
 from sim.params import LawParams
-from tests.plants import paper_plant
 from visthrow import config
 from visthrow.diagnose.models import law_terms as grammar
 from visthrow.task import Experiment
@@ -94,13 +90,6 @@ def test_factors_are_the_grammars():
                 found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}"
             )
     assert names() == (tuple(scalars), {block: tuple(of) for block, of in vectors.items()})
-
-
-def test_a_law_is_compiled_in_only_where_it_is():
-    plain = paper_plant()
-    step = HybridSim(plain, 1)._step
-    assert HybridSim(dataclasses.replace(plain, laws=()), 1)._step is step
-    assert HybridSim(dataclasses.replace(plain, laws=(SWIRL,)), 1)._step is not step
 
 
 def test_laws_are_part_of_the_configuration():

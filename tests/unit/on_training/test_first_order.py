@@ -220,39 +220,6 @@ def test_weights_get_what_autograd_gives_them():
     assert by_action.any(), "nothing was differentiated"
 
 
-def test_flights_stop_where_nothing_counts_any_more():
-    """Flown on to the horizon, which a latch that is not quite one asks for, they have the same
-    derivatives.
-    """
-    fo, found = (
-        first_order("state", "first_order.initial_release=1.0", "first_order.horizon=20"),
-        [],
-    )
-    start = fo.env.state_dict()
-    for latched in (1.0, 1.0 - 1e-12):
-        fo.env.load_state_dict(start)
-        torch.manual_seed(0)
-        fo._latched, fo._first = latched, 0
-        fo.rollout()
-        fo.derivatives()
-        found.append(
-            (
-                fo.flights.last,
-                fo.flights.steps.clone(),
-                fo.layers.by_action[: fo.flights.last].clone(),
-            )
-        )
-    (short, stopped_at, stopped), (long, flown_to, flown) = found
-    assert short < long == fo.p.horizon
-    assert len(set(stopped_at.tolist())) > 1, "flights stop one by one"
-    assert (stopped_at < flown_to).all()
-    assert flown.any()
-    assert not flown[short:].any()
-    torch.testing.assert_close(
-        stopped, flown[:short], rtol=1e-3, atol=1e-5 * flown.abs().max().item()
-    )  # products of fewer rows
-
-
 SLOWER = [
     "vehicle.queue.delay=0.045",
     "vehicle.motor.time_constant=0.06",
