@@ -211,9 +211,9 @@ def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
     """
     right = _misfit(sums, GAINS)
     reverse = _misfit(sums, -GAINS)
-    still = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn explains nothing
+    at_rest = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn explains nothing
     best = np.minimum(right, reverse)
-    second = np.minimum(np.maximum(right, reverse), still)
+    second = np.minimum(np.maximum(right, reverse), at_rest)
     noise = np.maximum(variance, best / count)
     better = np.sign(reverse - right) * np.maximum(second - best, 0.0) / noise
     return np.sign(better) * np.sqrt(np.abs(better))

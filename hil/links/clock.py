@@ -117,16 +117,16 @@ class TimeSync:
         self.steps = 0
 
     @staticmethod
-    def stamp(now: float) -> int:
+    def stamp(host_time: float) -> int:
         """Return a time [s] as TIMESYNC has it [ns]."""
-        return int(now * 1e9)
+        return int(host_time * 1e9)
 
-    def take(self, tc1: int, ts1: int, now: float) -> None:
+    def take(self, tc1: int, ts1: int, host_time: float) -> None:
         """Take the answer to a request of ours, at a time [s]: the peer's time and the request's
         [ns].
         """
         sent = ts1 / 1e9
-        trip, offset = now - sent, tc1 / 1e9 - 0.5 * (sent + now)
+        trip, offset = host_time - sent, tc1 / 1e9 - 0.5 * (sent + host_time)
         if (
             self._exchanges
             and abs(offset - self.offset) > 0.5 * (trip + self.round_trip) + self.DRIFT

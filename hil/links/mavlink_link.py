@@ -250,11 +250,11 @@ class LinkSync:
         link.on_pump.append(self.service)
         link.sync = self
 
-    def service(self, now: float) -> None:
+    def service(self, host_time: float) -> None:
         """Ask where it is time; nobody is asked before anybody was heard."""
-        if self._link.received and now - self._asked >= self._pause:
-            self._asked, self._pause = now, self._random.uniform(*ASK_EVERY)
-            stamp = TimeSync.stamp(now)
+        if self._link.received and host_time - self._asked >= self._pause:
+            self._asked, self._pause = host_time, self._random.uniform(*ASK_EVERY)
+            stamp = TimeSync.stamp(host_time)
             self._pending = [*self._pending[-MOST_PENDING:], stamp]
             self._link.send(mav.MAVLink_timesync_message(0, stamp))
 

@@ -179,7 +179,7 @@ class Roster:
         seen = seen if seen in self.seen or len(self.seen) < MOST_KEPT else OTHERS
         self.seen[seen] = self.seen.get(seen, 0) + count
 
-    def admit(self, message: Any, address: Address, now: float) -> bool:
+    def admit(self, message: Any, address: Address, host_time: float) -> bool:
         """Return whether a message is one of a party's; binds the party to its sender's address at
         a time [s].
         """
@@ -195,7 +195,7 @@ class Roster:
             self._count(Seen(address, system, component, kind))  # a party's, that nobody asked for
             return False
         if self.parties:
-            why = self._objection(party, message, kind, address, now)
+            why = self._objection(party, message, kind, address, host_time)
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
         seen = Seen(address, system, component, kind, why or "")
@@ -207,7 +207,7 @@ class Roster:
             self._count(seen)
         if why is not None or party is None:
             return why is None
-        self.heard[party.name] = now
+        self.heard[party.name] = host_time
         if kind == "NAMED_VALUE_INT" and message.name == SIMULATED:
             self.simulated = bool(message.value)
         before = self.at.get(party.name, address)
@@ -234,7 +234,7 @@ class Roster:
         )
 
     def _objection(
-        self, party: Party | None, message: Any, kind: str, address: Address, now: float
+        self, party: Party | None, message: Any, kind: str, address: Address, host_time: float
     ) -> str | None:
         """Return why a message is not taken, or None."""
         if party is None:
@@ -250,39 +250,39 @@ class Roster:
             )
         if self.at.get(party.name, ...) == address:
             return None
-        if (why := self._taken(party.name, address, now)) is not None:
+        if (why := self._taken(party.name, address, host_time)) is not None:
             return why
         first = "HEARTBEAT" if party.autopilot is not None else ", ".join(sorted(party.kinds))
         return None if not first or kind in first.split(", ") else f"{NOT_YET} {first}"
 
-    def _taken(self, name: str, address: Address, now: float) -> str | None:
+    def _taken(self, name: str, address: Address, host_time: float) -> str | None:
         """Return why an address may not speak for a name that another one speaks for, or None."""
         at = self.at.get(name, address)
         if at == address:
             return None
         if self.flying:
             return f"another sender while it flies; the {name} speaks from {shown(at)}"
-        if now - self.heard[name] < SILENT:
-            self._rivals[name] = (address, now)
+        if host_time - self.heard[name] < SILENT:
+            self._rivals[name] = (address, host_time)
             return f"a second sender; the {name} speaks from {shown(at)}"
         return None
 
-    def claim(self, name: str, address: Address, now: float) -> bool:
+    def claim(self, name: str, address: Address, host_time: float) -> bool:
         """Return whether an address may speak for a name at a time [s]; the first one that asks is
         bound to it, under the rules of parties.
         """
-        why = self._taken(name, address, now)
+        why = self._taken(name, address, host_time)
         if why is not None:
             self.refuse(Seen(address, None, None, name, why))
             return False
-        self.at[name], self.heard[name] = address, now
+        self.at[name], self.heard[name] = address, host_time
         return True
 
     def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:
         """Count what a source could not take from a sender, and say it once."""
         self.refuse(Seen(address, None, None, kind, why), count)
 
-    def rivals(self, now: float) -> list[str]:
+    def rivals(self, host_time: float) -> list[str]:
         """Return which names two senders speak for at a time [s], in words: only one of them is
         heard, and which one is chance.
         """
@@ -290,7 +290,7 @@ class Roster:
             f"two senders speak as the {name}: {shown(self.at[name])}, which is heard, and"
             f" {shown(address)}: end one, or name the right one in link.allow"
             for name, (address, time) in self._rivals.items()
-            if now - time < SILENT
+            if host_time - time < SILENT
         ]
 
     def expected(self) -> str:

@@ -90,15 +90,15 @@ def build_exchange(
         mask: Ints,
         # Out:
         moves: Ints,
-        again: Ints,
+        redrawn: Ints,
         out: Output,
     ):
         """Take the command, trip the latch; ``again``: the solver's bodies are to be put back."""
         env = wp.tid() + first
         moves[env] = mask[env]
-        again[env] = 0
+        redrawn[env] = 0
         if mask[env] == 0:
-            again[env] = state.attached[env]
+            redrawn[env] = state.attached[env]
             return
         state.status[env] = 0
         if not push(state.queue, env, command[env]):
@@ -144,28 +144,28 @@ def build_exchange(
         whole, switch = split_delay(p, period)
         active, _until = held(state.queue, env, whole, switch, time + half, period)
         s = load(state, env)
-        now = laws.on(
+        law_factors = laws.on(
             p, rope, airs[env % airs.shape[0]], s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
-            s = coupled.step_alone(p, now, s, active, g, h)
+            s = coupled.step_alone(p, law_factors, s, active, g, h)
             if st.size(s) < limit:
                 store(state, env, s)
             else:
                 state.status[env] = state.status[env] | nonfinite
                 moves[env] = 0
             return
-        f = flow(p, now, s, active)
+        f = flow(p, law_factors, s, active)
         acc = (wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]) / p.body.mass + g
         turn = angular_acceleration(p, s.rate_b, f.torque_b + wrench.twist_b[env])
         middle = advance(s, rate(p, s, f, acc, turn), half)
         middle.motor_speed = motor_advance(middle.motor_speed, f.motor_speed)
-        f = flow(p, now, middle, active)
+        f = flow(p, law_factors, middle, active)
         wrench.force_b[env] = f.force_b
         wrench.torque_b[env] = f.torque_b
         if wp.static(loaded):
             jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
-            wrench.load_w[env] = hanging(rope, now, out.payload_vel_w[env], n[L - 1], jet)
+            wrench.load_w[env] = hanging(rope, law_factors, out.payload_vel_w[env], n[L - 1], jet)
         after = advance(s, rate(p, middle, f, vec3(), vec3()), h)
         state.motor_speed[env] = motor_advance(after.motor_speed, f.motor_speed)
         state.integral[env] = after.integral
@@ -188,7 +188,7 @@ def build_exchange(
         # State in:
         state: State,
         moves: Ints,
-        again: Ints,
+        redrawn: Ints,
         wrench: Wrench,
         # In:
         bodies: Bodies,
@@ -215,13 +215,13 @@ def build_exchange(
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite
             moves[env] = 0
-            again[env] = 1
+            redrawn[env] = 1
             return
         body = scaled(vehicle, state, env).body
         mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
-        own = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
+        body_force_w = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
         fall = vec3(real(0.0), real(0.0), gravity)
-        wrench.pull_w[env] = body.mass * ((s.vel_w - state.vel_w[env]) / h + fall) - own
+        wrench.pull_w[env] = body.mass * ((s.vel_w - state.vel_w[env]) / h + fall) - body_force_w
         momentum = wp.cw_mul(body.inertia, (s.rate_b - state.rate_b[env]) / h)
         gyroscopic = wp.cross(mean_b, wp.cw_mul(body.inertia, mean_b))
         wrench.twist_b[env] = momentum + gyroscopic - wrench.torque_b[env]
@@ -235,15 +235,15 @@ def build_exchange(
             part = wp.clamp((timer - (time - h)) / h, real(0.0), one)
             before = out.payload_vel_w[env]
             # backwards from the end with the acceleration between the ends
-            back = (one - part) * h
+            remaining_time = (one - part) * h
             acc = (vel - before) / h
             depart(
                 ropes[env % ropes.shape[0]],
                 releases[env % releases.shape[0]],
                 airs[env % airs.shape[0]],
                 s,
-                pos - back * vel + (real(0.5) * back * back) * acc,
-                vel - back * acc,
+                pos - remaining_time * vel + (real(0.5) * remaining_time * remaining_time) * acc,
+                vel - remaining_time * acc,
                 n[L - 1],
                 gravity,
                 out,
@@ -279,8 +279,8 @@ def build_exchange(
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
             p = scaled(vehicle, state, env)
-            found = hazards(p, ropes[env % ropes.shape[0]], s, n, out.payload_pos_w[env])
-            state.status[env] = state.status[env] | found
+            hazard_bits = hazards(p, ropes[env % ropes.shape[0]], s, n, out.payload_pos_w[env])
+            state.status[env] = state.status[env] | hazard_bits
 
     @wp.kernel(module="unique", enable_backward=False)
     def show_kernel(

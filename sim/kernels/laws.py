@@ -211,7 +211,7 @@ def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
     """Scalars, and vectors by block, that a law may name."""
     t = types("float64")
     scalars, vectors = _factors(t, make_struct("Around", _around(t)))
-    return tuple(scalars), {block: tuple(of) for block, of in vectors.items()}
+    return tuple(scalars), {block: tuple(wanted_laws) for block, wanted_laws in vectors.items()}
 
 
 def _around(t: Types) -> dict[str, type]:

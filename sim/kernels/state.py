@@ -79,7 +79,7 @@ def allocate(
 
 
 def put(
-    t: Types, struct, given: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int
+    t: Types, struct, initial: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int
 ) -> None:
     """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment
     first.
@@ -89,12 +89,12 @@ def put(
     Args:
         t: types of the arrays.
         struct: of :func:`allocate`, or anything with arrays of these names.
-        given: name -> values, shape (E, ...), or None for every environment's default; and that
+        initial: name -> values, shape (E, ...), or None for every environment's default; and that
             default, shape (...).
         count: E.
     """
     real = np.float32 if t.real is wp.float32 else np.float64
-    for name, (value, default) in given.items():
+    for name, (value, default) in initial.items():
         value = (
             np.broadcast_to(default, (count, *np.shape(default)))
             if value is None

@@ -281,15 +281,27 @@ def build_step(
             for k in range(count):
                 if attached != 0:
                     rope = chain.stretched(natural, rope, stiffness, u, h)
-                now = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
+                law_factors = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
                     s, total, fell_back = coupled.step(
-                        p, rope, now, s, total, active, n, u, stiffness, g, gamma, max_turn, h
+                        p,
+                        rope,
+                        law_factors,
+                        s,
+                        total,
+                        active,
+                        n,
+                        u,
+                        stiffness,
+                        g,
+                        gamma,
+                        max_turn,
+                        h,
                     )
                     if fell_back:
                         status = status | fallback
                 else:
-                    s = coupled.step_alone(p, now, s, active, g, h)
+                    s = coupled.step_alone(p, law_factors, s, active, g, h)
             time = until
             if attached != 0 and timer >= real(0.0) and time > timer - tiny:
                 separate(p, rope, r, air, s, n, u, gravity, out, env, time)

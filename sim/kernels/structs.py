@@ -263,8 +263,8 @@ def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ..
     its plant's laws.
     """
     rows = pack(t.Air, *airs)
-    for row, own in zip(rows, laws, strict=True):
-        row["laws"][: len(own)] = [law.coefficient for law in own]
+    for row, row_laws in zip(rows, laws, strict=True):
+        row["laws"][: len(row_laws)] = [law.coefficient for law in row_laws]
     return rows
 
 

@@ -90,8 +90,8 @@ class World:
         ]
         bodies = [(vehicle.body, rope) for vehicle, rope in pairs]
         different = list(dict.fromkeys(bodies))
-        of = np.array([different.index(pair) for pair in bodies])
-        return [pairs[int(np.argmax(of == k))] for k in range(len(different))], of[
+        model_of = np.array([different.index(pair) for pair in bodies])
+        return [pairs[int(np.argmax(model_of == k))] for k in range(len(different))], model_of[
             np.arange(self.count) % len(rows)
         ]
 
@@ -151,8 +151,8 @@ class Exchange:
 def solver_class(name: str) -> type[Solver]:
     """Class of a solver by its name in :data:`SOLVERS`."""
     module, _, attribute = SOLVERS[name].partition(":")
-    found: type[Solver] = getattr(importlib.import_module(module), attribute)
-    return found
+    solver: type[Solver] = getattr(importlib.import_module(module), attribute)
+    return solver
 
 
 def refuse(extensions: frozenset[str], params: PlantParams) -> None:

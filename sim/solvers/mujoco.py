@@ -17,7 +17,7 @@ from sim.solvers.rods import Ints, Table, build_place, quat, vec3
 RK4_STEP = 5e-4
 """Largest substep of RK4 [s]: half of it moves a hard throw's end by less than a micrometre."""
 
-OWN = (
+MODEL_ARRAYS = (
     "body_pos",
     "body_ipos",
     "body_mass",
@@ -44,17 +44,20 @@ class MujocoSolver:
 
     def __init__(self, world: World) -> None:
         self.world, device, count = world, world.device, world.count
-        pairs, of = world.models()
+        pairs, model_of = world.models()
         models = [compile_model(vehicle.body, rope) for vehicle, rope in pairs]
         for model in models:
             model.opt.timestep = world.substep
             rk4 = world.substep <= RK4_STEP * (1.0 + 1e-9)
             kind = mujoco.mjtIntegrator
             model.opt.integrator = kind.mjINT_RK4 if rk4 else kind.mjINT_IMPLICITFAST
-        own = {name: np.stack([getattr(model, name) for model in models])[of] for name in OWN}
+        arrays = {
+            name: np.stack([getattr(model, name) for model in models])[model_of]
+            for name in MODEL_ARRAYS
+        }
         wide = {
             name: value
-            for name, value in own.items()
+            for name, value in arrays.items()
             if value.size and (name == "body_mass" or (value != value[0]).any())
         }
         make = _on_cpu if device == "cpu" else _on_gpu
@@ -62,7 +65,7 @@ class MujocoSolver:
             models[0], wide, count, device
         )
         self._vehicle = mujoco.mj_name2id(models[0], mujoco.mjtObj.mjOBJ_BODY, "vehicle")
-        self._nominal = wp.array(own["body_mass"][:, self._vehicle], dtype=float, device=device)
+        self._nominal = wp.array(arrays["body_mass"][:, self._vehicle], dtype=float, device=device)
         self._rows = wp.array(np.arange(count), dtype=wp.int32, device=device)
         self._payload_quat = wp.zeros(count, dtype=quat, device=device)
         self._kernels = _kernels(world)
@@ -89,8 +92,8 @@ class MujocoSolver:
 
     def _show(self) -> None:
         w = self.world
-        shown = [w.packed[1], self.qpos, self.qvel, w.bodies, self._payload_quat]
-        wp.launch(self._kernels["show"], w.count, shown, device=w.device)
+        outputs = [w.packed[1], self.qpos, self.qvel, w.bodies, self._payload_quat]
+        wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
 
 
 def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tuple:
@@ -126,22 +129,24 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
     import mujoco_warp
 
     with wp.ScopedDevice(device), wp.ScopedStream(wp.Stream(device)):
-        there = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(wide, count))
+        model_on_device = mujoco_warp.put_model(model, batch_sizes=dict.fromkeys(wide, count))
         for name, value in wide.items():
-            getattr(there, name).assign(value.astype(np.float32))
+            getattr(model_on_device, name).assign(value.astype(np.float32))
         data = mujoco_warp.make_data(model, nworld=count, njmax=CONSTRAINTS, naconmax=1)
-        mujoco_warp.step(there, data)  # modules load, which a capture cannot
+        mujoco_warp.step(model_on_device, data)  # modules load, which a capture cannot
         with wp.ScopedCapture(device=device, force_module_load=False) as captured:
-            mujoco_warp.step(there, data)
+            mujoco_warp.step(model_on_device, data)
         wp.synchronize_device(device)
 
-    def step(_read=(there, data)) -> None:  # the graph reads these, and must not outlive them
+    def step(
+        _read=(model_on_device, data),
+    ) -> None:  # the graph reads these, and must not outlive them
         wp.capture_launch(captured.graph, stream=wp.get_stream(device))
 
     def placed(mask) -> None:
         wp.launch(_clear, data.qacc_warmstart.shape, [mask, data.qacc_warmstart], device=device)
 
-    return data.qpos, data.qvel, data.ctrl, there.body_mass, step, placed
+    return data.qpos, data.qvel, data.ctrl, model_on_device.body_mass, step, placed
 
 
 @wp.kernel(enable_backward=False)
@@ -248,9 +253,9 @@ def _kernels(world: World) -> dict[str, Callable]:
             box = vec3(qpos[env, 7], qpos[env, 8], qpos[env, 9])
             box_vel = vec3(qvel[env, 6], qvel[env, 7], qvel[env, 8])
             top = wp.quat_rotate(turn, vec3(0.0, 0.0, rope.payload_offset))
-            along = box + top - pos
-            n = wp.normalize(along)
-            u = (box_vel + wp.cross(spin, top) - vel) / wp.length(along)
+            gap = box + top - pos
+            n = wp.normalize(gap)
+            u = (box_vel + wp.cross(spin, top) - vel) / wp.length(gap)
             bodies.cable_dir_w[0, env] = n
             bodies.cable_vel_w[0, env] = u - n * wp.dot(n, u)
             bodies.payload_pos_w[env] = box

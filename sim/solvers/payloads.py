@@ -54,9 +54,9 @@ def _add_two_cables(spec: "mujoco.MjSpec", vehicle: "mujoco.MjsBody", rope: Rope
     box.add_freejoint(name="box")
     _as_box(box, rope, 0.0)
     for name, side in (("front", 0.5), ("rear", -0.5)):
-        across = side * rope.cables_apart
-        vehicle.add_site(name=f"{name}_above", pos=[x + across, y, z])
-        box.add_site(name=f"{name}_below", pos=[across, 0.0, rope.payload_offset])
+        offset = side * rope.cables_apart
+        vehicle.add_site(name=f"{name}_above", pos=[x + offset, y, z])
+        box.add_site(name=f"{name}_below", pos=[offset, 0.0, rope.payload_offset])
         cable = spec.add_tendon(
             name=name, limited=True, range=[0.0, rope.length], solref_limit=[0.002, 1.0]
         )

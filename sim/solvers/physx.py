@@ -73,15 +73,22 @@ def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
     joint_apis = [f'"PhysicsLimitAPI:{axis}"' for axis in LOCKED]
     joint_apis += [f'"PhysicsDriveAPI:{axis}"' for axis in FREE]
     for i in range(rope.segments):
-        mass, centre, across = rod_inertial(rope, i == rope.segments - 1)
+        mass, centre, transverse = rod_inertial(rope, i == rope.segments - 1)
         place = {"z": mount[2] - i * length, "mass": mass, "centre": centre}
-        inertia = (across, across, AXIAL_INERTIA)
+        inertia = (transverse, transverse, AXIAL_INERTIA)
         parts.append(LINK.format(name=f"rod{i}", apis="", more="", inertia=inertia, **place))
         damping = rope.joint_damping + (rope.mount_damping if i == 0 else 0.0)
         axes = [LIMIT.format(axis) for axis in LOCKED]
         axes += [DRIVE.format(axis, float(np.radians(damping))) for axis in FREE]  # per degree
-        above, at = ("vehicle", tuple(mount)) if i == 0 else (f"rod{i - 1}", (0.0, 0.0, -length))
-        joint = {"apis": ", ".join(joint_apis), "above": above, "at": at, "axes": "\n".join(axes)}
+        above, anchor = (
+            ("vehicle", tuple(mount)) if i == 0 else (f"rod{i - 1}", (0.0, 0.0, -length))
+        )
+        joint = {
+            "apis": ", ".join(joint_apis),
+            "above": above,
+            "at": anchor,
+            "axes": "\n".join(axes),
+        }
         parts.append(JOINT.format(i=i, env=env, **joint))
     return f'def Xform "{env}" {{{"".join(parts)}\n}}\n'
 
@@ -100,8 +107,8 @@ class PhysxSolver:
         import ovstage
         from ovphysx.types import TensorType
 
-        models, of = world.models()
-        first = [int(np.argmax(of == k)) for k in range(len(models))]
+        models, model_of = world.models()
+        first = [int(np.argmax(model_of == k)) for k in range(len(models))]
         name = "env{:06d}".format
         usd = [environment(name(e), *model) for e, model in zip(first, models)]
         head = SCENE.format(
@@ -117,7 +124,7 @@ class PhysxSolver:
         self._stage, wait = stage, self._physx.wait_task
         wait(self._physx.attach_ovstage(stage, read_ordinal=1))
         for k, e in enumerate(first):
-            copies = [f"/{name(c)}" for c in np.flatnonzero(of == k) if c != e]
+            copies = [f"/{name(c)}" for c in np.flatnonzero(model_of == k) if c != e]
             if copies:  # nothing collides, so all may stand in one place
                 wait(self._physx.clone(f"/{name(e)}", copies, [(0.0,) * 6 + (1.0,)] * len(copies)))
         weakref.finalize(self, self._physx.destroy)
@@ -176,14 +183,14 @@ class PhysxSolver:
 
     def advance(self, duration: float) -> None:
         w, arrays, tensors = self.world, self._arrays, self._tensors
-        given = [w.wrench, w.bodies, self._rows, arrays["wrench"]]
-        wp.launch(self._kernels["push"], w.count, given, device=w.device)
+        inputs = [w.wrench, w.bodies, self._rows, arrays["wrench"]]
+        wp.launch(self._kernels["push"], w.count, inputs, device=w.device)
         tensors["wrench"].write(arrays["wrench"])
         self._physx.step_sync(duration)
         for name in ("links", "link_velocities"):
             tensors[name].read(arrays[name])
-        shown = [w.packed[1], self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
-        wp.launch(self._kernels["show"], w.count, shown, device=w.device)
+        outputs = [w.packed[1], self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
+        wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
 
 
 def _start(device: str) -> ModuleType:
@@ -248,10 +255,10 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
             out[row, 0, 6 + k] = pos[k]
         if wp.static(loaded):
             load = wrench.load_w[env]
-            at = bodies.payload_pos_w[env]
+            anchor = bodies.payload_pos_w[env]
             for k in range(3):
                 out[row, L, k] = load[k]
-                out[row, L, 6 + k] = at[k]
+                out[row, L, 6 + k] = anchor[k]
 
     @wp.kernel(module="unique", enable_backward=False)
     def show(

@@ -23,9 +23,9 @@ def rod_inertial(rope: RopeParams, last: bool) -> tuple[float, float, float]:
         return mass, -length / 2, about_centre
     ball, reach = rope.payload_mass, length + rope.payload_offset
     centre = (mass * length / 2 + ball * reach) / (mass + ball)
-    across = about_centre + rope.payload_inertia
-    across += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
-    return mass + ball, -centre, across
+    inertia = about_centre + rope.payload_inertia
+    inertia += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
+    return mass + ball, -centre, inertia
 
 
 def build_place(world: World, hinges: bool) -> wp.Kernel:

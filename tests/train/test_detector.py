@@ -61,7 +61,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
         rope.length + rope.payload_offset,
         1,
         3,
-        by=by,
+        method=by,
         nuisances=Nuisances(*(0.0,) * 8),
         keep=True,
     )
@@ -92,7 +92,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
-        RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, by="magic")
+        RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, method="magic")
 
 
 class Blind:

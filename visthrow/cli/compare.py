@@ -281,18 +281,20 @@ def write(
     atomic_write(paths[0], report(title, rows, note))
     atomic_write(
         paths[1],
-        tables.csv_text([(entry.name, plant, of) for entry in entries for of in entry.throws]),
+        tables.csv_text(
+            [(entry.name, plant, thrown) for entry in entries for thrown in entry.throws]
+        ),
     )
     subtitle = subtitle or f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
     panels = [
         (
-            f"target {of.target:.1f} m",
+            f"target {thrown.target:.1f} m",
             [
-                (e.name, e.throws[i].landing_w[e.throws[i].success] - (of.target, 0.0))
+                (e.name, e.throws[i].landing_w[e.throws[i].success] - (thrown.target, 0.0))
                 for e in entries
             ],
         )
-        for i, of in enumerate(entries[0].throws)
+        for i, thrown in enumerate(entries[0].throws)
     ]
     atomic_write(
         paths[2], figures.scatter(panels, heading=f"Landing points from above: {subtitle}")

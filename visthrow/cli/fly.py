@@ -111,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
             rope.length + rope.payload_offset,
             1,
             args.seed,
-            by=args.pixels,
+            method=args.pixels,
             keep=True,
         )
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)

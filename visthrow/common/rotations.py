@@ -84,12 +84,12 @@ def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     """Hamilton product of single quaternions: first b, then a."""
     ax, ay, az, aw = a
-    bx, by, bz, bw = b
+    bx, b_y, bz, bw = b
     return (
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * b_y,
+        aw * b_y - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * b_y - ay * bx + az * bw,
+        aw * bw - ax * bx - ay * b_y - az * bz,
     )
 
 

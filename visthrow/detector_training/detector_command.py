@@ -375,9 +375,9 @@ def mistaken(detectors: dict) -> dict[str, Any]:
         width = picture.shape[1] * 2 // 3
         for k in range(9):
             top = (picture.shape[0] - height) * (k // 3) // 2
-            left = (picture.shape[1] - width) * (k % 3) // 2
+            column = (picture.shape[1] - width) * (k % 3) // 2
             cut = cv2.resize(
-                picture[top : top + height, left : left + width],
+                picture[top : top + height, column : column + width],
                 (640, 640),
                 interpolation=cv2.INTER_AREA,
             )

@@ -72,7 +72,7 @@ class RenderedEyes:
         count: int,
         seed: int,
         device: str = "cpu",
-        by: str = "learnt",
+        method: str = "learnt",
         samples: int = 4,
         nuisances: Nuisances | None = None,
         weights: str | None = None,
@@ -83,13 +83,13 @@ class RenderedEyes:
         Args:
             params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so
                 far below it [m].
-            count: E. seed: of halls and sensors. device: of the renderer. by: one of `METHODS`.
+            count: E. seed: of halls and sensors. device: of the renderer. method: one of `METHODS`.
             samples: rays a pixel.
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
                 shipped. keep: whether frames are kept.
         """
-        if by not in METHODS:
-            raise ValueError(f"detector '{by}'; expected one of {', '.join(METHODS)}")
+        if method not in METHODS:
+            raise ValueError(f"detector '{method}'; expected one of {', '.join(METHODS)}")
         self.params = params
         self.count = count
         self._keep = keep
@@ -99,7 +99,7 @@ class RenderedEyes:
         self._draw = (count, seed)
         self._nuisances = nuisances or Nuisances()
         lens = Fisheye(params.fisheye)
-        if by == "learnt":
+        if method == "learnt":
             networks = Networks.load(weights) if weights else Networks.load()
             self.detector: Detector = LearntDetector(
                 lens, params.payload_radius, params.goal_side, networks=networks

@@ -254,11 +254,11 @@ class FlightLog:
                 name: Channel(
                     arrays[f"{name}/time"],
                     arrays[f"{name}/values"],
-                    of["unit"],
-                    of["frame"],
+                    quantity["unit"],
+                    quantity["frame"],
                     arrays[f"{name}/valid"],
                 )
-                for name, of in units.items()
+                for name, quantity in units.items()
             }
             return FlightLog(channels, meta)
         except LogError as error:

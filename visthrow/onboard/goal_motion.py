@@ -227,7 +227,7 @@ def predicted(
     camera: KeypointCamera,
     rot_wb: Tensor,
     goal_xy: Tensor,
-    known: Tensor,
+    is_known: Tensor,
 ) -> tuple[Tensor, Tensor]:
     """Return the frame, and its validity, with corners that are not seen where the goal so far
     would be seen.
@@ -235,7 +235,7 @@ def predicted(
     Args:
         layout, frame, valid, camera: as of :func:`measured_goal`. rot_wb: attitude in the frame,
             shape (E, 3, 3).
-        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. known: whether one has
+        goal_xy: goal by the steps so far [m], shape (E, 2), world frame. is_known: whether one has
             seen it, bool, shape (E, 1).
     """
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
@@ -243,7 +243,7 @@ def predicted(
     points, visible = camera.fisheye.project_normalized(corners_c, clip=True)
     measured_valid = valid[:, :GOAL_KEYPOINTS]
     end = VEHICLE + layout.goal
-    filled = visible & known & ~measured_valid
+    filled = visible & is_known & ~measured_valid
     corners = torch.where(filled[..., None], points, _corners(layout, frame))
     frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
     return frame, torch.cat([measured_valid | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)

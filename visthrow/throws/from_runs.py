@@ -122,9 +122,11 @@ def smoothness(log: FlightLog) -> float:
     `visthrow.training.protocol` has it.
     """
     times = log.meta["times"]
-    of = log["action"]
+    actions = log["action"]
     observation = log["observation"]
-    during = (of.time >= times["policy_start"] - 1e-9) & (of.time < times["recovery"] - 1e-9)
-    action = of.values[during, :4]
+    during = (actions.time >= times["policy_start"] - 1e-9) & (
+        actions.time < times["recovery"] - 1e-9
+    )
+    action = actions.values[during, :4]
     before = observation.values[during, VEHICLE : VEHICLE + 4]
     return float(np.sqrt(np.mean(np.square(action - before))))

@@ -191,13 +191,13 @@ class Throwing(Workers):
 
     def _throws(self, parts: Sequence[dict[str, np.ndarray]], policy: int, target: float) -> Throws:
         """All throws of one policy at one target."""
-        of = []
+        units = []
         for job, part in zip(self.jobs, parts):
             if job.target == target and policy in job.policies:
                 first = job.policies.index(policy) * job.count
-                of.append(
+                units.append(
                     {name: values[first : first + job.count] for name, values in part.items()}
                 )
         return Throws(
-            target, **{name: np.concatenate([part[name] for part in of]) for name in of[0]}
+            target, **{name: np.concatenate([part[name] for part in units]) for name in units[0]}
         )

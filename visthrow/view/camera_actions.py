@@ -122,13 +122,13 @@ def calibrate(args: argparse.Namespace) -> int:
         else:
             notes += ", the same model: nothing was fitted"
         notes = "; ".join([notes, *fit.remarks])
-    kept = "Mount, noise and sizes are"
+    note = "Mount, noise and sizes are"
     if mount is not None:
         place = {"position_b": mount.position_b, "rpy_deg": mount.rpy_deg}
         like = dataclasses.replace(like, mount=dataclasses.replace(like.mount, **place))
         notes += "; mount from the IMU's, taken to sit at the centre of mass, x forward, z up"
-        kept = "Noise and sizes are"
-    text = f"# Camera {notes}.\n# {kept} those of '{args.like}'; set your own.\n\n"
+        note = "Noise and sizes are"
+    text = f"# Camera {notes}.\n# {note} those of '{args.like}'; set your own.\n\n"
     params = dataclasses.replace(like, fisheye=lens)
     atomic_write(out, (text + config.dumps(params)).encode())
     print(

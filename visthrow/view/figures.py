@@ -384,7 +384,7 @@ def _curve(axis, line: Line):
         alpha=0.18,
         lw=0,
     )
-    (drawn,) = axis.plot(
+    (curve_line,) = axis.plot(
         x, [i.value for i in line.intervals], marker + "-", color=colour, ms=4.5, lw=1.5
     )
     if line.own is not None:
@@ -397,7 +397,7 @@ def _curve(axis, line: Line):
             mec=style.INK,
             mew=1.1,
         )
-    return drawn
+    return curve_line
 
 
 def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:

@@ -20,7 +20,7 @@ from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
-WIDTH, LEFT, PANEL, GAP = (
+WIDTH, LEFT_MARGIN, PANEL, GAP = (
     13.6,
     0.62,
     3.06,
@@ -64,13 +64,13 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
     lens = KeypointCamera(drawn_larger(camera))
     all_seen = True
     for column, (caption, time) in enumerate(views):
-        x = LEFT + column * (PANEL + GAP)
+        x = LEFT_MARGIN + column * (PANEL + GAP)
         axis = figure.add_axes((x / WIDTH, (PANEL + 1.06) / height, PANEL / WIDTH, upper / height))
         _side_view(axis, log, time, side, column)
         axis.set_title(f"({'abcd'[column]})  {caption},  t = {time - start:.2f} s", loc="left")
         axis = figure.add_axes((x / WIDTH, 0.08 / height, PANEL / WIDTH, PANEL / height))
         all_seen &= _camera_view(axis, log, lens, time, first=column == 0)
-    texts = {"x": LEFT / WIDTH, "ha": "left", "va": "top"}
+    texts = {"x": LEFT_MARGIN / WIDTH, "ha": "left", "va": "top"}
     figure.suptitle(_headline(log), y=1.0 - 0.2 / height, fontsize=13.5, fontweight="bold", **texts)
     quiet = {"fontsize": 10.5, "color": style.QUIET, **texts}
     if log.meta["plant"] == "poses":
@@ -116,8 +116,10 @@ def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
     paths = [
-        of.values[(of.time >= times["policy_start"]) & (of.time <= times["landing"] + 0.02)]
-        for of in (log["pos_w"], log["payload_pos_w"])
+        positions.values[
+            (positions.time >= times["policy_start"]) & (positions.time <= times["landing"] + 0.02)
+        ]
+        for positions in (log["pos_w"], log["payload_pos_w"])
     ]
     x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
     top = max(path[:, 2].max() for path in paths)

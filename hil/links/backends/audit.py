@@ -126,13 +126,13 @@ class Audit:
     def _settling(self, name: str) -> bool:
         return self._now - self._written_at.get(name, -1e9) < SETTLE
 
-    def service(self, now: float) -> None:
+    def service(self, host_time: float) -> None:
         """Ask for what is missing."""
-        self._now = now
+        self._now = host_time
         if self.done:
             return
-        self._begun = now if self._begun is None else self._begun
-        waited = now - self._begun
+        self._begun = host_time if self._begun is None else self._begun
+        waited = host_time - self._begun
         answered = self.found.keys() | self.refused.keys()
         missing = [
             r.name
@@ -154,8 +154,8 @@ class Audit:
                 self._tell(self.table())
             return
         for name in missing:
-            if now - self._asked.get(name, -1e9) >= ASK_AGAIN and not self._settling(name):
-                self._asked[name] = now
+            if host_time - self._asked.get(name, -1e9) >= ASK_AGAIN and not self._settling(name):
+                self._asked[name] = host_time
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:

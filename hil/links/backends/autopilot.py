@@ -224,11 +224,13 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _last_text(self) -> str:
         return self.texts[-1] if self.texts else "no text"
 
-    def _note(self, now: float) -> tuple[str, str]:
+    def _note(self, host_time: float) -> tuple[str, str]:
         p, beat = self.params, self._heartbeat
-        if beat is None or now - self._heard > p.heartbeat_timeout:
+        if beat is None or host_time - self._heard > p.heartbeat_timeout:
             return (
-                "no heartbeat" if beat is None else f"no heartbeat for {now - self._heard:.1f} s"
+                "no heartbeat"
+                if beat is None
+                else f"no heartbeat for {host_time - self._heard:.1f} s"
             ), WAIT
         if not self.audit.done:
             return "parameters are being read", WAIT
@@ -276,13 +278,15 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _expected_modes(self) -> str:
         """Return modes that a throw may begin in, in words."""
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         p = self.params
         thrust, x, y, z = command
         share = p.thrust.share(thrust, self.voltage)
-        return self._link.send(attitude_target(now, (p.system, p.component), share, (x, -y, -z)))
+        return self._link.send(
+            attitude_target(host_time, (p.system, p.component), share, (x, -y, -z))
+        )
 
-    def ask(self, mode: str, now: float) -> None:
+    def ask(self, mode: str, host_time: float) -> None:
         """Ask until the heartbeat shows the mode."""
         if mode != self._wanted:
             if (
@@ -293,33 +297,33 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._wanted, self._reached, self._asked_at = mode, False, -1e9
             if self._heartbeat is not None:
                 self._judge_mode()
-        if self._taken_over or now - self._asked_at < ASK_AGAIN:
+        if self._taken_over or host_time - self._asked_at < ASK_AGAIN:
             return
         beat = self._heartbeat
         if beat is None or self._role(beat.custom_mode) != mode:
-            self._asked_at = now
+            self._asked_at = host_time
             self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
             self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
         elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
-            self._asked_at = now
+            self._asked_at = host_time
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
 
-    def service(self, now: float) -> None:
-        if now - self._beat_at >= 1.0:
-            self._beat_at = now
+    def service(self, host_time: float) -> None:
+        if host_time - self._beat_at >= 1.0:
+            self._beat_at = host_time
             self._link.send(HEARTBEAT)
         if self._heartbeat is not None:
-            self.audit.service(now)
-            if now - self._streamed > 10.0 and self._wanted is None:
-                self._streamed = now
+            self.audit.service(host_time)
+            if host_time - self._streamed > 10.0 and self._wanted is None:
+                self._streamed = host_time
                 for number, period in STREAM:
                     self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, period)
-        if self.release_record.due(now):
+        if self.release_record.due(host_time):
             number, values = self._release_command()
             self._command(number, self.release_record.sends - 1, *values)
 
-    def abort(self, now: float) -> None:
-        self.ask(LAND, now)
+    def abort(self, host_time: float) -> None:
+        self.ask(LAND, host_time)
 
     def _command(self, number: int, confirmation: int, *values: float) -> None:
         p = self.params

@@ -53,17 +53,17 @@ class Backend:
     name = ""
     holds = False  # whether the autopilot has modes of its own that hold a place and land
 
-    def status(self, now: float) -> Status:
+    def status(self, host_time: float) -> Status:
         """Return what is known now."""
         raise NotImplementedError
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up;
         whether it was taken.
         """
         raise NotImplementedError
 
-    def ask(self, mode: str, now: float) -> None:
+    def ask(self, mode: str, host_time: float) -> None:
         """Ask for FOLLOW, HOLD or LAND; called at every tick while it is wanted."""
 
     def release(self, when: float) -> None:
@@ -75,26 +75,26 @@ class Backend:
     def rearm(self) -> None:
         """Forget the last throw's release: the operator has armed the next one."""
 
-    def service(self, now: float) -> None:
+    def service(self, host_time: float) -> None:
         """Do what is due: heartbeats, the release, its repetition."""
 
     def due(self) -> float | None:
         """Return when :meth:`service` is to be called at the latest [s]; None for the next tick."""
         return None
 
-    def abort(self, now: float) -> None:
+    def abort(self, host_time: float) -> None:
         """Ask the autopilot to land; called at every tick of an aborted run.
 
         A pilot who has taken over is left alone.
         """
 
-    def surrender(self, now: float) -> None:
+    def surrender(self, host_time: float) -> None:
         """Give the vehicle to its own hold, or to the pilot; called at every tick of a run that
         ended so.
         """
-        self.ask(HOLD, now)
+        self.ask(HOLD, host_time)
 
-    def finish(self, now: float) -> None:
+    def finish(self, host_time: float) -> None:
         """Put the autopilot at rest, as far as that is ours: the run is over."""
 
     def close(self) -> None:
@@ -110,10 +110,10 @@ class DryRun(Backend):
         self.commands = self.releases = 0
         self._release = IDLE
 
-    def status(self, now: float) -> Status:
+    def status(self, host_time: float) -> Status:
         return Status(True, "dry run", self._release)
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         self.commands += 1
         return True
 
@@ -192,11 +192,11 @@ class Release:
             self._moved = True
             self._judge()
 
-    def due(self, now: float) -> bool:
+    def due(self, host_time: float) -> bool:
         """Return whether to send it now; the caller does."""
         if self.state != PENDING:
             return False
-        if now - self._first > self.timeout:
+        if host_time - self._first > self.timeout:
             stood = (
                 "the output was not seen closed before"
                 if self.read_back and not self._closed
@@ -204,10 +204,10 @@ class Release:
             )
             why = f"accepted, but {stood}" if self._answered else "no final answer"
             self._end(FAILED, f"{why} within {self.timeout:g} s")
-        elif self.at is not None and now >= self.at - ROUNDING:
+        elif self.at is not None and host_time >= self.at - ROUNDING:
             if not self.sends:
                 self._sent = perf_counter()
-            self.sends, self.at = self.sends + 1, now + self.REPEAT
+            self.sends, self.at = self.sends + 1, host_time + self.REPEAT
             return True
         return False
 
@@ -239,7 +239,7 @@ class Autopilot(Backend):
     def __init__(self) -> None:
         self.texts: list[str] = []
 
-    def _note(self, now: float) -> tuple[str, str]:
+    def _note(self, host_time: float) -> tuple[str, str]:
         """Return what is wrong, or nothing; and what the autopilot does."""
         raise NotImplementedError
 
@@ -251,8 +251,8 @@ class Autopilot(Backend):
         """Return what it waits for, though nothing is wrong."""
         return ""
 
-    def status(self, now: float) -> Status:
-        note, mode = self._note(now)
+    def status(self, host_time: float) -> Status:
+        note, mode = self._note(host_time)
         fault, thrust = self.audit.fault(), None
         if not note and self.release_record.open_at_rest:
             note = "the mechanism's output is at its open end: close it; or its ends are exchanged"
@@ -295,8 +295,8 @@ class OnPort(Autopilot):
         self._port, self._silence, self._heard, self.dropped = port, silence, -1e9, 0
         self._taken = self._raised = self._over = False  # asked for; has followed; over
 
-    def _note(self, now: float) -> tuple[str, str]:
-        silence = now - self._heard
+    def _note(self, host_time: float) -> tuple[str, str]:
+        silence = host_time - self._heard
         if silence <= self._silence:
             return self._known()
         return (
@@ -309,7 +309,7 @@ class OnPort(Autopilot):
         """Return the same as `_note`, of one that is heard."""
         raise NotImplementedError
 
-    def ask(self, mode: str, now: float) -> None:
+    def ask(self, mode: str, host_time: float) -> None:
         self._taken |= mode == FOLLOW
 
     def close(self) -> None:
@@ -341,15 +341,15 @@ class Held:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         """Let a command wait; whether the last one that went out was taken."""
-        self._waiting.append((now + self._hold, command))
+        self._waiting.append((host_time + self._hold, command))
         return self._taken
 
-    def service(self, now: float) -> None:
-        while self._waiting and self._waiting[0][0] <= now + ROUNDING:
-            self._taken = self._backend.send(self._waiting.popleft()[1], now)
-        self._backend.service(now)
+    def service(self, host_time: float) -> None:
+        while self._waiting and self._waiting[0][0] <= host_time + ROUNDING:
+            self._taken = self._backend.send(self._waiting.popleft()[1], host_time)
+        self._backend.service(host_time)
 
     def due(self) -> float | None:
         times = [
@@ -359,7 +359,7 @@ class Held:
         ]
         return min(times, default=None)
 
-    def finish(self, now: float) -> None:
+    def finish(self, host_time: float) -> None:
         """End; nothing goes out after it."""
         self._waiting.clear()
-        self._backend.finish(now)
+        self._backend.finish(host_time)

@@ -228,7 +228,7 @@ class Betaflight(OnPort):
     def _box(self, number: int) -> bool:
         return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us
@@ -237,9 +237,9 @@ class Betaflight(OnPort):
         )  # arming wants the throttle low
         throttle = LOW if waiting else round(low + share * (HIGH - low))
         self._sticks_us = (*(self.sticks.position(i, r) for i, r in enumerate(rates)), throttle)
-        return self._frame(now)
+        return self._frame(host_time)
 
-    def _frame(self, now: float) -> bool:
+    def _frame(self, host_time: float) -> bool:
         p = self.params
         if not self._order:  # a stick in another's place is worse than none
             return False
@@ -247,19 +247,19 @@ class Betaflight(OnPort):
         for i, value in enumerate(self._sticks_us):
             channels[self._order[i]] = value
         if p.arm_channel:
-            channels[STICKS + p.arm_channel - 1] = HIGH if self._arms(now) else LOW
+            channels[STICKS + p.arm_channel - 1] = HIGH if self._arms(host_time) else LOW
         channels[STICKS + p.release_channel - 1] = LOW if self._opened is None else HIGH
-        self._framed = now
+        self._framed = host_time
         return self._write(msp.SET_RAW_RC, struct.pack(f"<{len(channels)}H", *channels))
 
-    def _arms(self, now: float) -> bool:
+    def _arms(self, host_time: float) -> bool:
         """Return whether ARM is to be high: not before nothing has spoken against it for a while,
         and low again where something does.
         """
         if not self._taken or self._over:
             return False
         return self._box(BOX_ARM) or (
-            self._free_since is not None and now - self._free_since >= ARM_LOW
+            self._free_since is not None and host_time - self._free_since >= ARM_LOW
         )
 
     def stop_release(self) -> None:
@@ -274,52 +274,52 @@ class Betaflight(OnPort):
         super().rearm()
         self._opened = None
 
-    def service(self, now: float) -> None:
+    def service(self, host_time: float) -> None:
         for data in chunks(self._port):
             for frame in self.parser.parse(data):
                 if frame.direction == msp.ANSWER:
-                    self._hear(frame, now)
+                    self._hear(frame, host_time)
                 elif frame.direction == msp.REFUSAL:
                     self.refused += 1
         for command, period in POLLS.items():
-            if now - self._polled[command] >= period and (
+            if host_time - self._polled[command] >= period and (
                 command != msp.SERVO or self.release_record.read_back
             ):
-                self._polled[command] = now
+                self._polled[command] = host_time
                 self._write(command)
-        if not (self._boxes and self._order) and now - self._boxed >= 0.5:
-            self._boxed = now
+        if not (self._boxes and self._order) and host_time - self._boxed >= 0.5:
+            self._boxed = host_time
             self._write(msp.BOXIDS)
             self._write(msp.RX_MAP)
         if (
             self._boxes and self._heard > 0.0
         ):  # whether it is armed must be known: then nothing is written
-            self.audit.service(now)
-        if self.release_record.due(now) and self._opened is None:
-            self._opened = now
-            self._frame(now)
+            self.audit.service(host_time)
+        if self.release_record.due(host_time) and self._opened is None:
+            self._opened = host_time
+            self._frame(host_time)
         waits = self.release_record.state == PENDING and self._opened is not None
-        if waits and now - self._read_back >= READ_BACK:
-            self._read_back = now
+        if waits and host_time - self._read_back >= READ_BACK:
+            self._read_back = host_time
             if self.release_record.read_back:
                 self._write(msp.SERVO)
             self._write(msp.RC)
-        if self._opened is not None and now - self._opened > OPEN_TIME:
+        if self._opened is not None and host_time - self._opened > OPEN_TIME:
             self._opened = None
         if (
             self.params.arm_channel
             and not self._taken
             and not self._over
-            and now - self._framed >= KEEP_ALIVE
+            and host_time - self._framed >= KEEP_ALIVE
         ):
-            self._frame(now)
+            self._frame(host_time)
 
     @property
     def _expires(self) -> bool:
         """Whether the last sticks cease to count when nothing follows."""
         return self.audit.found.get("fc_version", 0.0) >= EXPIRES - 1e-6
 
-    def surrender(self, now: float) -> None:
+    def surrender(self, host_time: float) -> None:
         """Give the vehicle to the pilot: fall silent where the receiver's channels then count
         again; else hold level with the throttle that the pilot hovered with, until the switch.
 
@@ -328,25 +328,29 @@ class Betaflight(OnPort):
         if self.params.arm_channel or self._expires:
             return
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, self._pilots_us)
-        self._frame(now)
+        self._frame(host_time)
 
-    def finish(self, now: float) -> None:
+    def finish(self, host_time: float) -> None:
         """Disarm where the arming channel is ours."""
         self._over = True
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)
         if self.params.arm_channel:
-            self._frame(now)
+            self._frame(host_time)
 
     def _write(self, command: int, payload: bytes = b"") -> bool:
         return self._put(msp.pack(msp.Frame(command, payload)))
 
-    def _hear(self, frame: msp.Frame, now: float) -> None:
+    def _hear(self, frame: msp.Frame, host_time: float) -> None:
         p = self.params
         if frame.command == msp.STATUS:
-            self._heard = now
+            self._heard = host_time
             self._hear_status(frame)
             self._free_since = (
-                None if self._blocks else now if self._free_since is None else self._free_since
+                None
+                if self._blocks
+                else host_time
+                if self._free_since is None
+                else self._free_since
             )
         elif frame.command == msp.RC:
             self._hear_channels(frame.words())

@@ -135,16 +135,16 @@ class Crazyflie(OnPort):
             self._place = pose.pos, math.degrees(tilt_and_heading(pose.quat)[1])
             self.poses += self._put(crtp.external_pose(pose.pos, pose.quat))
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
         thrust, *rates = command
         if not (self._state & FACTS["armed"] and self._taken):
             thrust, rates = 0.0, [0.0, 0.0, 0.0]
         share = self.params.thrust.share(thrust)
-        rates[2] = self._moved_yaw(rates[2], now)
+        rates[2] = self._moved_yaw(rates[2], host_time)
         x, y, z = (math.degrees(rate) for rate in rates)
         return self._put(crtp.manual(round(FACTS["manual_thrust"] * share), (x, y, z)))
 
-    def _moved_yaw(self, rate: float, now: float) -> float:
+    def _moved_yaw(self, rate: float, host_time: float) -> float:
         """Return the yaw rate to send for one that is wanted [rad/s].
 
         A yaw rate moves the yaw that is held, and the error of that makes the vehicle turn: in a
@@ -152,20 +152,20 @@ class Crazyflie(OnPort):
         of the error within one period.
         """
         last, when = self._yaw
-        self._yaw = rate, now
+        self._yaw = rate, host_time
         error = (1.0 + FACTS["yaw_d"]) / FACTS["yaw_p"] * (rate - last)
-        return rate + error / max(now - when, SHORTEST)
+        return rate + error / max(host_time - when, SHORTEST)
 
-    def surrender(self, now: float) -> None:
+    def surrender(self, host_time: float) -> None:
         """Let it hold the place of its last pose by its own controller, and sink to the ground from
         there; without poses fall silent: its supervisor acts.
         """
         if self._place is None:
             return
         if self._returned is None:
-            self._returned = now, *self._place
+            self._returned = host_time, *self._place
         since, (x, y, z), yaw = self._returned
-        lower = DESCENT * max(now - since - HOLDS, 0.0)
+        lower = DESCENT * max(host_time - since - HOLDS, 0.0)
         self._put(crtp.position((x, y, max(z - lower, 0.0)), yaw))
 
     def rearm(self) -> None:
@@ -175,42 +175,42 @@ class Crazyflie(OnPort):
         super().rearm()
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
-    def service(self, now: float) -> None:
+    def service(self, host_time: float) -> None:
         for data in chunks(self._port, self._stranger):
             packet = crtp.unpack(data)
             if packet is None:
                 self.roster.drop(self._port.sender, "datagram", "no CRTP packet")
             else:
-                self._hear(packet, now)
-        if now - self._asked >= ASK:
-            self._asked = now
+                self._hear(packet, host_time)
+        if host_time - self._asked >= ASK:
+            self._asked = host_time
             self._put(crtp.ask_state())
             if not self._speaks:
                 self._put(crtp.ask_protocol())
         if self._speaks and not self._state & FACTS["flying"]:  # nothing is set in flight
-            self.audit.service(now)
+            self.audit.service(host_time)
         ready = self._taken and not self._over and self.audit.done and not self.audit.problems
         armed = self._raised or bool(self._state & FACTS["armed"])
-        if ready and not armed and now - self._armed_at >= ARM_PERIOD:
-            self._armed_at = now
+        if ready and not armed and host_time - self._armed_at >= ARM_PERIOD:
+            self._armed_at = host_time
             self._put(crtp.arm(True))
-        if self.release_record.due(now):
+        if self.release_record.due(host_time):
             self._put(crtp.set_parameter(self.params.release_parameter, 1))
 
-    def finish(self, now: float) -> None:
+    def finish(self, host_time: float) -> None:
         """Stop the motors."""
         self._over = True
         self._put(crtp.manual(0, (0.0, 0.0, 0.0)))
         self._put(crtp.arm(False))
 
-    def _hear(self, packet: crtp.Packet, now: float) -> None:
+    def _hear(self, packet: crtp.Packet, host_time: float) -> None:
         place, data = (packet.port, packet.channel), packet.data
         self._speaks = True
         state, version = FACTS["ask_state"] | FACTS["answer"], FACTS["ask_protocol"]
         if len(data) < 3:
             return
         if (*place, data[0]) == (FACTS["port_supervisor"], FACTS["channel_info"], state):
-            self._heard, self._state = now, int.from_bytes(data[1:], "little")
+            self._heard, self._state = host_time, int.from_bytes(data[1:], "little")
         elif (*place, data[0]) == (FACTS["port_platform"], FACTS["channel_version"], version):
             self.audit.feed("protocol", int.from_bytes(data[1:], "little"))
         elif place == (FACTS["port_param"], FACTS["channel_by_name"]):

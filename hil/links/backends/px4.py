@@ -77,17 +77,20 @@ class Px4(MavlinkAutopilot):
             ", or Hold (4.3) or Position (3.0) to take it" if self.params.take else ""
         )
 
-    def send(self, command: tuple[float, ...], now: float) -> bool:
-        if now - self._sent_at > STREAM_GAP:
-            self._stream_since = now
-        self._sent_at = now
-        return super().send(command, now)
+    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+        if host_time - self._sent_at > STREAM_GAP:
+            self._stream_since = host_time
+        self._sent_at = host_time
+        return super().send(command, host_time)
 
-    def ask(self, mode: str, now: float) -> None:
+    def ask(self, mode: str, host_time: float) -> None:
         """Ask for a mode; for OFFBOARD set-points are streamed first."""
-        streamed = now - self._stream_since >= STREAM_FIRST and now - self._sent_at <= STREAM_GAP
+        streamed = (
+            host_time - self._stream_since >= STREAM_FIRST
+            and host_time - self._sent_at <= STREAM_GAP
+        )
         if mode != FOLLOW or streamed:
-            super().ask(mode, now)
+            super().ask(mode, host_time)
 
     def _release_command(self) -> tuple[int, tuple[float, ...]]:
         p = self.params

@@ -25,10 +25,10 @@ def split_delay(p: Any, period: Any):
     """
     tiny = type(period)(1.0e-6)
     whole = wp.floor(p.queue.delay / period + tiny / period)
-    rest = p.queue.delay - whole * period
-    if rest < tiny:
-        rest = period - period
-    return int(whole), rest
+    remainder = p.queue.delay - whole * period
+    if remainder < tiny:
+        remainder = period - period
+    return int(whole), remainder
 
 
 @wp.func

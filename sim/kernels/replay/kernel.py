@@ -323,10 +323,10 @@ def build_replay(
         slack = bool(False)
         slack_first = time - real(1.0)
         slack_last = time - real(1.0)
-        at = Pointers()
-        at.due = time
+        pointers = Pointers()
+        pointers.due = time
         for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
-            marks[e] = at
+            marks[e] = pointers
         total = coupled.momentum(p, rope, s, u)
         before = s.rate_b
         pay = ball.pos
@@ -351,12 +351,12 @@ def build_replay(
             latched = m.latched != 0
             slack = m.slack != 0
             knot = m.knot
-            at = m.at
+            pointers = m.at
             for i in range(L):
                 n[i] = moment_dirs[resume, i]
                 u[i] = moment_vels[resume, i]
                 stiffness[i] = moment_stiffness[resume, i]
-            copy_samples(windows, w, at, lanes.parent[lane], lane, out)
+            copy_samples(windows, w, pointers, lanes.parent[lane], lane, out)
         while time < end - tiny:
             until = end
             while (
@@ -383,31 +383,38 @@ def build_replay(
             if knot < windows.knots[w]:
                 if knot_time <= time + tiny:
                     if lanes.keep[lane] >= 0:
-                        kept = lanes.keep[lane] + knot
+                        knot_index = lanes.keep[lane] + knot
                         knot_of(
-                            knots, kept, p, rope, s, pay, pay_vel, chain.pull(rope, stiffness, u)
+                            knots,
+                            knot_index,
+                            p,
+                            rope,
+                            s,
+                            pay,
+                            pay_vel,
+                            chain.pull(rope, stiffness, u),
                         )
-                        if kept < moments.shape[0]:
-                            now = Moment()
-                            now.time = time
-                            now.quad = s
-                            now.rope = rope
-                            now.ball = ball
-                            now.total = total
-                            now.before = before
-                            now.pay = pay
-                            now.pay_vel = pay_vel
-                            now.separation = separation
-                            now.mode = mode
-                            now.latched = int(latched)
-                            now.slack = int(slack)
-                            now.knot = knot
-                            now.at = at
-                            moments[kept] = now
+                        if knot_index < moments.shape[0]:
+                            moment = Moment()
+                            moment.time = time
+                            moment.quad = s
+                            moment.rope = rope
+                            moment.ball = ball
+                            moment.total = total
+                            moment.before = before
+                            moment.pay = pay
+                            moment.pay_vel = pay_vel
+                            moment.separation = separation
+                            moment.mode = mode
+                            moment.latched = int(latched)
+                            moment.slack = int(slack)
+                            moment.knot = knot
+                            moment.at = pointers
+                            moments[knot_index] = moment
                             for i in range(L):
-                                moment_dirs[kept, i] = n[i]
-                                moment_vels[kept, i] = u[i]
-                                moment_stiffness[kept, i] = stiffness[i]
+                                moment_dirs[knot_index, i] = n[i]
+                                moment_vels[knot_index, i] = u[i]
+                                moment_stiffness[knot_index, i] = stiffness[i]
                     knot = knot + 1
                     knot_time = knot_time + knot_spacing
                 until = wp.min(until, wp.max(knot_time, time + tiny))
@@ -417,12 +424,12 @@ def build_replay(
             peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
             for j in range(count):
                 t0 = time + real(float(j)) * h
-                away = wp.abs(t0 + real(0.5) * h - peak) / knot_spacing
+                distance = wp.abs(t0 + real(0.5) * h - peak) / knot_spacing
                 hanging = int(0)
                 if mode == attached_code:
                     hanging = 1
                     rope = chain.stretched(natural, rope, stiffness, u, h)
-                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - away)
+                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
                 pushed = extra.on(p, rope, pushed, s, n, u, stiffness, active, hanging)
                 old = s
                 old_pay = pay
@@ -475,9 +482,9 @@ def build_replay(
                 k.h = h
                 last = j == count - 1 and until >= end - tiny
                 if (
-                    last or at.due <= k.t1
+                    last or pointers.due <= k.t1
                 ):  # most steps show nothing, and to ask costs as much as a tenth of a step
-                    at = sample(
+                    pointers = sample(
                         p,
                         x,
                         data,
@@ -492,7 +499,7 @@ def build_replay(
                         pay_vel,
                         k,
                         last,
-                        at,
+                        pointers,
                         out,
                         lane,
                     )

@@ -73,7 +73,7 @@ class Recording:
                     self.data,
                 ),
             )
-            self._there[kernel, device] = tuple(_struct(t, *given, device) for given in structs)
+            self._there[kernel, device] = tuple(_struct(t, *group, device) for group in structs)
         return self._there[kernel, device]
 
 
@@ -83,7 +83,7 @@ PIECES = 4  # of the lanes for each core of a CPU
 
 # lanes a core up to which a CPU has flown them all before a GPU has flown one: there each takes
 # some 50 times as long
-FEW = 32
+SMALL_BATCH = 32
 
 
 class Replay:
@@ -153,7 +153,7 @@ class Replay:
         """
         k, t = self.kernel, self.types
         count = len(lanes["window"])
-        device = self.device if count > FEW * cores() else "cpu"
+        device = self.device if count > SMALL_BATCH * cores() else "cpu"
         if (
             device != "cpu"
         ):  # lanes that wait for others would double the time, which is that of the slowest
@@ -172,9 +172,9 @@ class Replay:
         keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
         if keeps:
             ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
-            held = st.allocate(t, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
+            knot_states = st.allocate(t, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
         else:
-            ends, held = k.State(), k.Knots()
+            ends, knot_states = k.State(), k.Knots()
         out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
         moments, vec3 = knots if np.any(resumed) else 0, t.vec3
@@ -191,18 +191,18 @@ class Replay:
         ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, GRAVITY]
-        told = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
+        inputs = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
         (begin, flown), (windows, data) = (
-            (_struct(t, *given, device) for given in told),
+            (_struct(t, *group, device) for group in inputs),
             recording.on(k, t, device),
         )
         before = [*self._plants[device], *numerics, begin, windows, flown, data, order]
-        after, first = [ends, held, marks, *left_at, out], 0
+        after, first = [ends, knot_states, marks, *left_at, out], 0
         for rows in launches:
             self._launch(device, first, costs[rows], before, after)
             first += len(rows)
         read = (
-            (self._read(ends, rk.STATE_FIELDS), self._read(held, rk.KNOT_FIELDS))
+            (self._read(ends, rk.STATE_FIELDS), self._read(knot_states, rk.KNOT_FIELDS))
             if keeps
             else ({}, {})
         )
@@ -280,8 +280,8 @@ def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
     least one lane.
     """
     total = np.cumsum(costs)
-    inside = np.searchsorted(total, total[-1] / pieces * np.arange(1, pieces)) + 1
-    return np.unique([0, *inside.tolist(), len(costs)]).tolist()
+    cuts = np.searchsorted(total, total[-1] / pieces * np.arange(1, pieces)) + 1
+    return np.unique([0, *cuts.tolist(), len(costs)]).tolist()
 
 
 def _in_order(shared: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -54,8 +54,8 @@ def build_sensing(t: Types, Sensing: type):
     def pose(x: Sensing, com: vec3, pos_w: vec3, quat_wb: quat, reference: quat):
         frame = rotation_of_vector(quat_wb, x.frame_tilt)
         point = pos_w + wp.quat_rotate(quat_wb, x.marker_offset - com)
-        seen = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
-        turn = wp.quat_inverse(reference) * seen
+        quat_seen = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
+        turn = wp.quat_inverse(reference) * quat_seen
         return (real(1.0) + x.scale) * wp.quat_rotate(frame, point), vector_of_rotation(pos_w, turn)
 
     @wp.func
@@ -133,23 +133,23 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         vb: vec3,
         k: Steps,
         last: bool,
-        at: Pointers,
+        pointers: Pointers,
         out: wp.array2d(dtype=vec3),
         lane: int,
     ):
         """Write every measured stamp that falls into a step; the window's last step samples all
         that is left.
         """
-        next = at
-        next.due = windows.end[w]
+        pointers_after = pointers
+        pointers_after.due = windows.end[w]
         vehicles = windows.vehicle_count[w]
         payloads = windows.payload_count[w]
         span = k.h
-        while next.vehicle < vehicles:
-            i = windows.vehicle_first[w] + next.vehicle
+        while pointers_after.vehicle < vehicles:
+            i = windows.vehicle_first[w] + pointers_after.vehicle
             time = late(x, windows, w, data.vehicle_time[i], x.vehicle_delay)
             if time > k.t1 and not last:
-                next.due = wp.min(next.due, time)
+                pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
             pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
@@ -161,54 +161,63 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 s,
                 span,
             )
-            seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
-            out[2 * next.vehicle, lane] = seen
-            out[2 * next.vehicle + 1, lane] = turn
-            next.vehicle = next.vehicle + 1
-        while next.payload < payloads:
+            quat_seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
+            out[2 * pointers_after.vehicle, lane] = quat_seen
+            out[2 * pointers_after.vehicle + 1, lane] = turn
+            pointers_after.vehicle = pointers_after.vehicle + 1
+        while pointers_after.payload < payloads:
             time = late(
                 x,
                 windows,
                 w,
-                data.payload_time[windows.payload_first[w] + next.payload],
+                data.payload_time[windows.payload_first[w] + pointers_after.payload],
                 x.payload_delay,
             )
             if time > k.t1 and not last:
-                next.due = wp.min(next.due, time)
+                pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
-            out[2 * vehicles + next.payload, lane] = see_point(
+            out[2 * vehicles + pointers_after.payload, lane] = see_point(
                 x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span)
             )
-            next.payload = next.payload + 1
-        while next.gyro < windows.gyro_count[w]:
+            pointers_after.payload = pointers_after.payload + 1
+        while pointers_after.gyro < windows.gyro_count[w]:
             time = late(
-                x, windows, w, data.gyro_time[windows.gyro_first[w] + next.gyro], x.gyro_delay
+                x,
+                windows,
+                w,
+                data.gyro_time[windows.gyro_first[w] + pointers_after.gyro],
+                x.gyro_delay,
             )
             if time > k.t1 and not last:
-                next.due = wp.min(next.due, time)
+                pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
             bend = (
                 b.rate_b - a.rate_b - (a.rate_b - before)
             )  # a parabola through three ends of steps
             turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
-            out[2 * vehicles + payloads + next.gyro, lane] = see_rate(x, turning)
-            next.gyro = next.gyro + 1
-        return next
+            out[2 * vehicles + payloads + pointers_after.gyro, lane] = see_rate(x, turning)
+            pointers_after.gyro = pointers_after.gyro + 1
+        return pointers_after
 
     @wp.func
     def copy_samples(
-        windows: Windows, w: int, at: Pointers, parent: int, lane: int, out: wp.array2d(dtype=vec3)
+        windows: Windows,
+        w: int,
+        pointers: Pointers,
+        parent: int,
+        lane: int,
+        out: wp.array2d(dtype=vec3),
     ):
         """Copy the samples before a lane departs from another."""
         vehicles = windows.vehicle_count[w]
-        for i in range(2 * at.vehicle):
+        for i in range(2 * pointers.vehicle):
             out[i, lane] = out[i, parent]
-        for i in range(2 * vehicles, 2 * vehicles + at.payload):
+        for i in range(2 * vehicles, 2 * vehicles + pointers.payload):
             out[i, lane] = out[i, parent]
         first = 2 * vehicles + windows.payload_count[w]
-        for i in range(first, first + at.gyro):
+        for i in range(first, first + pointers.gyro):
             out[i, lane] = out[i, parent]
 
     return Sampling(sample, copy_samples, Steps, Pointers)

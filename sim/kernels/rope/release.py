@@ -54,13 +54,13 @@ def clearance(
     """Least distance [m] of the flight to a point, at ``samples`` equal fractions of ``time`` from
     0 to 1.
     """
-    least = wp.length(pos_w - vehicle_w)
+    nearest = wp.length(pos_w - vehicle_w)
     for k in range(1, samples):
         s = time * type(time)(float(k)) / type(time)(float(samples - 1))
-        least = wp.min(
-            least, wp.length(projectile(rope, air, pos_w, vel_w, gravity, s) - vehicle_w)
+        nearest = wp.min(
+            nearest, wp.length(projectile(rope, air, pos_w, vel_w, gravity, s) - vehicle_w)
         )
-    return least
+    return nearest
 
 
 def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
@@ -190,13 +190,13 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         vehicle_w: vec3,
         samples: int,
     ):
-        least = wp.length(pos_w - vehicle_w)
+        nearest = wp.length(pos_w - vehicle_w)
         pos = pos_w
         vel = vel_w
         h = time / real(float(samples - 1))
         for _ in range(samples - 1):
             pos, vel = fly(rope, air, pos, vel, gravity, h)
-            least = wp.min(least, wp.length(pos - vehicle_w))
-        return least
+            nearest = wp.min(nearest, wp.length(pos - vehicle_w))
+        return nearest
 
     return SimpleNamespace(time_to_height=drag_time, after=after, clearance=drag_clearance)

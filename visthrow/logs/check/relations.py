@@ -87,10 +87,10 @@ def relate(
         return None
     grid = start + period * np.arange(count)
     steps = int(reach / period)
-    found, follows = _related(time_a, a, time_b, b, grid, period, steps)
-    if found is not None and not np.all(follows):
-        found, _ = _related(time_a, a, time_b, b, grid[follows], period, steps)
-    return found
+    relation, follows = _related(time_a, a, time_b, b, grid, period, steps)
+    if relation is not None and not np.all(follows):
+        relation, _ = _related(time_a, a, time_b, b, grid[follows], period, steps)
+    return relation
 
 
 def _related(

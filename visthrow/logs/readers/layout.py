@@ -214,10 +214,12 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
         (r for r in reversed(named) if not all(unit_of(c) is not None for c in r if c)), named[-1]
     )
     for i, part in enumerate(parts):
-        own = final[i]
-        name = own if _FRAME.fullmatch(own) or i == 0 else ".".join(part)
+        unit_line = final[i]
+        name = unit_line if _FRAME.fullmatch(unit_line) or i == 0 else ".".join(part)
         names.append(
-            _joined(name.replace(":", ".") if len(named) > 1 else name, own, units[i], settings)
+            _joined(
+                name.replace(":", ".") if len(named) > 1 else name, unit_line, units[i], settings
+            )
         )
     return _prefixed(names) if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings else names
 

@@ -159,8 +159,10 @@ class MPC:
             - np.einsum("kij,kj->ki", by_state, self._states[:n])
             - np.einsum("kij,kj->ki", by_input, self._inputs)
         )
-        wanted = np.concatenate([np.concatenate([target[:n], effort], axis=1).ravel(), target[n]])
-        solution = self._solve(-self._weights * wanted, np.concatenate([state, free.ravel()]))
+        setpoints = np.concatenate(
+            [np.concatenate([target[:n], effort], axis=1).ravel(), target[n]]
+        )
+        solution = self._solve(-self._weights * setpoints, np.concatenate([state, free.ravel()]))
         stages = solution[: n * WIDTH].reshape(n, WIDTH)
         states = np.concatenate([stages[:, :STATES], solution[None, n * WIDTH :]])
         inputs = stages[:, STATES:]

@@ -179,7 +179,7 @@ def flown(
     """Results of sets of units, the batches of each joined; those that the folder holds are not
     flown again.
     """
-    found = work(
+    solutions = work(
         [u for part in sets for u in part],
         folder,
         fly_unit,
@@ -187,4 +187,4 @@ def flown(
         compute_device.cores(),
         lambda text: say(f"TO+MPC: {text}"),
     )
-    return [join(found[key_of(u)] for u in part)[0] for part in sets]
+    return [join(solutions[key_of(u)] for u in part)[0] for part in sets]

@@ -44,10 +44,10 @@ def section(thrown: ResultSet) -> Section:
     table = None
     moving = _moving(thrown, missing)
     for variant in VARIANTS[1:]:
-        found = thrown.matching(kind="policy", variant=variant)
-        if not found:
+        results = thrown.matching(kind="policy", variant=variant)
+        if not results:
             missing.append(TITLES[variant])
-        rows += _rows(found)
+        rows += _rows(results)
     rows += _rows(
         [r for r in thrown.matching(kind="policy") if r.unit["policy"] in SHIPPED and _is_beyond(r)]
     )
@@ -80,10 +80,10 @@ def _is_beyond(result: Result) -> bool:
     )
 
 
-def _rows(found: list[Result]) -> list[tuple[str, ...]]:
+def _rows(results: list[Result]) -> list[tuple[str, ...]]:
     rows = []
     for r in sorted(
-        found,
+        results,
         key=lambda r: json.dumps([r.unit[k] for k in ("policy", "plant", "departures", "target")]),
     ):
         unit = r.unit
@@ -175,7 +175,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
                 )
                 for speed, r in points
             ]
-    made: list = []
+    content: list = []
     if lines:
         panel = figures.Panel(
             "targets that move, from 2.0 m ahead in any direction",
@@ -186,11 +186,11 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
             "Landing error against where the target is at impact, in the training simulator; bands"
             " are 95 % intervals."
         )
-        made.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
+        content.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
     if rows:
         head = ("policy", "plant", "speed [m/s]", "throws", "landed", "landing error [m]")
-        made.append(Grid("Moving targets", head, tuple(rows)))
-    return made
+        content.append(Grid("Moving targets", head, tuple(rows)))
+    return content
 
 
 def _bars(thrown: ResultSet) -> list[str]:

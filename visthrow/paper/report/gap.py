@@ -108,7 +108,7 @@ def section(thrown: ResultSet) -> Section:
         if not lines:
             missing.append(sweep.title)
         panels.append(figures.Panel(sweep.title, sweep.xlabel, tuple(lines), "not thrown yet"))
-    made = [
+    content = [
         Text(
             "The shipped policies are flown in the training simulator at 2.0 m with one value"
             " changed and everything else as it is flown. Nothing is retrained. `vision` saw late,"
@@ -128,9 +128,9 @@ def section(thrown: ResultSet) -> Section:
             "added to its own [m]",
         )
         curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
-        made += [curves, Grid("The curves in figures", head, tuple(rows))]
+        content += [curves, Grid("The curves in figures", head, tuple(rows))]
     return parts.section(
-        "gap", "What vision costs, and why", *made, *_trained(thrown, missing), missing=missing
+        "gap", "What vision costs, and why", *content, *_trained(thrown, missing), missing=missing
     )
 
 
@@ -199,19 +199,21 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
                 {} if plant == "hybrid" else ANY
             )  # a reference plant is what it is, whatever the training had
             if variant == "full":
-                found = full
+                results = full
             else:
-                found = thrown.seeds("vision", variant, plant, TARGET, nominal)
-            if not found:
+                results = thrown.seeds("vision", variant, plant, TARGET, nominal)
+            if not results:
                 missing.append(f"trained with {title} ({SHORT[plant]})")
                 continue
-            error = st.mean(errors(found))
+            error = st.mean(errors(results))
             marks.append(figures.Mark(title, error, series))
             if variant == "full" or not full:
                 ratio = "-"
             else:
-                ratio = st.ratio(errors(found), errors(full)).text(2)
-            rows.append((title, SHORT[plant], str(len(found)), landed(*found), error.text(), ratio))
+                ratio = st.ratio(errors(results), errors(full)).text(2)
+            rows.append(
+                (title, SHORT[plant], str(len(results)), landed(*results), error.text(), ratio)
+            )
     if not rows:
         return []
     order = list(TRAINED.values())

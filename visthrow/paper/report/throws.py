@@ -95,10 +95,10 @@ def _scatter(thrown: ResultSet) -> Picture | None:
     for plant in ("reference-realistic", "hybrid"):
         panels = []
         for target in TARGETS:
-            found = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
+            sets = [(name, thrown.shipped(name, plant, target)) for name in SHIPPED]
             series = [
                 (f"{name} policy", result.miss)
-                for name, result in found
+                for name, result in sets
                 if result is not None and result.good.any()
             ]
             if series:

@@ -182,7 +182,7 @@ def _bar(thrown: ResultSet) -> str:
 
 
 def front_section(
-    thrown: ResultSet, shown: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
+    thrown: ResultSet, rows_of_panels: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
 ) -> Section:
     """Return the sweep on each plant, as in :data:`PANELS`, with the policies of these names on it,
     and who beats whom.
@@ -193,7 +193,7 @@ def front_section(
     missing = []
     picture = None
     table = None
-    for heading, plant, kinds, policies_on in shown:
+    for heading, plant, kinds, policies_on in rows_of_panels:
         title = SHORT[plant]
         policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
         policies = [
@@ -306,13 +306,13 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
     if not sets:
         return None
     rng = np.random.default_rng(0)
-    drawn = np.stack(
+    resampled = np.stack(
         [
             np.stack([s[rng.integers(len(s), size=len(s))].mean(0) for s in sets])
             for _ in range(DRAWS)
         ]
     )
-    samples = np.array([front.hypervolume(points) for points in drawn])
+    samples = np.array([front.hypervolume(points) for points in resampled])
     low, high = np.quantile(samples, (0.025, 0.975))
     return st.Interval(
         front.hypervolume(np.stack([s.mean(0) for s in sets])), float(low), float(high), "throws"
