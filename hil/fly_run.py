@@ -23,6 +23,7 @@ from hil.links.crtp import CFLIB
 from hil.links.device import check_device
 from hil.links.mavlink_link import Link
 from hil.links.pymav import read_key
+from hil.links.team_link import TeamLink
 from hil.operator_terminal import Console, Terminal
 from hil.params import HilParams
 from hil.poses.sources.images import open_images
@@ -46,6 +47,7 @@ def require_fake(params: HilParams) -> None:
     loopback address, or no MAVLink poses.
     """
     devices = [params.link.device, params.source.device or params.link.device]
+    devices += [f"udp:{member}" for member in (params.team.members if params.team else ())]
     if params.backend in ("betaflight", "crazyflie"):
         devices.append(getattr(params, params.backend).device)
     remote = [device for device in devices if not _is_loopback(device)]
@@ -87,7 +89,7 @@ def fly(args: argparse.Namespace) -> int:
         "autopilot": autopilot_record(backend, link),
         "links": [roster.summary() for roster in rosters],
     }
-    for part in (loop.eyes, loop.solver, backend, source):
+    for part in (loop.eyes, loop.solver, loop.team, backend, source):
         if part is not None:
             part.close()
     loop.recorder.close(summary)
@@ -145,7 +147,19 @@ def _prepare(
     operator: Operator = Terminal(flies and args.auto_arm, simulated, console.say)
     if args.action == "calibrate":
         operator = LandAfterCalibration(operator, runner.calibrating)
-    return Loop(runner, source, clock, operator, recorder, console.decision, Stages(), eyes), link
+    loop = Loop(
+        *(runner, source, clock, operator, recorder, console.decision, Stages(), eyes),
+        team=_team(params, runner.pilot.period, clock, args.speed),
+    )
+    return loop, link
+
+
+def _team(params: HilParams, period: float, clock: Clock, speed: float) -> TeamLink | None:
+    """Return the link to the rest of a team, on the machines' clock; None for one vehicle."""
+    if params.team is None:
+        return None
+    offset = time.time() * speed - clock.now()
+    return TeamLink(params.team, period, offset, params.link.remote)
 
 
 def _exit_status(summary: dict[str, Any], folder: Path) -> int:

@@ -18,6 +18,7 @@ from hil.links.backends.betaflight import BetaflightParams
 from hil.links.backends.crazyflie import CrazyflieParams
 from hil.links.backends.px4 import Px4Params
 from hil.links.roster import MavlinkId, check_allowed
+from hil.links.team_link import TeamLinkParams
 from hil.poses.body_track import MOST_PREDICTION
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
@@ -142,6 +143,7 @@ class HilParams(Bounded):
     aim: AimParams | None = None  # which releases are held back; None: none
     # of a camera, in the hover before the first throw; None: none
     calibration: CalibrationParams | None = None
+    team: TeamLinkParams | None = None  # that throws together; None: one vehicle
 
     def __post_init__(self) -> None:
         super().__post_init__()

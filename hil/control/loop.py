@@ -16,6 +16,7 @@ from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State, TickRecord
 from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
+from hil.links.team_link import TeamLink
 from hil.poses.sources.images import Eyes
 from hil.poses.sources.pose_source import Source
 
@@ -71,6 +72,7 @@ class Loop:
     stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
     eyes: Eyes | None = None  # a camera, where keypoints are a detector's
     solver: CalibrationSolver | None = None  # of its calibration
+    team: TeamLink | None = None  # to the runners of vehicles that throw with it
     ours: int = 0  # ticks that were missed because one of ours took too long
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
@@ -82,7 +84,8 @@ class Loop:
     )  # reasons to wait, without their numbers, and when they were said [s]
 
     def __post_init__(self) -> None:
-        self.ticker = Ticker(self.clock, self.runner.pilot.period)
+        grid = None if self.team is None else self.team.offset
+        self.ticker = Ticker(self.clock, self.runner.pilot.period, grid)
 
     def fly(self, limit: float = math.inf) -> dict[str, Any]:
         """Run until the state machine is done, the recorded poses have ended, or for ``most``
@@ -144,7 +147,11 @@ class Loop:
             runner.estimator.take_detections(self.eyes.poll(time))
         if self.solver is not None and (result := self.solver.poll()) is not None:
             runner.commander.calibration = result
+        if self.team is not None:
+            runner.parts.agreed = self.team.agreed(time)
         decision = runner.tick(time, late, status, words, recording)
+        if self.team is not None:
+            self.team.say(decision.ready)
         if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
             self.solver.submit(hovered)
         times = {

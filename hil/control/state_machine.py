@@ -11,6 +11,7 @@ command of the operator."""
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hil.links.team_link import NOTHING, THROW
 from hil.poses.gate import ABORT, HOLD
 from visthrow.config.bounds import Bounded, Positive
 
@@ -69,6 +70,8 @@ class Inputs:
     released: bool = False  # the latch has tripped in this throw
     lost: bool = False  # the payload has come off by itself
     astray: bool = False  # releases were refused, and no better one came in time
+    agreed: int | None = None  # what the team agreed on for this tick; None without a team
+    alone: bool = False  # the team has agreed on nothing for a while
     grounded: bool = False  # the vehicle has landed
     failure: str | None = None  # of policy, guard, release or of the runner itself
     arm: bool = False  # the operator's commands
@@ -109,6 +112,7 @@ class Machine:
         flown: whether this run has ever commanded the vehicle.
         aborted: whether an abort ended the run.
         handed_back: whether the vehicle went back to the autopilot's own hold, or to the pilot.
+        ready_to_throw: whether nothing but the team's word is missing.
         left_fence: how the vehicle left its fence after a throw, which ends the run by a landing
             without an abort.
     """
@@ -133,6 +137,7 @@ class Machine:
         self.flown = self.aborted = False
         self.left_fence: str | None = None
         self.handed_back = False
+        self.ready_to_throw = False
         self._lasting_since: float | None = None  # of the condition that must last [s]
 
     def step(self, time: float, inputs: Inputs) -> State:
@@ -176,7 +181,7 @@ class Machine:
         if self.state is State.THROW and state is not State.THROW and reason != "separated":
             self.cancelled += 1
         self.state, self.reason, self.since = state, reason, time
-        self._lasting_since = None
+        self._lasting_since, self.ready_to_throw = None, False
         self.throws += state is State.THROW
         self.flown |= state in FLYING
         self.aborted |= state is State.ABORT
@@ -201,6 +206,8 @@ class Machine:
                 texts.append(f"the autopilot does not follow yet{note}")
         if self.state in (State.ARMED, State.RECOVER) and not inputs.calm:
             texts.append("not calm yet")
+        if self.ready_to_throw and inputs.agreed == NOTHING:
+            texts.append("the team's word")
         if self.state is State.READY and not texts and not inputs.arm:
             texts.append("the operator's word: arm")
         return "; ".join(texts)
@@ -248,12 +255,14 @@ class Machine:
     def _armed(self, time: float, inputs: Inputs) -> None:
         if inputs.land:
             self._go_land(time, inputs)
-        elif inputs.poses_are_stale() or not (inputs.recording and inputs.following):
+            return
+        if inputs.poses_are_stale() or not (inputs.recording and inputs.following):
             reason = "disarmed: stale poses, not followed, or the recording failed"
             self._go(time, State.READY, reason)
-        elif self._lasted(time, inputs.calm and not inputs.failed_checks, self.params.quiet) and (
-            time - self.since >= self.params.armed_least
-        ):
+            return
+        calm = self._lasted(time, inputs.calm and not inputs.failed_checks, self.params.quiet)
+        self.ready_to_throw = calm and time - self.since >= self.params.armed_least
+        if inputs.agreed == THROW or (self.ready_to_throw and inputs.agreed is None):
             self._go(time, State.THROW, "calm")
         elif self._late(time):
             reason = self.waits(inputs) or "the swing did not calm down"
@@ -270,6 +279,8 @@ class Machine:
             self._go(time, State.RECOVER, "the payload has come off by itself")
         elif inputs.astray:
             self._go(time, State.RECOVER, "the policy released where it would miss")
+        elif inputs.alone:
+            self._go(time, State.RECOVER, "the team does not throw")
         elif self._late(time):
             self._go(time, State.RECOVER, "the policy did not release in time")
 
@@ -326,6 +337,8 @@ class TickRecord:
     release: bool = False  # the policy's release was executed
     note: str = ""
     waits: str = ""  # what the state waits for
+    ready: int = 0  # for what, as the team is told; see `hil.links.team_link`
+    agreed: int | None = None  # by the team for this tick; None without a team
     # in a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     detection: list | None = None
     rivals: list[str] | None = None  # bodies or autopilots that two senders speak for

@@ -1,5 +1,6 @@
 """Time: the monotonic clock, ticks on it, and the offset of a peer's clock."""
 
+import math
 import select
 import time
 from collections import deque
@@ -68,6 +69,7 @@ class Ticker:
     it missed.
 
     Attributes:
+        grid: offset of a clock at whose multiples of the period the ticks are [s]; None: at any.
         index: number of the current tick, missed ones counted. missed: ticks that were skipped.
         late: how late the current tick is, after those it skipped [s]. worst: the longest wait of
             any tick [s].
@@ -75,6 +77,7 @@ class Ticker:
 
     clock: Clock
     period: float
+    grid: float | None = None
     index: int = -1
     missed: int = 0
     late: float = 0.0
@@ -85,6 +88,9 @@ class Ticker:
         """Return the time of the next tick [s]."""
         if self._start is None:
             self._start = self.clock.now()
+            if self.grid is not None:
+                ticks = math.ceil((self._start + self.grid) / self.period)
+                self._start = ticks * self.period - self.grid
         return self._start + (self.index + 1) * self.period
 
     def take(self) -> float:

@@ -69,6 +69,7 @@ class Playback:
             calibration = Calibration.of(calibration)
         runner.commander.calibration = calibration
         runner.decider.rivals = line.get("rivals") or []
+        runner.parts.agreed = line.get("agreed")
         decision = runner.tick(
             time, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
         )

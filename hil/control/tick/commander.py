@@ -12,6 +12,7 @@ from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
 from hil.links.backends.base import FOLLOW, LAND, Status
 from hil.links.backends.base import HOLD as HOLDING
+from hil.links.team_link import NOTHING, RELEASE, THROW
 from hil.poses.body_track import BodyState
 from hil.poses.gate import ABORT, HOLD
 from visthrow.onboard.calibration import Calibration
@@ -73,6 +74,7 @@ class Commander:
         is a reading of `perf_counter`.
         """
         parts, state = self.parts, record.state
+        record.ready = THROW if parts.machine.ready_to_throw else NOTHING
         command = self._wanted_command(estimate, record)
         if parts.calibrating is not None:
             command = self._add_sway(estimate, status, command, record)
@@ -147,12 +149,16 @@ class Commander:
         """Return the policy's command, and note whether its release is executed."""
         parts = self.parts
         output = self._run_policy(estimate, record)
+        record.ready = THROW if parts.latch.at is None else RELEASE
         if output.release[0] and parts.latch.at is None:
             problem = self._release_problem(estimate)
-            record.release = problem is None
-            if problem is not None:
+            if problem is None:
+                record.ready, record.release = RELEASE, parts.agreed is None
+            else:
                 record.note = f"release refused: {problem}"
                 parts.pilot.not_released()
+        if parts.agreed == RELEASE and parts.latch.at is None:
+            record.release = True
         return tuple(map(float, output.command[0]))
 
     def _release_problem(self, estimate: Estimate) -> str | None:

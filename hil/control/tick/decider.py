@@ -8,10 +8,12 @@ from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
 from hil.links.backends.base import FAILED, FOLLOW, PENDING, Status
 from hil.links.backends.base import HOLD as HOLDING
+from hil.links.team_link import NOTHING
 from hil.poses.gate import HOLD
 from hil.poses.pose import GOAL
 from visthrow.onboard.hover import GRAVITY
 
+PATIENCE = 10  # ticks of a throw in which the team agrees on nothing, as after a lost message
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
 # reports that the autopilot's hover thrust is averaged over, and kept; share of the weight below
 # which it stands on the ground
@@ -32,6 +34,7 @@ class Decider:
         self.parts = parts
         self.inputs: Inputs | None = None
         self.rivals: list[str] = []
+        self._alone = 0  # ticks in which the team agreed on nothing
         self._shares: deque[float] = deque(maxlen=MOST_REPORTS)  # autopilot's thrust over weight
 
     def decide(
@@ -43,6 +46,7 @@ class Decider:
         state = machine.step(estimate.time, inputs)
         waits = machine.waits(inputs)
         record = TickRecord(estimate.time, state.value, machine.reason, waits=waits)
+        record.agreed = self.parts.agreed
         if inputs.streams:
             record.rivals = self.rivals or None
         return record
@@ -53,6 +57,7 @@ class Decider:
         parts, time = self.parts, estimate.time
         state, latch, vehicle = parts.machine.state, parts.latch, estimate.vehicle
         failure, fence, calm = status.fault, None, False
+        self._alone = self._alone + 1 if parts.agreed == NOTHING else 0
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
             failure = "the release was refused or not answered"
         checks = self._failed_checks(estimate, status)
@@ -75,6 +80,8 @@ class Decider:
             released=latch.at is not None,
             lost=latch.at is None and not parts.carries_payload(estimate),
             astray=parts.aim.given_up(time),
+            agreed=parts.agreed,
+            alone=self._alone > PATIENCE,
             grounded=vehicle is not None and vehicle.pos[2] < GROUND,
             failure=failure,
             arm=words.arm,

@@ -44,6 +44,7 @@ class FlightParts:
     hang: float  # of the payload's centre below the vehicle's at rest [m]
     thrust_tolerance: float  # of the hover, relative to the weight
     trained_age: float  # of the poses in training [s]
+    agreed: int | None = None  # by the team for this tick; None without a team
     spent: dict[str, float] = field(default_factory=dict)  # by the stages of the last tick [s]
 
     def carries_payload(self, estimate: Estimate) -> bool:

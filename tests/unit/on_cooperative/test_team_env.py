@@ -94,6 +94,19 @@ def test_a_camera_locates_goal_and_load_by_their_keypoints():
     torch.testing.assert_close(direction, straight, atol=0.02, rtol=0.0)
 
 
+def test_a_located_goal_is_the_mean_of_what_was_seen():
+    torch.manual_seed(1)
+    env = TeamEnv(experiment("pair_located"), seed=1, count=64)
+    columns, off = env.layout.columns("located")[:2], []
+    actions = hover(env, -torch.ones(64))
+    for _ in range(10):
+        places = env.get_observations()["actor"][:, columns]
+        goal = (env.views.goal_w - env.views.state["pos_w"])[:, :2]
+        off.append((places - goal).norm(dim=-1).median())
+        env.step(actions)
+    assert off[-1] < 0.7 * off[0]
+
+
 def test_one_policy_of_both_sees_with_both_and_releases_at_once():
     env = TeamEnv(experiment("pair_central"), seed=3, count=8)
     observed = env.get_observations()["actor"]

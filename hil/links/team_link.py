@@ -1,0 +1,126 @@
+"""A throw that every vehicle of a team agrees on, by datagrams between their runners.
+
+All runners have one clock and tick at its multiples. In each tick a runner says what it is ready
+for: nothing, a throw, or the release. The least that all were ready for ``delay`` ticks ago is
+agreed on, so that all do it in one tick. A word that comes later, or never, stands for nothing. A
+latch that has tripped cannot be taken back: its runner goes on saying so, and a member that has
+missed one word follows in the next tick."""
+
+import struct
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from hil.errors import ConfigError
+from hil.links.device import MOST_SHUT_OUT, check_device, open_port
+from visthrow.config.bounds import Bound, Bounded
+
+NOTHING, THROW, RELEASE = range(3)
+"""What a vehicle is ready for."""
+
+MESSAGE = struct.Struct("<4sBq")
+"""Mark, what the sender is ready for, number of the tick."""
+MARK = b"VTC2"
+WINDOW = 25  # ticks that a word may be off: of a runner with another clock, none is taken
+ROUNDING = 1e-3  # of a tick's time [ticks]
+
+
+@dataclass(frozen=True)
+class TeamLinkParams(Bounded):
+    """A team whose runners agree on each throw."""
+
+    member: Annotated[int, Bound(0)]  # place of this vehicle in ``members``
+    members: tuple[str, ...]  # ADDRESS:PORT of each vehicle's runner, this one's too
+    delay: Annotated[int, Bound(1)] = 1  # age of the words that count [ticks]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        count = len(self.members)
+        if not (self.member < count == len(set(self.members)) > 1):
+            raise ConfigError(
+                f"team: member {self.member} of {', '.join(self.members) or 'nobody'}; expected two"
+                " different addresses or more, and the place of one, from 0"
+            )
+
+
+@dataclass
+class Agreement:
+    """Words of the members of a team, tick by tick."""
+
+    member: int  # this one
+    team: int
+    delay: int = 1  # [ticks]
+    _now: int = 0
+    _words: dict[int, dict[int, int]] = field(default_factory=dict)  # by tick and member
+
+    def begin(self, tick: int) -> None:
+        """Begin a tick; forget what no longer counts."""
+        self._now = tick
+        self._words = {k: v for k, v in self._words.items() if k >= tick - self.delay}
+
+    def say(self, ready: int) -> bytes:
+        """Note what this vehicle is ready for in this tick; return the message for the others."""
+        self._note(self._now, self.member, ready)
+        return MESSAGE.pack(MARK, ready, self._now)
+
+    def receive(self, datagram: bytes, member: int) -> bool:
+        """Note another's word and return whether it is one; the first on a tick counts."""
+        if len(datagram) != MESSAGE.size:
+            return False
+        mark, ready, tick = MESSAGE.unpack(datagram)
+        if mark != MARK or ready > RELEASE or abs(tick - self._now) > WINDOW:
+            return False
+        self._note(tick, member, ready)
+        return True
+
+    @property
+    def agreed(self) -> int:
+        """What all agreed on for this tick."""
+        words = self._words.get(self._now - self.delay, {})
+        return min(words.values()) if len(words) == self.team else NOTHING
+
+    def _note(self, tick: int, member: int, ready: int) -> None:
+        self._words.setdefault(tick, {}).setdefault(member, ready)
+
+
+class TeamLink:
+    """Words to and from the other members, over UDP; no other sender is listened to.
+
+    Attributes:
+        offset: of the team's clock from the runner's [s].
+    """
+
+    def __init__(
+        self, params: TeamLinkParams, period: float, offset: float = 0.0, remote: bool = False
+    ) -> None:
+        """Listen at this member's address, for ticks of a period [s].
+
+        Raises LinkError: an address is none, is taken, or leaves this machine without ``remote``.
+        """
+        devices = [check_device(f"udp:{text}", remote=remote) for text in params.members]
+        self.offset, self._period = offset, period
+        self._agreement = Agreement(params.member, len(devices), params.delay)
+        self._port = open_port(devices.pop(params.member))
+        numbers = [k for k in range(len(params.members)) if k != params.member]
+        addresses = [(device.host, device.port) for device in devices]
+        self._others = dict(zip(addresses, numbers, strict=True))
+
+    def agreed(self, time: float) -> int:
+        """Read what has come; return what all agreed on for the tick at a time [s]."""
+        self._agreement.begin(int((time + self.offset) / self._period + ROUNDING))
+        for _ in range(MOST_SHUT_OUT):
+            datagram = self._port.read()
+            if datagram is None:
+                break
+            if self._port.sender in self._others:
+                self._agreement.receive(datagram, self._others[self._port.sender])
+        return self._agreement.agreed
+
+    def say(self, ready: int) -> None:
+        """Tell the others what this vehicle is ready for in this tick."""
+        message = self._agreement.say(ready)
+        for address in self._others:
+            self._port.write(message, address)
+
+    def close(self) -> None:
+        """Give the port back."""
+        self._port.close()
