@@ -147,11 +147,7 @@ class Loop:
             runner.estimator.take_detections(self.eyes.poll(time))
         if self.solver is not None and (result := self.solver.poll()) is not None:
             runner.commander.calibration = result
-        if self.team is not None:
-            runner.parts.agreed = self.team.agreed(time)
-        decision = runner.tick(time, late, status, words, recording)
-        if self.team is not None:
-            self.team.say(decision.ready)
+        decision = self._tick(time, late, status, words, recording)
         if self.solver is not None and (hovered := runner.calibrating.due()) is not None:
             self.solver.submit(hovered)
         times = {
@@ -174,6 +170,15 @@ class Loop:
         self.count += 1
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
+
+    def _tick(self, time: float, *inputs: Any) -> TickRecord:
+        """Decide one tick by what the team agreed on; tell it what this vehicle is ready for."""
+        if self.team is None:
+            return self.runner.tick(time, *inputs)
+        self.runner.parts.agreed = self.team.agreed(time)
+        decision = self.runner.tick(time, *inputs)
+        self.team.say(decision.ready)
+        return decision
 
     def _tell(self, decision: TickRecord) -> None:
         """Say a change of state and a new reason to wait at once, and one that differs in its

@@ -37,6 +37,7 @@ CHOICES = {
     "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT IDS MOST_PENDING ASK_EVERY EARLY LATE",
     "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH BEHIND LEAST_WORD",
     "hil/links/roster.py": "SILENT MOST_SAID",
+    "hil/links/team_link.py": "WINDOW",
     "hil/links/writer.py": "MOST_WAITING WRITE_EVERY",
     "hil/rehearsal/bridges/ardupilot_bridge.py": "LOW HIGH NEAR",
     "hil/rehearsal/bridges/betaflight_bridge.py": "ASK SAMPLE",

@@ -40,8 +40,14 @@ def around(team: int, tilt: float = TILT) -> np.ndarray:
 
 
 def hung(params: PlantParams, directions: np.ndarray, **options) -> TeamSim:
-    sim = TeamSim(params, 1, directions.shape[1], threads=1, **options)
-    sim.hang(np.array([[0.0, 0.0, 1.0]]), directions, np.array([[0.3, -0.2, 0.1]]))
+    """Level vehicles where straight cables lead from the load to them, all moving alike."""
+    rope, team = params.rope, directions.shape[1]
+    sim = TeamSim(params, 1, team, threads=1, **options)
+    sim.place(
+        np.array([0.0, 0.0, 1.0]) - rope.length * directions[0] - rope.mount,
+        vel_w=np.tile([0.3, -0.2, 0.1], (team, 1)),
+        cable_dir_w=np.repeat(directions[0][:, None], rope.segments, axis=1),
+    )
     return sim
 
 

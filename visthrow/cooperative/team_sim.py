@@ -3,7 +3,6 @@
 from functools import partial
 from typing import Any
 
-import numpy as np
 import warp as wp
 
 from sim import solvers
@@ -45,22 +44,3 @@ class TeamSim(HybridSim):
         """Position [m] and velocity [m/s] of the loads, each of shape (W,) of vec3."""
         solver: Any = self._exchange.solver  # type: ignore[union-attr]
         return solver.load_pos_w, solver.load_vel_w
-
-    def hang(self, load_w: np.ndarray, cable_dir_w: np.ndarray, vel_w: np.ndarray) -> None:
-        """Put level vehicles where straight cables lead from the loads to them.
-
-        Args:
-            load_w: [m], shape (W, 3). vel_w: of all that moves [m/s], shape (W, 3).
-            cable_dir_w: from each mount to the load, shape (W, V, 3).
-        """
-        ropes = self.plants()[1]
-        length = ropes["segment_length"] * self.params.rope.segments
-        directions = cable_dir_w.reshape(-1, 3)
-        rows = np.repeat(load_w, self.team, axis=0)
-        pos_w = rows - length[:, None] * directions - ropes["mount"]
-        segments = self.params.rope.segments
-        self.place(
-            pos_w,
-            vel_w=np.repeat(vel_w, self.team, axis=0),
-            cable_dir_w=np.repeat(directions[:, None], segments, axis=1),
-        )
