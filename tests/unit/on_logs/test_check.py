@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from visthrow import cli
 from visthrow.logs.axes import is_mirror
+from visthrow.logs.check import thrust_checks
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, table
 from visthrow.logs.check.signals import noise
@@ -108,6 +109,24 @@ def test_a_good_flight_has_nothing_wrong():
     assert answers["battery sag"] == "warn"
     (delay,) = [r for r in checked.rows if r.topic == "delay" and r.channel == "command, rate_b"]
     assert delay.figures["delay_s"] == pytest.approx(DELAY, abs=0.003)
+
+
+def test_thrust_in_pulses_follows_past_a_crash():
+    """A flight of pulses from 1000 us that begins on the ground and ends upside down on it."""
+    columns = flight(40.0)
+    time = columns["time"]
+    thrust = columns.pop("command")[:, :1]
+    ground = time < 5.0
+    fallen = time > 38.0
+    pulses = 1000.0 + 200.0 * np.repeat(thrust, 4, axis=1)
+    columns["acc_b"][ground] = [0.0, 0.0, G]
+    columns["acc_b"][fallen] = [0.0, 0.0, -3.0 * G]
+    del columns["pos_w"], columns["vel_w"]
+    pulses[ground] = 1000.0
+    log = log_of(columns, motor_output=Channel(time, pulses, "us", "none"))
+    row = next(row for row in thrust_checks.look(log) if "acc_b" in row.channel)
+    assert row.verdict == "ok", row.text
+    assert row.figures["correlation"] > 0.5
 
 
 def test_a_thrown_payload_is_no_other_scale_of_the_thrust():

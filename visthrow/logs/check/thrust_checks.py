@@ -201,17 +201,23 @@ def _correlations(
     grid = np.arange(start, end, 0.01)
     if len(grid) < 200:
         return None
-    x = _trimmed(relations.mean_over(time, command, grid, _SPAN)[:, 0])
-    y = np.array(
-        [_trimmed(relations.mean_over(*force, grid + delay, _SPAN)[:, 0]) for delay in _DELAYS]
-    )
+    x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
+    y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
+    curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
+    return max(filter(None, curves), key=lambda curve: np.max(curve[0]), default=None)
+
+
+def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Return the correlation of a thrust, shape (T,), with the force at each delay, shape (D, T),
+    and the nats by which no thrust explains the force better; None where one does not vary.
+    """
     x = x / np.mean(x) - 1.0
     varies = y / np.mean(y, axis=1, keepdims=True) - 1.0
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
     best = int(np.argmax(np.where((_DELAYS > -0.005) & (_DELAYS < _LATEST), curve, -1.0)))
-    independent = float(np.ptp(grid)) / (2.0 * _SPAN)
+    independent = 0.01 * len(x) / (2.0 * _SPAN)
     return curve, float(0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best])))
 
 
