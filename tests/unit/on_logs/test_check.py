@@ -7,9 +7,9 @@ import re
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from bench import delays
 from visthrow import cli
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import thrust_checks
@@ -237,42 +237,10 @@ def test_a_drifting_clock_is_told():
     assert float(found[2]) == pytest.approx(-2.5, abs=1.0)
 
 
-def drawn(seed):
-    """Position and velocity of a motion, slow, fast, noisy or with a crash at its end, noise white
-    or coloured, and how late the velocity is [s].
-    """
-    rng = np.random.default_rng(seed)
-    kind = ("slow", "fast", "noisy", "crash")[seed % 4]
-    time = np.arange(0.0, rng.uniform(12.0, 40.0), rng.choice([0.01, 0.02]))
-    frequency = rng.uniform(
-        0.02 if kind == "slow" else 0.1, 0.15 if kind == "slow" else 1.5, (6, 3)
-    )
-    size, phase = 0.1 * rng.uniform(0.02, 0.5, (6, 3)) / frequency, rng.uniform(0.0, 6.28, (6, 3))
-    late = rng.uniform(-0.1, 0.1)
-    turn = 2.0 * np.pi * frequency
-    pos = np.sum(size * np.sin(turn * time[:, None, None] + phase), axis=1)
-    vel = np.sum(size * turn * np.cos(turn * (time - late)[:, None, None] + phase), axis=1)
-    share = {"slow": 0.2, "fast": 0.05, "noisy": 1.0, "crash": 0.1}[kind] * rng.uniform(0.2, 1.0)
-    noise = rng.normal(0.0, share * np.std(vel), vel.shape)
-    if rng.random() < 0.5:
-        decay = np.exp(-(time[1] - time[0]) / rng.uniform(0.02, 0.5))
-        noise = lfilter([np.sqrt(1.0 - decay**2)], [1.0, -decay], noise, axis=0)
-    vel, pos = vel + noise, pos + rng.normal(0.0, 10.0 ** rng.uniform(-4.3, -3.0), pos.shape)
-    if kind == "crash":
-        last = np.maximum(time - time[-1] + 1.0, 0.0)[:, None]
-        vel = vel + last * np.std(vel) * rng.normal(0.0, 15.0, 3)
-        pos = pos + last**2 * np.std(vel) * rng.normal(0.0, 5.0, 3)
-    return time, pos, vel, late
-
-
 def test_deviations_of_delays_hold_what_they_say():
     """200 motions, seeds that nothing was chosen by; 95 % +- 3 % of truths within 1.96 sd."""
-    inside = []
-    for seed in range(5000, 5200):
-        time, pos, vel, late = drawn(seed)
-        found = relate(*derivative(time, pos), time, vel)
-        inside.append(abs(found.delay - late) < 1.96 * found.delay_sd)
-    assert np.mean(inside) >= 0.92
+    cases = [delays.measure(seed, kind) for seed in range(5000, 5050) for kind in delays.KINDS]
+    assert np.mean([abs(error) < 1.96 * sd for error, sd in cases]) >= 0.92
 
 
 @pytest.mark.parametrize("width", [0.05, 0.3])

@@ -158,8 +158,9 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
     missing = [name for name in ("command", "pos_w", "quat_wb") if measured(log, name) is None]
     if missing:
         raise DiagnoseError(
-            f"flight {number} holds no {' and no '.join(missing)}; a replay needs command, pos_w"
-            f" and quat_wb; it has {', '.join(sorted(log.channels))}"
+            f"flight {number} holds no {' and no '.join(missing)}; a replay needs command (or an"
+            " autopilot's throttle and rate_setpoint_b, of which it is made), pos_w and quat_wb; it"
+            f" has {', '.join(sorted(log.channels))}; a table's columns get these names by --config"
         )
     pos, quat, (landing, landing_point) = (
         _samples(log, "pos_w"),
