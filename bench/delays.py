@@ -1,4 +1,4 @@
-"""Stated deviations of delays against delays that were put in: `python -m bench.delays --seed 1`."""
+"""Hold stated deviations of delays against delays that were put in (python -m bench.delays)."""
 
 import argparse
 import sys

@@ -649,7 +649,9 @@ def _payload_late(
     best = int(np.argmin(spread))
     independent = max(float(np.ptp(time_p[overlap])) / relations.INDEPENDENT, 10.0)
     floor = 1e-9  # of a cable's length without any noise [m]
-    nats = independent * float(np.log(max(spread[len(delays) // 2], floor) / max(spread[best], floor)))
+    nats = independent * float(
+        np.log(max(spread[len(delays) // 2], floor) / max(spread[best], floor))
+    )
     if nats < _NATS or best in (0, len(delays) - 1) or abs(delays[best]) < _DELAY_WARN:
         return []
     text = (
