@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from visthrow.diagnose.models.model_interface import Effect, Linearised, Window
+from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 
 MASS = (0.21, 0.058)  # [kg]
 SIGMA = (5e-4, 8e-4)  # [m]
@@ -62,7 +62,7 @@ def catalogue(count: int = 20) -> tuple[Effect, ...]:
 
 
 @dataclass
-class SyntheticModel:
+class SyntheticModel(Model):
     """A synthetic :class:`visthrow.diagnose.models.model_interface.Model`; ``truth`` in floors."""
 
     effects: tuple[Effect, ...] = field(default_factory=catalogue)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.logs.flightlog import FlightLog
 
 MIRRORED = {"motor_1": "motor_2", "motor_2": "motor_1", "motor_3": "motor_4", "motor_4": "motor_3"}
@@ -95,7 +96,7 @@ def scrambled(logs: Sequence[FlightLog]) -> list[FlightLog]:
     return out
 
 
-class Flipped:
+class Flipped(Model):
     """A model whose residuals have another sign in every other flight: noise as before, but no
     cause in common.
     """

@@ -11,6 +11,7 @@ import pytest
 from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
+from tests.synthetic_diagnosis import SyntheticModel
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, linearise, moved
@@ -92,8 +93,9 @@ def test_lost_commands_are_found_beside_a_cause():
     assert found.nats > 50.0
 
 
-def test_another_model_without_commands_is_not_asked():
-    class Other:
-        effects, channels = (), ()
-
-    assert dropped.verdict(type("Problem", (), {"model": Other()})(), None, (), 5.0) is None
+def test_a_model_without_commands_has_no_verdict_on_them():
+    model = SyntheticModel()
+    windows = model.windows({})
+    problem = Problem.of(model, windows, range(len(windows)))
+    point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
+    assert dropped.verdict(problem, point, (), 5.0) is None

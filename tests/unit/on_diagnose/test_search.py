@@ -12,6 +12,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import result, search, selector
 from visthrow.diagnose.select.scatter import Varies, disagreement
 
@@ -118,7 +119,7 @@ def test_idempotence_what_was_found_is_not_found_again():
     model = world(truth={"effect_04": 10.0}, seed=6)
     first = search.explain(model, laws=False)
 
-    class Applied:
+    class Applied(Model):
         effects, channels = model.effects, model.channels
 
         def windows(self, theta):

@@ -68,7 +68,7 @@ class FlyerModel(NumericModel):
             np.array([s.data[name] for s in stretches])
             for name in ("rot", "input", "volts", "since", "lean", "direction")
         )
-        self._told = params.thrust(given_inputs)  # [N], (S, fine steps, motors)
+        self._commanded = params.thrust(given_inputs)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
         self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
         self._rate_at = 12 if params.cable is not None else 6
@@ -88,15 +88,17 @@ class FlyerModel(NumericModel):
         position = (
             p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
         ) / fine  # tables begin one window early
-        index = np.clip(position.astype(int), 0, self._told.shape[1] - 1)
+        index = np.clip(position.astype(int), 0, self._commanded.shape[1] - 1)
         share, out = (
             (position - index)[..., None],
-            np.empty((2, *position.shape, self._told.shape[2])),
+            np.empty((2, *position.shape, self._commanded.shape[2])),
         )
         for lag in np.unique(tau):
             keep, members = np.exp(-fine / lag), np.flatnonzero(tau == lag)
-            after, _ = lfilter([1.0 - keep], [1.0, -keep], self._told, 1, keep * self._told[:, :1])
-            thrust = np.concatenate([self._told[:, :1], after], 1)
+            after, _ = lfilter(
+                [1.0 - keep], [1.0, -keep], self._commanded, 1, keep * self._commanded[:, :1]
+            )
+            thrust = np.concatenate([self._commanded[:, :1], after], 1)
             whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
             which, rows, part = lanes.owner[members], index[:, members], share[:, members]
             begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
@@ -158,7 +160,7 @@ class FlyerModel(NumericModel):
             "rate_b": (
                 triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
             ),
-            "thrust": values[:, -self._told.shape[2] :].sum(1),
+            "thrust": values[:, -self._commanded.shape[2] :].sum(1),
         }
         if p.cable is not None:
             gap, vel = path[:, 6:9], path[:, 3:6] + path[:, 9:12]
@@ -186,7 +188,7 @@ class FlyerModel(NumericModel):
         )
         sag = p.voltage_coefficient + self.of(lanes, "battery_sag")
         scale = (1.0 + self.of(lanes, "thrust_gain")) * (1.0 + sag * volts)
-        motors = self._told.shape[2]
+        motors = self._commanded.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
         scales = np.stack([self.of(lanes, f"motor_{name}") for name in MOTORS], 1)

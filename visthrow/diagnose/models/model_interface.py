@@ -12,11 +12,12 @@ motor on a stand and a camera against motion capture are models of this one kind
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from sim.effects.effect import Effect
+from sim.params import LawParams
 
 
 @dataclass(frozen=True)
@@ -79,12 +80,22 @@ frame].
 
 
 class Model(Protocol):
-    """A simulation of measured flights that can be linearised about any sizes of its effects."""
+    """A simulation of measured flights that can be linearised about any sizes of its effects.
+
+    A model is a subclass that gives effects, channels, windows and residuals. What else some models
+    can do has a default here that says that this one cannot."""
 
     effects: Sequence[Effect]
-    channels: Sequence[
-        str
-    ]  # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
+    # names, such as "pos_w"; units are those of visthrow.logs.flightlog.STANDARD_CHANNELS
+    channels: Sequence[str]
+    device: str = "cpu"  # where it simulates, and the algebra of its windows with it
+    days: Sequence[int] = ()  # of each flight, by its number; none where the logs do not say
+    mistakes: Sequence[Any] = ()  # of the interface, which were corrected in its logs
+    cheap: bool = False  # derivatives are taken anew wherever the search goes
+    # whether what a law does to a window is far from its share at the knots, so that the search
+    # must simulate it
+    bends: bool = False
+    lawless: str = ""  # why no law outside the catalogue can act in it
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise
@@ -105,3 +116,37 @@ class Model(Protocol):
                 in every simulation has no need of it.
         """
         ...
+
+    def plain(self) -> "Model":
+        """Return the model without its extensions."""
+        return self
+
+    def with_laws(self, laws: Sequence[LawParams]) -> "Model":
+        """Return the model with further laws; itself where none can act in it."""
+        return self
+
+    def without_commands(
+        self, theta: Mapping[str, float], windows: Sequence[int]
+    ) -> list[np.ndarray]:
+        """Return the change of some windows' samples by each command that does not come, shape
+        (N, T) each; none where the model has no commands.
+
+        Args:
+            theta: sizes of the effects, at which :meth:`windows` was called before.
+            windows: numbers among those that it returned.
+        """
+        return []
+
+    def step_error(self) -> dict[str, float] | None:
+        """Return the largest change of any sample of each channel by a finer step, in its noise;
+        None where the step is no approximation.
+        """
+        return None
+
+    def landings(
+        self, theta: Mapping[str, float], flights: Sequence[int] | None = None
+    ) -> Any | None:
+        """Return predicted and measured landings (``PredictedLandings``); None where the model has
+        no throws.
+        """
+        return None

@@ -16,7 +16,7 @@ import numpy as np
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.law_terms import carries, term_of
-from visthrow.diagnose.models.model_interface import Effect, Linearised, Window
+from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel
 
@@ -70,17 +70,11 @@ class Lanes:
         return Lanes(self.owner[rows], self.theta[rows], self.nuisance[rows], self.latent[rows])
 
 
-class NumericModel(ABC):
-    """Implements :class:`visthrow.diagnose.models.model_interface.Model` on :meth:`simulate` and
-    :meth:`measure`.
-    """
+class NumericModel(Model, ABC):
+    """A model whose subclasses give :meth:`simulate` and :meth:`measure`."""
 
-    cheap = True  # derivatives are taken anew wherever the search goes
+    cheap = True
     latent_step = 1.0  # of the differences by latent forces [N or N m]
-    lawless = ""  # why no law outside the catalogue can act in it
-    # whether what a law does to a window is far from its share at the knots, so that the search
-    # must fly it
-    bends = False
 
     def __init__(
         self,
@@ -153,13 +147,13 @@ class NumericModel(ABC):
         self.effects = tuple(by_name[name] for name in names)
 
     def plain(self) -> "NumericModel":
-        """Return the model without its extensions."""
+        """See the base class."""
         model = copy(self)
         model._base, model.laws, model._flown = np.zeros_like(self._base), (), None
         return model
 
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
-        """Return the model with further laws."""
+        """See the base class."""
         if self._flown is None:  # its initial states follow from call to call
             self._flown = copy(self)
         self._flown.laws = (*self.laws, *laws)

@@ -93,8 +93,8 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
     for reason in contradictions(checked):
         print(f"left out of the tested flights: {reason}")
     after = test_flights.model
-    before = after.plain() if hasattr(after, "plain") else after
-    if diagnosis.explanations and hasattr(after, "with_laws"):
+    before = after.plain()
+    if diagnosis.explanations:
         after = after.with_laws(
             [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
         )
@@ -144,7 +144,7 @@ def write_report(
         measured if measured.channels else None
     )  # windows of one sample have nothing ahead that could be predicted
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
-    steps = model.step_error() if hasattr(model, "step_error") else None
+    steps = model.step_error()
     origin = provenance.collect()
     source = {
         "logs": len(logs),

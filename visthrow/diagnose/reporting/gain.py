@@ -97,10 +97,10 @@ def landing_gain(
     None where the model has no throws whose landing was seen.
     """
     model = work.problem.model
-    if not hasattr(model, "landings"):
-        return None
     flown = sorted({w.flight for w in work.after.windows})
     plain = model.landings({}, flown)
+    if plain is None:
+        return None
     named = model.landings(theta, flown) if theta else plain
     parts = (
         [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]

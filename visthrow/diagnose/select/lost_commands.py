@@ -127,8 +127,6 @@ def verdict(
 
     ``threshold``: nats that a finding needs.
     """
-    if not hasattr(problem.model, "without_commands"):
-        return None
     v, priors, sizes = (
         next(v for v in random_effects() if v.name == NAME),
         problem.priors,
@@ -139,6 +137,8 @@ def verdict(
     windows_all = range(len(problem.kept))
     for rows, shares in ((few_of(windows_all), reach[::LOOK]), (windows_all, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
+        if not columns:
+            return None
         statistics = CommandStatistics.of(
             problem, point, [point.windows[w] for w in rows], columns, rows
         )

@@ -69,7 +69,7 @@ class Problem:
         """The problem of some of a model's windows, with the correlation of their
         channels' noise.
         """
-        plain = Problem(model, tuple(numbers), varies=Varies(getattr(model, "days", ())))
+        plain = Problem(model, tuple(numbers), varies=Varies(tuple(model.days)))
         slabs = plain.priors.slab * plain.priors.floor
         return replace(
             plain,
@@ -99,7 +99,7 @@ class Problem:
         """The model with the terms at their sizes as its laws; None where their columns do.
         ``theta`` is in floors.
         """
-        if not self.terms or not getattr(self.model, "bends", False):
+        if not self.terms or not self.model.bends:
             return None
         sizes = zip(self.terms, theta[-len(self.terms) :])
         return self.model.with_laws(
@@ -223,7 +223,7 @@ def linearise(
         if not commands
         else [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     )
-    device, floors = getattr(problem.model, "device", "cpu"), problem.priors.floor
+    device, floors = problem.model.device, problem.priors.floor
     first = grams_of(extended, floors, channels, device)
     cleaned = levels.without_outliers(extended, first, floors, device)
     mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]

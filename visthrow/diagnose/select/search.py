@@ -76,7 +76,7 @@ def diagnose(
         for row in log.rows
         if (row.topic, row.verdict) == ("thrust", "warn")
     ]
-    if (why := getattr(model, "lawless", "")) and diagnosis.overall in (UNKNOWN, IN_PART):
+    if (why := model.lawless) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
 

@@ -302,7 +302,7 @@ class SearchState:
         silent = self.priors.visible & (
             np.diag(self.origin.information) <= 0.0
         )  # such as wind without drag: it may show elsewhere
-        anew = getattr(self.problem.model, "cheap", False) and np.any(silent)
+        anew = self.problem.model.cheap and np.any(silent)
         if (
             same and not anew and curvature(self.problem, self.origin, point) < SPIKE
         ):  # what it would fake may go unnamed

@@ -61,7 +61,7 @@ def conclude(search: Selector) -> Diagnosis:
     varied = {name for s in scatter if s.found for name in s.of}
     search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in varied}
     overall, block, reasons, withdrawn = _overall(search, latent_levels)
-    mistakes = tuple(getattr(model, "mistakes", ()))
+    mistakes = tuple(model.mistakes)
     if overall == result.NO_EFFECT and (any(s.found for s in scatter) or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
         overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]

@@ -21,7 +21,7 @@ from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.threads import aside, parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
-from visthrow.diagnose.models.model_interface import Linearised, Window
+from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import (
@@ -58,7 +58,7 @@ from visthrow.logs.flightlog import FlightLog
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 
 
-class ThrowModel:
+class ThrowModel(Model):
     """Flights of a vehicle, with or without a payload, against the simulator that training uses.
 
     Attributes:
@@ -256,11 +256,7 @@ class ThrowModel:
     def without_commands(
         self, theta: Mapping[str, float], windows: Sequence[int]
     ) -> list[np.ndarray]:
-        """Change of some windows' replayed samples by each command that does not come: the one
-        before stays. Shape (N, T) each.
-
-        ``theta``: sizes of the effects, at which :meth:`windows` was asked for before; ``windows``:
-        numbers among those that came."""
+        """See the base class; the command before stays."""
         setting = apply(self.entries, self.setting, theta)
         states, slopes = (
             self._settled_at.get(_key(theta), self._fitted()[0]),
@@ -324,9 +320,7 @@ class ThrowModel:
         return frozenset(e.name for e in self._switched if theta.get(e.name, 0.0) > 0.5)
 
     def step_error(self, finer: int = 4) -> dict[str, float]:
-        """Largest change of any sample of each channel when the step is so many times finer, in its
-        noise.
-        """
+        """See the base class; the step is so many times finer."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         worst, states = np.zeros(len(self.channels)), self._fitted()[0]
         for w, plain, halved in zip(
