@@ -103,7 +103,6 @@ def _listen(args: argparse.Namespace) -> int:
             time = clock.now()
             new_poses = source.poll(time)
             poses += new_poses
-            runner.decider.rivals = source.rivals(time)
             runner.tick(time, new_poses, autopilot.status(time), OperatorInput())
             last = runner.decider.problems() or last
             autopilot.tick(time, runner)

@@ -73,6 +73,7 @@ STREAMS = {
     "50 Hz": PoseStream("", regular(50.0)),
     "100 Hz": PoseStream(""),
     "300 Hz": PoseStream("", regular(300.0)),
+    "two senders": PoseStream("", second=True),
     "1 Hz": PoseStream("vehicle: 1.0 good poses a second; expected 36 or more", regular(1.0)),
     "8 Hz": PoseStream("8.0 good poses a second; expected 36 or more", regular(8.0)),
     "zero": PoseStream("stamps are 0 s: the sender does not stamp", restamped(lambda s: 0)),
@@ -88,11 +89,10 @@ STREAMS = {
     "quality": PoseStream("the source says that it does not see the body)", quality=-1),
     "jitter": PoseStream("stamps scatter by 4", jitter),
     "bursts": PoseStream("they come in bursts", bursts),
-    "two senders": PoseStream("two senders speak as the vehicle: 127.0.0.1:1, which", second=True),
     "half refused": PoseStream("50 % of the poses are refused (", wrong=2),
     "2 kHz": PoseStream("2000 poses a second; expected 582 at most", regular(2000.0)),
 }
-"""Three good streams, then fourteen bad ones and one more."""
+"""Four good streams, then bad ones."""
 
 
 class Sent(MavlinkSource):

@@ -140,7 +140,6 @@ class Loop:
         if finished:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
-        runner.decider.rivals = source.rivals(time)
         end = perf_counter()
         if self.eyes is not None:
             self.eyes.hint = runner.estimator.hint(time)

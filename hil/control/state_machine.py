@@ -341,6 +341,5 @@ class TickRecord:
     agreed: int | None = None  # by the team for this tick; None without a team
     # in a camera's newest frame since the last tick; see `hil.poses.detection.Detection`
     detection: list | None = None
-    rivals: list[str] | None = None  # bodies or autopilots that two senders speak for
     # that came with this tick, or why there is none; see `visthrow.onboard.calibration`
     calibration: dict | str | None = None

@@ -143,7 +143,6 @@ class Roster:
         self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
         self._said: set[tuple] = set()
-        self._rivals: dict[str, tuple[Address, float]] = {}  # second sender, and when it spoke [s]
 
     def shuts_out(self, address: Address) -> bool:
         """Return whether a datagram is not even looked into: not from the device's peer, not on the
@@ -263,7 +262,6 @@ class Roster:
         if self.flying:
             return f"another sender while it flies; the {name} speaks from {shown(at)}"
         if host_time - self.heard[name] < SILENT:
-            self._rivals[name] = (address, host_time)
             return f"a second sender; the {name} speaks from {shown(at)}"
         return None
 
@@ -281,17 +279,6 @@ class Roster:
     def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:
         """Count what a source could not take from a sender, and say it once."""
         self.refuse(Seen(address, None, None, kind, why), count)
-
-    def rivals(self, host_time: float) -> list[str]:
-        """Return which names two senders speak for at a time [s], in words: only one of them is
-        heard, and which one is chance.
-        """
-        return [
-            f"two senders speak as the {name}: {shown(self.at[name])}, which is heard, and"
-            f" {shown(address)}: end one, or name the right one in link.allow"
-            for name, (address, time) in self._rivals.items()
-            if host_time - time < SILENT
-        ]
 
     def expected(self) -> str:
         """Return the parties in words."""

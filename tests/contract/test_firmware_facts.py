@@ -29,8 +29,9 @@ CHOICES = {
     "hil/links/backends/autopilot.py": "ASK_AGAIN STREAM COMMAND_VALUES SERVO_NEAR",
     "hil/links/backends/base.py": "REPEAT",
     "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX LONGEST_DELAY NEAR KEEP_ALIVE OPEN_TIME"
-    " ARM_LOW POLLS READ_BACK",
+    " ARM_LOW POLLS READ_BACK RATES_PERIOD RATES_TIME",
     "hil/links/backends/crazyflie.py": "ASK ARM_PERIOD HOLDS DESCENT SHORTEST",
+    "hil/links/backends/crazyflie_gyro.py": "BLOCK PERIOD_MS AT_ONCE ASK_AGAIN STAMP",
     "hil/links/backends/px4.py": "MARGIN GAP",
     "hil/links/backends/thrust_curve.py": "LEAST_SHARES VOLTAGE_RANGE",
     "hil/links/device.py": "MOST_CHUNKS MOST_SHUT_OUT",

@@ -119,6 +119,7 @@ class FakeBetaflight(PortFake):
             msp.FC_VARIANT: lambda: b"BTFL",
             msp.FC_VERSION: self._version,
             msp.STATUS: self._status,
+            msp.RAW_IMU: self._imu,
             msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]),
             msp.BOXIDS: lambda: bytes(BOXES),
             msp.RC: self._rc,
@@ -225,6 +226,10 @@ class FakeBetaflight(PortFake):
     def _servo(self) -> bytes:
         shown = MIDDLE if self.parameters["channel_forwarding"] else self.ends[self.moved]
         return struct.pack("<8H", shown, *([MIDDLE] * 7))
+
+    def _imu(self) -> bytes:
+        rates = np.degrees(self.plant.state["rate_b"]).round().astype(int)
+        return struct.pack("<9h", 0, 0, 0, *rates, 0, 0, 0)
 
     def _ranges(self) -> bytes:
         arm = [BOX_ARM, ARM_AUX - 1, *RANGE]

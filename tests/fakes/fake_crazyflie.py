@@ -42,6 +42,10 @@ PASSED, READY, FLYING, LEVEL, LANDED, LOCKED, CRASHED = (
 )
 MAY_FLY = (READY, FLYING, LEVEL, LANDED)  # states in which the motors may turn
 
+GYRO = tuple(f"gyro.{axis}" for axis in FACTS["log_gyro"])
+VARIABLES = (*(f"motor.{letter}" for letter in "abcdefghijk"), *GYRO, "pm.vbat")
+"""Variables of its logging, in the order of their numbers."""
+
 
 @dataclass(frozen=True)
 class SetPoint:
@@ -93,6 +97,9 @@ class FakeCrazyflie(PortFake):
         self._velocity = np.zeros(3)
         self._force = np.array([0.0, 0.0, 1.0])  # specific force, body frame, of one g
         self._yaw_held, self._yaw_sum = 0.0, 0.0  # [rad], [rad s]
+        # numbers of the variables of each block, and its period and next time once started [s]
+        self._blocks: dict[int, list[int]] = {}
+        self._started: dict[int, list[float]] = {}
 
     def came(self, data: bytes) -> None:
         if self.silent or not data:
@@ -106,6 +113,8 @@ class FakeCrazyflie(PortFake):
             (FACTS["port_supervisor"], FACTS["channel_command"]): self._command,
             (FACTS["port_platform"], FACTS["channel_version"]): self._tell_version,
             (FACTS["port_param"], FACTS["channel_by_name"]): self._set_parameter,
+            (FACTS["port_log"], FACTS["log_contents"]): self._tell_variable,
+            (FACTS["port_log"], FACTS["log_control"]): self._log,
         }
         take = places.get((port, channel))
         if take is not None and len(data) > 1:
@@ -225,6 +234,40 @@ class FakeCrazyflie(PortFake):
             self.open_mechanism()
         told = data[: len(data) - len(rest)] + bytes([error])
         self._answer("port_param", "channel_by_name", told)
+
+    def _tell_variable(self, data: bytes) -> None:
+        if data[0] == FACTS["log_info"]:
+            told = struct.pack("<BHI", FACTS["log_info"], len(VARIABLES), 0)
+        else:
+            _, number = struct.unpack_from("<BH", data)
+            name = VARIABLES[number].replace(".", "\0").encode() + b"\0"
+            told = struct.pack("<BHB", FACTS["log_item"], number, FACTS["log_float"]) + name
+        self._answer("port_log", "log_contents", told)
+
+    def _log(self, data: bytes) -> None:
+        """Create or start a block of variables."""
+        command, block, error = data[0], data[1], 0
+        if command == FACTS["log_create"]:
+            error = FACTS["log_exists"] if block in self._blocks else 0
+            numbers = [number for _, number in struct.iter_unpack("<BH", data[2:])]
+            self._blocks.setdefault(block, numbers)
+        elif command == FACTS["log_start"] and block in self._blocks:
+            period = 1e-3 * struct.unpack_from("<H", data, 2)[0]
+            self._started[block] = [period, self.plant.time]
+        else:
+            error = FACTS["no_entry"]
+        self._answer("port_log", "log_control", bytes([command, block, error]))
+
+    def speak(self) -> None:
+        """Send the blocks that are due."""
+        rates = dict(zip(GYRO, np.degrees(self.plant.state["rate_b"])))
+        for block, due in self._started.items():
+            if self.plant.time >= due[1] - 1e-9 and not self.silent:
+                due[1] += due[0]
+                named = [VARIABLES[number] for number in self._blocks[block]]
+                numbers = [rates.get(name, 0.0) for name in named]
+                stamp = bytes([block]) + int(1e3 * self.plant.time).to_bytes(3, "little")
+                self._answer("port_log", "log_data", stamp + struct.pack("<3f", *numbers))
 
     def _go(self, state: str) -> None:
         """Enter a state of the supervisor; those that may not fly disarm."""

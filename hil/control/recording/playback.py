@@ -68,7 +68,6 @@ class Playback:
         if isinstance(calibration, dict):
             calibration = Calibration.of(calibration)
         runner.commander.calibration = calibration
-        runner.decider.rivals = line.get("rivals") or []
         runner.parts.agreed = line.get("agreed")
         decision = runner.tick(
             time, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]

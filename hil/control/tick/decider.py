@@ -25,15 +25,12 @@ class Decider:
 
     Attributes:
         inputs: of the machine at the last tick; None before it.
-        rivals: bodies or autopilots that two senders speak for, in words; see
-            `hil.links.roster.Roster`.
     """
 
     def __init__(self, parts: FlightParts) -> None:
         """Start before the first tick."""
         self.parts = parts
         self.inputs: Inputs | None = None
-        self.rivals: list[str] = []
         self._alone = 0  # ticks in which the team agreed on nothing
         self._shares: deque[float] = deque(maxlen=MOST_REPORTS)  # autopilot's thrust over weight
 
@@ -45,11 +42,9 @@ class Decider:
         self.inputs = inputs = self._inputs(estimate, status, words, recording)
         state = machine.step(estimate.time, inputs)
         waits = machine.waits(inputs)
-        record = TickRecord(estimate.time, state.value, machine.reason, waits=waits)
-        record.agreed = self.parts.agreed
-        if inputs.streams:
-            record.rivals = self.rivals or None
-        return record
+        return TickRecord(
+            estimate.time, state.value, machine.reason, waits=waits, agreed=self.parts.agreed
+        )
 
     def _inputs(
         self, estimate: Estimate, status: Status, words: OperatorInput, recording: bool
@@ -153,13 +148,12 @@ class Decider:
         """Return what is wrong with the streams of poses; nothing after the take-over."""
         if self.parts.machine.state not in (State.IDLE, State.CHECK):
             return []
-        problems = [
+        return [
             f"{body}: {text}"
             for body, track in self.parts.tracks.items()
             if body != GOAL
             for text in track.stream.problems(time)
         ]
-        return problems + self.rivals
 
     def problems(self) -> list[str]:
         """Return what forbids the take-over of the vehicle, as of the last tick."""

@@ -14,6 +14,7 @@ firmware arms.
 Source: `hil.links.facts`, betaflight; betaflight.com, Controlling Betaflight From a Companion
 Computer Over MSP."""
 
+import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from typing import Annotated
 
 from hil.links import msp
 from hil.links.backends.audit import Audit, Rule, equal
-from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
+from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, ROUNDING, WAIT, OnPort, Release
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
@@ -44,6 +45,7 @@ EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
 
 FEWEST_AUX = 4  # channels of a frame beside the sticks
 LONGEST_DELAY = 1.5  # of the failsafe [s]
+IMU = struct.Struct(f"<{FACTS['imu_rates']}x3h")  # body rates of MSP_RAW_IMU
 NEAR = 50  # a channel or output this near to its target has arrived [us]
 # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
 KEEP_ALIVE = 0.02
@@ -61,6 +63,11 @@ READ_BACK = 0.04
 The firmware takes one command in a turn of its serial ports, 100 turns a second by its default:
 with a question or two beside every frame the frames queued up, and came 0.1 to 0.3 s late just
 after a release.
+"""
+
+RATES_PERIOD, RATES_TIME = 0.02, 0.2
+"""Between two questions for body rates [s], and how long they are asked for once it follows, in
+which the signs of its rates show [s]: for longer they would make frames queue up.
 """
 
 AXES = ("roll", "pitch", "yaw")
@@ -125,7 +132,8 @@ class Betaflight(OnPort):
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
-        self._framed = self._boxed = self._read_back = -1e9
+        self._framed = self._boxed = self._read_back = self._rated = -1e9
+        self._followed_at: float | None = None  # since when it has followed [s]
         self._flags = self._blocks = 0
         self._free_since: float | None = (
             None  # since when nothing speaks against arming, with ARM low
@@ -287,6 +295,12 @@ class Betaflight(OnPort):
             ):
                 self._polled[command] = host_time
                 self._write(command)
+        if self._raised and self._followed_at is None:
+            self._followed_at = host_time
+        judged = self._followed_at is not None and host_time - self._followed_at <= RATES_TIME
+        if judged and host_time - self._rated >= RATES_PERIOD - ROUNDING:
+            self._rated = host_time
+            self._write(msp.RAW_IMU)
         if not (self._boxes and self._order) and host_time - self._boxed >= 0.5:
             self._boxed = host_time
             self._write(msp.BOXIDS)
@@ -354,6 +368,8 @@ class Betaflight(OnPort):
             )
         elif frame.command == msp.RC:
             self._hear_channels(frame.words())
+        elif frame.command == msp.RAW_IMU and len(frame.payload) >= IMU.size:
+            self.rates = tuple(map(math.radians, IMU.unpack_from(frame.payload)))
         elif frame.command == msp.ANALOG and (volts := frame.number("<H", FACTS["analog_volts"])):
             self.voltage = 0.01 * volts
         elif frame.command == msp.SERVO and 1 <= p.servo_output <= len(outputs := frame.words()):

@@ -5,8 +5,9 @@ The runner's hover controller flies before and after the throw. A manual set-poi
 it holds rates, and its thrust is neither locked nor cut; it flies as soon as the vehicle is armed.
 Legacy set-points, which others may send, mean what the parameters of ``flightmode`` say. These,
 the controller and the motors' override are set, and answered, before anything is armed. Silence
-levels the vehicle, and stops its motors later (its supervisor). A vehicle that is handed back holds
-its place by its own position controller, as long as it hears set-points of a place.
+levels the vehicle, and stops its motors later (its supervisor). Its body rates come by logging. A
+vehicle that is handed back holds its place by its own position controller, as long as it hears
+set-points of a place.
 
 Source: `hil.links.facts`, crazyflie."""
 
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from hil.links import crtp
 from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, equal
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
+from hil.links.backends.crazyflie_gyro import GyroStream
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import facts, values
@@ -84,6 +86,7 @@ class Crazyflie(OnPort):
         self.release_record = Release(params.release_timeout)
         self.poses = 0
         self.audit = Audit(self._rules(), self._ask, None, tell)
+        self.gyro = GyroStream(self._put)
         self._state, self._speaks = 0, False
         self._place: tuple[tuple[float, ...], float] | None = None  # position [m], heading [deg]
         self._returned: tuple[float, tuple[float, ...], float] | None = None  # when, and where
@@ -189,6 +192,8 @@ class Crazyflie(OnPort):
                 self._put(crtp.ask_protocol())
         if self._speaks and not self._state & FACTS["flying"]:  # nothing is set in flight
             self.audit.service(host_time)
+            if self.audit.done:
+                self.gyro.service(host_time)
         ready = self._taken and not self._over and self.audit.done and not self.audit.problems
         armed = self._raised or bool(self._state & FACTS["armed"])
         if ready and not armed and host_time - self._armed_at >= ARM_PERIOD:
@@ -208,6 +213,10 @@ class Crazyflie(OnPort):
         self._speaks = True
         state, version = FACTS["ask_state"] | FACTS["answer"], FACTS["ask_protocol"]
         if len(data) < 3:
+            return
+        if packet.port == FACTS["port_log"]:
+            self.gyro.hear(packet.channel, data)
+            self.rates = self.gyro.rates
             return
         if (*place, data[0]) == (FACTS["port_supervisor"], FACTS["channel_info"], state):
             self._heard, self._state = host_time, int.from_bytes(data[1:], "little")

@@ -50,10 +50,6 @@ class Source:
         """
         return sum([link.pump(self._clock) for link in self.links])
 
-    def rivals(self, time: float) -> list[str]:
-        """Return for whom two senders speak at a time [s], in words."""
-        return [text for roster in self.rosters for text in roster.rivals(time)]
-
     def hold(self, flying: bool) -> None:
         """Say whether the vehicle is ours in flight: then nobody's address on the links
         may change.

@@ -215,6 +215,9 @@ def test_no_separation_where_the_poses_do_not_tell():
     times = np.arange(0.0, 0.5, 0.01)
     fall = np.column_stack((times, 0 * times, -0.5 * 9.81 * times**2))
     assert separation(times, fall, 0.11) is None, "nothing ever held it"
+    held = np.minimum(times - 0.11, 0.0)[:, None]
+    gently = fall + 0.5 * np.array([0.0, 0.0, 4.0]) * held**2
+    assert separation(times, gently, 0.11) is None, "a pull of 4 m/s2 hides when it ended"
 
 
 def test_the_recording_of_a_run_holds_all(run, tmp_path):
