@@ -140,8 +140,18 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
             f"{path}: says itself what it holds and needs no mapping; look at it with: visthrow"
             f" diagnose check {path}"
         )
+    if _is_text(path):  # .tum, .dat, .log, .asc, ...
+        return table.read_table(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS, *SELF_DESCRIBING))
-    raise LogError(f"{path}: ending '{path.suffix}'; expected one of {of_tables}")
+    raise LogError(
+        f"{path}: ending '{path.suffix}', and no text; expected one of {of_tables}, or a table in"
+        " text"
+    )
+
+
+def _is_text(path: Path) -> bool:
+    with path.open("rb") as file:
+        return b"\0" not in file.read(4096)
 
 
 def _of_table(path: Path, mapping: TableMap | None) -> list[FlightLog]:

@@ -105,7 +105,9 @@ EXPORTS = {
     "tum with a hash.txt": "# timestamp tx ty tz qx qy qz qw\n" + lines(TUM, " "),
     "tum with two hashes.txt": "# ground truth\n# timestamp tx ty tz qx qy qz qw\n"
     + lines(TUM, " "),
-    "tum without a head.txt": lines(TUM, " "),
+    "tum without a head.tum": lines(TUM, " "),
+    "tum below a sentence.txt": "# TF Coordinate Frame: /optical(data: /optical)\n"
+    + lines(TUM, " "),
     "euroc.csv": "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],"
     "q_RS_y [],q_RS_z []\n" + lines([[int(1e18 + 1e9 * t), *r] for t, r in zip(TIME, WXYZ)]),
     "q1 to q4.csv": "time,x,y,z,q1,q2,q3,q4\n" + lines([[t, *r] for t, r in zip(TIME, WXYZ)]),
@@ -121,6 +123,20 @@ EXPORTS = {
     + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))], ";", comma=True),
     "line ends of windows.csv": motive().replace("\n", "\r\n"),
 }
+
+
+def test_poses_of_kitti_are_matrices(tmp_path):
+    """Twelve numbers a row without a head or a stamp: the upper rows of a pose, row by row."""
+    poses = np.concatenate([TURN.as_matrix(), POS[:, :, None]], axis=2).reshape(-1, 12)
+    path = tmp_path / "00.txt"
+    path.write_text(lines(poses.round(9).tolist(), " "))
+    table = table_of(path)
+    proposal = propose(table, path)
+    (log,) = logs_of(table, proposal.mapping, str(path))
+    assert any("how far are the rows apart" in question for question in proposal.questions)
+    np.testing.assert_allclose(log["pos_w"].values, POS, atol=1e-6)
+    turned = (Rotation.from_quat(log["quat_wb"].values) * TURN.inv()).magnitude()
+    assert np.max(turned) < 1e-6
 
 
 @pytest.mark.parametrize("name", EXPORTS)

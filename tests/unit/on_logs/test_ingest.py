@@ -416,7 +416,7 @@ class TestTables:
         with pytest.raises(LogError, match="no such file; in that folder"):
             read(tmp_path / "b.csv")
         with pytest.raises(LogError, match=r"ending '\.doc'"):
-            read(written(tmp_path, ["t,v"], "a.doc"))
+            read(written(tmp_path, ["t,v\0"], "a.doc"))
         (tmp_path / "run").mkdir()
         with pytest.raises(LogError, match="a folder without"):
             read(tmp_path / "run")

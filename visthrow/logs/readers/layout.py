@@ -13,6 +13,8 @@ import re
 from collections import Counter
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from visthrow.common.storage import counted
 
 MARKS = (",", ";", "\t", " ")
@@ -46,6 +48,9 @@ _FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*",
 _IDS = re.compile(r"\d+|[0-9a-f]{32}", re.I)
 RATES = ("FREQUENCY", "Export Frame Rate", "Capture Frame Rate", "Frame Rate")
 UNIT_OF_LENGTH = "Length Units"
+TUM = "timestamp tx ty tz qx qy qz qw"
+KITTI = "Rot[0] Rot[3] Rot[6] x Rot[1] Rot[4] Rot[7] y Rot[2] Rot[5] Rot[8] z"
+"""Columns of trajectories that are written without a head; of matrices column after column."""
 
 
 @dataclass
@@ -107,7 +112,7 @@ def layout_of(text: str, name: str = "") -> TextTable:
     cut = max((i + 1 for i in range(len(head)) if empty_before[i + 1]), default=0)
     if cut == len(head):
         cut = 0  # the empty line stands between the names and the numbers
-    named, settings, rate = _sorted_head(head, cut, width)
+    named, settings, rate = _sorted_head(head, cut, width, blank)
     if (
         len(body) > 1
         and all(cells[-1] == "" for _, cells in body)
@@ -115,7 +120,8 @@ def layout_of(text: str, name: str = "") -> TextTable:
     ):
         body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
         width -= 1
-    names = _names(named, width, settings)
+    names = _names(named, width, settings) if named else _marker_names(width, settings)
+    names = names or _headless_names(body, width, blank)
     return TextTable(names, body, _commas(mark, body), settings, rate)
 
 
@@ -162,7 +168,7 @@ def _commas(mark: str, body: list[tuple[int, list[str]]]) -> bool:
 
 
 def _sorted_head(
-    head: list[tuple[int, list[str]]], cut: int, width: int
+    head: list[tuple[int, list[str]]], cut: int, width: int, blank: bool
 ) -> tuple[list[list[str]], dict[str, str], float]:
     """Lines above the numbers: those that name columns, the settings, and the rate."""
     named = []
@@ -179,6 +185,8 @@ def _sorted_head(
             cells.pop()
         if len(filled) == 1 and is_number(filled[0]):
             rate = float(filled[0])
+        elif blank and len(cells) != width:
+            settings[cells[0]] = " ".join(cells[1:])  # a sentence
         elif i >= cut and len(cells) <= width and (len(filled) > width / 2 or not cells[0]):
             named.append(cells + [""] * (width - len(cells)))
         else:
@@ -192,8 +200,6 @@ def _sorted_head(
 
 def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list[str]:
     """Names of columns, of all lines that name them, unlike each other."""
-    if not named:
-        return _marker_names(width, settings) or [f"column {i}" for i in range(1, width + 1)]
     units = [""] * width
     parts: list[list[str]] = [[] for _ in range(width)]
     for row in named:
@@ -258,6 +264,23 @@ def _prefixed(names: list[str]) -> list[str]:
             name = f"{body}.{name}" + (f" [{unit}]" if unit else "")
         joined.append(name)
     return joined
+
+
+def _headless_names(body: list[tuple[int, list[str]]], width: int, blank: bool) -> list[str]:
+    """Names of a trajectory without a head, known by what its numbers are: TUM's eight columns end
+    in a unit quaternion xyzw, KITTI's twelve are a rotation matrix and a place, row by row.
+    """
+    cells = [row for _, row in body[:SAMPLED]]
+    numbers = all(is_number(cell) and "," not in cell for row in cells for cell in row)
+    if blank and numbers and width == 8:
+        quat = np.array(cells, dtype=float)[:, 4:]
+        if np.allclose(np.sum(quat**2, axis=1), 1.0, atol=0.01):
+            return TUM.split()
+    if blank and numbers and width == 12:
+        turn = np.array(cells, dtype=float).reshape(-1, 3, 4)[:, :, :3]
+        if np.allclose(turn @ turn.transpose(0, 2, 1), np.eye(3), atol=0.01):
+            return KITTI.split()
+    return [f"column {i}" for i in range(1, width + 1)]
 
 
 def _marker_names(width: int, settings: dict[str, str]) -> list[str]:
