@@ -2,10 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
-from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.marginal import gram_of
+from visthrow.diagnose.likelihood.marginal import correlated_of, gram_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import Model
 
@@ -26,7 +25,7 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     noise, _ = levels.fit(told[-1], raw[-1])
     squares = []
     for windows, grams in zip(told, raw):
-        shaped = designs.correlated_of(grams, windows, noise.correlation_time, "cpu")
+        shaped = correlated_of(grams, windows, noise.correlation_time)
         squares.append(
             sum(share.square for share in integrals(shaped, noise).shares(shaped, noise))
         )

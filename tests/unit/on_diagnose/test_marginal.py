@@ -226,7 +226,7 @@ def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted, devi
     spoilt[[40, 201]] += 0.2
     given = [replace(windows[0], residual=spoilt), windows[1]]
     first, second = noise.without_outliers(
-        given, [marginal.gram_of(w, floors, 2) for w in given], floors, device
+        given, [marginal.gram_of(w, floors, 2) for w in given], device
     )
     assert set(np.flatnonzero(first.sigma > windows[0].sigma)) == {40, 201}
     assert second is windows[1]

@@ -18,8 +18,7 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.designs import correlated_of
-from visthrow.diagnose.likelihood.marginal import hidden_gram
+from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram
 from visthrow.diagnose.likelihood.noise_levels import roughly
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
@@ -224,9 +223,7 @@ def test_a_fit_of_initial_states_is_no_prior_of_them(monkeypatch):
     def reduced():
         model = ThrowModel(logs, paper_plant(), only=["joint_damping"])
         windows = model.windows({})
-        return correlated_of(
-            [hidden_gram(w, len(model.channels)) for w in windows], windows, 0.3, "cpu"
-        )
+        return correlated_of([hidden_gram(w, len(model.channels)) for w in windows], windows, 0.3)
 
     fitted = reduced()
     monkeypatch.setattr(initial_fit, "ROUNDS", 1)

@@ -22,10 +22,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from visthrow.diagnose.likelihood import designs
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
-from visthrow.diagnose.likelihood.marginal import hidden_gram, left_of
+from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram, left_of
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Window
 
@@ -244,6 +243,6 @@ def _likelihood(
     """
     correlated = with_correlations(windows, correlations_of)
     grams = parallel_map(lambda window: hidden_gram(window, channels), correlated)
-    shaped = designs.correlated_of(grams, correlated, noise.CORRELATION_TIMES[1], "cpu")
+    shaped = correlated_of(grams, correlated, noise.CORRELATION_TIMES[1])
     levels, value = noise.roughly(shaped, start)
     return value, levels

@@ -18,12 +18,12 @@ matter."""
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
 TAIL = 6.0
@@ -43,13 +43,6 @@ NEGATIVE = 1e-3
 """Largest negative eigenvalue of the information, relative to its diagonal, that rounding leaves:
 some 1e-13 of an effect's squares, of which `ROUNDING` are left at least.
 """
-
-
-class DeviceArray(NamedTuple):
-    """An array on a GPU, where it was calculated."""
-
-    values: Any  # torch.Tensor
-    of: np.ndarray  # the same on the host
 
 
 @dataclass(frozen=True)
@@ -75,12 +68,6 @@ class Gram:
         int, float
     ]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
-    there: DeviceArray | None = None  # of an ``inner``, which may have been replaced since
-
-    @property
-    def placed(self) -> "DeviceArray | np.ndarray":
-        """``inner``, with the same on a GPU where it was calculated there."""
-        return self.there if self.there is not None and self.there.of is self.inner else self.inner
 
     @property
     def latents(self) -> int:
@@ -188,10 +175,7 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 def without_effects(gram: Gram) -> Gram:
     """Return a Gram matrix of nuisances and latents alone."""
     size = gram.nuisances + gram.latents
-    if not isinstance(gram.placed, DeviceArray):
-        return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
-    device_inner = DeviceArray(gram.placed.values[:, :size, :size], gram.inner[:, :size, :size])
-    return replace(gram, inner=device_inner.of, cross=gram.cross[:, :size], there=device_inner)
+    return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
 
 
 def whitened(window: Window, values: np.ndarray) -> np.ndarray:
@@ -211,13 +195,6 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         rows = window.channel == c
         white, residual = z[rows], r[rows]
         inner[c], cross[c], square[c] = white.T @ white, residual @ white, residual @ residual
-    return gram_with(window, inner, cross, square)
-
-
-def gram_with(window: Window, inner: np.ndarray, cross: np.ndarray, square: np.ndarray) -> Gram:
-    """The gram of a window whose inner products are known, see :class:`Gram`; its latents are at
-    the knots.
-    """
     count = np.bincount(window.channel, minlength=len(square)).astype(float)
     blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
     turned = sum(
@@ -295,7 +272,11 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
         channels, -1, size
     )
     inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ factor).reshape(channels, size, -1)
-    return correlated_with(gram, inner, factor)
+    cross = gram.cross.copy()
+    cross[:, part] = (cross[:, part].reshape(-1, knots) @ factor).reshape(channels, -1)
+    shown = _information_by_block(inner, gram.nuisances, gram.latent_block)
+    whole = np.kron(np.eye(groups), factor)
+    return replace(gram, inner=inner, cross=cross, factor=whole, shown=shown)
 
 
 def knot_factor(window: Window, time: float) -> np.ndarray:
@@ -309,26 +290,6 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
     return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
 
 
-def correlated_with(
-    gram: Gram, inner: np.ndarray, factors: np.ndarray, device_inner: DeviceArray | None = None
-) -> Gram:
-    """The gram into which a factor of each group's knots was multiplied, with the inner products
-    that came of it.
-    """
-    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.copy()
-    cross[:, part] = (cross[:, part].reshape(-1, len(factors)) @ factors).reshape(len(cross), -1)
-    groups = gram.latents // len(factors)
-    factor, groups_range = np.zeros((groups, len(factors), groups, len(factors))), range(groups)
-    factor[groups_range, :, groups_range] = factors  # of each group, the same
-    factor, information = (
-        factor.reshape(gram.latents, gram.latents),
-        _information_by_block(inner, gram.nuisances, gram.latent_block),
-    )
-    return replace(
-        gram, inner=inner, cross=cross, factor=factor, shown=information, there=device_inner
-    )
-
-
 def _knots(group: np.ndarray, time: np.ndarray) -> int:
     """Knots of groups that follow one another with the same ones each; where they do not, all
     latents are one.
@@ -338,6 +299,28 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
         return len(group)
     groups, times = group.reshape(-1, count), time.reshape(-1, count)
     return count if np.all(groups == groups[:, :1]) and np.all(times == times[0]) else len(group)
+
+
+def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Gram]:
+    """Reduce windows to their inner products, see :func:`gram_of`."""
+    return parallel_map(lambda w: gram_of(w, floors, channels), windows)
+
+
+def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float) -> list[Gram]:
+    """Correlate the latent forces of all windows, see :func:`correlated`."""
+    return parallel_map(lambda pair: correlated(*pair, time), zip(grams, windows))
+
+
+def with_residuals(
+    grams: Sequence[Gram],
+    windows: Sequence[Window],
+    floors: np.ndarray,
+    residuals: Sequence[np.ndarray],
+) -> list[Gram]:
+    """Return Gram matrices with other residuals, see :func:`with_residual`."""
+    return parallel_map(
+        lambda of: with_residual(of[0], of[1], floors, of[2]), zip(grams, windows, residuals)
+    )
 
 
 def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
@@ -373,15 +356,6 @@ def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
     states = window.nuisance.shape[1]
     residual = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
     return residual - window.latent @ fit[states:] if len(fit) > states else residual
-
-
-def with_products(gram: Gram, cross: np.ndarray, square: np.ndarray) -> Gram:
-    """Return a Gram matrix of the same derivatives with other residuals, whose inner products with
-    columns at the knots, and with themselves, are given.
-    """
-    part, cross = slice(gram.nuisances, gram.nuisances + gram.latents), cross.copy()
-    cross[:, part] = cross[:, part] @ gram.factor
-    return replace(gram, cross=cross, square=square)
 
 
 @dataclass(frozen=True)

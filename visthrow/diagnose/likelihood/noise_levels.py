@@ -13,9 +13,16 @@ from functools import lru_cache
 import numpy as np
 from scipy.linalg import lapack
 
-from visthrow.diagnose.likelihood import designs
-from visthrow.diagnose.likelihood.marginal import TAIL, Gram, Noise, hidden_gram, without_effects
-from visthrow.diagnose.likelihood.stack import Stack
+from visthrow.diagnose.likelihood.marginal import (
+    TAIL,
+    Gram,
+    Noise,
+    correlated_of,
+    hidden_gram,
+    left_of,
+    without_effects,
+)
+from visthrow.diagnose.likelihood.stack import Same, Stack
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
@@ -75,7 +82,7 @@ def fit(
     if start is None and any(gram.latents for gram in grams):
         noise = _likeliest(windows, grams, device)
         time = noise.correlation_time
-    shaped = designs.correlated_of(grams, windows, time, device)
+    shaped = correlated_of(grams, windows, time)
     begin = replace(noise or _first_guess(shaped), correlation_time=time)
     return maximised(shaped, begin, device)[0], shaped
 
@@ -88,7 +95,7 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
 
     def likely(i: int, noise: Noise | None) -> float:
         if i not in levels_of:
-            shaped = designs.correlated_of(bare, windows, CORRELATION_TIMES[i], device)
+            shaped = correlated_of(bare, windows, CORRELATION_TIMES[i])
             begin = replace(noise or _first_guess(shaped), correlation_time=CORRELATION_TIMES[i])
             levels_of[i] = maximised(shaped, begin, device, ROUGHLY_NATS)
         return levels_of[i][1]
@@ -161,7 +168,7 @@ class _Layout:
         """Number the parameters: of the same windows, once."""
         count, phases = sum(gram.count for gram in grams), tuple(gram.phase for gram in grams)
         latents, measured = (
-            designs.Same([gram.latent_block for gram in grams]),
+            Same([gram.latent_block for gram in grams]),
             tuple(np.flatnonzero(count > 0).tolist()),
         )
         return _Layout._numbered(
@@ -171,7 +178,7 @@ class _Layout:
     @staticmethod
     @lru_cache(maxsize=8)
     def _numbered(
-        latents: designs.Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int
+        latents: Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int
     ) -> "_Layout":
         """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``:
         those with samples, of so many.
@@ -345,14 +352,13 @@ def _likelihood(
 
 
 def without_outliers(
-    windows: Sequence[Window], grams: Sequence[Gram], floors: np.ndarray, device: str = "cpu"
+    windows: Sequence[Window], grams: Sequence[Gram], device: str = "cpu"
 ) -> list[Window]:
     """Give single samples far outside a sigma that puts them at HUBER; windows with none are
     returned as they are.
 
     Latent forces have a wide prior here, so that a missing effect is followed and only what no
-    force can do stands out. ``grams``: of the windows, with ``factor`` the identity; ``floors``: of
-    the effects, shape (K,)."""
+    force can do stands out. ``grams``: of the windows, with ``factor`` the identity."""
     sigmas = [window.sigma for window in windows]
     windows_left, starts, bare = (
         list(range(len(windows))),
@@ -361,9 +367,8 @@ def without_outliers(
     )
     for cleaning in range(CLEANINGS):
         where = "cpu" if cleaning else device  # few are looked at once more
-        residuals = designs.left_by(
-            starts, floors, len(grams[0].count), widely_fitted(starts, bare, where), where
-        )
+        fits = widely_fitted(starts, bare, where)
+        residuals = parallel_map(lambda pair: left_of(*pair), zip(starts, fits))
         distances = {
             w: _outlier_distances(windows[w], residual)
             for w, residual in zip(windows_left, residuals)
@@ -383,7 +388,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
     priors of the latents.
     """
     time = CORRELATION_TIMES[0]
-    shaped = designs.correlated_of(bare, windows, time, device)
+    shaped = correlated_of(bare, windows, time)
     share = np.zeros((len(bare), len(LATENT_BLOCKS)))
     for row, gram in zip(share, bare):
         for (block, _), level in _first_guess([gram]).latent_sd.items():

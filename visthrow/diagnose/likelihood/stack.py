@@ -15,9 +15,7 @@ import torch
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.designs import Same, padded
 from visthrow.diagnose.likelihood.marginal import (
-    DeviceArray,
     Gram,
     Noise,
     Share,
@@ -25,7 +23,7 @@ from visthrow.diagnose.likelihood.marginal import (
     WindowStatistics,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.likelihood.transfer import all_to_host
+from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 T = TypeVar("T")
@@ -41,20 +39,31 @@ BEGUN = 4
 BLOCKS = len(LATENT_BLOCKS)
 
 
+class Same(tuple):
+    """Arrays that are the same only if they are the very ones."""
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Same)
+            and len(self) == len(other)
+            and all(a is b for a, b in zip(self, other))
+        )
+
+    def __hash__(self) -> int:
+        return hash(tuple(map(id, self)))
+
+
 class _HiddenColumns:
     """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded
     columns are 0.
     """
 
-    def __init__(
-        self, inner: Sequence[DeviceArray | np.ndarray], sizes: Sequence[int], device: str
-    ):
+    def __init__(self, inner: Sequence[np.ndarray], sizes: Sequence[int], device: str):
         """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its
         hidden columns.
         """
         self._inner, self._sizes, self._device = inner, sizes, device
-        whole = inner[0].of if isinstance(inner[0], DeviceArray) else inner[0]
-        self._channels, self._effects = len(whole), whole.shape[1] - sizes[0]
+        self._channels, self._effects = len(inner[0]), inner[0].shape[1] - sizes[0]
         self._begun, self._lock = {}, Lock()
 
     def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
@@ -90,8 +99,11 @@ class _HiddenColumns:
             lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :],
         )
 
-    def _moved(self, height: int, width: int, part: Callable[[T, int], T]) -> torch.Tensor:
-        return padded(self._inner, part, (self._channels, height, width), self._device)
+    def _moved(
+        self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]
+    ) -> torch.Tensor:
+        parts = [[part(inner, w)] for w, inner in enumerate(self._inner)]
+        return side_by_side(parts, (self._channels, height, width), self._device)
 
 
 _ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_HiddenColumns) for most in (2, 32))
@@ -199,7 +211,7 @@ class Stack:
             torch.from_numpy(a).to(self.device)
             for a in (cross, square, counts, log_sigma, member, initial)
         ]
-        inner = [gram.placed for gram in grams]
+        inner = [gram.inner for gram in grams]
         columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(
             Same(inner), tuple(sizes), self.device
         )

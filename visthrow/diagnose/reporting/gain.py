@@ -11,9 +11,8 @@ import numpy as np
 
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
-from visthrow.diagnose.likelihood.designs import grams_of
 from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
-from visthrow.diagnose.likelihood.marginal import finite
+from visthrow.diagnose.likelihood.marginal import finite, grams_of
 from visthrow.diagnose.likelihood.noise_levels import without_outliers
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
@@ -182,9 +181,7 @@ def on_others(
         windows = [w for w in model.windows(sizes) if finite(w) and w.flight not in without]
         floors_of = floors[: windows[0].effects.shape[1]] if windows else floors
         correlated = with_correlations(windows, diagnosis.work.problem.correlated)
-        mended = without_outliers(
-            correlated, grams_of(correlated, floors_of, channels, "cpu"), floors_of
-        )
+        mended = without_outliers(correlated, grams_of(correlated, floors_of, channels))
         outliers = 0
         for plain, window in zip(correlated, mended):
             innovation, expected, horizon = predicted(window, noise, window.residual)

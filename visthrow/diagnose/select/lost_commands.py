@@ -19,8 +19,8 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import few_of
-from visthrow.diagnose.likelihood.designs import correlated_of, grams_of
 from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
+from visthrow.diagnose.likelihood.marginal import correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judged
@@ -83,7 +83,7 @@ class CommandStatistics:
             len(problem.model.channels),
             point.device,
         )
-        grams = correlated_of(grams, windows, point.noise.correlation_time, point.device)
+        grams = correlated_of(grams, windows, point.noise.correlation_time)
         noise = levels.only(point.noise, grams, rows)
         shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
         information = np.array([columns_of.information for columns_of in shares])

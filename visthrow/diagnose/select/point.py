@@ -12,7 +12,6 @@ import numpy as np
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
-from visthrow.diagnose.likelihood.designs import grams_of, with_residuals
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     OWN_FLOOR,
@@ -22,7 +21,15 @@ from visthrow.diagnose.likelihood.evidence import (
     log_evidence,
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
-from visthrow.diagnose.likelihood.marginal import Gram, Noise, Statistics, gather, rescored
+from visthrow.diagnose.likelihood.marginal import (
+    Gram,
+    Noise,
+    Statistics,
+    gather,
+    grams_of,
+    rescored,
+    with_residuals,
+)
 from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 from visthrow.diagnose.select.scatter import Varies, freed, own_shares
@@ -224,10 +231,10 @@ def linearise(
         else [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     )
     device, floors = problem.model.device, problem.priors.floor
-    first = grams_of(extended, floors, channels, device)
-    cleaned = levels.without_outliers(extended, first, floors, device)
+    first = grams_of(extended, floors, channels)
+    cleaned = levels.without_outliers(extended, first, device)
     mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]
-    recomputed = dict(zip(mended, grams_of([cleaned[w] for w in mended], floors, channels, "cpu")))
+    recomputed = dict(zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)))
     raw = [recomputed.get(w, gram) for w, gram in enumerate(first)]
     noise, grams = levels.fit(cleaned, raw, start, device)
     integrals, position = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
@@ -336,9 +343,7 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
-    grams = with_residuals(
-        point.grams, point.windows, problem.priors.floor, residuals, point.device
-    )
+    grams = with_residuals(point.grams, point.windows, problem.priors.floor, residuals)
     return regathered(
         point,
         point.integrals,
@@ -382,9 +387,7 @@ def bend(problem: Problem, origin: Point, moved_point: Point, active: Sequence[i
         new.residual - (old.residual - old.effects @ change)
         for old, new in zip(origin.windows, moved_point.windows)
     ]
-    grams = with_residuals(
-        moved_point.grams, moved_point.windows, problem.priors.floor, bent, moved_point.device
-    )
+    grams = with_residuals(moved_point.grams, moved_point.windows, problem.priors.floor, bent)
     total = sum(share.score for share in moved_point.integrals.shares(grams, moved_point.noise))
     return covariance(moved_point.information, problem.priors.deviation(list(active))) @ total
 

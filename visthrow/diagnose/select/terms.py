@@ -15,11 +15,10 @@ import numpy as np
 import torch
 from scipy.linalg import lapack
 
-from visthrow.diagnose.likelihood.designs import Same
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
-from visthrow.diagnose.likelihood.stack import BATCH, statistics
+from visthrow.diagnose.likelihood.stack import BATCH, Same, statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.law_terms import (
