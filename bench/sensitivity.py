@@ -245,12 +245,13 @@ def picture(figures: dict[str, Any], path: Path, shown: int = 16) -> None:
             error = [1e3 * e for _, e in found["sweeps"][key]]
             axes.plot(np.array(values) * factor, error, "o-", label=name)
         axes.axhline(1e3 * MISS, color="gray", linestyle=":")
-        axes.set(xlabel=label, ylabel="landing error [mm]", yscale="log")
+        axes.set(xlabel=label, ylabel="landing error [mm]", ylim=(0.0, 1.1e3 * MISS))
     two.set_xscale("symlog", linthresh=1.0)
     one.legend(frameon=False)
-    every = {
-        e: min(_priors(row)) for found in figures.values() for e, row in found["effects"].items()
-    }
+    every: dict[str, float] = {}
+    for found in figures.values():
+        for effect, row in found["effects"].items():
+            every[effect] = min(every.get(effect, math.inf), min(_priors(row)))
     names = [e for e in sorted(every, key=every.__getitem__) if math.isfinite(every[e])][:shown]
     for number, (name, found) in enumerate(figures.items()):
         rows = [
