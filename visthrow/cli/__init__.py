@@ -10,7 +10,13 @@ import sys
 from collections.abc import Sequence
 
 from visthrow import __version__
-from visthrow.common.arguments import EXIT_BAD_INPUT, EXIT_INTERRUPTED, add_commands, run_command
+from visthrow.common.arguments import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERRUPTED,
+    add_commands,
+    complete,
+    run_command,
+)
 from visthrow.common.errors import VisthrowError
 
 COMMANDS = {
@@ -106,7 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after
     Ctrl-C."""
     try:
-        args = build_parser().parse_args(argv)
+        parser = build_parser()
+        complete(parser)
+        args = parser.parse_args(argv)
         return run_command(COMMANDS, args.command, args)
     except KeyboardInterrupt:
         print("visthrow: interrupted", file=sys.stderr)

@@ -6,6 +6,7 @@ import argparse
 import contextlib
 import importlib
 import math
+import os
 import signal
 import sys
 import threading
@@ -123,6 +124,26 @@ def add_commands(
         )
 
 
+def complete(parser: argparse.ArgumentParser) -> None:
+    """Answer a shell that asks for completions and exit; return at once where none asks.
+
+    The words of the line choose the commands whose arguments are loaded.
+    """
+    line = os.environ.get("COMP_LINE")
+    if "_ARGCOMPLETE" not in os.environ or line is None:
+        return
+    import argcomplete
+
+    chosen = parser
+    for word in line.split()[1:]:
+        parsers = chosen._subparsers._group_actions[0].choices if chosen._subparsers else {}
+        if word in parsers:
+            chosen = parsers[word]
+            if isinstance(chosen, _Lazy):
+                chosen.add_module_arguments()
+    argcomplete.autocomplete(parser)
+
+
 def run_command(commands: Commands, name: str, args: argparse.Namespace) -> int:
     """Run the chosen command; returns its exit status.
 
@@ -142,11 +163,15 @@ class _Lazy(argparse.ArgumentParser):
         super().__init__(*args, **kwargs)
         self._module = module
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+    def add_module_arguments(self) -> None:
+        """Add the arguments of the module, once."""
         if self._module is not None:
             module = self._module
             self._module = None
             importlib.import_module(module).add_arguments(self)
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        self.add_module_arguments()
         namespace_out, unknown = super().parse_known_args(args, namespace)
         if (
             unknown and self._subparsers is None

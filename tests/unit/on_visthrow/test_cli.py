@@ -24,6 +24,7 @@ runs counts.
 """
 
 HEAVY = {
+    "argcomplete",
     "torch",
     "warp",
     "rsl_rl",
