@@ -107,10 +107,15 @@ class MavlinkDecoder:
         )
 
 
+FORMER_FRAMES = dict(enumerate("MOCAP_NED MOCAP_ENU VISION_NED VISION_ENU".split(), start=14))
+"""MAV_FRAMEs of before 2019, which MAVLink only reserves today."""
+
+
 def frame_name(number: int) -> str:
     """Return the name of a MAV_FRAME."""
     entry = mav.enums["MAV_FRAME"].get(number)
-    return str(number) if entry is None else entry.name.removeprefix("MAV_FRAME_")
+    known = str(number) if entry is None else entry.name.removeprefix("MAV_FRAME_")
+    return FORMER_FRAMES.get(number, known)
 
 
 def seen_of(message: Any, address: Address, why: str) -> Seen:
