@@ -107,7 +107,7 @@ class MavlinkDecoder:
         )
 
 
-FORMER_FRAMES = dict(enumerate("MOCAP_NED MOCAP_ENU VISION_NED VISION_ENU".split(), start=14))
+FORMER_FRAMES = dict(enumerate(["MOCAP_NED", "MOCAP_ENU", "VISION_NED", "VISION_ENU"], start=14))
 """MAV_FRAMEs of before 2019, which MAVLink only reserves today."""
 
 
