@@ -31,6 +31,7 @@ CHOICES = {
     "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX LONGEST_DELAY NEAR KEEP_ALIVE OPEN_TIME"
     " ARM_LOW POLLS READ_BACK RATES_PERIOD RATES_TIME",
     "hil/links/backends/crazyflie.py": "ASK ARM_PERIOD HOLDS DESCENT SHORTEST",
+    "tests/fakes/fake_crazyflie.py": "GYRO_NOISE",
     "hil/links/backends/crazyflie_gyro.py": "BLOCK PERIOD_MS AT_ONCE ASK_AGAIN STAMP",
     "hil/links/backends/px4.py": "MARGIN GAP",
     "hil/links/backends/thrust_curve.py": "LEAST_SHARES VOLTAGE_RANGE",

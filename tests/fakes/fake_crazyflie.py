@@ -42,6 +42,7 @@ PASSED, READY, FLYING, LEVEL, LANDED, LOCKED, CRASHED = (
 )
 MAY_FLY = (READY, FLYING, LEVEL, LANDED)  # states in which the motors may turn
 
+GYRO_NOISE = 0.1  # of a reported body rate [deg/s]
 GYRO = tuple(f"gyro.{axis}" for axis in FACTS["log_gyro"])
 VARIABLES = (*(f"motor.{letter}" for letter in "abcdefghijk"), *GYRO, "pm.vbat")
 """Variables of its logging, in the order of their numbers."""
@@ -100,6 +101,7 @@ class FakeCrazyflie(PortFake):
         # numbers of the variables of each block, and its period and next time once started [s]
         self._blocks: dict[int, list[int]] = {}
         self._started: dict[int, list[float]] = {}
+        self._rng = np.random.default_rng(0)
 
     def came(self, data: bytes) -> None:
         if self.silent or not data:
@@ -260,7 +262,8 @@ class FakeCrazyflie(PortFake):
 
     def speak(self) -> None:
         """Send the blocks that are due."""
-        rates = dict(zip(GYRO, np.degrees(self.plant.state["rate_b"])))
+        noise = GYRO_NOISE * self._rng.standard_normal(len(GYRO))
+        rates = dict(zip(GYRO, np.degrees(self.plant.state["rate_b"]) + noise))
         for block, due in self._started.items():
             if self.plant.time >= due[1] - 1e-9 and not self.silent:
                 due[1] += due[0]

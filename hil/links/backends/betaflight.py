@@ -55,7 +55,7 @@ OPEN_TIME = 2.0
 ARM_LOW = 0.5
 
 # what is asked for all the time, and how often [s]
-POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.ANALOG: 1.0}
+POLLS = {msp.STATUS: 0.1, msp.RC: 0.1, msp.SERVO: 0.1, msp.RAW_IMU: 0.1, msp.ANALOG: 1.0}
 
 READ_BACK = 0.04
 """Between two questions for the release [s].
@@ -132,7 +132,7 @@ class Betaflight(OnPort):
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
-        self._framed = self._boxed = self._read_back = self._rated = -1e9
+        self._framed = self._boxed = self._read_back = -1e9
         self._followed_at: float | None = None  # since when it has followed [s]
         self._flags = self._blocks = 0
         self._free_since: float | None = (
@@ -289,18 +289,16 @@ class Betaflight(OnPort):
                     self._hear(frame, host_time)
                 elif frame.direction == msp.REFUSAL:
                     self.refused += 1
-        for command, period in POLLS.items():
-            if host_time - self._polled[command] >= period and (
+        if self._raised and self._followed_at is None:
+            self._followed_at = host_time
+        judged = self._followed_at is not None and host_time - self._followed_at <= RATES_TIME
+        periods = POLLS | ({msp.RAW_IMU: RATES_PERIOD} if judged else {})
+        for command, period in periods.items():
+            if host_time - self._polled[command] >= period - ROUNDING and (
                 command != msp.SERVO or self.release_record.read_back
             ):
                 self._polled[command] = host_time
                 self._write(command)
-        if self._raised and self._followed_at is None:
-            self._followed_at = host_time
-        judged = self._followed_at is not None and host_time - self._followed_at <= RATES_TIME
-        if judged and host_time - self._rated >= RATES_PERIOD - ROUNDING:
-            self._rated = host_time
-            self._write(msp.RAW_IMU)
         if not (self._boxes and self._order) and host_time - self._boxed >= 0.5:
             self._boxed = host_time
             self._write(msp.BOXIDS)
