@@ -15,7 +15,9 @@ import math
 import struct
 import warnings
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -213,8 +215,10 @@ def _mcap(path: Path) -> Table:
     chunks = summary.chunk_indexes if summary is not None else []
     require_room(path, sum(chunk.uncompressed_size for chunk in chunks), LogError)
     topics = Topics()
-    encodings = set()
-    for _, channel, message in reader.iter_messages():
+    listed = summary.channels.values() if summary is not None else ()
+    encodings = {channel.message_encoding for channel in listed}
+    messages = reader.iter_messages() if not encodings or encodings - {"cdr", "ros1"} else ()
+    for _, channel, message in messages:
         encodings.add(channel.message_encoding)
         if channel.message_encoding not in ("cdr", "ros1"):
             label = f"{channel.topic} ({channel.message_encoding})"
@@ -255,7 +259,8 @@ class Topics:
             self._left_out[topic] = f"{label}: messages of {len(raw)} bytes hold no signal"
             return
         try:
-            row = dict(_numbers(decode(raw), ""))
+            row: dict[str, float] = {}
+            _add_numbers(row, decode(raw), "")
         except Exception as error:  # readers of others raise what comes
             self._left_out[topic] = f"{label}: cannot be decoded: {error!r}"[:200]
             return
@@ -271,8 +276,11 @@ class Topics:
         )
         table = Columns()
         for topic, messages in self._rows.items():
-            for name in dict.fromkeys(name for row in messages for name in row):
-                values = np.array([row.get(name, np.nan) for row in messages])
+            names = list(dict.fromkeys(name for row in messages for name in row))
+            blank = dict.fromkeys(names, np.nan)
+            whole = [row if len(row) == len(names) else blank | row for row in messages]
+            columns = np.array(list(map(itemgetter(*names), whole))).T
+            for name, values in zip(names, columns):
                 clock = name in ("time", "arrival")
                 table[f"{topic}:{name}"] = values - start if clock else values
         table.left_out = list(self._left_out.values())
@@ -288,20 +296,34 @@ def _stamp(row: dict[str, float], head: str) -> float:
     return whole + 1e-9 * part
 
 
-def _numbers(value: Any, name: str) -> Iterator[tuple[str, float]]:
-    """Name and value of each number in a message."""
+@cache
+def _places(name: str, count: int) -> tuple[str, ...]:
+    return tuple(f"{name}[{i}]" for i in range(count))
+
+
+@cache
+def _members(kind: type, name: str) -> tuple[tuple[str, str], ...]:
+    """Members of a message and what they are called within it."""
+    members = [m for m in getattr(kind, "__dataclass_fields__", ()) if not m.startswith("__")]
+    return tuple((member, f"{name}.{member}" if name else member) for member in members)
+
+
+def _add_numbers(row: dict[str, float], value: Any, name: str) -> None:
+    """Add each number in a message to a row, by its name."""
     if isinstance(value, (bool, int, float, np.integer, np.floating)):
-        yield name, float(value)
+        row[name] = float(value)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        if value.size <= WIDEST:
+            row.update(zip(_places(name, value.size), map(float, value.ravel().tolist())))
     elif isinstance(value, dict):
         for key, item in value.items():
-            yield from _numbers(item, f"{name}.{key}" if name else key)
+            _add_numbers(row, item, f"{name}.{key}" if name else key)
     elif isinstance(value, (list, tuple, np.ndarray)) and len(value) <= WIDEST:
-        for i, item in enumerate(value):
-            yield from _numbers(item, f"{name}[{i}]")
-    elif hasattr(value, "__dataclass_fields__"):
-        for key in value.__dataclass_fields__:
-            if not key.startswith("__"):
-                yield from _numbers(getattr(value, key), f"{name}.{key}" if name else key)
+        for place, item in zip(_places(name, len(value)), value):
+            _add_numbers(row, item, place)
+    else:
+        for member, place in _members(type(value), name):
+            _add_numbers(row, getattr(value, member), place)
 
 
 def _c3d(path: Path) -> Table:
