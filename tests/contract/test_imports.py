@@ -234,29 +234,6 @@ def test_importing_visthrow_and_the_command_line_is_cheap():
     assert {"torch", "numpy", "warp", "cv2"}.isdisjoint(result.stdout.split())
 
 
-def test_a_process_that_throws_on_the_reference_plant_needs_no_trainer():
-    """Tensordict brings torch's compiler along, which takes about as long to import as torch
-    itself; so did a pilot's first step.
-    """
-    code = """
-import sys
-import numpy as np
-import visthrow.throws.reference_protocol
-from visthrow.onboard.pilot import Pilot
-from visthrow.throws.loading import load_policy
-loaded = load_policy("vision")
-level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
-payload = still - [0.0, 0.0, 0.4]
-pilot = Pilot(loaded.policy, loaded.experiment.camera)
-pilot.act(still, level, still, still, payload, still)
-print(*sys.modules)
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    assert {"tensordict", "rsl_rl", "torch._dynamo"}.isdisjoint(result.stdout.split())
-
-
 def test_only_the_configuration_names_a_solver():
     """``visthrow`` and ``hil`` know the simulator, not the engine behind it."""
     wrong = [

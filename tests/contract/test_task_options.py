@@ -160,28 +160,6 @@ def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
     assert "flown with rope.length = 0.34" in (tmp_path / "compare-hybrid.md").read_text()
 
 
-def test_releases_are_those_of_the_throws_and_a_rod_does_not_bow():
-    from bench.releases import releases, row
-
-    loaded = load_policy("state")
-    found = releases(loaded, 2.0, 6, "cpu", 0)
-    throws = protocol.throw(loaded.experiment, loaded.policy.act, 2.0, 6, "cpu", 0)
-    np.testing.assert_allclose(found.landing_w[:, :2], throws.landing_w, atol=1e-6)
-    # a parabola from the release to the landing at 0.04 m
-    fall = (
-        found.ball_vel_w[:, 2]
-        + np.sqrt(found.ball_vel_w[:, 2] ** 2 + 2 * 9.81 * (found.ball_w[:, 2] - 0.04))
-    ) / 9.81
-    np.testing.assert_allclose(found.time + fall, throws.duration, atol=1e-4)
-    np.testing.assert_allclose(
-        found.ball_w[:, :2] + fall[:, None] * found.ball_vel_w[:, :2], throws.landing_w, atol=1e-4
-    )
-    assert (found.bow > 1e-3).all()
-    rod = load_policy("state", "state", ["rope.segments=1"], allow=["rope.segments"])
-    assert releases(rod, 2.0, 2, "cpu", 0).bow.max() < 1e-6
-    assert row("state", "its own", found).startswith("| state | its own | 0.6")
-
-
 def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
     plain, moving = contract_of(experiment("state")), contract_of(experiment("state_moving"))
     assert "goal_velocity" not in plain["observation"]

@@ -7,19 +7,18 @@ import pytest
 
 from visthrow.diagnose.select import search
 from visthrow.diagnose.throw.throw_model import ThrowModel
-from visthrow.logs.flightlog import FlightLog
 from visthrow.task import plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.recorded import MEASURED, fly
 
-SEEDS = (1, 2)
+SEEDS = (1,)
 LATE = (8e-3, 12e-3)
 """Age of what the pilot of these flights is told [s]."""
 
 
 @pytest.fixture(scope="module")
 def flown():
-    """Policy and flights, as ``visthrow fly --seed 1`` and ``2`` save them."""
+    """Policy and flights, as ``visthrow fly --seed 1`` saves them."""
     loaded = load_policy("vision", None, [])
     return loaded, [fly(loaded, np.array([2.0, 0.0, 0.0]), seed=seed) for seed in SEEDS]
 
@@ -36,21 +35,6 @@ def test_flights_of_fly_hide_nothing(flown):
     """
     diagnosis = told(*flown)
     assert (diagnosis.overall, dict(diagnosis.theta), diagnosis.events) == ("NO EFFECT", {}, ())
-
-
-def test_flights_without_noise_hide_nothing(flown):
-    """A latent force of 16 uN stands out from a phase that has next to none; it moves
-    no landing.
-    """
-    loaded, logs = flown
-    exact = [
-        FlightLog(
-            {k: c for k, c in log.channels.items() if not k.startswith("measured_")}, log.meta
-        )
-        for log in logs[:1]
-    ]
-    diagnosis = told(loaded, exact)
-    assert (diagnosis.overall, dict(diagnosis.theta)) == ("NO EFFECT", {})
 
 
 @pytest.mark.parametrize("name", MEASURED)

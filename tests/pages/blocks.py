@@ -14,7 +14,7 @@ more:
 
 The blocks of a page run in order in a folder of the page's own that looks like the root of a clone.
 What another page has run already, with the same arguments and files, is not run again: what it
-wrote is copied. A training is evaluated with 20 throws for 200."""
+wrote is copied. A training is evaluated with 4 throws for 200."""
 
 import contextlib
 import dataclasses
@@ -183,7 +183,7 @@ class Runner:
         spoken = " ".join(block.text for block in blocks if block.language in ("sh", "python"))
         files = " ".join(block.text for block in blocks if block.title)
         names: dict[str, object] = {}
-        with contextlib.chdir(folder), mock.patch.object(trainer, "EVALUATED", 20):
+        with contextlib.chdir(folder), mock.patch.object(trainer, "EVALUATED", 4):
             for block in blocks:
                 if block.title:
                     assert block.title in spoken + files, (

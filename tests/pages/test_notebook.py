@@ -9,7 +9,7 @@ NOTEBOOK = ROOT / "docs" / "tutorials" / "notebook.ipynb"
 FEWER = {
     "ITERATIONS = 14 ": "ITERATIONS = 1 ",
     "os.chdir(work)": (
-        "os.chdir(work)\nfrom visthrow.training import trainer\ntrainer.EVALUATED = 20"
+        "os.chdir(work)\nfrom visthrow.training import trainer\ntrainer.EVALUATED = 4"
     ),
 }
 """What is smaller than on the page: iterations of training, and throws that evaluate it."""

@@ -15,10 +15,10 @@ def same_bits(one_thread):
 
 @pytest.fixture(autouse=True)
 def few_throws(monkeypatch):
-    """An evaluation throws 20 times for 200: that it is made, written and printed does not hang on
+    """An evaluation throws 4 times for 200: that it is made, written and printed does not hang on
     how many.
     """
-    monkeypatch.setattr(trainer, "EVALUATED", 20)
+    monkeypatch.setattr(trainer, "EVALUATED", 4)
 
 
 @pytest.fixture

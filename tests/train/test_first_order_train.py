@@ -2,11 +2,7 @@
 however it was stopped.
 """
 
-import os
 import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import pytest
@@ -27,8 +23,6 @@ SMALL = [
     "first_order.horizon=12",
     "first_order.iterations=4",
 ]
-PATIENCE = 300.0
-"""Longest wait for what takes seconds on an idle machine [s]."""
 
 
 def words(folder, *extra):
@@ -81,24 +75,6 @@ def test_its_policy_is_one_like_any_other(whole):
 def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled, number):
     folder = tmp_path / "run"
     signalled(FirstOrder, words(folder), number)
-    assert same(whole, folder)
-
-
-def test_killed_it_goes_on(whole, tmp_path):
-    """SIGKILL, as a machine without power would."""
-    folder = tmp_path / "run"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    running = subprocess.Popen(
-        [sys.executable, "-m", "visthrow.cli", *words(folder)], env=environment
-    )
-    end = time.monotonic() + PATIENCE
-    while not (folder / CHECKPOINT).exists():
-        assert time.monotonic() < end, "no checkpoint came"
-        assert running.poll() is None or (folder / CHECKPOINT).exists()
-        time.sleep(0.01)
-    running.kill()
-    running.wait()
-    assert cli.main(words(folder, "--resume")) == 0
     assert same(whole, folder)
 
 

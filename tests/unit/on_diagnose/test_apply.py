@@ -168,27 +168,6 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
     assert "--laws 1 writes it" in capsys.readouterr().out
 
 
-def test_laws_that_belong_together_are_written_together(diagnosis, tmp_path):
-    """The first explanation has two terms, the second, which stands in its place, one of them."""
-    swirl = {
-        "block": "payload force",
-        "factors": ["speed"],
-        "vector": "vertical_cross_vel",
-        "coefficient": 0.02,
-    }
-    other = swirl | {"factors": [], "coefficient": 0.03}
-    given = diagnosis(
-        theta={},
-        covariance=[],
-        laws=[swirl, other],
-        explanations=[[swirl, other], [other | {"coefficient": 0.05}]],
-    )
-    for rank, coefficients in ((1, [0.02, 0.03]), (2, [0.05])):
-        out = tmp_path / f"{rank}.toml"
-        assert cli.main(["diagnose", "apply", given, "--out", str(out), "--laws", str(rank)]) == 0
-        assert [law.coefficient for law in config.load(Experiment, out).laws] == coefficients
-
-
 def test_every_effect_can_be_written():
     before = shipped()
     setting = patch.generalised(patch.Setting(plant_of(before), camera=before.camera))

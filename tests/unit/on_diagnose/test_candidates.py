@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.select import point as points
-from visthrow.diagnose.select import result, search, selector
-from visthrow.diagnose.select.point import fitted, linearise
+from visthrow.diagnose.select import result, search
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -54,76 +52,8 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
     assert diagnosis.overall == result.KNOWN
 
 
-class Luckier(SyntheticModel):
-    """Initial states fitted anew explain more than the first at any size, and derivatives there
-    tell of more than the size does.
-    """
-
-    def __post_init__(self):
-        super().__post_init__()
-        self.fits = 0
-
-    def windows(self, theta):
-        self.fits += 1
-        found = super().windows(theta)
-        return [
-            replace(w, residual=r)
-            for w, r in zip(found, self._fitted(theta, [w.residual for w in found]))
-        ]
-
-    def residuals(self, theta, about=None):
-        return self._fitted(theta, super().residuals(theta))
-
-    def _fitted(self, theta, residuals):
-        rough, taken_back = np.random.default_rng(3), (1.0 - SHOWN) * theta.get(NAME, 0.0)
-        if self.fits > 1:
-            return [r + taken_back * w.effects[:, 3] for r, w in zip(residuals, self._windows)]
-        return [
-            r + LUCK * w.sigma * rough.choice((-1.0, 1.0), len(r))
-            for r, w in zip(residuals, self._windows)
-        ]
-
-
-def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
-    """Without it they explain the flights as well, which the simulation shows and derivatives do
-    not.
-    """
-    monkeypatch.setattr(
-        selector.Selector,
-        "settle",
-        lambda self, point, active, doubted=None: (
-            point
-            if doubted is None
-            else fitted(self.problem, linearise(self.problem, point.theta, point.noise), active)
-        ),
-    )
-    model = Luckier(effects=EFFECTS, truth={NAME: 2.0}, seed=8)
-    assert not search.explain(model, laws=False).named
-    assert model.fits == 2
-
-
 def test_what_whips_where_nothing_is_hidden_is_not_named():
     assert explained(0.0).overall == result.NO_EFFECT
-
-
-@pytest.mark.parametrize("alike", [(), ("effect_05", "effect_07")])
-def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
-    """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its
-    mass in all others.
-    """
-    plain, tried = points.candidate, []
-
-    def candidate(problem, point, active):
-        tried.append(tuple(active))
-        return plain(problem, point, active)
-
-    monkeypatch.setattr(points, "candidate", candidate)
-    effects = [replace(e, confused_with=alike) if e.name == NAME else e for e in EFFECTS]
-    diagnosis = search.explain(
-        SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False
-    )
-    assert diagnosis.named == (NAME,)
-    assert {(5,), (7,)} <= set(tried) if alike else not {(5,), (7,)} & set(tried)
 
 
 class Levered(SyntheticModel):

@@ -85,12 +85,6 @@ def test_white_noise_is_white():
     )
 
 
-def test_what_lasts_for_longer_than_a_filter_is_no_noise():
-    slow = [replace(w, time=30.0 * w.time) for w in flown(3, "first").windows({})]
-    priors = Priors.of(catalogue(SOME), ("pos_w", "payload_pos_w"))
-    assert not correlations(slow, priors.slab * priors.floor, 2)
-
-
 @pytest.mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
 def test_time_order_and_size_are_those_planted(colour, order):
     for seed in (3,):
@@ -109,11 +103,3 @@ def test_noise_that_is_correlated_is_no_cause(monkeypatch):
     assert [d.overall for d in said] == [result.NO_EFFECT] * 2
     monkeypatch.setattr(point, "correlations", lambda *_: {})
     assert any(search.explain(flown(seed, "first")).overall != result.NO_EFFECT for seed in (0, 7))
-
-
-def test_a_cause_is_found_behind_it():
-    diagnosis = search.explain(flown(5, "first", truth={"effect_01": 15.0}))
-    assert diagnosis.named == ("effect_01",)
-    assert (
-        diagnosis["effect_01"].low < 15.0 * catalogue(SOME)[1].floor < diagnosis["effect_01"].high
-    )

@@ -41,16 +41,6 @@ def interval(statistics: Statistics) -> tuple[float, float]:
     return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)
 
 
-def test_one_flight_alone_tells_a_size_to_a_floor_and_a_third():
-    """Nothing tells how flights differ, so that the prior stands."""
-    unlike, kept = between_flights(
-        flights(np.full(1, SIZE), np.random.default_rng(1)), PRIORS, [0], np.array([SIZE, 0.0])
-    )
-    np.testing.assert_allclose(
-        unlike * kept, 1.0, rtol=0.05
-    )  # of the half-normal's square, over the grid
-
-
 def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter():
     """Of sixteen flights nothing of a third of the size is left; where they scatter by more than
     that, the scatter is.
@@ -72,10 +62,3 @@ def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
         )
         held += abs(size - SIZE) < 1.96 * sd
     assert held > LEAST * TRIED
-
-
-def test_without_names_nothing_is_added():
-    """Bounds of a model that explains its flights are those of its noise and its floors."""
-    assert not between_flights(
-        flights(np.zeros(3), np.random.default_rng(4)), PRIORS, [], np.zeros(2)
-    )[0]

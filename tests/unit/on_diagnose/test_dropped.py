@@ -2,11 +2,9 @@
 what else there is.
 """
 
-from dataclasses import replace
 from functools import cache
 
 import numpy as np
-import pytest
 
 from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
@@ -14,7 +12,7 @@ from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select import search
-from visthrow.diagnose.select.point import Problem, linearise, moved
+from visthrow.diagnose.select.point import Problem, linearise
 from visthrow.diagnose.throw.replay import Lane
 from visthrow.diagnose.throw.throw_model import ThrowModel
 
@@ -56,24 +54,6 @@ def test_a_column_is_what_the_missing_command_changes():
         np.testing.assert_allclose(column, change, atol=1e-12)
         largest = max(largest, np.abs(change).max())
     assert largest > 1e-3  # a turn of that [rad], else nothing is compared
-
-
-def test_a_problem_with_lost_commands_says_the_same_both_ways():
-    model = model_of(SHARE, throws=1)
-    windows = model.windows({})
-    problem = replace(Problem.of(model, windows, tuple(range(len(windows)))), lost=SHARE)
-    point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    again = moved(problem, point, np.append(1e-9, point.theta[1:]))
-    for w, own, there, columns in zip(point.windows, windows, again.windows, point.commands):
-        np.testing.assert_allclose(there.residual, w.residual, atol=1e-9)
-        assert w.nuisance.shape[1] == own.nuisance.shape[1] + columns.shape[1]
-        assert np.all(
-            w.nuisance_sd[len(own.nuisance_sd) :] == pytest.approx(np.sqrt(SHARE * (1.0 - SHARE)))
-        )
-        np.testing.assert_allclose(own.residual - w.residual, SHARE * columns.sum(1), atol=1e-12)
-    assert all(
-        w.nuisance.shape == windows[i].nuisance.shape for i, w in point.about.windows.items()
-    )
 
 
 def told(diagnosis):

@@ -23,20 +23,6 @@ class Phase:
         return self.noise.latent_sd[block, self.phase]
 
 
-@pytest.mark.parametrize(("phases", "excessive"), [(2, True), (6, False)])
-def test_of_many_levels_one_is_high_by_chance(phases, excessive, monkeypatch):
-    """What is too much of one would be seen in one of a dozen of any null world's, at a threshold
-    of five nats.
-    """
-    monkeypatch.setattr(excess, "_Phase", Phase)
-    names = [f"phase {i}" for i in range(phases)]
-    sd = {(0, name): 10.0 if name == names[-1] else 1.0 for name in names}
-    point = SimpleNamespace(noise=SimpleNamespace(latent_sd=sd), grams=[], windows=[])
-    found = excess.levels(PROBLEM, point, point, 5.0)
-    assert [level.nats for level in found] == [*[0.0] * (phases - 1), 6.0]
-    assert [level.excessive for level in found] == [*[False] * (phases - 1), excessive]
-
-
 @pytest.mark.parametrize(("metres_a_newton", "excessive"), [(1e-4, False), (1.0, True)])
 def test_a_force_that_moves_no_landing_is_nothing_unknown(metres_a_newton, excessive, monkeypatch):
     """The throw's force of 10 N stands out from the calm phase's 1 N; it moves the vehicle by 1 mm

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.models.law_terms import Term
-from visthrow.diagnose.select import result, search, selector, terms
-from visthrow.diagnose.select.point import Problem, candidate, linearise, lost, only
+from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select.point import Problem, linearise, lost
 
 EFFECTS = catalogue(12)
 BAD = 10
@@ -70,24 +69,3 @@ def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goe
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)
     assert diagnosis.windows == len(model.windows({})) - 1
-
-
-@pytest.mark.parametrize(
-    ("active", "stands"), [([0], True), ([0, 5], False), ([5], False), ([], False)]
-)
-def test_without_lost_windows_the_search_goes_on_from_names_that_stand_alone(active, stands):
-    """Otherwise it begins anew: the window may have brought the name.
-
-    Terms that were looked at on the way are left behind.
-    """
-    model = SyntheticModel(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
-    problem = Problem(model, tuple(range(len(model.windows({})))))
-    nominal = linearise(problem, np.zeros(len(EFFECTS)))
-    at = selector.Selector(problem, nominal, 5.0, lambda _: None, active=active, origin=nominal)
-    at.point = candidate(at.problem, nominal, active)
-    drag = terms.as_effect(Term("vehicle force", ("speed",), "vel"), 0.1, 7.0)
-    at.problem, (at.origin, at.point) = terms.extended(problem, (at.origin, at.point), [drag])
-    left = [i for i in problem.kept if i != BAD]
-    assert at.stands_without([BAD], problem.only(left), only(nominal, left), 5.0) == stands
-    assert len(at.point.windows) == len(at.origin.windows) == len(left)
-    assert len(at.point.theta) == len(at.priors.floor) == len(EFFECTS)

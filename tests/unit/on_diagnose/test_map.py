@@ -163,20 +163,6 @@ def unnamed(
     }
 
 
-@pytest.mark.parametrize(
-    ("length", "angle"), [(of, leaning) for of in ("m", "cm", "mm") for leaning in ("rad", "deg")]
-)
-def test_gravity_says_the_units_that_no_name_says(length, angle):
-    """A gentle flight, whose degrees could be radians: in the right units it accelerates level as
-    it leans.
-    """
-    found = propose(unnamed(flight(20.0, scale=0.05), length, angle), "a.csv")
-    assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": length, "quat_wb": angle}
-    assert f"{length} by gravity" in found.why["pos_w"]
-    assert f"{angle} by gravity" in found.why["quat_wb"]
-    assert not found.questions
-
-
 @pytest.mark.parametrize(("seed", "asked"), [(0, False), (2, True)])
 def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_about(seed, asked):
     """About the origin both stay in a hall, and a hundredth of the path is near a 57th
@@ -205,18 +191,6 @@ def test_angles_that_would_turn_a_flight_over_are_in_degrees():
     assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "mm", "quat_wb": "deg"}
     assert "in rad half of the time tilted by more than 93 deg" in found.why["quat_wb"]
     assert not found.questions
-
-
-def test_a_path_that_names_its_unit_tells_that_of_the_angles_to_one_that_does_not():
-    columns = unnamed(flight(20.0, seed=2, scale=0.05), "cm", "deg", above=2.9)
-    second = {f"mocap_pos_{letter}_cm": columns[f"pos_{letter}"] + 1.0 for letter in "xyz"}
-    found = propose(columns | second, "a.csv")
-    assert {c.name: c.unit for c in found.mapping.channels} == {
-        "pos_w": "cm",
-        "mocap_pos_w": "cm",
-        "quat_wb": "deg",
-    }
-    assert not any("a guess" in question for question in found.questions)
 
 
 def test_a_hover_in_millimetres_is_no_flight_of_a_kilometre():
@@ -251,23 +225,6 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
         )
         assert found.mapping.channels[0].unit == unit
         assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
-
-
-@pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("gone", [np.nan, np.inf])
-def test_columns_without_a_number_are_no_channel(gone):
-    columns = flight(20.0)
-    lost = np.full(len(columns["time"]), gone)
-    table = {
-        "time": columns["time"],
-        **named("pos", columns["pos_w"]),
-        **named("vel", columns["vel_w"]),
-        **named("acc", columns["acc_b"]),
-    }
-    found = propose(
-        {**table, "acc_x": lost, **named("cam_pos", np.stack([lost] * 3, axis=1))}, "a.csv"
-    )
-    assert {c.name for c in found.mapping.channels} == {"pos_w", "vel_w"}
 
 
 def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
@@ -396,42 +353,6 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
     again = join([box, run])
     assert again["rate_b"] is box["rate_b"]
     assert "estimated" not in again.meta
-
-
-def test_samples_in_steps_are_not_stale_where_they_repeat_themselves():
-    """Rates of whole degrees a second at 400 Hz: those at which a step was just taken are half a
-    step ahead of the rate.
-    """
-    time = np.arange(0.0, 25.0, 2.5e-3)
-    rate = np.stack([0.3 * np.sin(2.0 * np.pi * f * time) for f in (0.5, 0.7, 0.9)], axis=1)
-    step = np.radians(1.0)
-    rounded = step * np.round(rate / step)
-    pose = {
-        "pos_w": Channel(
-            time[::10], np.random.default_rng(0).normal(0.0, 1e-3, (1000, 3)), "m", "world"
-        ),
-        "quat_wb": Channel(
-            time[::10],
-            np.tile([0.0, 0.0, 0.0, 1.0], (1000, 1)) + 1e-6 * np.arange(1000)[:, None],
-            "1",
-            "world",
-        ),
-        "command": Channel(time[::20], np.zeros((500, 4)), "N, rad/s", "body"),
-    }
-    gyro = record_of(FlightLog({**pose, "rate_b": Channel(time, rounded, "rad/s", "body")})).gyro
-    assert len(gyro.time) == len(time)
-    assert gyro.sigma == pytest.approx(step / np.sqrt(12.0), rel=0.1)
-    ahead = np.mean((gyro.values - rate) * np.sign(np.gradient(rate, axis=0)))
-    assert abs(ahead) < 0.02 * step
-    held = (
-        np.repeat(rate[::5], 5, axis=0) + 0.0
-    )  # a finer sensor that is logged five times as often as it measures
-    assert (
-        len(
-            record_of(FlightLog({**pose, "rate_b": Channel(time, held, "rad/s", "body")})).gyro.time
-        )
-        == len(time) / 5
-    )
 
 
 def test_a_throttle_becomes_a_command_in_newtons(tmp_path):

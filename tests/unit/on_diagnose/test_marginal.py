@@ -12,7 +12,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.likelihood.stack import BATCH, Stack, integrals, statistics
+from visthrow.diagnose.likelihood.stack import Stack, statistics
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.logs.check.signals import highpass_sigma
 
@@ -98,65 +98,6 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         assert likelihood(of, choice, 0) == pytest.approx(dense_value, abs=1e-3)
 
 
-def test_windows_side_by_side_are_what_they_are_alone(fitted):
-    """Of different sizes, in more batches than one, in their order."""
-    _, windows, floors, levels, grams = fitted
-    lean = [
-        replace(
-            w,
-            latent=w.latent[:, :-4],
-            latent_block=w.latent_block[:-4],
-            latent_axis=w.latent_axis[:-4],
-            latent_time=w.latent_time[:-4],
-        )
-        for w in windows[::3]
-    ]
-    shorter = [
-        marginal.correlated(marginal.gram_of(w, floors, 2), w, levels.correlation_time)
-        for w in lean
-    ]
-    mixed = [*grams, *shorter]
-    rows = [*range(len(grams)), *range(0, len(grams), 3)]
-    values = [likelihood(gram, levels, w) for gram, w in zip(mixed, rows)]
-    assert len(mixed) > BATCH
-    stack = Stack(mixed, windows=rows)
-    np.testing.assert_allclose(stack.values(levels), values, rtol=1e-8)
-    np.testing.assert_allclose(stack.look(levels)[0], values, rtol=1e-8)
-    for latents in (False, True):
-        together = stack.integrals(levels, latents=latents).shares(mixed, levels)
-        for share, gram, w in zip(together, mixed, rows, strict=True):
-            single = alone(gram, levels, w, latents)
-            size = np.abs(single.information).max()
-            np.testing.assert_allclose(share.information, single.information, atol=1e-9 * size)
-            np.testing.assert_allclose(share.score, single.score, atol=1e-9 * size)
-            assert share.square == pytest.approx(single.square, rel=1e-9)
-
-
-def test_other_residuals_leave_the_information(fitted):
-    _, _, floors, levels, grams = fitted
-    theta = np.linspace(-1.0, 1.0, len(floors))
-    shares = integrals(grams, levels).shares(grams, levels)
-    known = marginal.gather(grams, shares, np.zeros(len(floors)))
-    other = [replace(g, cross=0.5 * g.cross, square=0.25 * g.square) for g in grams]
-    shares = integrals(other, levels).shares(other, levels)
-    plain, again = (
-        marginal.gather(other, shares, theta),
-        marginal.rescored(known, other, shares, theta),
-    )
-    for name in (
-        "flights",
-        "information",
-        "score",
-        "square",
-        "samples",
-        "theta",
-        "absolute",
-        "absolute_square",
-    ):
-        np.testing.assert_allclose(getattr(again, name), getattr(plain, name), rtol=1e-12)
-    assert not np.allclose(again.score, known.score)
-
-
 def test_broken_derivatives_are_told_with_their_window(fitted):
     gram = fitted[4][3]
     with pytest.raises(
@@ -176,28 +117,6 @@ def test_a_single_huge_state_does_not_leak_into_the_effects(fitted):
     )
     own = np.sqrt(np.diag(plain.information))
     assert np.max(np.abs(moved.score - plain.score) / own) < 0.1
-
-
-def test_gradients_of_the_likelihood_are_its_differences(fitted):
-    _, _, _, levels, grams = fitted
-    levels = replace(
-        levels, share=levels.share * np.random.default_rng(0).uniform(0.7, 1.4, levels.share.shape)
-    )
-    layout = noise._Layout.of(grams, levels)
-    x = layout.pack(levels)
-    stack = Stack(grams)
-    _, slope, _ = noise._likelihood(stack, levels, layout)
-    step, first = 1e-3, len(layout.keys)
-
-    def value(i: int, h: float) -> float:
-        moved = x.copy()
-        moved[i] += h
-        return noise._likelihood(stack, layout.unpack(moved, levels), layout)[0]
-
-    for i in [*range(first), first, first + 7, len(x) - 2, len(x) - 1]:
-        assert (value(i, step) - value(i, -step)) / (2 * step) == pytest.approx(
-            slope[i], rel=1e-3, abs=0.1
-        )
 
 
 @pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
@@ -253,21 +172,6 @@ def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window
     assert again.latent_sd[0, "throw"] < 2.0 * levels.latent_sd[0, "throw"]
 
 
-def test_levels_do_not_depend_on_where_their_search_starts(bad_window):
-    """Two models may only differ by what they explain, not by how far the levels of their bad
-    windows were sought.
-    """
-    _, found, grams = bad_window
-
-    def value(levels) -> float:
-        return levels.log_prior + sum(likelihood(gram, levels, w) for w, gram in enumerate(grams))
-
-    less = np.where(found.share == 1.0, 1.0, 0.7 * found.share)
-    starts = [replace(found, share=share) for share in (less, np.ones_like(found.share))]
-    again = [value(noise.maximised(grams, start, "cpu")[0]) for start in starts]
-    np.testing.assert_allclose(again, value(found), atol=10.0 * noise.ENOUGH_NATS)
-
-
 def test_rounding_of_huge_derivatives_does_not_spoil_the_curvature(fitted):
     """Columns of 1e5 deviations once took -50 degrees of freedom from three samples, and the
     levels' step had no solution.
@@ -318,43 +222,6 @@ def test_a_model_without_latent_forces_works():
     levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
     part = alone(grams[0], levels, 0)
     assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)
-
-
-def test_rounding_leaves_no_negative_information(fitted):
-    """Two effects that are one but for rounding: a wide prior would turn the negative eigenvalue
-    into evidence.
-    """
-    *_, levels, grams = fitted
-    part = alone(grams[0], levels, 0)
-    nearly = np.array([[1.0, 1.0 + 1e-7], [1.0 + 1e-7, 1.0]])
-    found = marginal.gather(
-        grams[:1], [replace(part, information=1e6 * nearly, score=np.zeros(2))], np.zeros(2)
-    )
-    assert np.linalg.eigvalsh(1e6 * nearly).min() < 0.0
-    assert np.linalg.eigvalsh(found.information.sum(0)).min() >= 0.0
-
-
-def test_an_effect_that_the_initial_state_explains_but_for_rounding_says_nothing(fitted):
-    """The difference of two numbers of 1e13 is rounding of either sign: beside an effect that is
-    seen it made an eigenvalue of -1e-4, and the diagnosis ended.
-    """
-    *_, levels, grams = fitted
-    part, size = alone(grams[0], levels, 0), 2
-    squares = grams[0].inner[:, : grams[0].nuisances + grams[0].latents + size].copy()
-    squares = squares[:, :, : squares.shape[1]]
-    squares[:, -1, -1] = 1e13
-    gram = replace(grams[0], inner=squares, cross=grams[0].cross[:, : squares.shape[1]])
-    left = np.array([[1e6, 10.0], [10.0, 1e-6]])
-    assert np.linalg.eigvalsh(left).min() < 0.0
-    found = marginal.gather(
-        [gram], [replace(part, information=left, score=np.array([5.0, 7.0]))], np.zeros(size)
-    )
-    np.testing.assert_array_equal(found.information[0], [[1e6, 0.0], [0.0, 0.0]])
-    np.testing.assert_array_equal(found.score[0], [5.0, 0.0])
-    again = marginal.rescored(
-        found, [gram], [replace(part, score=np.array([6.0, 7.0]))], np.zeros(2)
-    )
-    np.testing.assert_array_equal(again.score[0], [6.0, 0.0])
 
 
 def test_information_that_is_negative_beyond_rounding_is_an_error(fitted):

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from bench.diagnose import beside_aeroid, flown
-from bench.diagnose.flown import LATE, G, attitude, ball_log, fly
+from bench.diagnose.flown import LATE, G, ball_log, fly
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -19,7 +19,7 @@ from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, TorqueParams
+from visthrow.diagnose.models.flyer_params import FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
@@ -226,12 +226,6 @@ class TestStand:
         assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
         assert len(record["logs"]) == 3
 
-    def test_residual_is_zero_where_it_is_right(self):
-        model = StandModel([self.log(k_f=1.5e-6, seed=0)], STAND)
-        (residual,) = model.residuals({})
-        assert np.max(np.abs(residual[12:])) < 1e-9  # currents
-        assert np.max(np.abs(residual[:12]) / model.stretches[0].sigma[:12]) < 3.0
-
 
 class TestFlyer:
     def test_the_truth_leaves_noise(self):
@@ -333,74 +327,6 @@ class TestFlyer:
             "cmd_delay": LATE,
         }
         assert all(near(estimates, name, size) for name, size in truth.items()), estimates
-
-    def test_an_estimate_that_takes_drag_for_tilt(self):
-        """The log's attitude leans by a filter of the test's own: a' = rate (F_xy / F_z - a), and
-        by a gyro's offset over the rate.
-        """
-        log, rate, offset = fly(8.0, drag=0.03), 1.5, np.array([0.012, -0.009, 0.0])
-        time = log["pos_w"].time
-        true, speed = attitude(time), np.gradient(log["pos_w"].values, time, axis=0)
-        acc_w = np.gradient(speed, time, axis=0)
-        force = true.inv().apply(
-            np.convolve(acc_w[:, 2], np.ones(9) / 9, "same")[:, None] * [0, 0, 1] + [0, 0, G]
-        )
-        force[:, :2] = -0.03 / 0.03 * true.inv().apply(speed)[:, :2]  # drag over mass
-        lean = np.zeros((len(time), 2))
-        for i in range(1, len(time)):
-            share = force[i, :2] / force[i, 2]
-            lean[i] = lean[i - 1] + (time[i] - time[i - 1]) * rate * (share - lean[i - 1])
-        lean = lean + [offset[1] / rate, -offset[0] / rate]
-        turn = np.column_stack(
-            [-lean[:, 1], lean[:, 0], 0.0 * time]
-        )  # the estimate's axis stands where the force points
-        leaning = true * Rotation.from_rotvec(turn)
-        step = leaning[:-1].inv() * leaning[1:]
-        gyro = (
-            step.as_rotvec() / np.diff(time)[:, None] + offset
-        )  # in the mean of the flight the lean does not change
-        channels = {
-            "quat_wb": Channel(time, leaning.as_quat(), "1", "world"),
-            "acc_b": Channel(time, force, "m/s^2", "body"),
-            "rate_b": Channel(time[1:], gyro, "rad/s", "body"),
-        }
-        params = FlyerParams(**{**vars(FLYER), "estimator_rate": rate})
-        model = FlyerModel([FlightLog({**log.channels, **channels})], params)
-        names = [
-            "estimator_lean",
-            "rotor_drag_xy",
-            "cmd_delay",
-            "thrust_gain",
-            "marker_rot_x",
-            "marker_rot_y",
-        ]
-        estimates = found(model, names)
-        assert estimates["estimator_lean"][0] == pytest.approx(1.0, abs=0.1), estimates
-        assert estimates["rotor_drag_xy"][0] == pytest.approx(0.03, rel=0.1), estimates
-        alone = found(model, names[1:])
-        assert alone["rotor_drag_xy"][0] < 0.025, alone  # without it the drag is taken for less
-
-    def test_derivatives_are_those_of_the_residuals(self):
-        torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
-        params = FlyerParams(**{**vars(FLYER), "cable": CableParams(0.5, 0.008), "torque": torque})
-        log = fly(4.0, cable=0.5)
-        rates = Channel(log["pos_w"].time, np.zeros((len(log["pos_w"].time), 3)), "rad/s", "body")
-        model = FlyerModel([FlightLog({**log.channels, "rate_b": rates})], params)
-        window = model.windows({})[0]
-        size, start = np.zeros(len(model.effects)), model._start[0]
-        for k, effect in enumerate(model.effects):
-            step = 0.02 * effect.prior_sd
-            sides = []
-            for sign in (1.0, -1.0):
-                moved = size.copy()
-                moved[k] = sign * step
-                sides.append(model._off(moved, np.array([start] + list(model._start[1:])))[0])
-            slope = -(sides[0] - sides[1]) / (2 * step)
-            scale = np.max(np.abs(slope)) + 1e-12
-            assert window.effects[:, k] / scale == pytest.approx(slope / scale, abs=0.02), (
-                effect.name
-            )
-        assert window.latent.shape[1] == len(window.latent_block) == len(window.latent_time)
 
     def test_motor_gains_from_rates(self):
         """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body

@@ -56,26 +56,3 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
     time = record_of(flight(1000.0, 0.02, (4.0, 5.0))).gyro.time
     assert not np.any((time > 4.0) & (time < 5.0))
     assert np.sum(time <= 4.0) == pytest.approx(1000, abs=3)
-
-
-def test_a_gyro_of_which_a_third_is_lost_or_stale_still_tells_all():
-    """Samples that lack here and there shift no time: the motion is all there, with as little noise
-    as those that came allow.
-    """
-    log, rng = flight(1000.0, 0.02), np.random.default_rng(3)
-    rate = log["rate_b"]
-    came = np.flatnonzero(rng.random(len(rate.time)) > 0.33)
-    gyro = record_of(
-        FlightLog(
-            {**log.channels, "rate_b": Channel(rate.time[came], rate.values[came], "rad/s", "body")}
-        )
-    ).gyro
-    assert len(gyro.time) > 0.9 * len(came) / 4
-    left = gyro.values - np.sin(2.0 * np.pi * 10.0 * gyro.time)[:, None] * SWING
-    assert np.std(left) == pytest.approx(0.0101, rel=0.1)
-
-
-@pytest.mark.parametrize("rate", [200.0, 400.0])
-def test_slower_gyros_stay_as_they_are(rate):
-    log = flight(rate, 0.02)
-    np.testing.assert_array_equal(record_of(log).gyro.values, log["rate_b"].values)

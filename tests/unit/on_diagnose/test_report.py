@@ -12,7 +12,6 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
-from visthrow.diagnose.likelihood.correlation import Correlation, with_correlations
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blackbox, blind, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
@@ -138,42 +137,6 @@ def test_errors_are_those_of_the_samples_ahead_added_up(found):
                 assert own.count[row, c, h] == sum(at.sum() for at in rows)
 
 
-def test_a_state_that_the_head_hardly_tells_is_no_floor(found):
-    """The floor of one such window was twenty times the errors of all."""
-    _, diagnosis = found
-    point = diagnosis.work.after
-    vague = [
-        replace(w, nuisance_sd=1e3 * w.nuisance_sd, nuisance=1e3 * w.nuisance**3)
-        for w in point.windows
-    ]
-    groups = [w.flight for w in vague]
-    errors = forms.errors(vague, groups, point.noise, [w.residual for w in vague], 2)
-    assert np.all(errors.floor <= forms.FAR_ABOVE * errors.square)
-
-
-def test_noise_that_lasts_leaves_more_than_white_noise_does(found):
-    """The floor of a prediction against draws of the noise, in the head that the initial state is
-    fitted to and ahead of it.
-    """
-    _, diagnosis = found
-    point, draws = diagnosis.work.after, 4000
-    white = replace(point.windows[0], correlated=())
-    (window,) = with_correlations([white], {0: Correlation(0.05, 0.95, 2)})
-    drawn = (
-        np.random.default_rng(0).normal(size=(len(window.time), draws))
-        * point.noise.scale[window.channel, None]
-    )
-    for rows, factor in window.correlated:
-        for own in rows.T:
-            drawn[own] = factor @ drawn[own]
-    left, floor, horizon = forms.predicted(window, point.noise, drawn * window.sigma[:, None])
-    rows = (window.channel == 0) & (horizon >= 0)
-    np.testing.assert_allclose(
-        floor[rows], (left[rows] ** 2).mean(1), rtol=5.0 * np.sqrt(2.0 / draws)
-    )  # five deviations
-    assert floor[rows].sum() > 1.5 * forms.predicted(white, point.noise, drawn)[1][rows].sum()
-
-
 def test_prediction_does_not_look_at_what_it_predicts(found):
     _, diagnosis = found
     point = diagnosis.work.after
@@ -185,54 +148,6 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     )
     np.testing.assert_allclose(spoilt[~late], plain[~late])
     np.testing.assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
-
-
-class Means(SyntheticModel):
-    """Windows of one instant and without an initial state, as means of slow flight are."""
-
-    def __post_init__(self):
-        super().__post_init__()
-        self._windows = [self._mean(w) for w in self._windows]
-
-    def _mean(self, window):
-        at = np.flatnonzero(window.time == window.time[20])
-        cut = {
-            name: getattr(window, name)[at]
-            for name in ("time", "channel", "sigma", "effects", "latent")
-        }
-        seen = self._answer(cut["effects"], self.truth) + cut["sigma"] * self._draw.normal(
-            size=len(at)
-        )
-        return replace(
-            window, **cut, residual=seen, nuisance=np.zeros((len(at), 0)), nuisance_sd=np.zeros(0)
-        )
-
-
-def test_windows_without_states_are_predicted_whole(found):
-    """Nothing is fitted in their head, so nothing of them is left out of the prediction."""
-    point = found[1].work.after
-    window = point.windows[0]
-    bare = replace(window, nuisance=np.zeros((len(window.time), 0)), nuisance_sd=np.zeros(0))
-    left, expected, horizon = forms.predicted(bare, point.noise, window.residual)
-    np.testing.assert_allclose(left, window.residual / window.sigma)
-    np.testing.assert_allclose(expected, point.noise.scale[window.channel] ** 2)
-    assert horizon.min() == 0
-    assert (horizon >= 0).all()
-
-
-def test_means_of_windows_have_a_gain_too(tmp_path):
-    model = Means(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
-    diagnosis = search.explain(model, laws=False)
-    assert diagnosis.named == ("effect_05",)
-    measured = gain.measure(diagnosis)
-    assert measured.whole
-    assert measured["pos_w"].gain > 0.5
-    assert [row[0] for row in measured["pos_w"].horizons] == [forms.HORIZONS[0]]
-    sections = {s.name: s for s in report.sections(diagnosis, measured)}
-    section = sections["gain"]
-    assert "initial state" not in sections["residuals"].parts[0].caption
-    assert len(section.parts) == 1  # no curve over a horizon that is none
-    assert "whole windows" in section.parts[0].note
 
 
 def test_no_black_box_where_no_latent_force_acts(found):
@@ -341,37 +256,6 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
     assert len(r.csv().splitlines()) == 1 + len(r.time)
 
 
-def swung(reference: manoeuvres.Reference, rope: float) -> tuple[float, float]:
-    """Largest angle [deg] of a point pendulum from the axis of a vehicle that follows exactly, and
-    the least tension in weights.
-
-    In the vehicle's frame gravity is g - a, along which the rotors' axis lies: n' = w x n, w' = n x
-    (g - a) / rope."""
-    gravity, parts = np.array([0.0, 0.0, -9.81]), 6
-    rows = int(np.argmax(reference.release)) if reference.release.any() else len(reference.time)
-    felt = gravity - reference.acc_w[:rows]
-    n, w, angle, tension = np.array([0.0, 0.0, -1.0]), np.zeros(3), 0.0, np.inf
-    for a in felt:
-        for _ in range(parts):
-            w = w + manoeuvres.PERIOD / parts * np.cross(n, a) / rope
-            n = n + manoeuvres.PERIOD / parts * np.cross(w, n)
-            n /= np.linalg.norm(n)
-        angle = max(angle, np.degrees(np.arccos(np.clip(n @ a / np.linalg.norm(a), -1.0, 1.0))))
-        tension = min(tension, (rope * w @ w + n @ a) / 9.81)
-    return angle, tension
-
-
-@pytest.mark.parametrize(
-    "manoeuvre", [m for m in manoeuvres.catalogue() if m.payload], ids=lambda m: m.name
-)
-def test_no_manoeuvre_swings_the_payload_near_the_rotors_or_slackens_its_rope(manoeuvre):
-    angle, tension = swung(
-        manoeuvre.reference(), rope=0.38
-    )  # the paper's, with the payload's radius
-    assert angle < 60.0  # a controller that lags adds some
-    assert tension > 0.2
-
-
 def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
     """With the rope level, and the vehicle tilted by a tenth of a turn towards it, the swing is 54
     degrees; upright it is 90.
@@ -427,24 +311,6 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
-def test_a_candidate_is_on_the_page_too(found, measured):
-    _, diagnosis = found
-    line = "the flights ask for it"
-    findings = tuple(
-        replace(f, verdict=result.CANDIDATE, sentence=line) if f.name == "effect_03" else f
-        for f in diagnosis.findings
-    )
-    shaky = replace(diagnosis, findings=findings)
-    verdict = report.sections(shaky, measured)[0]
-    assert any(
-        part.text.startswith(f"**CANDIDATE.** {line}")
-        for part in verdict.parts
-        if hasattr(part, "text")
-    )
-    assert f"CANDIDATE {line}" in report.summary(shaky, measured)
-    assert "CANDIDATE" not in report.summary(diagnosis, measured)
-
-
 def test_an_event_is_left_out_or_weighs_little(found):
     """A flight that was left out has no windows any more; one whose window is far rougher than
     others has.
@@ -459,21 +325,6 @@ def test_an_event_is_left_out_or_weighs_little(found):
     assert out.endswith("left out")
     parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
     assert sum(text.startswith("**EVENT.**") for text in parts) == 2
-
-
-def test_errors_are_told_in_millimetres(found, measured):
-    """On the page as on the command line; a unit that has no smaller one stays."""
-    channel = measured["pos_w"]
-    line = f"held-out error of pos_w: {1e3 * channel.before:.3g} -> {1e3 * channel.after:.3g} mm,"
-    assert line in report.summary(found[1], measured)
-    grid, _ = next(s for s in report.sections(found[1], measured) if s.name == "gain").parts
-    assert grid.rows[0][1:3] == ("mm", f"{1e3 * channel.before:.3g}")
-    odd = replace(
-        measured, channels=(replace(channel, channel="current", unit="A", blackbox=float("nan")),)
-    )
-    text = report.summary(found[1], odd)
-    assert f"held-out error of current: {channel.before:.3g} -> {channel.after:.3g} A," in text
-    assert "nan" not in text
 
 
 @pytest.mark.parametrize(

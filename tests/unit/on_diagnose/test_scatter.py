@@ -10,7 +10,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares, varying
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -83,15 +83,6 @@ def test_a_mean_is_as_sure_as_there_are_days():
     np.testing.assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
 
 
-def test_shares_of_days_come_before_those_of_flights():
-    statistics, days = campaign(np.random.default_rng(11), 5, 0.0, 0.0)
-    moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
-    statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
-    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
-    np.testing.assert_allclose(shares[:, 0], moved, atol=0.5)
-    assert np.all(shares[:, 1:] == 0.0)
-
-
 def told(rng, **deviation):
     return {
         s.name: s
@@ -139,3 +130,12 @@ def test_training_draws_what_varies():
     theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
     assert theta == {"release_lag": 0.02}
     np.testing.assert_allclose(covariance, [[1.01e-4]])
+
+
+def test_shares_of_days_come_before_those_of_flights():
+    statistics, days = campaign(np.random.default_rng(11), 5, 0.0, 0.0)
+    moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
+    statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
+    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
+    np.testing.assert_allclose(shares[:, 0], moved, atol=0.5)
+    assert np.all(shares[:, 1:] == 0.0)

@@ -150,40 +150,6 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     assert diagnosis["effect_03"].manoeuvres
 
 
-def test_two_effects_that_do_as_two_others_are_classes_with_both():
-    """Two motors across, as weak as each other, do as less thrust and a trim of the yaw; no one of
-    these does as one of those.
-    """
-    truth, others = {"effect_03": 14.0, "effect_09": 14.0}, {"effect_01", "effect_07"}
-
-    def change(model, window):
-        columns = window.effects.copy()
-        columns[:, 7] = columns[:, 9] - columns[:, 1]
-        columns[:, 1] += columns[:, 3]
-        return replace(
-            window, effects=columns, residual=window.residual + model._answer(columns, truth)
-        )
-
-    diagnosis = search.explain(altered(change, seed=3), laws=False)
-    assert {frozenset(names) for names, _ in diagnosis.sets} == {
-        frozenset(truth),
-        frozenset(others),
-    }
-    for name in (*truth, *others):
-        beside = set(truth) if name in truth else others
-        assert diagnosis[name].verdict == result.CLASS
-        assert not beside & set(diagnosis[name].partners) or name not in diagnosis.theta
-        assert diagnosis[name].low < 14.0 * EFFECTS[3].floor < diagnosis[name].high
-
-
-def test_a_class_may_have_a_dozen_members():
-    """What a hover shows of a weight, eight causes explain alike."""
-    same = {f"effect_{j:02d}": ("effect_03", 1.0) for j in (0, 1, 4, 6, 7, 9, 10)}
-    model = world(truth={"effect_03": 12.0}, same=same, seed=2)
-    diagnosis = search.explain(model, laws=False)
-    assert {f.name for f in diagnosis.findings if f.verdict == result.CLASS} == {"effect_03", *same}
-
-
 def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model = world(truth={"effect_03": 12.0}, seed=2)
     model.effects = tuple(
@@ -353,39 +319,6 @@ def _threshold(count: int) -> float:
     )
 
 
-def test_additions_are_differences_of_the_evidence():
-    rng = np.random.default_rng(2)
-    information, priors = (
-        _information(8),
-        replace(_priors(8), low=np.full(8, -4.0), high=np.full(8, 30.0)),
-    )
-    score = rng.normal(size=8) * 20.0
-    gain = evidence.additions(information, score, priors, [2])
-    assert gain[2] == -np.inf
-    own = (
-        np.arange(8) == 2
-    )  # the named one's bounds stay out of it: its marginal mass changes with every addition
-    free = replace(
-        priors, low=np.where(own, -np.inf, priors.low), high=np.where(own, np.inf, priors.high)
-    )
-    base = evidence.log_evidence(information, score, free, [2])
-    for j in (0, 5):
-        assert gain[j] == pytest.approx(
-            evidence.log_evidence(information, score, free, [2, j]) - base, abs=1e-8
-        )
-    pairs = evidence.pair_additions(
-        information, score, replace(priors, visible=np.arange(8) != 6), [2]
-    )
-    np.testing.assert_allclose(pairs, pairs.T)
-    np.testing.assert_array_equal(
-        np.isinf(pairs).sum(1), [3, 3, 8, 3, 3, 3, 8, 3]
-    )  # itself, the one named, the one not visible
-    for i, j in ((0, 5), (7, 1)):
-        assert pairs[i, j] == pytest.approx(
-            evidence.log_evidence(information, score, free, [2, i, j]) - base, abs=1e-8
-        )
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -3.0])
 @pytest.mark.parametrize("where", [(0, 0), (1, 0)])
 def test_information_that_no_flights_can_give_is_refused(bad, where):
@@ -424,17 +357,3 @@ def test_evidence_is_the_integral():
     assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(
         integral(6.0, -1.0, 9.0), abs=1e-6
     )
-
-
-def test_a_candidate_that_cannot_stand_does_not_end_the_search(monkeypatch):
-    sure = selector.Selector.sure
-
-    def refusing(self, point, active, j):
-        return self.name(j) != "effect_03" and sure(self, point, active, j)
-
-    monkeypatch.setattr(selector.Selector, "sure", refusing)
-    diagnosis = search.explain(
-        world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False
-    )
-    assert [step.named for step in diagnosis.steps][:1] == ["effect_07"]
-    assert "effect_03" not in diagnosis.theta  # nor is it exchanged for what was named

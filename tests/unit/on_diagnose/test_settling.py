@@ -9,9 +9,7 @@ import pytest
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.throw import linearising, throw_model
 from visthrow.diagnose.throw.linearising import exact
-from visthrow.diagnose.throw.replay import rough_step
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import FlightLog
 
@@ -22,23 +20,6 @@ RATE_KEPT = 0.2
 """By which that sway may change the body rates of fitted states [rad/s], rms: 0.07 found, 0.64 if
 no gust is thought possible.
 """
-ROUGH = 0.01
-"""Of a column's norm, by which one of twice as long steps may differ in a free flight: 0.005 found,
-for the command delay.
-"""
-EITHER_WAY = 1e-3
-"""Of a steady torque's column, by which pushes to either side may differ."""
-NAMES = [
-    "rope_length",
-    "mass_payload",
-    "cmd_delay",
-    "motor_tau",
-    "com_x",
-    "release_lag",
-    "wind_x",
-    "mocap_delay_quad",
-    "d_filter",
-]
 
 
 def swayed(log: FlightLog) -> FlightLog:
@@ -84,21 +65,6 @@ def test_states_do_not_depend_on_what_was_fitted_before(logs):
         np.testing.assert_array_equal(a.residual, b.residual)
 
 
-def test_long_steps_tell_derivatives_as_well(logs, monkeypatch):
-    """Residuals are those of nominal steps, and every column stands where it belongs."""
-    model = ThrowModel(logs, paper_plant(), only=NAMES)
-    rough = model.windows({})
-    monkeypatch.setattr(throw_model, "exact", lambda e: True)
-    for a, b in zip(rough, model.windows({})):
-        np.testing.assert_array_equal(a.residual, b.residual)
-        for name in a.knots:
-            np.testing.assert_array_equal(a.knots[name], b.knots[name])
-        off = np.linalg.norm((a.effects - b.effects) / a.sigma[:, None], axis=0)
-        norm = np.linalg.norm(b.effects / a.sigma[:, None], axis=0)
-        assert np.all(off <= ROUGH * norm), dict(zip(NAMES, off / norm))
-        assert a.phase != "throw" or np.array_equal(a.effects, b.effects)
-
-
 def test_what_long_steps_do_not_tell_keeps_the_nominal_ones(logs):
     model = ThrowModel(logs, paper_plant())
     assert {name for name, e in model.entries.items() if exact(e)} == {
@@ -106,32 +72,6 @@ def test_what_long_steps_do_not_tell_keeps_the_nominal_ones(logs):
         "payload_inertia",
         "step_error",
     }
-
-
-def test_long_steps_stay_stable():
-    setting = setting_with({})
-    assert rough_step(setting, 0.002) == pytest.approx(0.004)
-    controller = dataclasses.replace(setting.plant.vehicle.controller, gyro_time_constant=0.0015)
-    vehicle = dataclasses.replace(setting.plant.vehicle, controller=controller)
-    quick = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=vehicle))
-    assert 0.002 < rough_step(quick, 0.002) < 2.0 * 0.0015
-    assert rough_step(quick, 0.004) == pytest.approx(0.004)  # never below the nominal one
-
-
-def test_derivatives_by_latent_torques_hold_either_way(logs, monkeypatch):
-    """A steady torque is controlled away; what a long step's second order leaves would look alike
-    for all axes.
-    """
-    model = ThrowModel(logs, paper_plant(), only=["rope_length"])
-    there = model.windows({})
-    monkeypatch.setattr(
-        linearising, "LATENT_SIZES", tuple(-size for size in linearising.LATENT_SIZES)
-    )
-    for a, b in zip(there, model.windows({})):
-        for axis in range(3):
-            of = (a.latent_block == 1) & (a.latent_axis == axis)
-            steady, other = a.latent[:, of].sum(1), b.latent[:, of].sum(1)
-            assert np.linalg.norm(steady - other) < EITHER_WAY * np.linalg.norm(steady)
 
 
 def bend(states) -> np.ndarray:
@@ -150,20 +90,3 @@ def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():
         only=["rope_length"],
     )
     assert bend(model.begun({})[1]).max() < BENDING
-
-
-def test_where_vehicle_and_air_hardly_move_speeds_tell_nothing(logs):
-    model = ThrowModel(logs, paper_plant(), only=["rotor_drag", "com_x", "flapping"])
-    blocks = [e.block for e in model.effects]
-    drag = np.array([block == "aerodynamics" for block in blocks])
-    window = max(model.windows({}), key=lambda w: np.abs(w.knots["vel_w"]).max())
-    assert linearising.without_calm_speeds(window, blocks, (0.0, 0.0, 0.0)) is window
-    slow = {name: 0.03 * value for name, value in window.knots.items() if name.endswith("vel_w")}
-    hover = dataclasses.replace(window, knots={**window.knots, **slow})
-    calm = linearising.without_calm_speeds(hover, blocks, (0.0, 0.0, 0.0))
-    assert not np.any(calm.effects[:, drag])
-    assert not np.any(calm.knots["vel_w"])
-    np.testing.assert_array_equal(calm.effects[:, ~drag], window.effects[:, ~drag])
-    assert (
-        linearising.without_calm_speeds(hover, blocks, (0.5, 0.0, 0.0)) is hover
-    )  # hover in a wind

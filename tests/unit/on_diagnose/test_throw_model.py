@@ -18,11 +18,7 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram
-from visthrow.diagnose.likelihood.noise_levels import roughly
-from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.throw import initial_fit
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.replay import STABLE, rough_step
@@ -93,28 +89,6 @@ def test_silent_at_the_truth(planted):
     wrong = model.residuals({})
     right = model.residuals(PLANTED)
     assert sum(np.sum(r**2) for r in right) < sum(np.sum(r**2) for r in wrong)
-
-
-def test_a_log_that_begins_in_flight_is_followed_from_its_first_window_on():
-    """Of before nothing is known: which command acted, and what the integrals hold, here against a
-    centre of mass that lies off.
-    """
-    setting = setting_with({"motor_mixing": 1.0, "com_y": 4e-3})
-    (log,) = fly(setting, noise=0.2, free=1, throws=0, seconds=2.6)
-    late = {
-        name: dataclasses.replace(
-            c, time=c.time[c.time > 1.0], values=c.values[c.time > 1.0], valid=c.valid[c.time > 1.0]
-        )
-        for name, c in log.channels.items()
-    }
-    model = ThrowModel([FlightLog(late, {})], setting.plant, only=["rope_length"])
-    first = model.windows({})[0]
-    start, z = (
-        first.nuisance * first.nuisance_sd / first.sigma[:, None],
-        first.residual / first.sigma,
-    )
-    z = z - start @ np.linalg.lstsq(start, z, rcond=None)[0]
-    assert np.mean(z**2) < 1.3, np.mean(z**2)
 
 
 @pytest.mark.parametrize("blocks", [{}, {"motor_mixing": 1.0}])
@@ -212,23 +186,6 @@ def test_what_is_known_of_the_sensors_is_taken_off():
     informed = ThrowModel(logs, paper_plant(), sensing=sensing, only=["rope_length"])
     left = informed.residuals({})
     assert all(np.mean((r / w.sigma) ** 2) < 1.3 for r, w in zip(left, informed.windows({})))
-
-
-def test_a_fit_of_initial_states_is_no_prior_of_them(monkeypatch):
-    """What flights are worth does not depend on how far their states were fitted before derivatives
-    are taken there.
-    """
-    logs = fly(setting_with({}), noise=1.0, free=1, throws=1, seconds=3.0)
-
-    def reduced():
-        model = ThrowModel(logs, paper_plant(), only=["joint_damping"])
-        windows = model.windows({})
-        return correlated_of([hidden_gram(w, len(model.channels)) for w in windows], windows, 0.3)
-
-    fitted = reduced()
-    monkeypatch.setattr(initial_fit, "ROUNDS", 1)
-    noise = roughly(fitted)[0]
-    assert np.abs(Stack(fitted).values(noise) - Stack(reduced()).values(noise)).max() < 0.5
 
 
 def test_the_catalogue_is_sound():
@@ -367,12 +324,3 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
     assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
     assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
     assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
-
-
-def test_the_charge_is_told_by_more_than_one_voltage(planted):
-    """Single samples are noisy, and some autopilots log a first one of nothing."""
-    log = planted[0][0]
-    time = np.arange(0.0, 2.0, 0.02)
-    volts = np.where(time == 0.0, 3.0, 15.2 - 0.1 * time)
-    seen = record_of(FlightLog({**log.channels, "battery_voltage": Channel(time, volts, "V")}, {}))
-    assert seen.voltage == pytest.approx(15.2, abs=0.03)

@@ -8,11 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests import logfiles
 from tests.unit.on_logs.test_check import faults, flight, log_of
 from visthrow.diagnose.inputs import setup
-from visthrow.logs import read
-from visthrow.logs.check import relations
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, copies
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -181,64 +178,6 @@ def test_a_rotor_sensor_that_reads_wrong(factor, words):
     assert "reads" not in faults(log_of(columns, motor_speed=rotors))
     wrong = Channel(columns["time"], speed * [1.0, 1.0, factor, 1.0], "rad/s")
     assert words in faults(log_of(columns, motor_speed=wrong))
-
-
-def test_jumps_in_every_channel_and_across_gaps():
-    columns = flight()
-    columns["rate_b"][700] += 90.0
-    columns["vel_w"][300] += 25.0
-    found = faults(log_of(columns), "warn")
-    assert "values rate_b: 2 jumps" in found
-    assert "values vel_w: 2 jumps" in found
-    columns = flight()
-    keep = np.ones(len(columns["time"]), bool)
-    keep[400:430] = False
-    whole = {name: values[keep] for name, values in columns.items()}
-    assert "across gaps" not in faults(log_of(whole), "warn")
-    whole["pos_w"] = whole["pos_w"] + np.where(whole["time"] > 4.2, 2.0, 0.0)[:, None] * [
-        1.0,
-        0.0,
-        0.0,
-    ]
-    assert "1 jumps across gaps, the largest 2" in faults(log_of(whole), "warn")
-
-
-def test_a_release_is_not_saturated():
-    columns = flight()
-    released = Channel(columns["time"], (columns["time"] > 5.0).astype(float), "1")
-    assert "saturated" not in faults(log_of(columns, release_command=released), "warn")
-
-
-def test_positions_at_10_hz_are_looked_at(tmp_path):
-    """ArduPilot's own logs hold its estimate at 10 Hz; the difference of two is then 0.2 s wide."""
-    columns, path = flight(), tmp_path / "a.BIN"
-    imu = ("QBffffff", "TimeUS,I,GyrX,GyrY,GyrZ,AccX,AccY,AccZ")
-    flip = np.array([1.0, -1.0, -1.0])
-    rows = [
-        ("IMU", (int(1e6 * t), 0, *(w * flip), *(a * flip)))
-        for t, w, a in zip(columns["time"], columns["rate_b"], columns["acc_b"])
-    ]
-    rows += [
-        (
-            "XKF1",
-            (int(1e6 * t), 0, 0.0, 0.0, 0.0, *(v * flip), 0.0, *(p * flip), 0.0, 0.0, 0.0, 0.0),
-        )
-        for t, p, v in list(zip(columns["time"], columns["pos_w"], columns["vel_w"]))[::10]
-    ]
-    logfiles.write_bin(path, {"IMU": imu, "XKF1": logfiles.XKF1}, rows)
-    (log,) = read(path)
-    (checked,) = check([log])
-    assert checked.verdict != "bad"
-    compared = [
-        row for row in checked.rows if row.channel == "d(pos_w)/dt, vel_w" and row.topic == "frames"
-    ]
-    assert compared
-    assert compared[0].figures["correlation"] > 0.95
-    time, rate = relations.derivative(log["pos_w"].time, log["pos_w"].values)
-    assert len(time) > 100
-    assert rate[:, 0] == pytest.approx(
-        np.interp(time, log["vel_w"].time, log["vel_w"].values[:, 0]), abs=0.1
-    )
 
 
 def test_explain_leaves_a_copy_out(tmp_path, capsys):

@@ -9,7 +9,6 @@ import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
-from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
@@ -126,21 +125,6 @@ def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
     assert values[:3].any()
 
 
-def test_hats_at_the_knots_follow_the_curve_between_them():
-    """Of a swing of 2 Hz, the values at knots a tenth of a second apart would cut an eighth off."""
-    fine, knots = np.linspace(0.0, 10.0, 801), np.arange(11)
-    curve = lambda t: np.sin(2.0 * np.pi * 0.2 * t + 0.3)  # noqa: E731  in knots
-    hats = np.maximum(1.0 - np.abs(fine[:, None] - knots), 0.0)
-    inside = slice(80, -80)
-    told = [(hats @ c)[inside] for c in (curve(knots), grammar.between(11) @ curve(knots))]
-    truth = curve(fine)[inside]
-    share = [float(t @ truth / (truth @ truth)) for t in told]
-    assert share[0] < 0.9
-    assert share[1] == pytest.approx(1.0, abs=0.02)
-    for count in (1, 2):
-        np.testing.assert_array_equal(grammar.between(count), np.eye(count))
-
-
 @pytest.mark.parametrize(
     ("term", "unit", "formula"),
     [
@@ -234,33 +218,6 @@ def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> 
     )
 
 
-@pytest.mark.parametrize("block", ["vehicle force", "payload force"])
-def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
-    """Information and score of a column that the windows' inner products were given, and of no
-    further simulation.
-    """
-    at = beside_a_law(
-        SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
-    )
-    known = [laws.KnotValues(w.knots) for w in at.point.windows]
-    of = terms.screen(
-        at.point, terms.statistics(at.point.grams, at.point.noise, "cpu"), block, known
-    )
-    for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        problem, (point,) = terms.extended(
-            at.problem, [at.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
-        )
-        scale = problem.priors.floor[-1]
-        assert point.information[-1, -1] == pytest.approx(scale**2 * of.own[i], rel=1e-6)
-        assert point.score[-1] == pytest.approx(
-            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i])
-        )
-        cross, most = scale * of.cross, scale * np.abs(of.cross).max()
-        np.testing.assert_allclose(
-            point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most
-        )
-
-
 def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
     at = beside_a_law(with_a_name_for_the_law(0.1), [1])
     strongest = terms.strongest_forces(at.nominal)
@@ -269,23 +226,6 @@ def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
     )
     assert DRAG in [effect.term for effect in found]
     assert DRAG not in [effect.term for effect in beside]
-
-
-def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
-    """Appended to what the windows say it is the column that a linearisation gives; without it
-    nothing has changed.
-    """
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    at, plain = beside_a_law(model, [3], DRAG), beside_a_law(model, [3])
-    again = linearise(at.problem, np.zeros(len(EFFECTS) + 1))
-    np.testing.assert_allclose(at.nominal.information, again.information, rtol=1e-2)
-    law = terms.laws(at.problem, at.point, at.active, 0.0)[0]
-    assert law.coefficient == pytest.approx(-0.02, rel=0.05)
-    assert at.point.theta[-1] * at.priors.floor[-1] == pytest.approx(law.coefficient, rel=0.05)
-    problem, off = terms.bare(at.problem, at.nominal)
-    assert problem.model is model
-    np.testing.assert_allclose(off.information, plain.nominal.information, rtol=1e-9)
-    np.testing.assert_allclose(off.score, plain.nominal.score, rtol=1e-9)
 
 
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():

@@ -10,7 +10,6 @@ import pytest
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
-from visthrow.paper import RECORDS
 from visthrow.paper.baseline import front, spline
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.fly_plan import (
@@ -18,16 +17,12 @@ from visthrow.paper.baseline.fly_plan import (
     _started,
     delays_of,
     fly_pendulum,
-    fly_plant,
-    pendulum_state,
-    random_starts,
 )
 from visthrow.paper.baseline.mpc import MPC, MPCParams
 from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import plan_throw
 from visthrow.task import Experiment, plant_of
 from visthrow.throws import results
-from visthrow.throws.plants import HybridPlant
 from visthrow.throws.reference_protocol import batch_plant, place_in_hover
 
 pytest.importorskip("piqp")
@@ -36,10 +31,6 @@ OWN_MODEL = 0.05
 """Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027.
 """
 
-HYBRID = 0.2
-"""Mean landing error on the training simulator, all its noise and spread on, with all delays made
-up for [m] (measured 0.135).
-"""
 
 FEED_FORWARD = 0.3
 """Of the first command against the flat input [N, rad/s]: one is held for 20 ms, the other changes
@@ -134,33 +125,6 @@ def test_own_model_throws_land_near_the_target(plan):
     assert np.array_equal(flown.landing_w, again.landing_w)
 
 
-def test_starts_vary_and_are_states_of_a_pendulum(plan):
-    state = random_starts(plan, 50, 0)
-    assert np.allclose(np.linalg.norm(state[:, pm.DIR], axis=1), 1.0)
-    assert np.allclose((state[:, pm.DIR] * state[:, pm.RATE]).sum(1), 0.0, atol=1e-12)
-    assert 0.01 < state[:, 0].std() < 0.03
-
-
-def test_pendulum_state_of_a_hanging_plant(experiment):
-    snapshot = HybridPlant(experiment, 2).state
-    state = pendulum_state(snapshot, np.array(experiment.rope.mount))
-    assert np.allclose(state[:, pm.DIR], [0.0, 0.0, -1.0], atol=1e-6)
-    model = pm.pendulum_of(plant_of(experiment))
-    length = np.linalg.norm(snapshot.payload_pos_w - snapshot.pos_w - experiment.rope.mount, axis=1)
-    assert np.allclose(length, model.length, atol=1e-5)
-
-
-def test_training_simulator_with_and_without_compensation(plan, experiment):
-    flown = fly_plant(plan, "hybrid", experiment, delays_of(experiment), 3)
-    assert flown.success.all()
-    assert flown.error.mean() < HYBRID
-    lagging = fly_plant(plan, "hybrid", experiment, delays_of(experiment, "delay"), 3)
-    # A tenth of a second at 1.7 m/s past the plan; the single throws' worst moments differ from
-    # processor to processor.
-    assert lagging.position_error.mean() > flown.position_error.mean() + 0.05
-    assert lagging.landing_w[:, 0].mean() > flown.landing_w[:, 0].mean()
-
-
 def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment):
     pytest.importorskip("mujoco")
     flown, _ = _started("reference-realistic", experiment, 2.0, 0, 3, 5, "cpu")
@@ -172,13 +136,6 @@ def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment
         plant.step(command)
     assert np.array_equal(flown.state.pos_w, plant.state.pos_w)
     assert np.array_equal(flown.measured().pos_w, plant.measured().pos_w)
-
-
-def test_flown_throws_are_scored_as_policies_are(plan, experiment):
-    flown = fly_plant(plan, "hybrid", experiment, delays_of(experiment), 2)
-    assert flown.error == pytest.approx(np.linalg.norm(flown.landing_w - [2.0, 0.0], axis=1))
-    assert np.all((flown.clearance > 0.2) & (flown.clearance < 2.0))
-    assert np.all((flown.smoothness > 0.0) & (flown.smoothness < 1.0))
 
 
 def test_delays_by_name(experiment):
@@ -200,31 +157,6 @@ def test_front_and_hypervolume_by_hand():
     assert pareto(points).tolist() == [1, 2, 3]
     assert front.hypervolume(points, (4.0, 4.0)) == pytest.approx(7.0)
     assert front.hypervolume(np.empty((0, 2))) == 0.0
-
-
-def test_the_record_holds_the_sweep_that_is_stated():
-    """Every speed with every weight in both bounds on the simulator and the pendulum; some on the
-    stand-in for a real vehicle.
-    """
-    flown = {}
-    for result in results.load(RECORDS / "throws" / "baseline.json"):
-        u = result.unit
-        swept = (u["kind"], u["target"], u["throws"]) == ("baseline", 2.0, 10)
-        if swept and u["compensation"] != "delay":
-            place = (u["plant"], u["bounds"])
-            flown.setdefault(place, set()).add((u["speed"], u["w_t"], u["rho"]))
-    every = {(v, *weights) for v in front.SPEEDS for weights in front.WEIGHTS}
-    assert len(every) == 20
-    for plant in ("hybrid", "pendulum"):
-        for bounds in ("payload", "payload and thrust"):
-            assert flown.pop((plant, bounds)) == every
-    stand_in = ("reference-realistic", "payload and thrust")
-    assert flown == {stand_in: {setting for setting in every if setting[0] in (2.2, 2.9)}}
-    assert {row[:3] for row in front.PAPER_FRONT} >= {
-        (2.2, *front.WEIGHTS[2]),
-        (1.7, *front.WEIGHTS[3]),
-        (1.7, *front.WEIGHTS[4]),
-    }
 
 
 def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):

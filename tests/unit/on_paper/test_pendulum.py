@@ -5,8 +5,7 @@ import pytest
 
 from sim.params import GRAVITY
 from visthrow.paper.baseline import pendulum_model as pm
-from visthrow.paper.baseline.fly_plan import look_ahead
-from visthrow.paper.baseline.pendulum_model import DIR, POS, QUAT, RATE, VEL, Pendulum
+from visthrow.paper.baseline.pendulum_model import DIR, QUAT, RATE, VEL, Pendulum
 
 MODEL = Pendulum(0.21, 0.06, 0.36)
 
@@ -49,13 +48,6 @@ def energy(model: Pendulum, state: np.ndarray) -> np.ndarray:
     )
 
 
-def test_hover_is_an_equilibrium():
-    state, control = pm.hover(MODEL, np.array([0.3, -0.2, 0.95]))
-    assert np.allclose(roll(state, control, 0.5), state, atol=1e-12)
-    assert control[0] == pytest.approx(0.27 * 9.81)
-    assert pm.tension(MODEL, state, control) == pytest.approx(0.06 * 9.81)
-
-
 def test_without_thrust_energy_and_momentum_are_kept():
     state, control = random_states(20)
     control[:, 0] = 0.0
@@ -67,19 +59,6 @@ def test_without_thrust_energy_and_momentum_are_kept():
         both.append(0.21 * vel + 0.06 * now[:, VEL])
     fallen = both[0] - [0.0, 0.0, 0.27 * 9.81 * 1.0]
     assert np.allclose(both[1], fallen, atol=1e-6)
-
-
-def test_thrust_adds_its_power_to_the_energy():
-    state, control = random_states(20, 1)
-    h = 1e-4
-    after, before = pm.step(MODEL, state, control, h), pm.step(MODEL, state, control, -h)
-    rise = (energy(MODEL, after) - energy(MODEL, before)) / (2.0 * h)
-    x, y, z, w = state[:, QUAT].T
-    axis = np.column_stack(
-        [2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)]
-    )
-    power = control[:, 0] * (axis * pm.vehicle(MODEL, state)[1]).sum(1)
-    assert np.allclose(rise, power, rtol=1e-4, atol=1e-4)
 
 
 def test_newton_holds_for_each_body_with_the_tension_between_them():
@@ -114,16 +93,6 @@ def test_small_swing_has_the_period_of_two_bodies():
     assert abs(half[10]) < 1e-3 * angle * omega
 
 
-def test_unit_lengths_and_right_angles_are_kept():
-    state = roll(*random_states(10, 3), 0.5)
-    assert np.allclose(np.linalg.norm(state[:, DIR], axis=1), 1.0, atol=1e-12)
-    assert np.allclose(np.linalg.norm(state[:, QUAT], axis=1), 1.0, atol=1e-12)
-    assert np.allclose((state[:, DIR] * state[:, RATE]).sum(1), 0.0, atol=1e-10)
-    pos, vel = pm.vehicle(MODEL, state)
-    assert np.allclose(np.linalg.norm(state[:, POS] - pos, axis=1), 0.36)
-    assert np.allclose(((state[:, VEL] - vel) * state[:, DIR]).sum(1), 0.0, atol=1e-10)
-
-
 def test_fourth_order():
     state, control = random_states(5, 4)
     exact = roll(state, control, 0.1, 0.001)
@@ -145,21 +114,6 @@ def test_jacobians_are_those_of_the_step():
         ]
         slope = by_state[:, :, i] if i < pm.STATES else by_input[:, :, i - pm.STATES]
         assert np.allclose((ends[0] - ends[1]) / (2 * h), slope, atol=1e-7)
-
-
-def test_looking_ahead_follows_the_commands_on_their_way():
-    """Three different commands under way, each held for its own 20 ms: predicted as
-    they will act.
-    """
-    state = pm.hover(MODEL, np.zeros((1, 3)))[0]
-    sent = np.array([[[3.0, 1.0, 0.0, 0.0]], [[2.0, -2.0, 1.0, 0.0]], [[4.0, 0.0, 3.0, 0.5]]])
-    seen = look_ahead(MODEL, state, sent, 0.02, 0.045)
-    expected = pm.step(
-        MODEL, state, sent[2], 0.005
-    )  # 45 ms before: the third last command, for 5 ms more
-    expected = pm.step(MODEL, pm.step(MODEL, expected, sent[1], 0.02), sent[0], 0.02)
-    assert np.allclose(seen, expected, atol=1e-9)
-    assert look_ahead(MODEL, state, sent, 0.02, 0.0) is state
 
 
 @pytest.mark.parametrize(

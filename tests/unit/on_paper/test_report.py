@@ -10,10 +10,8 @@ import pytest
 from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow import cli
-from visthrow.paper.baseline import spline, thrower
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, beyond, gap, result_set, throws, trade
-from visthrow.paper.sweep.work_units import load_list
+from visthrow.paper.report import ablations, beyond, result_set, throws, trade
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page
@@ -45,16 +43,6 @@ def texts(section, kind: str) -> str:
 
 def only(*found) -> result_set.ResultSet:
     return result_set.ResultSet(tuple(found))
-
-
-def test_of_alike_results_the_one_with_most_throws_counts():
-    rng = np.random.default_rng(0)
-    few, many = (made_up.policy(rng, "state", "state", "hybrid", 2.0, count=n) for n in (5, 50))
-    changed = made_up.policy(rng, "state", "state", "hybrid", 2.0, count=99, departures={"a.b": 1})
-    found = only(few, many, changed)
-    assert found.shipped("state", "hybrid", 2.0) is many
-    assert found.by_departure("state", "a.b") == [(1, changed)]
-    assert found.seeds("state", "full", "hybrid", 2.0, {}) == []
 
 
 def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
@@ -104,17 +92,6 @@ def test_an_empty_book_says_everything_that_is_missing(tmp_path):
         assert not any(isinstance(part, Picture) for part in section.parts), section.name
     html = page.html_of("t", "l", sections)
     assert html.count('class="missing"') >= len(sections)
-
-
-def test_policies_stand_beside_the_papers_vehicle(full):
-    rows = [
-        row
-        for row in grids(throws.throws_section(full))[0].rows
-        if row[:3] == ("state", "2.0", "training simulator")
-    ]
-    ours = full.shipped("state", "hybrid", 2.0).of("error").mean()
-    assert rows[0][5].startswith(f"{ours:.3f} [")
-    assert rows[0][-1] == "0.105 ± 0.099, 1.154 ± 0.015"
 
 
 def test_difference_of_vision_has_the_right_sign():
@@ -193,12 +170,6 @@ def test_hypervolume_of_one_setting_is_its_rectangle():
     assert expected in volume
 
 
-def test_curves_hold_the_policys_own_value(full):
-    points = gap.curve(full, gap.SWEEPS[2], "vision")
-    assert [value for value, _ in points][:2] == [0.0, pytest.approx(0.4)]
-    assert points[0][1] is full.shipped("vision", "hybrid", 2.0)
-
-
 def test_bars_are_judged_by_the_mean(full):
     said = "\n".join(
         part.text
@@ -255,35 +226,8 @@ def test_the_command_reports_from_records(tmp_path, full, capsys):
         assert not (tmp_path / "other").exists()
 
 
-def test_what_no_record_holds_is_flown_once(tmp_path, monkeypatch):
-    pytest.importorskip("piqp")
-    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr(
-        baseline_record,
-        "full",
-        lambda: [thrower.unit(thrower.IDEAL, "none", target, 1) for target in (1.5, 2.0)],
-    )
-    words = ["--records", str(tmp_path / "records"), "--out", str(tmp_path / "out")]
-    record = tmp_path / "records" / "throws" / "baseline.json"
-    results.pack([], record)
-    assert baseline_record.main(words) == 0
-    made = record.read_bytes()
-    assert {r.unit["target"] for r in results.load(record)} == {1.5, 2.0}
-    monkeypatch.setattr(thrower, "fly_unit", lambda unit: pytest.fail("flown again"))
-    assert baseline_record.main(words) == 0
-    assert record.read_bytes() == made
-
-
 def test_what_the_report_stands_on_is_stated_once():
     keys = [results.key_of(unit) for unit in baseline_record.full()]
     assert len(set(keys)) == len(keys)
     assert {unit["target"] for unit in baseline_record.full()} == {1.5, 2.0, 2.5}
     assert len(command.quick_units()) == 5
-
-
-def test_the_quick_list_can_do_without_the_reference_plant():
-    plants = {}
-    for changes in ((), command.NO_REFERENCE):
-        units = load_list(command.QUICK_LIST, changes).throws.values()
-        plants[changes] = {unit.params.plant for row in units for unit in row}
-    assert plants == {(): {"hybrid", "reference-realistic"}, command.NO_REFERENCE: {"hybrid"}}

@@ -14,11 +14,11 @@ import pytest
 from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
-from visthrow.paper.sweep import RunGroup, SweepList, pool
+from visthrow.paper.sweep import pool
 from visthrow.paper.sweep import work_units as units
 from visthrow.paper.sweep.sweep_record import collect, status
 from visthrow.paper.sweep.work import held, locked
-from visthrow.paper.sweep.work_units import expand, load_list
+from visthrow.paper.sweep.work_units import load_list
 from visthrow.throws import results
 
 LIST = """
@@ -88,24 +88,6 @@ def throw(unit, out):
     results.save(units.throws_folder(out), results.Result(unit.unit(out), columns))
 
 
-def test_order_is_the_lists_and_batches_are_the_protocols(path):
-    work = load_list(path)
-    assert [source.name for source in work.sources] == [
-        "state",
-        "state-1",
-        "state_rigid_cable-1",
-        "state-2",
-        "state_rigid_cable-2",
-    ]
-    first = work.throws[work.sources[1].id]
-    assert [(u.set, u.target, u.batch, u.count) for u in first] == [
-        ("own", 1.5, None, 3),
-        ("own", 2.0, None, 3),
-        ("transfer", 2.0, 0, 100),
-        ("transfer", 2.0, 1, 50),
-    ]
-
-
 def test_a_run_is_its_resolved_config_and_seed(path):
     def keys(*changes):
         return {source.name: source.key for source in load_list(path, changes).sources}
@@ -117,41 +99,6 @@ def test_a_run_is_its_resolved_config_and_seed(path):
     assert not set(keys('commit="same"').values()) & set(plain.values()) - {""}
     changed = keys('runs.trained.changes=["ppo.discount=0.98"]')
     assert not (set(changed.values()) & set(plain.values())) - {""}
-
-
-def test_runs_that_differ_by_changes_alone_are_kept_apart(tmp_path):
-    """A list of one change at a time: a name and a line of the record for each."""
-    groups = {"plain": (), "discount": ("ppo.discount=0.98",), "spread": ("ppo.initial_std=0.3",)}
-    runs = {
-        name: RunGroup(throws=(), configs=("state",), changes=changes)
-        for name, changes in groups.items()
-    }
-    work = expand("changes", SweepList(runs=runs, throws={}))
-    assert [source.name for source in work.sources] == [
-        "state-1",
-        "state-discount-1",
-        "state-spread-1",
-    ]
-    for source in work.sources:
-        finish(source, tmp_path)
-    training, _ = collect(work, tmp_path, tmp_path / "records")
-    assert [run["name"] for run in json.loads(training.read_text())["runs"]] == [
-        source.name for source in work.sources
-    ]
-
-
-def test_a_field_added_later_changes_no_key(path):
-    """Keys are made of what differs from a default: a schema that grows does not train everything
-    anew.
-    """
-    source = load_list(path).sources[1]
-    stated = config.to_dict(source.experiment(), defaults=False)
-    del stated["vehicle"]["battery"]
-    assert "target" not in stated["task"]
-    assert source.key != results.key_of({"config": stated, "seed": 1})
-    stated = config.to_dict(source.experiment(), defaults=False)
-    assert source.key == results.key_of({"config": stated, "seed": 1})
-    assert config.to_dict(source.experiment()) != stated
 
 
 def test_departures_are_what_differs_from_the_training(path, tmp_path):
@@ -171,18 +118,6 @@ def test_departures_are_what_differs_from_the_training(path, tmp_path):
     )
     shipped = work.throws["state"][0].unit(tmp_path)
     assert (shipped["variant"], shipped["train_seed"], shipped["departures"]) == ("full", None, {})
-
-
-def test_another_policy_under_the_same_name_is_thrown_again(path, tmp_path):
-    work = load_list(path)
-    source = work.sources[1]
-    finish(source, tmp_path)
-    unit = work.throws[source.id][0]
-    throw(unit, tmp_path)
-    assert unit.done(tmp_path)
-    policy = source.policy(tmp_path)
-    policy.write_bytes(policy.read_bytes() + b"x")
-    assert not unit.done(tmp_path)
 
 
 class FakeStarter:

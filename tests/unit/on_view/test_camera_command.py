@@ -3,8 +3,6 @@ whether a lens fits its pictures.
 """
 
 import re
-import subprocess
-import sys
 
 import cv2
 import numpy as np
@@ -224,23 +222,6 @@ def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, caps
     )
     assert np.ptp(before.astype(int), axis=-1).max() == 0
     assert cv2.imread(str(tmp_path / "seen_straight.png")).shape == (320, 320, 3)
-
-
-def test_a_rendered_scene_says_nothing_of_a_missing_gpu(tmp_path):
-    """In a process of its own: Warp's library writes to stderr when it starts, once."""
-    words = [
-        sys.executable,
-        "-m",
-        "visthrow.cli",
-        "camera",
-        "show",
-        "fisheye",
-        "--out",
-        str(tmp_path / "a.png"),
-    ]
-    shown = subprocess.run(words, capture_output=True, text=True, check=True)
-    assert "in view: 4 of 4 keypoints of the goal" in shown.stdout
-    assert shown.stderr == ""
 
 
 def test_a_payload_below_the_ground_is_not_drawn(tmp_path, capsys):

@@ -5,6 +5,7 @@ import pytest
 import visthrow
 from visthrow.cli import api
 from visthrow.common.errors import VisthrowError
+from visthrow.training import trainer
 
 
 def test_keywords_become_options():
@@ -20,7 +21,8 @@ def test_keywords_become_options():
     assert api._words("--json", None, False) == []
 
 
-def test_a_throw_a_comparison_and_a_training(tmp_path):
+def test_a_throw_a_comparison_and_a_training(tmp_path, monkeypatch):
+    monkeypatch.setattr(trainer, "EVALUATED", 4)
     log = visthrow.fly("state", target=1.5, device="cpu", out=tmp_path / "fly")
     assert log.meta["goal_w"][0] == 1.5
     figures = visthrow.compare("state", throws=2, targets=[2.0], device="cpu", out=tmp_path / "c")

@@ -89,7 +89,7 @@ def test_onnx_gives_the_policys_actions(name, tmp_path):
         np.testing.assert_allclose(outputs[0], action, rtol=0.0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@pytest.mark.parametrize("name", ["state", "recurrent"])
 def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
     from visthrow.cli.c_source import write_c
 
