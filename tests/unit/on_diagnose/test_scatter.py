@@ -10,7 +10,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, varying
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares, varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
