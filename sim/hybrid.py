@@ -200,20 +200,28 @@ class HybridSim:
         self.threads = threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         self.types, self._step, self._reset = _kernels(params, direct, motors, self.extensions)
-        t = self.types
-        self._vehicles: Any = wp.array(
-            pack_vehicle(t, vehicles, kinds_of(params.vehicle)), dtype=t.Vehicle, device=device
-        )
-        self._ropes: Any = wp.array(
-            pack_rope(t, ropes_on(vehicles, ropes)), dtype=t.Rope, device=device
-        )
-        self._airs: Any = wp.array(
-            pack_air(t, airs, [params.laws] * len(airs)), dtype=t.Air, device=device
-        )
-        self._release: Any = wp.array(pack(t.Release, *releases), dtype=t.Release, device=device)
+        ropes = ropes_on(vehicles, ropes)
+        self._pack(ropes, airs, releases)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
-        self._exchange = self._exchanged(ropes_on(vehicles, ropes))
+        self._exchange = self._exchanged(ropes)
         self.place(pos_w=np.zeros((count, 3)))
+
+    def _pack(
+        self, ropes: list[RopeParams], airs: list[AirParams], releases: list[ReleaseParams]
+    ) -> None:
+        """Copy the parameters to the device."""
+        t = self.types
+        laws = [self.params.laws] * len(airs)
+        rows = (
+            (t.Vehicle, pack_vehicle(t, self.vehicles, kinds_of(self.params.vehicle))),
+            (t.Rope, pack_rope(t, ropes)),
+            (t.Air, pack_air(t, airs, laws)),
+            (t.Release, pack(t.Release, *releases)),
+        )
+        arrays: list[Any] = [
+            wp.array(packed, dtype=struct, device=self.device) for struct, packed in rows
+        ]
+        self._vehicles, self._ropes, self._airs, self._release = arrays
 
     def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
         """Return the solver of the plant's bodies with what it exchanges; None for the fused

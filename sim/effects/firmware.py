@@ -68,6 +68,25 @@ def calibrated_voltage(
     return vehicle.battery.reference_voltage * math.sqrt(full / vehicle.controller.max_thrust)
 
 
+NEEDED = (
+    "rollPID",
+    "pitchPID",
+    "yawPID",
+    "ff_weight",
+    "iterm_relax_cutoff",
+    "motor_idle",
+    "pidsum_limit",
+    "iterm_windup",
+)
+"""Settings without which there is no controller; other filters count as off."""
+
+
+def _lag(settings: Mapping[str, str], *names: str) -> float:
+    """Return the delay of low-passes one after the other [s]; 0 Hz are none."""
+    cutoffs = [numbers(settings, name)[0] for name in names]
+    return sum(1.0 / (2.0 * math.pi * hz) for hz in cutoffs if hz > 0.0)
+
+
 def controller_of(
     vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float
 ) -> ControllerParams:
@@ -82,17 +101,7 @@ def controller_of(
         mix_thrust: of a motor in hover [N].
         voltage: at which the throttle was calibrated [V].
     """
-    lists = (
-        "rollPID",
-        "pitchPID",
-        "yawPID",
-        "ff_weight",
-        "iterm_relax_cutoff",
-        "motor_idle",
-        "pidsum_limit",
-        "iterm_windup",
-    )
-    missing = [name for name in lists if name not in settings]
+    missing = [name for name in NEEDED if name not in settings]
     if missing:
         raise ValueError(
             f"settings without {', '.join(missing)}; expected those of a blackbox's header, such as"
@@ -121,17 +130,11 @@ def controller_of(
         x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
         return x, y, z
 
-    def lag(*names: str) -> float:
-        """Return the delay of low-passes one after the other [s]; 0 Hz are none."""
-        return sum(
-            1.0 / (2.0 * math.pi * hz) for name in names if (hz := numbers(settings, name)[0]) > 0.0
-        )
-
-    gyro = lag("gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
-    whole = gyro + lag("dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
+    gyro = _lag(settings, "gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
+    whole = gyro + _lag(settings, "dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
     share, yaw_share = (
         (gyro + filtering) / whole if whole > 0.0 else 1.0
-        for filtering in (0.0, lag("yaw_lowpass_hz"))
+        for filtering in (0.0, _lag(settings, "yaw_lowpass_hz"))
     )
     x, y, z = (windup * limit * torque for limit, torque in zip(extremes, torques, strict=True))
     return dataclasses.replace(
@@ -142,7 +145,7 @@ def controller_of(
         d_gain=gains(D_SCALE, [a[2] for a in axes]),
         feedforward_gain=gains(F_SCALE, forward),
         integral_limit=(x, y, z),
-        setpoint_time_constant=lag("iterm_relax_cutoff"),
+        setpoint_time_constant=_lag(settings, "iterm_relax_cutoff"),
         gyro_time_constant=whole,
         gyro_share=(share, share, yaw_share),
         min_thrust=full * idle**2,

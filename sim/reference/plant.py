@@ -153,30 +153,21 @@ class ReferencePlant:
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
         offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
-        body = np.hstack(
-            (
-                values["pos_w"] + offset_w,
-                values["quat_wb"],
-                values["vel_w"] + offset_vel,
-                values["rate_b"],
-            )
-        )
+        pos, vel = values["pos_w"] + offset_w, values["vel_w"] + offset_vel
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)
         n_dot = values["cable_vel_w"] - np.sum(values["cable_vel_w"] * n, -1, keepdims=True) * n
-        self._state = np.hstack(
-            (
-                body,
-                block,
-                np.zeros((count, 6)),
-                n.reshape(count, -1),
-                n_dot.reshape(count, -1),
-                np.zeros((count, 2)),
-            )
-        )
+        body = pos, values["quat_wb"], vel, values["rate_b"], block, np.zeros((count, 6))
+        ropes = n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2))
+        self._state = np.hstack((*body, *ropes))
         if self._ropes.stretch is not None:
             self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
+        self._begin(weight)
+
+    def _begin(self, weight: np.ndarray) -> None:
+        """Set clock and queue to hover at this weight [N], shape (E,); nothing is released."""
+        count = self.count
         hover = np.zeros((count, 4))
         hover[:, 0] = weight
         self._queue_times = [np.full(count, -np.inf)]
@@ -219,10 +210,18 @@ class ReferencePlant:
         self._next_wind = self._wind
         # Compiling a model takes milliseconds; without these draws the ropes of the last episode
         # serve on.
-        if self._ropes is not None and not (
+        if self._ropes is None or (
             extras.payload_mass_sigma or extras.rope_length_sigma or any(extras.com_offset_sigma)
         ):
-            return
+            self._build_ropes(length, com)
+
+    def _build_ropes(self, length: np.ndarray, com: np.ndarray) -> None:
+        """Build ropes of these lengths [m], shape (E,), on vehicles with these centres of mass [m],
+        shape (E, 3), and choose a step that bears them.
+        """
+        extras = self.extras
+        rope = self.params.rope
+        vehicle = self.params.vehicle
         damping = rope.joint_damping + extras.extra_joint_damping
         ropes = [
             replace(

@@ -21,17 +21,6 @@ MOST = 13
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
-    "long: visthrow.training.first_order.first_order_training.__init__",
-    "long: sim.effects.firmware.controller_of",
-    "long: sim.hybrid.__init__",
-    "long: sim.kernels.replay.lanes.run",
-    "long: sim.reference.plant._draw",
-    "long: sim.reference.plant.reset",
-    "long: visthrow.cli.fly.run",
-    "long: visthrow.cli.train.add_arguments",
-    "long: visthrow.detector_training.detector_command.add_arguments",
-    "long: visthrow.detector_training.detector_command.counted",
-    "long: visthrow.detector_training.scenes.scene.dressed",
     "long: visthrow.diagnose.extend.apply_cli.add_arguments",
     "long: visthrow.diagnose.extend.apply_cli.run",
     "long: visthrow.diagnose.extend.patch.text",
@@ -47,10 +36,6 @@ KNOWN = {
     "long: visthrow.diagnose.throw.linearising.lanes_of",
     "long: visthrow.diagnose.throw.replay.__init__",
     "long: visthrow.diagnose.throw.throw_model.__init__",
-    "long: visthrow.onboard.calibration.__init__",
-    "long: visthrow.paper.commands.baseline_command.add_arguments",
-    "long: visthrow.paper.report.trade.front_section",
-    "long: visthrow.view.figures.trades",
 }
 """What is still to be mended.
 

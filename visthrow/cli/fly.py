@@ -60,33 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     find_policy(args.policy)  # said before anything heavy is imported
-    from visthrow.common.errors import ConfigError
-    from visthrow.common.extras import load_extra
     from visthrow.common.storage import writable, write_json
-    from visthrow.logs.export import FORMATS
     from visthrow.throws.loading import load_policy
-    from visthrow.throws.plants import known_plant
     from visthrow.throws.recorded import check_goal, fly
     from visthrow.training.compute_device import resolve
 
-    known_plant(args.plant)
-    if len(args.target) > 2:
-        raise ConfigError(
-            f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y"
-        )
-    formats = (*FORMATS, ".mcap")
-    for path in args.export:
-        if Path(path).suffix not in formats:
-            raise ConfigError(
-                f"--export {path}: ending '{Path(path).suffix}'; expected one of"
-                f" {', '.join(formats)}"
-            )
-    for override in args.overrides:
-        if override.startswith("task.noise.command"):
-            raise ConfigError(
-                f"--set {override}: fly sends commands as they are, without training's noise;"
-                " compare throws with it"
-            )
+    _check(args)
     loaded = load_policy(args.policy, args.config, args.overrides, args.allow)
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
@@ -95,25 +74,7 @@ def run(args: argparse.Namespace) -> int:
         loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
-    eyes = None
-    rope = loaded.experiment.rope
-    if args.pixels is not None:
-        rendered = load_extra(
-            "visthrow.detector_training.eyes", "detector", "--pixels", ConfigError
-        )
-        if loaded.policy.contract["observation"]["layout"] != "vision":
-            raise ConfigError(
-                f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
-            )
-        eyes = rendered.RenderedEyes(
-            loaded.experiment.camera,
-            rope.mount,
-            rope.length + rope.payload_offset,
-            1,
-            args.seed,
-            method=args.pixels,
-            keep=True,
-        )
+    eyes = None if args.pixels is None else _rendered_eyes(loaded, args.pixels, args.seed)
     log = fly(loaded, goal, args.plant, args.seed, resolve(args.device), eyes)
     paths = write(Path(args.out), log, loaded.experiment)
     if eyes is not None:
@@ -135,6 +96,49 @@ def run(args: argparse.Namespace) -> int:
             },
         )
     return 0 if log.meta["result"]["success"] else 1
+
+
+def _check(args: argparse.Namespace) -> None:
+    """Raise ConfigError for arguments that no flight follows."""
+    from visthrow.common.errors import ConfigError
+    from visthrow.logs.export import FORMATS
+    from visthrow.throws.plants import known_plant
+
+    known_plant(args.plant)
+    if len(args.target) > 2:
+        raise ConfigError(
+            f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y"
+        )
+    formats = (*FORMATS, ".mcap")
+    for path in args.export:
+        if Path(path).suffix not in formats:
+            raise ConfigError(
+                f"--export {path}: ending '{Path(path).suffix}'; expected one of"
+                f" {', '.join(formats)}"
+            )
+    for override in args.overrides:
+        if override.startswith("task.noise.command"):
+            raise ConfigError(
+                f"--set {override}: fly sends commands as they are, without training's noise;"
+                " compare throws with it"
+            )
+
+
+def _rendered_eyes(loaded, method: str, seed: int):
+    """Return a detector on rendered pictures for a vision policy."""
+    from visthrow.common.errors import ConfigError
+    from visthrow.common.extras import load_extra
+
+    rendered = load_extra("visthrow.detector_training.eyes", "detector", "--pixels", ConfigError)
+    if loaded.policy.contract["observation"]["layout"] != "vision":
+        raise ConfigError(
+            f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
+        )
+    rope = loaded.experiment.rope
+    reach = rope.length + rope.payload_offset
+    return rendered.RenderedEyes(
+        loaded.experiment.camera, rope.mount, reach, 1, seed, method=method, keep=True
+    )
 
 
 def write(folder: Path, log, experiment) -> list[Path]:

@@ -10,32 +10,29 @@ from typing import Any
 
 from visthrow.common.arguments import NUMBER, SOLVER, WHOLE, add_common
 
+EXAMPLES = (
+    "examples:\n  visthrow train laptop                          a state policy on the cores of"
+    " a laptop\n  visthrow train laptop --until 0.04             stop once throws at 2.0 m land"
+    " within 4 cm on average\n  visthrow train mine.toml --from state          adapt the"
+    " shipped policy to a vehicle of your own\n  visthrow train vision --seed 2 --out runs/v2  "
+    " another seed, in a folder of its own\n  visthrow train --resume --out runs/v2          go"
+    " on where an interrupted run stopped\n  torchrun --nproc-per-node 2 -m visthrow.cli train"
+    " state   on two GPUs\n"
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow train laptop                          a state policy on the cores of"
-        " a laptop\n  visthrow train laptop --until 0.04             stop once throws at 2.0 m land"
-        " within 4 cm on average\n  visthrow train mine.toml --from state          adapt the"
-        " shipped policy to a vehicle of your own\n  visthrow train vision --seed 2 --out runs/v2  "
-        " another seed, in a folder of its own\n  visthrow train --resume --out runs/v2          go"
-        " on where an interrupted run stopped\n  torchrun --nproc-per-node 2 -m visthrow.cli train"
-        " state   on two GPUs\n"
-    )
+    parser.epilog = EXAMPLES
+    add = parser.add_argument
     names = (
         "a name of configs/train (state, vision, vision_located, laptop, laptop_vision, paper, ...)"
         " or a TOML file of your own"
     )
-    parser.add_argument(
-        "config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder"
-    )
-    parser.add_argument(
-        "--seed", type=WHOLE, help="of everything random (default: 1, or that of the resumed run)"
-    )
-    parser.add_argument(
-        "--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)"
-    )
-    parser.add_argument(
+    add("config", metavar="CONFIG", nargs="?", help=f"{names}; a resumed run has it in its folder")
+    add("--seed", type=WHOLE, help="of everything random (default: 1, or that of the resumed run)")
+    add("--out", metavar="FOLDER", help="folder of the run (default: runs/CONFIG-SEED)")
+    add(
         "--from",
         dest="start",
         metavar="POLICY",
@@ -44,20 +41,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             " configs/ppo/adapt.toml"
         ),
     )
-    parser.add_argument(
+    add(
         "--iterations",
         type=int,
         metavar="N",
         help="stop after iteration N (default: the configuration's last)",
     )
-    parser.add_argument("--minutes", type=NUMBER, metavar="T", help="stop after this time")
-    parser.add_argument(
+    add("--minutes", type=NUMBER, metavar="T", help="stop after this time")
+    add(
         "--until",
         type=NUMBER,
         metavar="ERROR",
         help="stop once throws at 2.0 m land so near on average [m]",
     )
-    parser.add_argument(
+    add(
         "--evaluate-every",
         type=int,
         metavar="N",
@@ -66,19 +63,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             " with --until and --view)"
         ),
     )
-    parser.add_argument(
+    add(
         "--checkpoint-every",
         type=int,
         metavar="N",
         help="iterations between checkpoints (default: a hundredth of the time)",
     )
-    parser.add_argument(
+    add(
         "--view",
         action="store_true",
         help="show a throw of each evaluation in this machine's browser",
     )
-    parser.add_argument("--resume", action="store_true", help="go on from the folder's checkpoint")
-    parser.add_argument("--solver", **SOLVER)
+    add("--resume", action="store_true", help="go on from the folder's checkpoint")
+    add("--solver", **SOLVER)
     add_common(parser)
 
 

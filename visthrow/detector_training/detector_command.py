@@ -64,106 +64,117 @@ CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    train = actions.add_parser("train", help="train it; rendering and learning on one device")
-    train.add_argument(
+    _add_train(actions.add_parser("train", help="train it; rendering and learning on one device"))
+    _add_check(
+        actions.add_parser(
+            "check", help="recall and pixel error by nuisance, beside the OpenCV detector"
+        )
+    )
+    _add_throw(
+        actions.add_parser(
+            "throw",
+            help="throws closed loop on rendered pictures: render, detect, policy, simulate",
+        )
+    )
+
+
+def _add_train(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
         "name",
         nargs="?",
         default="small",
         metavar="NAME",
         help="of configs/detector, or a file (default: small)",
     )
-    train.add_argument(
+    add(
         "--out",
         default="runs/detector",
         metavar="FOLDER",
         help="for checkpoint and weights (default: runs/detector)",
     )
-    train.add_argument(
+    add(
         "--textures",
         metavar="FOLDER",
         help="photographs for ground and walls (default: those of scikit-image)",
     )
-    train.add_argument(
-        "--minutes", type=ABOVE_ZERO, metavar="N", help="stop after so long; --resume goes on"
-    )
-    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
-    add_common(train, json=False)
-    check = actions.add_parser(
-        "check", help="recall and pixel error by nuisance, beside the OpenCV detector"
-    )
-    check.add_argument(
+    add("--minutes", type=ABOVE_ZERO, metavar="N", help="stop after so long; --resume goes on")
+    add("--resume", action="store_true", help="go on from the checkpoint in --out")
+    add_common(parser, json=False)
+
+
+def _add_check(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
         "--weights",
         metavar="FILE",
         help="of visthrow detector train (default: those that are shipped)",
     )
-    check.add_argument(
-        "--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)"
-    )
-    check.add_argument(
+    add("--frames", type=int, default=100, metavar="N", help="a nuisance (default: 100)")
+    add(
         "--known",
         default="pose",
         choices=PRIORS,
         help="what the detectors are told; track: as in flight (default: pose)",
     )
-    check.add_argument(
+    add(
         "--textures",
         metavar="FOLDER",
         help="photographs (default: those of scikit-image that were not trained on)",
     )
-    check.add_argument("--seed", type=WHOLE, default=0, help="of the scenes")
-    check.add_argument(
+    add("--seed", type=WHOLE, default=0, help="of the scenes")
+    add(
         "--out",
         metavar="FILE",
         help="picture of the first frames of each nuisance with what was found, .png",
     )
-    add_common(check)
-    throw = actions.add_parser(
-        "throw", help="throws closed loop on rendered pictures: render, detect, policy, simulate"
-    )
-    throw.add_argument(
+    add_common(parser)
+
+
+def _add_throw(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
         "--policy",
         default="vision",
         metavar="POLICY",
         help="a shipped name or a file (default: vision)",
     )
-    throw.add_argument(
+    add(
         "--by",
         default="contours",
         choices=("learnt", "contours"),
         help="detector (default: contours)",
     )
-    throw.add_argument(
+    add(
         "--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)"
     )
-    throw.add_argument(
-        "--target", type=NUMBER, default=2.0, metavar="M", help="distance (default: 2.0)"
-    )
-    throw.add_argument(
+    add("--target", type=NUMBER, default=2.0, metavar="M", help="distance (default: 2.0)")
+    add(
         "--throws",
         type=int,
         default=20,
         metavar="N",
         help="each in a hall of its own (default: 20)",
     )
-    throw.add_argument(
+    add(
         "--jobs",
         type=int,
         default=1,
         metavar="N",
         help="processes; the throws do not depend on them (default: 1)",
     )
-    throw.add_argument(
+    add(
         "--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic"
     )
-    throw.add_argument(
+    add(
         "--nuisances",
         type=NUMBER,
         default=0.5,
         metavar="X",
         help="0: clean, 1: as bad as in training (default: 0.5)",
     )
-    throw.add_argument("--seed", type=WHOLE, default=0, help="of everything random")
-    add_common(throw)
+    add("--seed", type=WHOLE, default=0, help="of everything random")
+    add_common(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -455,7 +466,7 @@ def counted(
     """
     from camera.detectors.contours import detected_keypoints
     from camera.fisheye import Fisheye
-    from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, payload_keypoints
+    from camera.keypoints import KeypointCamera, payload_keypoints
     from camera.mount import nominal_rot_cb
     from camera.overlay import draw_overlay
     from visthrow.detector_training.scenes.scene import Nuisances, random_scenes, truth_of
@@ -489,24 +500,27 @@ def counted(
                     eyes, detection, rot_wc @ nominal_rot_cb(camera.mount).numpy()
                 )
                 off = np.linalg.norm(lens.denormalize(points).numpy() - true[e], axis=1)
-                for kind, part in (
-                    ("ball", slice(GOAL_KEYPOINTS, None)),
-                    ("goal", slice(0, GOAL_KEYPOINTS)),
-                ):
-                    thing = getattr(detection, kind)
-                    visible = bool(getattr(truth, f"{kind}_seen")[e])
-                    rows[name].append(
-                        (
-                            kind,
-                            visible,
-                            thing is not None,
-                            float(off[part].mean()),
-                            getattr(thing, "score", 0.0),
-                        )
-                    )
+                rows[name] += _rows_of(detection, truth, e, off)
                 if name == next(iter(detectors)) and len(pictures) < 4:
                     pictures.append(draw_overlay(eyes, points, valid, np.ascontiguousarray(image)))
     return {name: figures_of(rows[name], spent[name]) for name in detectors}, pictures
+
+
+def _rows_of(detection, truth, frame: int, off: np.ndarray) -> list[tuple]:
+    """Return kind, visible, detected, error [px] and score of ball and goal in a frame.
+
+    ``off``: errors of all keypoints [px], shape (K,).
+    """
+    from camera.keypoints import GOAL_KEYPOINTS
+
+    parts = {"ball": off[GOAL_KEYPOINTS:], "goal": off[:GOAL_KEYPOINTS]}
+    rows = []
+    for kind, errors in parts.items():
+        thing = getattr(detection, kind)
+        visible = bool(getattr(truth, f"{kind}_seen")[frame])
+        score = getattr(thing, "score", 0.0)
+        rows.append((kind, visible, thing is not None, float(errors.mean()), score))
+    return rows
 
 
 def _print(level: str, figures: dict[str, dict[str, float]], first: bool) -> None:

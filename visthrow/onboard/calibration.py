@@ -250,7 +250,12 @@ class CalibrationProblem:
         self.corners = points[:, :GOAL_KEYPOINTS].mean(1)
         self.ball_seen = torch.from_numpy(visible)
         self.corners_seen = torch.from_numpy(hovered.valid[:, :GOAL_KEYPOINTS].all(1))
-        s = spreads
+        self._set_priors()
+
+    def _set_priors(self) -> None:
+        """Set the deviations of constants, pushes and attitudes from the spreads."""
+        s = self.spreads
+        make = {"dtype": torch.float64}
         spread = {
             "camera": s.tilt,
             "scale": s.scale,
@@ -267,13 +272,10 @@ class CalibrationProblem:
             "goal": s.goal,
         }
         self.prior = torch.cat(
-            [
-                torch.full((n,), max(spread[name], 1e-9), dtype=torch.float64)
-                for name, n in CONSTANTS.items()
-            ]
+            [torch.full((n,), max(spread[name], 1e-9), **make) for name, n in CONSTANTS.items()]
         )
-        self.push = tensor([s.push, s.push, s.lift])
-        self.attitude = tensor([s.attitude, s.attitude, s.heading * s.attitude])
+        self.push = torch.tensor([s.push, s.push, s.lift], **make)
+        self.attitude = torch.tensor([s.attitude, s.attitude, s.heading * s.attitude])
         self.split(self.prior[None])["attitude"][0, 2] *= s.heading
 
     def start(self) -> tuple[Tensor, Tensor]:

@@ -269,6 +269,36 @@ def _landings(axis, points: np.ndarray, half: float, series: int, label: str) ->
         axis.plot(-center[1], center[0], marker, color=colour, ms=7, mec="white", mew=1.2, zorder=6)
 
 
+def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
+    """Draw policies with their intervals, (label, duration, error) each; return what the legend
+    names.
+    """
+    labels: dict[str, object] = {}
+    for i, (label, duration, error) in enumerate(stars):
+        colour = style.COLOURS[3 + i]
+        axis.plot(
+            [duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6
+        )
+        axis.plot(
+            [duration.low, duration.high],
+            [error.value] * 2,
+            "-",
+            color=colour,
+            lw=2.0,
+            alpha=0.6,
+        )
+        star = {
+            "color": colour,
+            "ms": 14,
+            "mec": "white",
+            "mew": 0.7,
+            "ls": "none",
+            "zorder": 5,
+        }
+        labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
+    return labels
+
+
 def trades(panels: Sequence[Trade]) -> bytes:
     """Agility against accuracy, a panel a plant; lines join the settings that no other
     one beats.
@@ -288,28 +318,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
             else:
                 look = {"marker": "x", "ms": 6, "ls": "--"}
             labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
-        for i, (label, duration, error) in enumerate(panel.stars):
-            colour = style.COLOURS[3 + i]
-            axis.plot(
-                [duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6
-            )
-            axis.plot(
-                [duration.low, duration.high],
-                [error.value] * 2,
-                "-",
-                color=colour,
-                lw=2.0,
-                alpha=0.6,
-            )
-            star = {
-                "color": colour,
-                "ms": 14,
-                "mec": "white",
-                "mew": 0.7,
-                "ls": "none",
-                "zorder": 5,
-            }
-            labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
+        labels |= _stars(axis, panel.stars)
         empty = [label for _, label, points in panel.fronts if not len(points)]
         if empty or not panel.fronts:
             if empty:

@@ -134,6 +134,14 @@ class Replay:
         }
         self._plants: dict[str, list[wp.array]] = {}
 
+    def _plants_on(self, device: str) -> list[wp.array]:
+        """Return the plants' arrays on a device, copied once."""
+        if device not in self._plants:
+            self._plants[device] = [
+                wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()
+            ]
+        return self._plants[device]
+
     def run(
         self,
         starts: Mapping[str, np.ndarray],
@@ -154,21 +162,11 @@ class Replay:
         k, t = self.kernel, self.types
         count = len(lanes["window"])
         device = self.device if count > SMALL_BATCH * cores() else "cpu"
-        if (
-            device != "cpu"
-        ):  # lanes that wait for others would double the time, which is that of the slowest
+        if device != "cpu":  # lanes that wait for others would double the time of the slowest
             lanes = {**lanes, "resume": np.full(count, -1)}
-        if device not in self._plants:
-            self._plants[device] = [
-                wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()
-            ]
         w = np.asarray(lanes["window"])
         height = max(int(np.max(recording.rows[w])), 1)
-        segments = {
-            "cable_dir_w": self.segments,
-            "cable_vel_w": self.segments,
-            "stiffness": self.segments,
-        }
+        segments = dict.fromkeys(("cable_dir_w", "cable_vel_w", "stiffness"), self.segments)
         keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
         if keeps:
             ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
@@ -177,11 +175,9 @@ class Replay:
             ends, knot_states = k.State(), k.Knots()
         out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
-        moments, vec3 = knots if np.any(resumed) else 0, t.vec3
-        ropes = [
-            wp.empty((moments, self.segments), dtype=kind, device=device)
-            for kind in (vec3, vec3, t.real)
-        ]
+        moments = knots if np.any(resumed) else 0
+        size = (moments, self.segments)
+        ropes = [wp.empty(size, dtype=kind, device=device) for kind in (t.vec3, t.vec3, t.real)]
         left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
         marks = wp.empty(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
@@ -196,16 +192,14 @@ class Replay:
             (_struct(t, *group, device) for group in inputs),
             recording.on(k, t, device),
         )
-        before = [*self._plants[device], *numerics, begin, windows, flown, data, order]
+        before = [*self._plants_on(device), *numerics, begin, windows, flown, data, order]
         after, first = [ends, knot_states, marks, *left_at, out], 0
         for rows in launches:
             self._launch(device, first, costs[rows], before, after)
             first += len(rows)
-        read = (
-            (self._read(ends, rk.STATE_FIELDS), self._read(knot_states, rk.KNOT_FIELDS))
-            if keeps
-            else ({}, {})
-        )
+        if not keeps:
+            return Replayed(self._download(out), {}, {})
+        read = self._read(ends, rk.STATE_FIELDS), self._read(knot_states, rk.KNOT_FIELDS)
         return Replayed(self._download(out), *read)
 
     def _launch(

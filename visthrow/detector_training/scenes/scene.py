@@ -201,35 +201,36 @@ def posed_scenes(
     )
 
 
-def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
-    """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
-    count = scenes.count
-    flat = lambda *columns: torch.cat([c if c.dim() == 2 else c[:, None] for c in columns], -1)  # noqa: E731
-    ground = scenes.ground.clone()
-    walls = scenes.walls.clone()
+def _flat(*columns: Tensor) -> Tensor:
+    """Join columns, shape (F,) or (F, n)."""
+    return torch.cat([c if c.dim() == 2 else c[:, None] for c in columns], -1)
+
+
+def _exposed(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
+    """Return sensors and shutters drawn at random."""
+    gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
+    noise = n.noise * d.uniform(0.0, 1.0, 1).square()
+    seed = torch.arange(count) * 7919.0 + d.one_of(1000)
+    sensor = _flat(
+        gain,
+        0.06 * noise[:, 0],
+        0.04 * noise[:, 0],
+        1.0 + n.light * d.uniform(-0.45, 0.1),
+        torch.zeros(count),
+        seed,
+    )
+    shutter = _flat(
+        n.motion * d.uniform(0.0, 0.012),
+        n.motion * d.uniform(0.0, 0.012),
+        n.blur * d.uniform(0.0, 1.0).square() * 1.6,
+    )
+    return sensor, shutter
+
+
+def _coloured(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
+    """Return balls and goals with colours, sizes and turns drawn at random."""
     ball = scenes.ball.clone()
     goal = scenes.goal.clone()
-    pictured = d.chance(n.ground)
-    tint = d.uniform(0.45, 1.1, 1) * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
-    ground = torch.where(
-        pictured[:, None],
-        flat(
-            d.one_of(textures),
-            d.uniform(0.4, 3.0),
-            d.uniform(0.0, 6.28),
-            d.uniform(0.0, 2.0, 2),
-            tint,
-        ),
-        ground,
-    )
-    dressed_walls = flat(
-        d.one_of(textures),
-        d.uniform(3.0, 9.0),
-        d.uniform(3.0, 7.0),
-        d.uniform(1.5, 6.0),
-        d.uniform(0.3, 1.0),
-    )
-    walls = torch.where(pictured[:, None], dressed_walls, walls)
     ball[:, 7:11] = torch.nn.functional.normalize(d.normal(1.0, 4), dim=-1)
     ball[:, 11:14] = (
         ball[:, 11:14] + n.look * (d.uniform(-0.18, 0.12, 1) + d.uniform(-0.08, 0.08, 3))
@@ -241,11 +242,41 @@ def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     goal[:, 9:12] = (goal[:, 9:12] + n.look * d.uniform(-0.25, 0.07, 1)).clamp(0.02, 1.0)
     goal[:, 4] = goal[:, 4] + n.look * d.uniform(-0.008, 0.012)
     goal[:, 5] = torch.where(d.chance(0.6 * n.look), d.one_of(4), goal[:, 5])
+    return ball, goal
+
+
+def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
+    """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
+    count = scenes.count
+    ground = scenes.ground.clone()
+    walls = scenes.walls.clone()
+    pictured = d.chance(n.ground)
+    tint = d.uniform(0.45, 1.1, 1) * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
+    ground = torch.where(
+        pictured[:, None],
+        _flat(
+            d.one_of(textures),
+            d.uniform(0.4, 3.0),
+            d.uniform(0.0, 6.28),
+            d.uniform(0.0, 2.0, 2),
+            tint,
+        ),
+        ground,
+    )
+    dressed_walls = _flat(
+        d.one_of(textures),
+        d.uniform(3.0, 9.0),
+        d.uniform(3.0, 7.0),
+        d.uniform(1.5, 6.0),
+        d.uniform(0.3, 1.0),
+    )
+    walls = torch.where(pictured[:, None], dressed_walls, walls)
+    ball, goal = _coloured(scenes, d, n)
     direction = torch.nn.functional.normalize(
         torch.cat([d.normal(0.5, 2), torch.ones(count, 1)], -1), dim=-1
     )
     colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
-    light = flat(
+    light = _flat(
         torch.where(d.chance(n.light)[:, None], direction, scenes.light[:, :3]),
         d.uniform(0.3, 0.7),
         colour,
@@ -256,22 +287,7 @@ def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     rope[:, 4:7] = d.uniform(0.05, 0.9, 1)
     lens = scenes.lens.clone()
     lens[:, 9] = n.light * d.uniform(0.0, 2.0)
-    gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
-    noise = n.noise * d.uniform(0.0, 1.0, 1).square()
-    seed = torch.arange(count) * 7919.0 + d.one_of(1000)
-    sensor = flat(
-        gain,
-        0.06 * noise[:, 0],
-        0.04 * noise[:, 0],
-        1.0 + n.light * d.uniform(-0.45, 0.1),
-        torch.zeros(count),
-        seed,
-    )
-    shutter = flat(
-        n.motion * d.uniform(0.0, 0.012),
-        n.motion * d.uniform(0.0, 0.012),
-        n.blur * d.uniform(0.0, 1.0).square() * 1.6,
-    )
+    sensor, shutter = _exposed(count, d, n)
     things = _things(scenes, d, n)
     return replace(
         scenes,

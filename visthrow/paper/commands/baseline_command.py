@@ -22,19 +22,22 @@ NOTE = (
 )
 
 
+EXAMPLES = (
+    "examples:\n  visthrow baseline                              tables at three targets and"
+    " the sweep at 2.0 m (minutes)\n  visthrow baseline --quick                      two"
+    " throws, a small sweep, own model alone\n  visthrow baseline --plants hybrid"
+    " reference-realistic --no-sweep\n\nThe baseline plans the payload's path to a release"
+    " state by projectile motion, with height and speed of a\nlearnt policy's release, and"
+    " tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model,"
+    " an\nidealised upper bound, and on the plants, with and without making up for delays and"
+    " the release's lag.\nWhat is flown is kept in the output folder; interrupted and started"
+    " again, the command goes on.\n"
+)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow baseline                              tables at three targets and"
-        " the sweep at 2.0 m (minutes)\n  visthrow baseline --quick                      two"
-        " throws, a small sweep, own model alone\n  visthrow baseline --plants hybrid"
-        " reference-realistic --no-sweep\n\nThe baseline plans the payload's path to a release"
-        " state by projectile motion, with height and speed of a\nlearnt policy's release, and"
-        " tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model,"
-        " an\nidealised upper bound, and on the plants, with and without making up for delays and"
-        " the release's lag.\nWhat is flown is kept in the output folder; interrupted and started"
-        " again, the command goes on.\n"
-    )
+    parser.epilog = EXAMPLES
     parser.add_argument(
         "--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]"
     )

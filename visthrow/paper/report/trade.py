@@ -181,6 +181,48 @@ def _bar(thrown: ResultSet) -> str:
     return "In its own model: " + "; ".join(words) + "."
 
 
+def _panel(
+    heading: str, plant: str, kinds: Sequence, policies: Sequence[tuple], charts: Sequence[tuple]
+) -> figures.Trade:
+    """Return the panel of a plant: fronts of the baseline, policies, and the paper's points."""
+    stars = [
+        (f"{name} policy", st.mean(result.of("duration")), st.mean(result.of("error")))
+        for name, result in policies
+    ]
+    crosses = _paper_points() if plant == thrower.IDEAL else ()
+    late = {"delay": ", release lag not made up for"}
+    fronts = tuple(
+        (
+            kinds.index((made_up, bounds)),
+            f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}",
+            points_of(selected),
+        )
+        for (made_up, bounds), selected in charts
+    )
+    return figures.Trade(heading, fronts, tuple(stars), crosses)
+
+
+def _front_table(sums: Sequence[tuple]) -> Grid:
+    """Return the fronts in figures."""
+    head = (
+        "plant",
+        "what",
+        "settings",
+        "all landed",
+        "fastest [s]",
+        "most accurate [m]",
+        "hypervolume [s m]",
+        "correlation of landing error with e_v",
+    )
+    time, error = front.CORNER
+    note = (
+        f"Hypervolume: area that is beaten up to {time:g} s and {error:g} m; more is better."
+        " Correlations are over throws of all settings; the paper states that the error follows"
+        " e_v."
+    )
+    return Grid("Fronts in figures", head, tuple(sums), note, heads=2)
+
+
 def front_section(
     thrown: ResultSet, rows_of_panels: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
 ) -> Section:
@@ -214,21 +256,7 @@ def front_section(
             sentences += _verdicts(title, label, selected, policies, policies_on)
         for name, result in policies:
             sums.append(_policy_sum(title, name, result))
-        stars = [
-            (f"{name} policy", st.mean(r.of("duration")), st.mean(r.of("error")))
-            for name, r in policies
-        ]
-        crosses = _paper_points() if plant == thrower.IDEAL else ()
-        late = {"delay": ", release lag not made up for"}
-        fronts = tuple(
-            (
-                kinds.index((made_up, bounds)),
-                f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}",
-                points_of(selected),
-            )
-            for (made_up, bounds), selected in charts
-        )
-        panels.append(figures.Trade(heading, fronts, tuple(stars), crosses))
+        panels.append(_panel(heading, plant, kinds, policies, charts))
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting"
         " counts where all its throws landed. Plans bound the payload's path alone, as the paper's"
@@ -243,26 +271,7 @@ def front_section(
         )
         picture = Picture("front", figures.trades(panels), text)
     if sums:
-        head = (
-            "plant",
-            "what",
-            "settings",
-            "all landed",
-            "fastest [s]",
-            "most accurate [m]",
-            "hypervolume [s m]",
-            "correlation of landing error with e_v",
-        )
-        corner = (
-            "Hypervolume: area that is beaten up to {:g} s and {:g} m; more is better. ".format(
-                *front.CORNER
-            )
-        )
-        note = (
-            corner + "Correlations are over throws of all settings; the paper states that the error"
-            " follows e_v."
-        )
-        table = Grid("Fronts in figures", head, tuple(sums), note, heads=2)
+        table = _front_table(sums)
     caption = (
         lead,
         picture,

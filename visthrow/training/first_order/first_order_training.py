@@ -37,6 +37,19 @@ OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the med
 NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
 
 
+def _require_supported(experiment: Experiment) -> None:
+    """Raise ConfigError for a task that flights without release cannot be trained on."""
+    observation = experiment.task.observation
+    late = observation.oldest > experiment.sim.control_period
+    unsupported = experiment.task.target.moves or experiment.fleet is not None
+    if observation.layout != "state" or late or unsupported:
+        raise ConfigError(
+            'algorithm = "first_order" takes observation.layout = "state", a latency of one period'
+            ' at most, one vehicle and goals that stand still; "distillation" makes a vision policy'
+            " of its policy"
+        )
+
+
 class FirstOrder:
     """First-order training by a surrogate that is fitted to the environment's plants;
     :class:`visthrow.training.trainer.Algorithm`.
@@ -46,20 +59,9 @@ class FirstOrder:
         self.cfg = experiment
         self.p = experiment.first_order
         self._ranks = ranks
-        observation = experiment.task.observation
         p = experiment.ppo
         on_gpu = device.startswith("cuda")
-        late = observation.oldest > experiment.sim.control_period
-        unsupported = experiment.task.target.moves or experiment.fleet is not None
-        if observation.layout != "state" or late or unsupported:
-            expected = (
-                'observation.layout = "state", a latency of one period at most, one vehicle and'
-                " goals that stand still"
-            )
-            raise ConfigError(
-                f'algorithm = "first_order" takes {expected}; "distillation" makes a vision policy'
-                " of its policy"
-            )
+        _require_supported(experiment)
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag = int(lag + 1e-6)
         remainder = max(lag - int(lag + 1e-6), 0.0)
