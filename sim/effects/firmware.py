@@ -87,6 +87,22 @@ def _lag(settings: Mapping[str, str], *names: str) -> float:
     return sum(1.0 / (2.0 * math.pi * hz) for hz in cutoffs if hz > 0.0)
 
 
+def _torques(vehicle: VehicleParams, thrust: float) -> list[float]:
+    """Return the torques about the axes for an output of 1 a degree [N m].
+
+    ``thrust``: of a motor for a mixer output of 1 [N].
+    """
+    rotors = vehicle.rotors
+    arms = (sum(map(abs, rotors.y)), sum(map(abs, rotors.x)), 4.0 * vehicle.thrust.torque_ratio)
+    return [arm * thrust / MIXER_SCALE * DEGREE for arm in arms]
+
+
+def _gains(torques: list[float], scale: float, values: list[float]) -> tuple[float, float, float]:
+    """Return the gains of the axes [N m]."""
+    x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
+    return x, y, z
+
+
 def controller_of(
     vehicle: VehicleParams, settings: Mapping[str, str], mix_thrust: float, voltage: float
 ) -> ControllerParams:
@@ -108,16 +124,10 @@ def controller_of(
             " rollPID:45,80,40"
         )
     c = vehicle.controller
-    rotors = vehicle.rotors
     full = c.max_thrust * (voltage / vehicle.battery.reference_voltage) ** 2
     idle = numbers(settings, "motor_idle")[0] * 1e-4
-    thrust = (
-        2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)
-    )  # of a motor for a mixer output of 1 [N]
-    arms = (sum(map(abs, rotors.y)), sum(map(abs, rotors.x)), 4.0 * vehicle.thrust.torque_ratio)
-    torques = [
-        arm * thrust / MIXER_SCALE * DEGREE for arm in arms
-    ]  # for an output of 1 a degree [N m]
+    thrust = 2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)  # for an output of 1 [N]
+    torques = _torques(vehicle, thrust)
     axes = [numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")]
     forward = numbers(settings, "ff_weight")
     extremes = [
@@ -125,10 +135,6 @@ def controller_of(
         for name in ("pidsum_limit", "pidsum_limit", "pidsum_limit_yaw")
     ]
     windup = 0.01 * numbers(settings, "iterm_windup")[0] / DEGREE
-
-    def gains(scale: float, values: list[float]) -> tuple[float, float, float]:
-        x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
-        return x, y, z
 
     gyro = _lag(settings, "gyro_lpf1_static_hz", "gyro_lpf2_static_hz")
     whole = gyro + _lag(settings, "dterm_lpf1_static_hz", "dterm_lpf2_static_hz")
@@ -140,10 +146,12 @@ def controller_of(
     return dataclasses.replace(
         c,
         kind="motor_mixing",
-        p_gain=gains(P_SCALE, [a[0] for a in axes]),
-        i_gain=gains(I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]),
-        d_gain=gains(D_SCALE, [a[2] for a in axes]),
-        feedforward_gain=gains(F_SCALE, forward),
+        p_gain=_gains(torques, P_SCALE, [a[0] for a in axes]),
+        i_gain=_gains(
+            torques, I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]
+        ),
+        d_gain=_gains(torques, D_SCALE, [a[2] for a in axes]),
+        feedforward_gain=_gains(torques, F_SCALE, forward),
         integral_limit=(x, y, z),
         setpoint_time_constant=_lag(settings, "iterm_relax_cutoff"),
         gyro_time_constant=whole,
