@@ -121,6 +121,10 @@ EXPORTS = {
     + lines([[t, *(1e3 * p).round(3), *q] for t, p, q in zip(TIME, POS, QUATS)]),
     "semicolons and commas.csv": "time;x;y;z;qx;qy;qz;qw\n"
     + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))], ";", comma=True),
+    "motive without labels.csv": motive().replace(",Type,", ",,").replace(",Name,", ",,"),
+    "vicon with devices.csv": "Devices\n1000\n,,Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n"
+    + "".join(f"{i},{j},1.0,2.0,{i % 7}\n" for i in range(9) for j in range(10))
+    + f"\n{vicon()}",
     "line ends of windows.csv": motive().replace("\n", "\r\n"),
 }
 
@@ -212,6 +216,42 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, tmp_path):
         assert "payload_pos_w" in log
         assert np.array_equal(np.flatnonzero(~log["pos_w"].valid), np.arange(200, 260))
     assert not any("mirror" in question for question in found.questions)
+
+
+@pytest.mark.parametrize("extra", ["", "EVENT\tThrow\t120\t1.2\n", "TRAJECTORY_TYPES\tA\tB\n"])
+def test_markers_of_qualisys_without_names_of_columns(extra, tmp_path):
+    """Places alone below the settings: the markers' names and the rate stand among these."""
+    head = "NO_OF_FRAMES\t400\nNO_OF_MARKERS\t2\nFREQUENCY\t100\nDATA_INCLUDED\t3D\n"
+    rows = [[*(1e3 * p).round(3), *(1e3 * (p - [0, 0, 0.5])).round(3)] for p in POS]
+    path = tmp_path / "a.tsv"
+    path.write_text(f"{head}{extra}MARKER_NAMES\tquad\tball\n{lines(rows, chr(9))}")
+    table = table_of(path)
+    (log,) = logs_of(table, propose(table, path).mapping, str(path))
+    np.testing.assert_allclose(log["pos_w"].values, POS, atol=1e-6)
+    np.testing.assert_allclose(log["payload_pos_w"].time[:3], [0.0, 0.01, 0.02])
+
+
+def test_a_body_that_was_never_solved_is_named(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(motive(gap=slice(0, len(TIME))))
+    table = table_of(path)
+    assert "quad.Position.X [m]: blank throughout" in table.left_out
+
+
+KINDS = {"Rotation": "deg", "Position": "m"}
+
+
+def test_angles_in_degrees_are_no_position(tmp_path):
+    """Euler angles of an order that no name tells are left out and listed."""
+    angles = TURN.as_euler("XYZ", degrees=True)
+    names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
+    path = tmp_path / "a.csv"
+    rows = [[t, *a, *p] for t, a, p in zip(TIME, angles, POS)]
+    path.write_text(lines([["time", *names], *rows]))
+    found = propose(table_of(path), path)
+    (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
+    assert entry.columns[0] == "quad.Position.X [m]"
+    assert "quad.Rotation.X [deg]" in found.left_out
 
 
 def test_zeros_of_a_body_that_stands_at_the_origin_are_no_gap(tmp_path):

@@ -502,6 +502,7 @@ class _Chooser:
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
+        smooth = [g for g in smooth if g.unit not in ("deg", "rad")]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
         if not groups:  # no name speaks of a place
             patterns = [pattern for name, pattern in _HINTS if name != "position"]

@@ -45,7 +45,12 @@ _UNITS |= {"rpm", "pwm", "%", "count", "frames", "quaternion", "m s^-1", "ft", "
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 _WORDS = ("true", "false")
 _FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*", re.I)
-_IDS = re.compile(r"\d+|[0-9a-f]{32}", re.I)
+_IDS = re.compile(r"\d+|([0-9a-f]+:)?[0-9a-f]{8,}", re.I)
+_KINDS = {"Type", "Parent", "Rigid Body", "Rigid Body Marker", "Marker", "Bone", "Bone Marker"}
+"""Of Motive's assets: words of lines that name no column."""
+_KEY = re.compile(r"[A-Z]+(_[A-Z]+)+|EVENT")  # first cell of a line of Qualisys' settings
+SECTIONS = ("Objects", "Trajectories", "Segments", "Model Outputs", "Joints", "Devices")
+"""Tables of a file of Vicon, each below its title; the first of these that is there is read."""
 RATES = ("FREQUENCY", "Export Frame Rate", "Capture Frame Rate", "Frame Rate")
 UNIT_OF_LENGTH = "Length Units"
 TUM = "timestamp tx ty tz qx qy qz qw"
@@ -62,6 +67,7 @@ class TextTable:
     comma: bool  # whether decimals are written with a comma
     settings: dict[str, str] = field(default_factory=dict)  # of the lines above
     rate: float = 0.0  # of the frames, where the table says it [Hz]
+    left_out: list[str] = field(default_factory=list)  # other tables of the file
 
 
 def is_number(cell: str) -> bool:
@@ -97,6 +103,7 @@ def layout_of(text: str, name: str = "") -> TextTable:
             empty_before.append(reader.line_num > last + 1)
             rows.append((reader.line_num, cells))
             last = reader.line_num
+    rows, left_out = _section(rows)
     widths = Counter(len(cells) for _, cells in rows[-1000:] if _holds_numbers(cells))
     if not widths:
         return TextTable(rows[0][1] if rows else [], [], False)
@@ -122,7 +129,22 @@ def layout_of(text: str, name: str = "") -> TextTable:
         width -= 1
     names = _names(named, width, settings) if named else _marker_names(width, settings)
     names = names or _headless_names(body, width, blank)
-    return TextTable(names, body, _commas(mark, body), settings, rate)
+    return TextTable(names, body, _commas(mark, body), settings, rate, left_out)
+
+
+Rows = list[tuple[int, list[str]]]
+
+
+def _section(rows: Rows) -> tuple[Rows, list[str]]:
+    """Return the table to read of a file that holds several, and what is left out."""
+    titles = {cells[0].strip(): i for i, (_, cells) in enumerate(rows) if not any(cells[1:])}
+    starts = {title: titles[title] for title in SECTIONS if title in titles}
+    if len(starts) < 2:
+        return rows, []
+    chosen = next(iter(starts))
+    end = min((start for start in starts.values() if start > starts[chosen]), default=len(rows))
+    others = [f"the table {title}: {chosen} is read" for title in starts if title != chosen]
+    return rows[starts[chosen] : end], others
 
 
 def _separator(lines: list[str]) -> str:
@@ -187,6 +209,8 @@ def _sorted_head(
             rate = float(filled[0])
         elif blank and len(cells) != width:
             settings[cells[0]] = " ".join(cells[1:])  # a sentence
+        elif "NO_OF_FRAMES" in settings and _KEY.fullmatch(cells[0]):
+            settings[cells[0]] = "\t".join(cells[1:])
         elif i >= cut and len(cells) <= width and (len(filled) > width / 2 or not cells[0]):
             named.append(cells + [""] * (width - len(cells)))
         else:
@@ -204,10 +228,12 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
     parts: list[list[str]] = [[] for _ in range(width)]
     for row in named:
         filled = [cell for cell in row if cell]
+        if (len(filled) > 1 and all(_IDS.fullmatch(c) for c in filled[1:])) or (
+            len(named) > 1 and filled and _KINDS.issuperset(filled)
+        ):
+            continue
         if len(named) > 1 and filled and all(unit_of(cell) is not None for cell in filled):
             units = [unit_of(cell) or "" for cell in row]
-            continue
-        if row[1:2] == ["Type"] or (len(filled) > 1 and all(_IDS.fullmatch(c) for c in filled[1:])):
             continue
         last = ""
         for i, cell in enumerate(row):
@@ -227,7 +253,9 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
                 name.replace(":", ".") if len(named) > 1 else name, unit_line, units[i], settings
             )
         )
-    return _prefixed(names) if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings else names
+    if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings:
+        names = _prefixed(names)
+    return [name or f"column {i}" for i, name in enumerate(names, start=1)]
 
 
 def _joined(name: str, last: str, unit: str, settings: dict[str, str]) -> str:

@@ -95,10 +95,13 @@ def read_table(path: str | Path) -> Columns:
     if twice:
         raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
     table = Columns()
-    for name, cells in zip(header, zip(*(row for _, row in body))):
-        if any(cells):  # a column that is blank throughout is a separator's
-            table |= _lists(name, cells) or {name: _column(cells, layout.comma)}
     table.settings = layout.settings
+    table.left_out = layout.left_out
+    for name, cells in zip(header, zip(*(row for _, row in body))):
+        if any(cells):
+            table |= _lists(name, cells) or {name: _column(cells, layout.comma)}
+        elif not name.startswith("column "):  # of a separator
+            table.left_out.append(f"{name}: blank throughout")
     _add_time(table, layout.rate)
     return table
 
@@ -107,8 +110,11 @@ def _add_time(table: Columns, rate: float) -> None:
     """Stamps of frames that count at a known rate, where no column is called a time, in place."""
     frames = next((table[name] for name in table if name.lower().startswith("frame")), None)
     timed = any(name.lower().startswith("time") for name in table)
-    if rate > 0.0 and frames is not None and not timed and frames.dtype.kind == "f":
-        table["time [s]"] = (frames - frames[0]) / rate
+    if rate > 0.0 and not timed and table:
+        if frames is None:
+            frames = np.arange(len(next(iter(table.values()))), dtype=float)
+        if frames.dtype.kind == "f":
+            table["time [s]"] = (frames - frames[0]) / rate
 
 
 def _lists(name: str, cells: tuple[str, ...]) -> Table:
