@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 import warp as wp
 
-from sim import hybrid
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
 from sim.params import BodyParams
@@ -75,47 +74,6 @@ def drive(sim: HybridSim, commands: np.ndarray, release: np.ndarray | None = Non
     for k, command in enumerate(commands):
         sim.set_command(command, None if release is None else release * (k >= RELEASED))
         sim.step()
-
-
-@pytest.mark.parametrize("threads", [2, 3])
-def test_slices_on_several_threads_equal_the_whole(threads, monkeypatch):
-    """Starts, steps, releases and the payload of a batch that is cut into pieces, and of one that
-    is not.
-    """
-    monkeypatch.setattr(hybrid, "FEWEST", 4)
-    cut, launched = hybrid.in_pieces, []
-    monkeypatch.setattr(
-        hybrid,
-        "in_pieces",
-        lambda launch, marks, n: launched.append((marks, n)) or cut(launch, marks, n),
-    )
-    count, spreads = 37, start_spreads()
-    states = []
-    for number in (1, threads):
-        sim = HybridSim(
-            paper_plant(),
-            count,
-            seed=3,
-            vehicles=vehicles(count),
-            ropes=ropes(count),
-            threads=number,
-        )
-        for episode in range(2):
-            sim.randomize(spreads, wp.array(np.arange(count) % 3 != episode, dtype=wp.int32))
-            drive(sim, random_commands(episode, STEPS, count), np.arange(count) % 2)
-        states.append(
-            everything(sim) | {"episode": sim.episode.numpy(), "goal_w": sim.goal_w.numpy()}
-        )
-        assert bool(launched) == (number > 1)
-    assert_same(*states)
-    assert {n for _, n in launched} == {threads}
-    assert all(
-        len(kernel.module.execs) == 1 for kernel in (sim._step.step, sim._reset.randomize)
-    ), "compiled once"
-    assert all(
-        marks[0] == 0 and marks[-1] == count and len(marks) > threads for marks, _ in launched
-    )
-    assert not np.array_equal(states[0]["attached"], np.ones(count))
 
 
 def test_a_batch_equals_its_members_alone():

@@ -109,7 +109,11 @@ def test_nothing_hidden_is_no_effect(kind):
 
 
 @pytest.mark.parametrize(
-    ("kind", "law"), [("trim", "ground"), pytest.param("pendulum", "brake", marks=pytest.mark.slow)]
+    ("kind", "law"),
+    [
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (("trim", "ground"), ("pendulum", "brake"))
+    ],
 )
 def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_path, capsys):
     plain, extended, out = tmp_path / "plain.toml", tmp_path / "extended.toml", tmp_path / "out"

@@ -20,7 +20,7 @@ noise, gusts, initial states.
 @pytest.mark.parametrize(
     ("lacks", "name"),
     [
-        ("vehicle.motor.kind='instant'", "motor_lag"),
+        pytest.param("vehicle.motor.kind='instant'", "motor_lag", marks=pytest.mark.slow),
         ("vehicle.controller.kind='geometric'", "controller_kind"),
     ],
 )

@@ -8,7 +8,6 @@ import pytest
 from hil.check import AutopilotCheck
 from hil.control.loop import Loop
 from hil.control.state_machine import OperatorInput
-from hil.links import msp
 from hil.links.backends.ardupilot import BRAKE
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
 from hil.links.pymav import mav
@@ -536,35 +535,6 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     found, text = check.results(desk.now, desk.runner.mass)[-1]
     assert found == good, text
     assert check.meter.share == pytest.approx(hover, rel=0.01)
-
-
-@pytest.mark.slow
-def test_a_hover_that_does_not_take_the_weight_arms_no_throw():
-    """The vehicle needs a tenth more than its weight by the config: the hover controller finds out,
-    and no throw begins.
-    """
-    from visthrow.throws.wire_plant import make
-
-    summary, fake, told = throw(
-        make("state", 0),
-        loaded=AT_ONCE,
-        seconds=6.0,
-        overrides=("ardupilot.thrust.hover=0.169", *QUICK[:1], "states.armed=2.5"),
-    )
-    assert (summary["throws"], fake.witness.releases) == (0, 0)
-    assert any("hovering takes 1.1" in d.reason + d.waits for d in told), "and says why"
-    assert not any("swing" in d.reason for d in told)
-
-
-def test_an_answer_that_nobody_asked_for_changes_nothing():
-    desk = Desk("betaflight").follow()
-    for frame in (
-        msp.Frame(msp.SERVO, b"\xd0\x07", msp.ANSWER),
-        msp.Frame(msp.RC, bytes([0xD0, 7] * 12), msp.ANSWER),
-    ):
-        desk.fake.port.write(msp.pack(frame))
-    desk.turn(0.1, HOVER)
-    assert desk.status.release == "idle"
 
 
 def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():

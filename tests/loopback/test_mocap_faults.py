@@ -3,16 +3,13 @@
 In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the same on every machine.
 """
 
-import math
-
 import pytest
 
 from hil.control.state_machine import OperatorInput
-from hil.poses.pose import VEHICLE, Pose
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
-from tests.mocap_faults import FAULTS, MocapFault
+from tests.mocap_faults import FAULTS
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -116,27 +113,3 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     assert runner.latch.count == fake.witness.releases
     if name not in FLOWN_THROUGH and name != "jump":
         assert fake.witness.commands == 0, "what fails the checks is never flown"
-
-
-def test_faults_themselves():
-    good = [
-        Pose(0.01 * i, 0.01 * i, VEHICLE, (0.0, 0.0, 1.0 + i), (1.0, 0.0, 0.0, 0.0))
-        for i in range(50)
-    ]
-
-    def made(name):
-        fault = MocapFault(name, 0.1)
-        return [p for pose in good for p in fault.spoil([pose], pose.stamp)]
-
-    for name in FAULTS:
-        assert made(name)[:10] == good[:10], "before its time nothing happens"
-    assert len(made("stop")) == 10
-    assert {p.pos for p in made("repeat")[10:]} == {good[9].pos}
-    assert made("order")[10].quat == (0.0, 0.0, 0.0, 1.0)
-    assert all(math.isnan(x) for x in made("nan-quaternion")[10].quat)
-    assert [p.stamp for p in made("rare")[10:]] == pytest.approx([0.1, 0.3])
-    assert len(made("double")) == 90
-    arrivals = [p.arrival for p in made("shuffle")]
-    assert arrivals != sorted(arrivals)
-    with pytest.raises(ValueError, match="did you mean 'swap'"):
-        MocapFault("swop", 0.0)

@@ -14,10 +14,8 @@ import sys
 import termios
 import time
 
-import numpy as np
 import pytest
 
-from hil.control.recording.playback import replay
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
@@ -34,13 +32,6 @@ ONE_THROW, MOST_LATE = 0.25, 100
 of them.
 """
 
-FEW_MISSED = 3
-"""Ticks of a run that may be missed where its throw is to land in its place."""
-
-SPEEDS = (1.0, 0.5, 0.25)
-"""Of both processes' clocks: the next one is flown where the machine was too busy for the one
-before; the last one counts as it is.
-"""
 
 START = 5.0
 """After which a run whose output is not read has begun to listen [s]."""
@@ -188,19 +179,6 @@ class Pair:
                 process.communicate()
 
 
-def kept_up(folder, fly):
-    """What ``fly(folder, speed)`` gives, with whether the machine was late, at the first of
-    `SPEEDS` at which it was not.
-    """
-    for speed in SPEEDS:
-        place = folder / f"at-{speed:g}"
-        place.mkdir()
-        *found, late = fly(place, speed)
-        if not late:
-            break
-    return *found, place
-
-
 @pytest.fixture
 def never(tmp_path):
     """A policy that hovers and never releases, as a file."""
@@ -255,44 +233,3 @@ def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["reason"] == "the process was told to end (SIGHUP)"
     assert (tmp_path / "run" / "throw-01.npz").is_file()
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("policy", ["state", "vision"])
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
-def test_a_throw_with_each_kind(tmp_path, kind, policy):
-    """In real time where the machine keeps up, with the simulator's vehicle and the shipped
-    policies.
-    """
-
-    def fly(folder, speed):
-        both = ("--speed", str(speed))
-        with Pair(
-            folder,
-            kind,
-            policy,
-            plant=("--policy", policy),
-            overrides=("states.abort=0.5",),
-            both=both,
-        ) as pair:
-            out, _ = pair.runner.communicate(timeout=PATIENCE)
-            report = pair.report(end=False)
-        summary = json.loads((folder / "run" / "summary.json").read_text())
-        return (
-            out,
-            report,
-            summary,
-            report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED,
-        )
-
-    out, report, summary, folder = kept_up(tmp_path, fly)
-    assert report["landing_w"] is not None, out
-    assert (report["breaches"], report["releases"]) == ([], 1)
-    assert (summary["latches"], summary["errors"]) == (1, [])
-    autopilot = summary["autopilot"]
-    assert (autopilot["backend"], autopilot["parameters"]["problems"]) == (kind, [])
-    assert autopilot["release"]["state"] == "accepted"
-    assert replay(folder / "run")["differences"] == []
-    # A fake that is late has a clock that stands still and then hurries.
-    assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
-    assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW

@@ -2,7 +2,6 @@
 lands.
 """
 
-import dataclasses
 import json
 import socket
 import subprocess
@@ -26,12 +25,11 @@ from hil.poses.sources.player import read_tlog
 from tests.hil_flight import AutoOperator
 from tests.loopback.wire import throw
 from visthrow import config
-from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make
 
 LANDING = 0.05
-"""Mean landing error over the wire of three throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of
+"""Mean landing error over the wire of two throws at 2 m [m], with 1 mm, 0.2 deg, 10 ms and 2 % of
 loss; 0.10 m is asked for.
 """
 
@@ -52,7 +50,7 @@ throw lands is not the runner's doing.
 @pytest.mark.parametrize("policy", ["state", "vision"])
 def test_throws_in_lock_step(policy):
     loaded, errors = Policy.load(find_policy(policy)), []
-    for seed in range(3):
+    for seed in range(2):
         summary, fake, _ = throw(
             make(policy, seed), seed=seed, policy=policy, loaded=loaded, seconds=5.5
         )
@@ -68,30 +66,6 @@ def test_throws_in_lock_step(policy):
         )
         assert summary["held_back"] == 0, "a right throw is not delayed"
     assert np.mean(errors) < LANDING
-
-
-def test_a_policy_that_asks_too_early_is_held_back_and_throws_all_the_same(monkeypatch):
-    """Its first questions come in hover: none is passed on, and none is told to the policy as done;
-    the throw then lands.
-    """
-    loaded, asked, act = Policy.load(find_policy("vision")), [], Pilot.act
-
-    def hasty(pilot, *args):
-        out = act(pilot, *args)
-        if len(asked) < 8 and len(args) > 6:  # a warm-up knows no time
-            asked.append(args[-1])
-            pilot._previous = np.append(pilot._previous[:, :4], np.ones((1, 1), np.float32), axis=1)
-            out = dataclasses.replace(out, release=np.array([True]))
-        return out
-
-    monkeypatch.setattr(Pilot, "act", hasty)
-    summary, fake, _ = throw(make("vision", 0), policy="vision", loaded=loaded, seconds=4.5)
-    assert (summary["held_back"], summary["latches"], fake.witness.releases) == (8, 1, 1)
-    assert summary["latch_times"][0] > asked[-1] + 0.1
-    assert (
-        np.hypot(fake.plant.landing["landing_w"][0] - 2.0, fake.plant.landing["landing_w"][1])
-        < ONE_THROW
-    )
 
 
 @pytest.mark.parametrize("after", [0.0, 0.0017, 0.0049])

@@ -53,7 +53,7 @@ def reference() -> ReferencePlant:
     return flown
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@pytest.mark.parametrize("precision", ["float64"])
 def test_whole_plant(precision):
     pos, vel = start()
     sim = HybridSim(

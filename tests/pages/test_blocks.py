@@ -1,8 +1,5 @@
 """The runner of blocks catches a page that shows what does not work."""
 
-import importlib
-import sys
-
 import pytest
 
 from tests.pages.blocks import ROOT, Runner, blocks_of, pages
@@ -51,20 +48,6 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
     assert (tmp_path / "again_md" / "made.txt").exists()
 
 
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_a_module_that_a_test_has_imported_runs_anew(tmp_path, monkeypatch):
-    (tmp_path / "whole").mkdir()
-    (tmp_path / "whole" / "part.py").write_text(
-        "from pathlib import Path\nPath('ran.txt').write_text(__name__)\n"
-    )
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.chdir(tmp_path)
-    before = importlib.import_module("whole.part")
-    run(tmp_path, "```sh\npython -m whole.part\n```\n")
-    assert (tmp_path / "work" / "page_md" / "ran.txt").read_text() == "__main__"
-    assert sys.modules.pop("whole.part") is before
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -105,19 +88,6 @@ def test_what_hides_a_block_fails(tmp_path, text, said):
     page.write_text(text)
     with pytest.raises(ValueError, match=said):
         blocks_of(page, root=tmp_path)
-
-
-def test_arguments_are_added(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(
-        "<!-- run with: --seed 1 -->\n<!-- run train with: --iterations 1 -->\n"
-        "```sh\nvisthrow train laptop\nvisthrow fly\nls\n```\n"
-    )
-    assert blocks_of(page, root=tmp_path)[0].commands() == [
-        ["visthrow", "train", "laptop", "--seed", "1", "--iterations", "1"],
-        ["visthrow", "fly", "--seed", "1"],
-        ["ls"],
-    ]
 
 
 def test_all_pages_are_read():

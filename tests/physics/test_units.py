@@ -81,7 +81,7 @@ def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
     return {name: sim.get(name) * size for name, size in sizes.items()}
 
 
-@pytest.mark.parametrize("kind", ["betaflight", "motor_mixing", "geometric"])
+@pytest.mark.parametrize("kind", ["betaflight", "motor_mixing"])
 def test_a_plant_in_other_units_flies_the_same_flight(kind):
     p = plant()
     vehicle = dataclasses.replace(

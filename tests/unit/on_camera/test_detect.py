@@ -217,38 +217,3 @@ def test_exact_rays_give_the_keypoints_of_training():
     found, valid = detected_keypoints(camera, FrameDetections(None, None), ROT[0].numpy())
     assert not valid.any()
     assert not found.any()
-
-
-def test_nuisances_do_what_they_say(scene):
-    rng = np.random.default_rng
-    clean = degrade(scene, NuisanceParams(), rng(0))
-    assert np.abs(clean[..., ::-1].astype(float) / 255 - scene).max() < 0.003
-    again = [degrade(scene, NuisanceParams(noise=0.05, blur=1.0), rng(3)) for _ in range(2)]
-    np.testing.assert_array_equal(*again)
-    inside = np.s_[120:280, 120:280]
-    blurred = degrade(scene, NuisanceParams(blur=2.0, motion=6.0), rng(1))
-    assert abs(float(blurred[inside].mean()) - float(clean[inside].mean())) < 1.0, "light is kept"
-    sharp = [np.abs(np.diff(f[inside].astype(float), axis=0)).mean() for f in (blurred, clean)]
-    assert sharp[0] < 0.8 * sharp[1]
-    noisy = degrade(scene, NuisanceParams(noise=0.06), rng(1))
-    spread = (noisy[inside].astype(float) - clean[inside]).std() / 255
-    assert 0.03 < spread < 0.06
-    bar = degrade(scene, NuisanceParams(occlusion=0.5), rng(2), (200.0, 200.0, 12.0))
-    changed = np.argwhere(np.any(bar != clean, axis=-1))
-    assert len(changed) > 20
-    assert np.abs(changed - 200).max() < 40
-
-
-def test_clutter_lies_where_it_was_put(cluttered):
-    red, green, blue = cluttered.transpose(2, 0, 1)
-    eye = POS[0] + ROT[0] @ CAMERA.position_b
-    for thing, mask in (
-        (CLUTTER[2], (blue > 1.5 * green) & (blue > 0.15)),
-        (CLUTTER[1], (green > 2.0 * blue) & (red > 2.0 * blue)),
-    ):
-        point = (
-            CAMERA.rot_cb @ ROT[0].T @ (torch.tensor(thing.centre_w, dtype=torch.float64) - eye)
-        )[None]
-        pixel = CAMERA.fisheye.project(point)[0][0].numpy()
-        v, u = np.nonzero(mask)
-        assert np.hypot(u.mean() - pixel[0], v.mean() - pixel[1]) < 2.0

@@ -71,43 +71,6 @@ def test_the_witness_catches_releases(armed, payload_w, answered, text):
     assert witness.releases == 3
 
 
-@pytest.mark.parametrize("delay", [0.0, 0.004, 0.017])
-def test_set_points_and_releases_act_when_they_come(delay):
-    """Within a period of the plant, after the kind's delay: the vehicle is not the coarser for its
-    periods.
-    """
-    here, there = pipe()
-    plant, link = LevelPlant(), Link(here)
-    fake = make_fake(
-        "ardupilot", plant, Link(there, 1, 1), options=read_options([f"command_delay={delay}"])
-    )
-    period, came, rates = plant.period, [0.0013, 0.0213, 0.0229], [0.0, 2.0, -1.0]
-    at = 0.0
-    fake.wall = lambda: at
-    for n in range(20):
-        for at, rate in zip(came, rates):
-            if n * period <= at < (n + 1) * period:
-                link.send(attitude_target(0.0, (1, 1), 0.2, (rate, 0.0, 0.0)))
-                fake.hear()
-        at = 0.0537
-        if n == 10:
-            link.send(
-                mav.MAVLink_command_long_message(
-                    1, 1, mav.MAV_CMD_DO_GRIPPER, 0, 1, 0, 0, 0, 0, 0, 0
-                )
-            )
-            fake.hear()
-        fake.step()
-    flown = np.array(plant.commands)[:, 1]
-    edges = np.array([*came, 1.0]) + delay
-    for n, rate in enumerate(flown):
-        inside = np.clip(np.diff(np.clip(edges, n * period, (n + 1) * period)), 0.0, None)
-        if edges[0] <= n * period:
-            assert rate == pytest.approx(inside @ rates / period, abs=1e-9), n
-    assert flown.max() < 2.0, "a set-point that lasts for a third of a period counts as such"
-    assert plant.released == pytest.approx(0.0537, abs=1e-9)
-
-
 def test_a_fake_reports_what_its_witness_saw():
     """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
     here, there = pipe()

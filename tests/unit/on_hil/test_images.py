@@ -200,39 +200,6 @@ def told(looker, picture, stamp, hint, blind=False):
     return detection, kept[0]
 
 
-def test_a_turn_of_the_vehicle_does_not_lose_the_ball(folder, pictures):
-    """Where the ball was is kept in the world: after a turn of 20 deg it is looked for elsewhere in
-    the picture.
-    """
-    pos, vector, ball = pose(0)
-    looker = Eyes(params(folder), training())
-    assert told(looker, pictures[0], 0.0, None)[1].ball_ray_c is None
-    hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
-    detection, prior = told(looker, pictures[0], 0.0, hint)
-    assert prior.ball_ray_c is None
-    assert detection.ball is not None
-    for k in range(1, 5):
-        told(looker, pictures[0], 0.02 * k, hint)
-    turned = torch.tensor([[0.0, 0.4, 0.0]], dtype=torch.float64)
-    missed, prior = told(
-        looker, pictures[0], 0.1, Hint(tuple(pos.tolist()), quaternion(turned), None), blind=True
-    )
-    camera = KeypointCamera(training(), dtype=torch.float64)
-    rot = rotation_from_vector(turned)[0]
-    eye = torch.tensor(pos) + rot @ camera.position_b
-    there = (camera.rot_cb @ rot.T @ (torch.tensor(ball) - eye)).numpy()
-    cosine = there @ prior.ball_ray_c / np.linalg.norm(there)
-    assert math.acos(cosine) < prior.ball_within, "but for the lens's own way of 1 cm"
-    np.testing.assert_allclose(prior.up_c, (camera.rot_cb @ rot.T)[:, 2].numpy(), atol=1e-6)
-    assert prior.height == pytest.approx(float(eye[2]), abs=1e-6)
-    np.testing.assert_allclose(
-        missed.ball[:3],
-        prior.ball_ray_c,
-        atol=1e-9,
-        err_msg="missed, it reads where it is expected",
-    )
-
-
 def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_while_that_is_known(
     folder, pictures
 ):

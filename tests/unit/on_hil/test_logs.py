@@ -8,12 +8,9 @@ import pytest
 
 from hil.control.recording.record import lines
 from hil.errors import SourceError
-from hil.params import HilParams
 from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
-from visthrow import config
 from visthrow.cli import main
-from visthrow.common.errors import ConfigError
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
 
@@ -139,15 +136,6 @@ def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
     (pose,) = read_bin(path, (LogBody("vehicle", "POS"),))
     assert pose.pos == pytest.approx((3.0, 2.0, -1.5), abs=0.02), "1e-7 deg are 11 mm"
     assert pose.quat == pytest.approx(YAWED)
-
-
-def test_damage_in_a_bin_costs_a_few_messages(tmp_path):
-    path = tmp_path / "a.BIN"
-    files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(50)])
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 40] = b"\x00" * 40
-    path.write_bytes(data[:-20])
-    assert 40 <= len(read_bin(path, VEHICLE)) < 50
 
 
 def test_a_vision_pose_of_negative_quality_is_none(tmp_path):
@@ -292,25 +280,6 @@ def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyulog", None)
     with pytest.raises(SourceError, match=r"pip install 'visthrow\[logs\]'"):
         read_ulg(tmp_path / "a.ulg", (LogBody("vehicle", "vehicle_odometry"),))
-
-
-LOG = ('source.kind="bin"', 'source.file="a.BIN"', 'source.logs=[{body="vehicle", message="VISP"}]')
-
-
-def test_configs_of_logs():
-    loaded = config.load(HilParams, config.find("hil", "dry_run"), LOG)
-    assert loaded.source.logs == VEHICLE
-    for overrides, message in (
-        ((*LOG, 'frames.vehicle.quaternion="xyzw"'), "kind bin writes 'wxyz'"),
-        ((*LOG, 'backend="ardupilot"'), "a recording flies dry"),
-        (LOG[:1], "expected the file of the bin source"),
-        (
-            (*LOG[:2], 'source.logs=[{body="drone", message="VISP"}]'),
-            "one of 'vehicle', 'payload', 'goal'",
-        ),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            config.load(HilParams, config.find("hil", "dry_run"), overrides)
 
 
 @pytest.mark.parametrize("kind", ["bin", "ulg"])

@@ -14,7 +14,6 @@ import pytest
 
 from bench.processes import free_port
 from hil.errors import LinkError, SourceError
-from hil.params import HilParams
 from hil.poses.sources.motion_capture import (
     MocapParams,
     MotionCaptureSource,
@@ -22,8 +21,6 @@ from hil.poses.sources.motion_capture import (
     RigidBody,
 )
 from hil.poses.sources.open_source import open_mocap
-from visthrow import config
-from visthrow.common.errors import ConfigError
 
 BODIES = (RigidBody("vehicle", "quad"), RigidBody("payload", "ball"))
 PARAMS = MocapParams("vicon", "127.0.0.1", timeout=1.0)
@@ -305,45 +302,3 @@ def test_wrong_names_hosts_and_missing_packages(monkeypatch):
         monkeypatch.setitem(__import__("sys").modules, package, None)
         with pytest.raises(SourceError, match=rf"pip install 'visthrow\[{package}\]'"):
             open_mocap(MocapParams(system, "127.0.0.1"), bodies, time.monotonic, False)
-
-
-def test_configs_of_mocap():
-    mocap = 'source.mocap={system="vicon", host="127.0.0.1"}'
-    overrides = [
-        'source.kind="mocap"',
-        *(f'frames.{name}.quaternion="xyzw"' for name in ("vehicle", "payload")),
-    ]
-    bodies = 'source.bodies=[{body="vehicle", name="quad"}]'
-    loaded = config.load(
-        HilParams, config.find("hil", "dry_run"), [*overrides, mocap, bodies, 'backend="ardupilot"']
-    )
-    assert loaded.source.mocap.host == "127.0.0.1"
-    assert config.loads(HilParams, config.dumps(loaded)) == loaded
-    for wrong, message in (
-        (overrides, "source.mocap is missing"),
-        (overrides[:1] + [mocap], "kind mocap writes 'xyzw'"),
-        ([*overrides, mocap.replace("vicon", "kinect")], "one of 'vicon'"),
-    ):
-        with pytest.raises(ConfigError, match=message):
-            config.load(HilParams, config.find("hil", "dry_run"), wrong)
-
-
-def test_the_stand_in_has_the_face_of_motioncapture():
-    real = pytest.importorskip("motioncapture")
-    assert {"waitForNextFrame", "rigidBodies"} <= set(dir(real.MotionCapture))
-    assert {"name", "position", "rotation"} <= set(dir(real.RigidBody))
-    assert {"x", "y", "z", "w"} <= set(dir(real.Quaternion))
-    source = open_mocap(MocapParams("mock", "127.0.0.1"), BODIES, time.monotonic, False)
-    assert source.poll(0.0) == []
-    source.close()
-
-
-def test_the_stand_in_has_the_face_of_natnet():
-    real = pytest.importorskip("natnet")
-    client = real.NatNetClient(
-        server_ip_address="127.0.0.1", local_ip_address="127.0.0.1", use_multicast=False
-    )
-    assert client.on_data_frame_received_event.handlers == []
-    assert {"connect", "run_async", "shutdown"} <= set(dir(client))
-    fields = real.DataFrame.__dataclass_fields__
-    assert {"rigid_bodies", "suffix"} <= set(fields)

@@ -173,16 +173,6 @@ def test_every_column_that_is_left_out_is_listed(name, tmp_path):
     assert any("Frame" in column for column in found.left_out)
 
 
-def test_bodies_of_one_export_are_told_apart(tmp_path):
-    path = tmp_path / "two.tsv"
-    path.write_text(qualisys(("quad", "ball")))
-    table = table_of(path)
-    found = propose(table, "two.tsv")
-    log = logs_of(table, found.mapping, "two.tsv")[0]
-    gap = log["pos_w"].values - log["payload_pos_w"].values
-    assert gap == pytest.approx(np.tile([0.0, 0.0, 0.5], (len(TIME), 1)), abs=1e-6)
-
-
 def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
     c3d = pytest.importorskip("c3d")
     writer = c3d.Writer(point_rate=100.0, analog_rate=100.0)
@@ -252,16 +242,6 @@ def test_angles_in_degrees_are_no_position(tmp_path):
     (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
     assert "quad.Rotation.X [deg]" in found.left_out
-
-
-def test_zeros_of_a_body_that_stands_at_the_origin_are_no_gap(tmp_path):
-    pos = np.concatenate([np.zeros((100, 3)), POS - POS[0]])
-    rows = [[0.01 * i, *p, 0, 0, 0, 1] for i, p in enumerate(pos)]
-    path = tmp_path / "a.csv"
-    path.write_text("time,x,y,z,qx,qy,qz,qw\n" + lines(rows))
-    table = table_of(path)
-    log = logs_of(table, propose(table, "a.csv").mapping, "a.csv")[0]
-    assert np.all(log["pos_w"].valid)
 
 
 ASKED = {

@@ -260,25 +260,6 @@ def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
     assert not said.err
 
 
-def test_text_where_numbers_stood(tmp_path):
-    path = tmp_path / "export.csv"
-    export(own(), path)
-    path.write_bytes(path.read_bytes().replace(b"True", b"Tr", 1))
-    with pytest.raises(LogError, match="holds text such as 'Tr'"):
-        read(path)
-
-
-def test_stamps_that_are_text(tmp_path):
-    path = tmp_path / "decoded.csv"
-    rows = lines_of("betaflight_bbl", "LOG00037_start.csv.gz").decode().splitlines()
-    at = [name.split(" ")[0] for name in rows[0].split(",")].index("time")
-    cells = rows[5].split(",")
-    cells[at] = "late"
-    path.write_text("\n".join([*rows[:5], ",".join(cells), *rows[6:]]))
-    with pytest.raises(LogError, match="column 'time'"):
-        read(path)
-
-
 def test_bytes_that_do_not_inflate(tmp_path):
     path = tmp_path / "payload.csv.gz"
     data = bytearray(gzip.compress(payload_table()))

@@ -3,16 +3,10 @@
 import copy
 
 import numpy as np
-import pytest
 import torch
 
-from hil.params import HilParams
-from visthrow import config
 from visthrow.onboard.compiled import Compiled
 from visthrow.onboard.estimator import Estimator
-from visthrow.onboard.pilot import VIEWS, Pilot
-from visthrow.onboard.policy import Policy
-from visthrow.onboard.shipped import find_policy
 
 CALLS = 60
 
@@ -24,46 +18,6 @@ def equal(compiled: Compiled, arrays: list[np.ndarray]) -> tuple[np.ndarray, ...
     for one, other in zip(found, expected):
         np.testing.assert_array_equal(one, other.numpy(), strict=True)
     return found
-
-
-def drawn_views(rng: np.random.Generator, count: int) -> np.ndarray:
-    """Vehicles over, beside and below a goal, at any attitude, with the payload near them."""
-    parts = {name: rng.normal(size=(count, width)) for name, width in VIEWS.items()}
-    parts["pos_w"][:, 2] += 1.0
-    parts["quat_wb"] /= np.linalg.norm(parts["quat_wb"], axis=1, keepdims=True)
-    parts["payload_w"] = parts["pos_w"] + 0.3 * parts["payload_w"]
-    parts["attached"] = (parts["attached"] > 0.0).astype(float)
-    return np.concatenate(list(parts.values()), axis=1).astype(np.float32)
-
-
-@pytest.mark.parametrize("given", [False, True])
-@pytest.mark.parametrize("count", [1, 3, 7])
-@pytest.mark.parametrize("name", ["state", "vision", "vision_located", "vision_betaflight"])
-def test_observation_and_decision_of_shipped_policies(name, count, given):
-    pilot = Pilot(
-        Policy.load(find_policy(name)),
-        config.load(HilParams, config.find("hil", "fake")).camera,
-        count,
-    )
-    rng, fits = np.random.default_rng(0), pilot.layout.fits
-    history, answers, sums = pilot._history, pilot._answers, pilot._goal_fit
-    previous, memory = pilot.previous_action, pilot._memory
-    for step in range(CALLS):
-        carried = [
-            previous,
-            history,
-            np.full(count, step % 20 == 0),
-            *([answers] if pilot.layout.response else []),
-        ]
-        carried += [sums, np.full(count, 0.02 * step, dtype=np.float32)] if fits else []
-        points = rng.normal(scale=0.7, size=(count, 8, 2)).astype(np.float32)
-        seen = [points, rng.random((count, 8)) > 0.4] if given else []
-        observation, history, *rest = equal(
-            pilot._observe, [drawn_views(rng, count), *carried, *seen]
-        )
-        answers, *rest = rest if pilot.layout.response else (answers, *rest)
-        sums = rest[0] if fits else sums
-        previous, *_, memory = equal(pilot._decide, [observation, memory])
 
 
 def test_a_memory_that_torch_writes_in_place():

@@ -146,21 +146,6 @@ def test_mass_and_battery():
     assert_uniform(sim.get("charge_used").astype(float), 0.0, z.battery_used)
 
 
-def test_six_cables_for_good():
-    """The length belongs to the environment: it is there before and after a reset, each as often as
-    the others.
-    """
-    sim, z = started(), spreads()
-    lengths = np.linalg.norm(np.diff(sim.cable_points_w(), axis=1), axis=-1).sum(axis=1)
-    nominal = paper_plant().rope.length
-    expected = nominal * np.linspace(
-        1.0 - z.tether_spread, 1.0 + z.tether_spread, z.tether_variants
-    )
-    np.testing.assert_allclose(lengths, expected[np.arange(COUNT) % z.tether_variants], rtol=1e-5)
-    densities = {round(r.rope_mass / r.length, 12) for r in tether_lengths(paper_plant().rope, z)}
-    assert len(densities) == 1, "the mass per metre is kept"
-
-
 def test_goals_fill_the_disk_evenly():
     """Uniform on a disk: the squared radius and the angle are uniform and independent."""
     goal = started().goal_w.numpy().astype(float)

@@ -215,61 +215,6 @@ def test_latent_forces_push(flight):
     assert np.all((pushed[early, 2] > 0.9 * low) & (pushed[early, 2] < 1.1 * high))
 
 
-def test_latent_lanes_may_leave_the_nominal_one_at_a_knot(flight):
-    """To the bit what they see who fly the whole window, before the release and after it, with the
-    rope still on or not.
-    """
-    tail = dataclasses.replace(plant(), release=dataclasses.replace(plant().release, rope_tail=0.3))
-    pushed = np.arange(1, 9)
-    given = {
-        "count": 9,
-        "axis": np.append(-1, pushed % 9),
-        "knot": np.append(0, pushed),
-        "keep": np.append(0, np.full(8, -1)),
-        "size": np.append(0.0, np.full(8, 0.01)),
-    }
-    for p in (plant(), tail):
-        whole, _ = replay(flight, [p], **given)
-        left, _ = replay(
-            flight,
-            [p],
-            **given,
-            resume=np.append(-1, pushed - 1),
-            parent=np.append(-1, np.zeros(8, dtype=int)),
-        )
-        for name, value in whole.items():
-            np.testing.assert_array_equal(left[name], value)
-
-
-def test_lanes_that_are_seen_otherwise_ride_along(flight):
-    """To the bit what they see who fly by themselves, with late and early stamps, while another
-    lane leaves the nominal one.
-    """
-    late = SensingParams(vehicle_delay=0.006, scale=0.01)
-    seen = [SensingParams(), late, SensingParams(payload_delay=-0.003, gyro_bias=(0.1, 0.0, 0.0))]
-    given = {
-        "count": 4,
-        "plant": np.array([0, 1, 2, 0]),
-        "axis": np.array([-1, -1, -1, 2]),
-        "size": 0.01,
-        "knot": 4,
-        "keep": np.array([0, -1, -1, -1]),
-    }
-    alone, _ = replay(flight, [plant()] * 3, seen, **given)
-    sharing, _ = replay(
-        flight,
-        [plant()] * 3,
-        seen,
-        **given,
-        shared=np.array([2, 0, 0, 0]),
-        resume=np.array([-1, -1, -1, 3]),
-        parent=np.array([-1, -1, -1, 0]),
-    )
-    for name, value in alone.items():
-        np.testing.assert_array_equal(sharing[name], value)
-        assert np.any(value[:, 0] != value[:, 1]) or np.any(value[:, 0] != value[:, 2])
-
-
 def test_sensors(flight):
     x = SensingParams(
         vehicle_delay=0.003,

@@ -10,7 +10,6 @@ import torch
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY
-from sim.units import Units, in_units
 from sim.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
@@ -105,36 +104,6 @@ def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
         near = 0.15 * (high - low)  # both ends are reached
         assert low * (1 - 1e-9) <= factor.min() < low + near, name
         assert high - near < factor.max() <= high * (1 + 1e-9), name
-
-
-@pytest.mark.parametrize("name", NAMED)
-def test_named_vehicles_lie_in_the_class(name):
-    base = experiment()
-    fleet, known, plant = base.fleet, plant_of(base), plant_of(of(name))
-    v, ratio = plant.vehicle, known.vehicle.body.mass / plant.vehicle.body.mass
-    alike = in_units(known, Units(ratio ** (1 / 3), ratio))
-    arm = np.hypot(v.rotors.x[0], v.rotors.y[0]) / np.hypot(
-        alike.vehicle.rotors.x[0], alike.vehicle.rotors.y[0]
-    )
-    factors = {
-        "thrust": v.controller.max_thrust / alike.vehicle.controller.max_thrust,
-        "arm": arm,
-        "inertia": v.body.inertia[0] / alike.vehicle.body.inertia[0] / arm**2,
-        "motor_lag": v.motor.time_constant / alike.vehicle.motor.time_constant,
-        "propeller": v.rotors.radius / alike.vehicle.rotors.radius / arm,
-        "rope": plant.rope.length / alike.rope.length,
-        "payload": plant.rope.payload_mass / alike.rope.payload_mass,
-        "payload_size": plant.rope.payload_radius / alike.rope.payload_radius,
-        "delay": v.queue.delay,
-        "mass": v.body.mass,
-    }
-    outside = {
-        key: x
-        for key, x in factors.items()
-        if not getattr(fleet, key)[0] <= x <= getattr(fleet, key)[1]
-    }
-    assert not outside
-    assert 4 * v.controller.max_thrust / (plant.total_mass * GRAVITY) >= fleet.least_thrust
 
 
 def test_a_vehicle_flies_the_same_in_a_batch_as_alone_to_the_bit():
