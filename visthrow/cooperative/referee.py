@@ -50,17 +50,13 @@ class MujocoTeam:
         for world in np.flatnonzero(placed):
             data, model = self._data[world], self._nominal[world]
             mujoco.mj_resetData(model, data)
-            for k in range(self.team):
-                row = world * self.team + k
-                joint = model.joint(f"{k}_root")
+            rows = range(world * self.team, (world + 1) * self.team)
+            for k, row in enumerate(rows):
                 body = model.body(f"{k}_vehicle").id
                 model.body_mass[body] = w.vehicles[row % len(w.vehicles)].body.mass * scale[row]
-                start, speed = joint.qposadr[0], joint.dofadr[0]
-                data.qpos[start : start + 7] = pose[row]
-                data.qvel[speed : speed + 6] = velocity[row]
-                data.qpos[start + 7 : start + 7 + angles.shape[1]] = angles[row]
-                data.qvel[speed + 6 : speed + 6 + rates.shape[1]] = rates[row]
-            data.qpos[:3], data.qvel[:3] = load[row], load_vel[row]
+            data.qpos[:3], data.qvel[:3] = load[rows[0]], load_vel[rows[0]]
+            data.qpos[3:] = np.concatenate((pose[rows], angles[rows]), axis=1).flat
+            data.qvel[3:] = np.concatenate((velocity[rows], rates[rows]), axis=1).flat
             self._show(world)
 
     def advance(self, duration: float) -> None:
@@ -84,14 +80,14 @@ class MujocoTeam:
             data.qpos[:3],
             data.qvel[:3],
         )
+        places = data.qpos[3:].reshape(self.team, -1)
+        speeds = data.qvel[3:].reshape(self.team, -1)
         for k in range(self.team):
             row = world * self.team + k
-            joint = model.joint(f"{k}_root")
-            start, speed = joint.qposadr[0], joint.dofadr[0]
-            bodies.pos_w.numpy()[row] = data.qpos[start : start + 3]
-            bodies.quat_wb.numpy()[row] = data.qpos[[start + 4, start + 5, start + 6, start + 3]]
-            bodies.vel_w.numpy()[row] = data.qvel[speed : speed + 3]
-            bodies.rate_b.numpy()[row] = data.qvel[speed + 3 : speed + 6]
+            bodies.pos_w.numpy()[row] = places[k, :3]
+            bodies.quat_wb.numpy()[row] = np.roll(places[k, 3:7], -1)
+            bodies.vel_w.numpy()[row] = speeds[k, :3]
+            bodies.rate_b.numpy()[row] = speeds[k, 3:6]
             first = model.body(f"{k}_rod0").id
             rods = slice(first, first + self.world.params.rope.segments)
             directions = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]
@@ -109,8 +105,8 @@ def _compile(members: list[tuple]) -> "mujoco.MjModel":
     load.mass = sum(rope.payload_mass for _, rope in members)
     load.inertia, load.explicitinertial = [1e-6] * 3, True
     load.add_site(name="load")
-    for name, axis in (("x", [1, 0, 0]), ("y", [0, 1, 0]), ("z", [0, 0, 1])):
-        load.add_joint(name=f"load_{name}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
+    for axis in np.eye(3):
+        load.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     for k, (body, rope) in enumerate(members):
         spec.attach(_vehicle(body, rope), prefix=f"{k}_", frame=spec.worldbody.add_frame())
         hold = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")

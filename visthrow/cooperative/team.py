@@ -4,7 +4,7 @@ The rope's ``payload_mass`` is a member's share of the load."""
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from sim.hybrid import rope_variants
 from sim.params import VehicleParams
@@ -79,8 +79,8 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     for world in range(LEVELS):
         weak, late = world < faults, world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
-        gain = _between(team.weak, part) if weak else 1.0
-        delay = _between(team.late, part) if late else 0.0
+        gain = between(team.weak, part) if weak else 1.0
+        delay = between(team.late, part) if late else 0.0
         for v in range(team.vehicles):
             vehicles.append(_weakened(vehicle, gain if v == 0 else 1.0))
             lag = release.lag + (delay if v == 0 else 0.0)
@@ -89,7 +89,8 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
 
 
-def _between(interval: tuple[float, float], part: float) -> float:
+def between(interval: tuple[float, float], part: Any) -> Any:
+    """Value at this share of the way from the lower to the upper end."""
     low, high = interval
     return low + (high - low) * part
 
@@ -99,8 +100,6 @@ def _weakened(vehicle: VehicleParams, gain: float) -> VehicleParams:
     gains = tuple(gain * one for one in vehicle.thrust.gain)
     return dataclasses.replace(vehicle, thrust=dataclasses.replace(vehicle.thrust, gain=gains))
 
-
-Fault = Literal["none", "weak", "late", "old"]
 
 FAULTS: dict[str, dict[str, Any]] = {
     "none": {},
@@ -118,9 +117,9 @@ def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
         tether_variants=experiment.task.start.tether_variants,
         tether_spread=experiment.task.start.tether_spread,
     )
-    clean = {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
     hover = {"tilt_deg": (33.0, 37.0), "across_deg": 5.0, "faulty": 1.0}
-    team = dataclasses.replace(experiment.team, **{**clean, **hover, **FAULTS[fault]})
+    hover |= {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
+    team = dataclasses.replace(experiment.team, **(hover | FAULTS[fault]))
     task = dataclasses.replace(experiment.task, start=start)
     return dataclasses.replace(experiment, task=task, team=team)
 

@@ -30,7 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             help="of the bodies: the training's, or MuJoCo with 15 segments (default: tree)",
         )
     flight.add_argument("policy", nargs="?", default="pair", help=f"of {', '.join(POLICIES)}")
-    flight.add_argument("--fault", default="none", help="none, weak, late or old (default: none)")
+    flight.add_argument(
+        "--fault",
+        choices=("none", "weak", "late", "old"),
+        default="none",
+        help="of a vehicle, a latch or the messages (default: none)",
+    )
     comparison.add_argument("policies", nargs="*", default=["pair"], metavar="POLICY")
     comparison.add_argument("--throws", type=WHOLE, default=200, help="of each (default: 200)")
     comparison.add_argument("--json", metavar="FILE", help="write the figures to this file as well")
@@ -47,11 +52,11 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
 
     Raises PolicyError: no such policy; MismatchError: one of another team or task.
     """
-    from visthrow import config
     from visthrow.common.errors import PolicyError, VisthrowError, suggest
     from visthrow.common.extras import load_extra
     from visthrow.cooperative.team import TeamExperiment, team_contract
     from visthrow.onboard.policy import Policy
+    from visthrow.throws.loading import trained_in
 
     file = Path(name)
     if not file.is_file():
@@ -61,27 +66,14 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
             f"no policy '{name}', neither a file nor shipped; {suggest(name, POLICIES)}"
         )
     policy = Policy.load(file)
-    vision = policy.contract["observation"]["layout"] == "vision"
-    central = policy.contract["team"].get("central")
-    path = config.find("cooperative", "pair_central" if central else POLICIES[vision])
-    experiment = config.load(TeamExperiment, path)
-    policy.require(team_contract(experiment), allow=("team",))
-    if solver == "tree":
-        return experiment, policy, None
-    referee = load_extra(
-        "visthrow.cooperative.referee", "reference", "--solver mujoco", VisthrowError
-    )
-    experiment = config.load(TeamExperiment, path, ["rope.segments=15"])
-    return experiment, policy, referee.MujocoTeam
-
-
-def _fault(name: str) -> str:
-    from visthrow.common.errors import ConfigError, suggest
-    from visthrow.cooperative.team import FAULTS
-
-    if name not in FAULTS:
-        raise ConfigError(f"no fault '{name}'; {suggest(name, FAULTS)}")
-    return name
+    changes, build = [], None
+    if solver == "mujoco":
+        changes = ["rope.segments=15"]
+        module = "visthrow.cooperative.referee"
+        build = load_extra(module, "reference", "--solver mujoco", VisthrowError).MujocoTeam
+    experiment = trained_in(policy, file, changes, TeamExperiment)
+    policy.require(team_contract(experiment), allow=("team", "rope"))
+    return experiment, policy, build
 
 
 def _fly(args: argparse.Namespace) -> int:
@@ -89,10 +81,10 @@ def _fly(args: argparse.Namespace) -> int:
     from visthrow.common.storage import writable
     from visthrow.cooperative.throw_track import record_throw, write
 
-    folder, fault = Path(args.out), _fault(args.fault)
+    folder = Path(args.out)
     writable(folder)
     experiment, policy, build = load(args.policy, args.solver)
-    options = {"fault": fault, "target": args.target, "seed": args.seed, "build": build}
+    options = {"fault": args.fault, "target": args.target, "seed": args.seed, "build": build}
     track = record_throw(experiment, policy.act, **options)
     if not track.released:
         print("The load was not released.")

@@ -17,7 +17,7 @@ from camera.keypoint_noise import StepDraw, apply_noise
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
-from visthrow.cooperative.team import TeamExperiment, layout_of, members
+from visthrow.cooperative.team import TeamExperiment, between, layout_of, members
 from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
@@ -25,9 +25,15 @@ from visthrow.onboard.goal_motion import SUMS, fitted_goal
 from visthrow.task import plant_of
 from visthrow.training import rewards, terminations
 from visthrow.training.compute_device import rounded_products
+from visthrow.training.env.options import redraw
 
-RESULTS = ("episodes", "released", "landing_error", "duration", "contact")
-"""Sums over finished worlds; landing error [m] and duration [s] over the released ones."""
+RESULTS = {
+    "released": "episodes",
+    "landing_error": "released",
+    "duration": "released",
+    "contact": "episodes",
+}
+"""Sums over finished worlds, errors in [m] and durations in [s], and what their means are over."""
 
 
 class TeamEnv(VecEnv):
@@ -76,7 +82,7 @@ class TeamEnv(VecEnv):
         )
         self.layout = layout_of(experiment)
         self.camera = KeypointCamera(experiment.camera, device)
-        make = {"device": device, "dtype": torch.float32}
+        make = {"device": device}
         ropes = torch.tensor([r.segment_length for r in options["ropes"]], **make)
         rows = torch.arange(self.rows, device=device)
         self._segment = ropes[rows % len(ropes)]
@@ -116,7 +122,7 @@ class TeamEnv(VecEnv):
             "first": (worlds,),
         }
         memory = {name: torch.zeros(shape, **make) for name, shape in shapes.items()}
-        memory["totals"] = torch.zeros(len(RESULTS), dtype=torch.float64, **make)
+        memory["totals"] = torch.zeros(1 + len(RESULTS), dtype=torch.float64, **make)
         return memory
 
     def _rows(self, of_worlds: Tensor) -> Tensor:
@@ -146,11 +152,10 @@ class TeamEnv(VecEnv):
 
     def episode_means(self) -> dict[str, float]:
         """Means over the worlds that finished since :meth:`clear_totals`, and their number."""
-        totals = dict(zip(RESULTS, self._memory["totals"].tolist(), strict=True))
-        released, episodes = max(totals["released"], 1.0), max(totals["episodes"], 1.0)
-        means = {name: totals[name] / released for name in ("landing_error", "duration")}
-        shares = {name: totals[name] / episodes for name in ("released", "contact")}
-        return {**shares, **means, "episodes": totals["episodes"]}
+        names = ("episodes", *RESULTS)
+        totals = dict(zip(names, self._memory["totals"].tolist(), strict=True))
+        means = {name: totals[name] / max(totals[of], 1.0) for name, of in RESULTS.items()}
+        return means | {"episodes": totals["episodes"]}
 
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
@@ -215,9 +220,9 @@ class TeamEnv(VecEnv):
         joints = (pos + arm + steps).transpose(0, 1)
         load = self._rows(self.load_w) - pos
         radius = self.cfg.rope.payload_radius + self.cfg.vehicle.collision_radius
-        gaps = [load.square().sum(-1).sqrt() - radius]
+        gaps = [load.norm(dim=-1) - radius]
         for k in range(1, self.team):
-            gaps.append((self._neighbour(pos, k) - pos).square().sum(-1).sqrt() - 2.0 * reach)
+            gaps.append((self._neighbour(pos, k) - pos).norm(dim=-1) - 2.0 * reach)
             cable = (self._neighbour(joints, k) - pos[:, None]).square().sum(-1).amin(-1).sqrt()
             gaps.append(torch.where(self._neighbour(attached, k), cable - reach, 10.0))
         return self._worlds(torch.stack(gaps).amin(0)).amin(1)
@@ -232,11 +237,8 @@ class TeamEnv(VecEnv):
         begin = time - self.cfg.sim.control_period
         earliest = torch.where(separated, when, 1e6).amin(1) + begin
         memory["first"].copy_(torch.minimum(memory["first"], earliest))
-        chosen = {}
-        for name in ("landing_w", "time_to_impact"):
-            values = self._worlds(out[name])
-            index = last.view(-1, 1, *(1,) * (values.dim() - 2))
-            chosen[name] = values.gather(1, index.expand(-1, 1, *values.shape[2:]))[:, 0]
+        rows = self.team * torch.arange(self.worlds, device=self.device) + last
+        chosen = {name: out[name][rows] for name in ("landing_w", "time_to_impact")}
         end = begin + when.amax(1)
         chosen["duration"] = end + chosen["time_to_impact"]
         chosen["apart"] = end - memory["first"]
@@ -250,7 +252,7 @@ class TeamEnv(VecEnv):
         path = self.load_w[:, None] + self.load_vel_w[:, None] * time
         path = path + self._half_gravity * time.square()
         offsets = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
-        return offsets.square().sum(-1).sqrt().flatten(1).amin(1)
+        return offsets.norm(dim=-1).flatten(1).amin(1)
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Rewards of the rows and ends of the worlds of the step just made."""
@@ -310,54 +312,47 @@ class TeamEnv(VecEnv):
             "command_bias": noise.command_bias,
             "keypoint_bias": self.cfg.camera.noise.bias_std,
         }
-        for name, std in spreads.items():
-            old = memory[name]
-            where = rows.view(-1, *(1,) * (old.dim() - 1))
-            torch.where(where, torch.randn_like(old) * std, old, out=old)
-        low, high = task.observation.latency
+        redraw(memory, spreads, rows)
         age = memory["pose_age"]
-        torch.where(rows, low + (high - low) * torch.rand_like(age), age, out=age)
-        low, high = self.cfg.team.age
+        drawn = between(task.observation.latency, torch.rand_like(age))
+        torch.where(rows, drawn, age, out=age)
         age = memory["age"]
         part = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
-        torch.where(fresh, low + (high - low) * part, age, out=age)
+        torch.where(fresh, between(self.cfg.team.age, part), age, out=age)
 
     def _form(self, fresh: Tensor) -> None:
         """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
         team, state, goal = self.cfg.team, self.views.state, self.views.goal_w
         draw = torch.rand(self.worlds, 4, device=self.device)
         heading = 2.0 * math.pi * draw[:, 0]
-        low, high = team.goal
-        distance = low + (high - low) * draw[:, 1]
-        goals = torch.stack([distance * heading.cos(), distance * heading.sin()], -1)
+        distance = between(team.goal, draw[:, 1])
+        along = [distance * heading.cos(), distance * heading.sin(), torch.zeros_like(distance)]
+        goals = torch.stack(along, -1)
         if self._goal is not None:
-            goals = self._goal[:2].expand_as(goals)
+            goals = self._goal.expand_as(goals)
             heading = torch.atan2(goals[:, 1], goals[:, 0])
-        goals = torch.cat([goals, torch.zeros_like(goals[:, :1])], -1)
         spread = math.radians(team.across_deg) * (2.0 * draw[:, 2] - 1.0)
-        low, high = (math.radians(degree) for degree in team.tilt_deg)
-        tilt = self._rows(low + (high - low) * draw[:, 3])
+        tilt = self._rows(torch.deg2rad(between(team.tilt_deg, draw[:, 3])))
         rows = torch.arange(self.rows, device=self.device)
-        turn = 2.0 * math.pi / self.team * (rows % self.team)
-        azimuth = self._rows(heading + spread) + 0.5 * math.pi + turn
+        place = 2.0 * math.pi / self.team * (rows % self.team)
+        azimuth = self._rows(heading + spread) + 0.5 * math.pi + place
         side = -tilt.sin()
         down = torch.stack([side * azimuth.cos(), side * azimuth.sin(), -tilt.cos()], -1)
-        lead, lead_vel = (self._worlds(state[name])[:, :1] for name in ("pos_w", "vel_w"))
-        length = self._segment * self.cfg.rope.segments
-        drop = self.cfg.rope.length * tilt.cos()
-        load = lead.expand(-1, self.team, -1).flatten(0, 1).clone()
-        load[:, 2] -= drop
-        arm = (ob.rotation_from_quat(state["quat_wb"]) @ self._mount[:, None])[..., 0]
-        spin = ob.rotation_from_quat(state["quat_wb"])
+        load, vel = (self._rows(state[name][:: self.team]) for name in ("pos_w", "vel_w"))
+        load = load.clone()
+        load[:, 2] -= self.cfg.rope.length * tilt.cos()
+        turn = ob.rotation_from_quat(state["quat_wb"])
         turning = torch.linalg.cross(state["rate_b"], self._mount.expand_as(state["rate_b"]))
-        vel = lead_vel.expand(-1, self.team, -1).flatten(0, 1)
-        vel = vel - (spin @ turning[..., None])[..., 0]
-        pos = load - length[:, None] * down - arm
+        length = self._segment * self.cfg.rope.segments
+        formed = {
+            "pos_w": load - length[:, None] * down - turn @ self._mount,
+            "vel_w": vel - (turn @ turning[..., None])[..., 0],
+            "cable_dir_w": down,
+            "cable_vel_w": torch.zeros_like(down),
+        }
         where = self._rows(fresh)[:, None]
         goal.copy_(torch.where(where, self._rows(goals), goal))
-        state["vel_w"].copy_(torch.where(where, vel, state["vel_w"]))
-        state["pos_w"].copy_(torch.where(where, pos, state["pos_w"]))
-        for name, value in (("cable_dir_w", down), ("cable_vel_w", torch.zeros_like(down))):
+        for name, value in formed.items():
             state[name].copy_(torch.where(where, value, state[name]))
 
     @rounded_products(False)

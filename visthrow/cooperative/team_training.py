@@ -1,21 +1,18 @@
 """Training of a team's policy by rsl_rl's PPO, and throws with it."""
 
-import contextlib
-import io
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from rsl_rl.algorithms import PPO
 
 from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.onboard import actions as act
 from visthrow.onboard.policy import Policy
 from visthrow.training.compute_device import rounded_products
-from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
+from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 
 ASKING = 1.0
@@ -30,26 +27,14 @@ class TeamTraining(PPOTraining):
         torch.manual_seed(seed)
         if device.startswith("cuda"):
             torch.cuda.set_device(device)
-        p, ranks = experiment.ppo, Ranks(device)
-        self.experiment, self.device, self.seed = experiment, device, seed
-        self.iterations, self.samples = p.iterations, p.environments * p.steps
-        self.env = TeamEnv(experiment, device, seed)
-        with contextlib.redirect_stdout(io.StringIO()):
-            self.alg = PPO.construct_algorithm(
-                self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
-            )
-        self.alg.train_mode()
+        super().__init__(experiment, device, seed, Ranks(device), TeamEnv)
         with torch.no_grad():
             self.alg.actor.mlp[-1].bias[act.COMMANDS :: act.ACTIONS] += ASKING
-        self._obs = self.env.get_observations()
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._rollouts, self._eager = 0, eager
+        self._eager = eager
 
     def rollout(self) -> None:
-        if self._eager:
-            self._rollout()
-        else:
-            super().rollout()
+        work = self._rollout if self._eager else super().rollout
+        work()
 
     def collect(self, done: float) -> None:
         team = self.experiment.team
@@ -58,9 +43,9 @@ class TeamTraining(PPOTraining):
         self.env.earliest.fill_(round(share * team.first_release))
         super().collect(done)
 
-    def policy(self, made_by: dict[str, Any] | None = None) -> Policy:
+    def policy(self, made_by: dict[str, Any]) -> Policy:
         """The policy as it stands."""
-        return self.export(team_contract(self.experiment), made_by or {})
+        return self.export(team_contract(self.experiment), made_by)
 
     def run(self, seconds: float, iterations: int | None = None) -> Iterator[dict[str, float]]:
         """Train for a time [s], or so many iterations; yields the figures of each.
@@ -153,13 +138,12 @@ def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict
         return result
     error = values["landing_error"][good]
     bias = values["landing_w"][good, :2].mean(0) - [target, 0.0]
-    return result | {
-        "error_mean": float(error.mean()),
-        "error_median": float(np.median(error)),
-        "error_p95": float(np.quantile(error, 0.95)),
-        "error_sem": float(error.std() / len(error) ** 0.5),
-        "bias": [float(b) for b in bias],
-        "duration_mean": float(values["duration"][good].mean()),
-        "apart_mean": float(values["apart"][good].mean()),
-        "apart_most": float(values["apart"][good].max()),
+    figures = {
+        "error_mean": error.mean(),
+        "error_median": np.median(error),
+        "error_p95": np.quantile(error, 0.95),
+        "duration_mean": values["duration"][good].mean(),
+        "apart_mean": values["apart"][good].mean(),
     }
+    means = {name: float(value) for name, value in figures.items()}
+    return result | means | {"bias": bias.tolist()}

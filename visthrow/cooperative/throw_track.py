@@ -73,8 +73,6 @@ def record_throw(
 
 
 HUES = (style.COLOURS[0], style.COLOURS[3], style.COLOURS[5])  # of vehicles
-GHOSTS = 5
-"""Times at which the picture shows vehicles and cables."""
 
 
 def picture(track: ThrowTrack, path: Path) -> None:
@@ -83,7 +81,8 @@ def picture(track: ThrowTrack, path: Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 2, figsize=(9.2, 4.0), layout="constrained")
-    steps = np.unique(np.linspace(0, len(track.time) - 1, GHOSTS).round().astype(int))
+    # at five times it shows vehicles and cables
+    steps = np.unique(np.linspace(0, len(track.time) - 1, 5).round().astype(int))
     for axis, columns, name in zip(axes, ([0, 2], [0, 1]), "zy", strict=True):
         for v in range(track.pos_w.shape[1]):
             colour = HUES[v % len(HUES)]

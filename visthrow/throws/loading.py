@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from visthrow import config
 from visthrow.common import toml_text
@@ -12,6 +12,8 @@ from visthrow.common.errors import ConfigError, MismatchError, PolicyError, sugg
 from visthrow.onboard.policy import Policy, find_policy, flattened
 from visthrow.task import Experiment, contract_of
 from visthrow.task.fleet import specialised
+
+Kind = TypeVar("Kind", bound=Experiment)
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,14 @@ def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
         )
 
 
-def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) -> Experiment:
-    """Experiment that a policy was trained in, as its training says that it is flown, with changes.
+def trained_in(
+    policy: Policy,
+    path: str | Path,
+    overrides: Iterable[str] = (),
+    kind: type[Kind] = Experiment,  # type: ignore[assignment]
+) -> Kind:
+    """Experiment that a policy was trained in, as its training says that it is flown, with changes;
+    ``kind`` is its schema.
 
     Raises PolicyError: the policy does not carry its config.
     """
@@ -113,7 +121,7 @@ def trained_in(policy: Policy, path: str | Path, overrides: Iterable[str] = ()) 
     learning = config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
     text = toml_text.dumps(config.without_none({**trained, "ppo": learning}))
     return config.loads(
-        Experiment,
+        kind,
         text,
         [*trained.get("flown", ()), *overrides],
         name=f"{path} (the config it was trained with)",

@@ -28,13 +28,6 @@ def test_the_load_in_halves_takes_two_throws_of_time(tmp_path):
     assert halves["landed"] == 1.0
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["fly", "trio"], "no policy 'trio'"),
-        (["fly", "--fault", "broken"], "no fault 'broken'"),
-    ],
-)
-def test_a_name_that_is_not_there_is_told(words, message, tmp_path, capsys):
-    assert main(["cooperative", *words, *(["--out", str(tmp_path)])]) == 2
-    assert message in capsys.readouterr().err
+def test_a_policy_that_is_not_there_is_told(tmp_path, capsys):
+    assert main(["cooperative", "fly", "trio", "--out", str(tmp_path)]) == 2
+    assert "no policy 'trio'" in capsys.readouterr().err

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
@@ -61,7 +62,10 @@ class PPOTraining:
     :class:`visthrow.training.trainer.Algorithm`.
     """
 
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
+    def __init__(
+        self, experiment: Experiment, device: str, seed: int, ranks: Ranks, build: Any = ThrowEnv
+    ):
+        """Build environment and networks; ``build`` makes the environment, as the class does."""
         p = experiment.ppo
         if (p.environments * p.steps) % p.minibatches:
             raise ConfigError(
@@ -72,7 +76,7 @@ class PPOTraining:
         self.device = device
         self.iterations = p.iterations
         self.samples = p.environments * p.steps * ranks.world
-        self.env = ThrowEnv(experiment, device, seed)
+        self.env = build(experiment, device, seed)
         with contextlib.redirect_stdout(io.StringIO()):
             self.alg: CapturedPPO = PPO.construct_algorithm(
                 self.env.get_observations(), self.env, rsl_rl_config(p, ranks), device
