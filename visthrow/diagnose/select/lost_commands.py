@@ -81,7 +81,6 @@ class CommandStatistics:
             windows,
             np.append(problem.priors.floor, np.ones(longest)),
             len(problem.model.channels),
-            point.device,
         )
         grams = correlated_of(grams, windows, point.noise.correlation_time)
         noise = levels.only(point.noise, grams, rows)
