@@ -77,7 +77,10 @@ def draw(path: str | Path, log: FlightLog, camera: CameraParams) -> None:
         where = f"Flown on {log.meta['plant_meaning']}"
     else:
         where = f"Simulated on {log.meta['plant_meaning']}"
-    legend = f"Faint: the vehicle every {GHOST_EVERY:g} s. Dashed: the ball in free flight."
+    legend = (
+        f"Faint: the vehicle every {GHOST_EVERY:g} s. Brown: the rope. Dashed: the ball in free"
+        " flight."
+    )
     figure.text(y=1.0 - 0.54 / height, s=f"{where}, seen from the side. {legend}", **quiet)
     unseen = "" if all_seen else "; a cross: outside the field of view"
     field = f"{camera.fisheye.fov_deg:g}°"
