@@ -68,8 +68,8 @@ def run(args: argparse.Namespace) -> int:
         with Throwing(*throws, together=True) as throwing:
             paths = _throw_here(loaded, folder, args.throws)
             print(
-                f"{count} throws a policy on the reference plant, which stands in for a real"
-                " vehicle ...",
+                f"{count} throws a policy on the reference plant, independent code with less noise"
+                " than training ...",
                 flush=True,
             )
             paths += _tabled(loaded, throwing.results(), "reference-realistic", folder)
