@@ -18,6 +18,7 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, LawParams, PlantParams
 from sim.solvers.mujoco import _on_gpu
+from sim.solvers.rods import rod_inertial
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
 from tests.simulators import fly
@@ -122,6 +123,19 @@ def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
     sick.place(np.zeros((3, 3)))
     sick.step()
     assert not sick.get("status").any()
+
+
+@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+def test_what_stood_still_flies_on_from_there(solver, substep, near):
+    sim = HybridSim(on(paper_plant(), solver, substep), 2)
+    sim.set_command(np.zeros((2, 4)))
+    for _ in range(5):
+        sim.step(wp.array([1, 0], dtype=wp.int32))
+    first = sim.get("vel_w")[0]
+    for _ in range(5):
+        sim.step()
+    assert first[2] < -0.5
+    np.testing.assert_allclose(sim.get("vel_w")[1], first, atol=1e-3)
 
 
 def hanging(name: str, **vehicle) -> HybridSim:
@@ -256,3 +270,35 @@ def test_a_vehicle_that_is_held_is_held_in_the_solver_too():
         plant.hold(stand)
     plant.step(np.zeros((1, 4)))
     assert stand["pos_w"][0, 2] - plant.state.pos_w[0, 2] < 0.005
+
+
+def test_the_last_rod_carries_the_ball():
+    """Against a thousand pieces of the rod."""
+    rope = dataclasses.replace(paper_plant().rope, rope_mass=0.05, payload_inertia=3e-5)
+    pieces, share = 1000, rope.segment_mass / 1000
+    heights = -rope.segment_length * (np.arange(pieces) + 0.5) / pieces
+    heights = np.append(heights, -rope.segment_length - rope.payload_offset)
+    masses = np.append(np.full(pieces, share), rope.payload_mass)
+    centre = np.average(heights, weights=masses)
+    inertia = masses @ (heights - centre) ** 2 + rope.payload_inertia
+    assert rod_inertial(rope, True) == pytest.approx((masses.sum(), centre, inertia), rel=1e-5)
+
+
+@pytest.mark.parametrize("drag", [0.0, 0.05])
+def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
+    """Where a hinge's rate is twice the rod's; with the payload's drag."""
+    plant = paper_plant()
+    rope = dataclasses.replace(plant.rope, payload_drag=drag)
+    plant = dataclasses.replace(plant, rope=rope)
+    segments, tilt = plant.rope.segments, math.radians(60.0)
+    direction = np.tile([0.0, math.sin(tilt), -math.cos(tilt)], (1, segments, 1))
+    rate = np.tile([6.0, 0.0, 0.0], (1, segments, 1))
+    level = np.array([[0.0, 0.0, 0.0, 1.0]])
+    found = []
+    for solver in ("chain", "mujoco_warp"):
+        sim = HybridSim(on(plant, solver, 5e-4), 1)
+        sim.place(np.zeros((1, 3)), level, np.zeros((1, 3)), np.zeros((1, 3)), direction, rate)
+        for _ in range(5):
+            sim.step()
+        found.append(sim.get("payload_vel_w"))
+    np.testing.assert_allclose(found[1], found[0], atol=0.01)
