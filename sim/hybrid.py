@@ -227,7 +227,8 @@ class HybridSim:
         """Return the solver of the plant's bodies with what it exchanges; None for the fused
         kernel.
         """
-        params, build = self.params, self._solver()
+        params = self.params
+        build = self._solver()
         if build is None:
             params.rope.require_chain("sim.solver 'chain'")
             return None

@@ -61,14 +61,29 @@ def build_exchange(
     t: Types, params: PlantParams, step: StepKernels, extensions: frozenset[str]
 ) -> ExchangeKernels:
     """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
-    real, vec3, vec4 = t.real, t.vec3, t.vec4
-    L, loaded = params.rope.segments, bool(extensions & LOADS)
-    parts, State, Output = step.parts, step.State, step.Output
-    load, store, load_rope = parts.load, parts.store, parts.load_rope
-    flow, rate, motor_advance, laws = parts.flow, parts.rate, parts.motor_advance, parts.laws
-    coupled, depart, hanging = parts.coupled, parts.depart, parts.payload.hanging
-    rope_size, scaled, hazards = parts.rope_size, parts.scaled, parts.hazards
-    nonfinite, limit = st.NONFINITE, real(st.SPEED_LIMIT)
+    real = t.real
+    vec3 = t.vec3
+    vec4 = t.vec4
+    L = params.rope.segments
+    loaded = bool(extensions & LOADS)
+    parts = step.parts
+    State = step.State
+    Output = step.Output
+    load = parts.load
+    store = parts.store
+    load_rope = parts.load_rope
+    flow = parts.flow
+    rate = parts.rate
+    motor_advance = parts.motor_advance
+    laws = parts.laws
+    coupled = parts.coupled
+    depart = parts.depart
+    hanging = parts.payload.hanging
+    rope_size = parts.rope_size
+    scaled = parts.scaled
+    hazards = parts.hazards
+    nonfinite = st.NONFINITE
+    limit = real(st.SPEED_LIMIT)
     Ints = wp.array(dtype=wp.int32)
     Vehicles, Ropes, Releases, Airs = (
         wp.array(dtype=kind) for kind in (t.Vehicle, t.Rope, t.Release, t.Air)

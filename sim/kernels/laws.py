@@ -27,7 +27,8 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
     """Warp functions of the scalars, and of the vectors by block; forces in the world frame,
     torques in the body's.
     """
-    vec3, real = t.vec3, t.real
+    vec3 = t.vec3
+    real = t.real
 
     def axis(x: float, y: float, z: float):
         @wp.func
@@ -92,7 +93,9 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
     def tension(a: Around):
         return a.tension
 
-    body_x, body_y, vertical = axis(1.0, 0.0, 0.0), axis(0.0, 1.0, 0.0), axis(0.0, 0.0, 1.0)
+    body_x = axis(1.0, 0.0, 0.0)
+    body_y = axis(0.0, 1.0, 0.0)
+    vertical = axis(0.0, 0.0, 1.0)
     up = turned(vertical)
 
     @wp.func
@@ -145,7 +148,9 @@ def _factors(t: Types, Around: type) -> tuple[dict, dict]:
             wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST)
         )
 
-    vel_body, cable_body, swing_body = turned_back(vel), turned_back(cable), turned_back(swing)
+    vel_body = turned_back(vel)
+    cable_body = turned_back(cable)
+    swing_body = turned_back(swing)
     scalars = {
         "thrust": thrust,
         "thrust_rate": thrust_rate,
@@ -262,15 +267,13 @@ def build_laws(
     Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command,
     attached)`` -> air whose pushes hold the laws' forces besides its own, and ``in_flight(air,
     vel_w)`` [N] on a payload that has left. Without laws both do nothing."""
-    vec3, vec4, real, Vehicle, Rope, Air, QuadState = (
-        t.vec3,
-        t.vec4,
-        t.real,
-        t.Vehicle,
-        t.Rope,
-        t.Air,
-        t.QuadState,
-    )
+    vec3 = t.vec3
+    vec4 = t.vec4
+    real = t.real
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Air = t.Air
+    QuadState = t.QuadState
     if not laws:  # their factors take a seventh of the time in which a kernel is composed
 
         @wp.func

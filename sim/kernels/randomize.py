@@ -24,8 +24,12 @@ class ResetKernels:
 
 def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
     """Build the reset kernels for a number of segments."""
-    real, vec3, quat = t.real, t.vec3, t.quat
-    Vehicle, Rope, Randomization = t.Vehicle, t.Rope, t.Randomization
+    real = t.real
+    vec3 = t.vec3
+    quat = t.quat
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Randomization = t.Randomization
     L = params.rope.segments
     start = build_start(t, params.vehicle, State)
 

@@ -48,8 +48,13 @@ def build_parts(
     ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``,
     ``hazards``; ``depart``, which writes what follows when the payload separates with a stated
     velocity."""
-    real, vec3 = t.real, t.vec3
-    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
+    real = t.real
+    vec3 = t.vec3
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Release = t.Release
+    Air = t.Air
+    QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
@@ -180,17 +185,31 @@ def build_step(
             nothing.
         motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
     """
-    real, vec3, vec4 = t.real, t.vec3, t.vec4
-    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
+    real = t.real
+    vec3 = t.vec3
+    vec4 = t.vec4
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Release = t.Release
+    Air = t.Air
+    QuadState = t.QuadState
     L = params.rope.segments
-    nonfinite, fallback = st.NONFINITE, st.FALLBACK
+    nonfinite = st.NONFINITE
+    fallback = st.FALLBACK
     parts = build_parts(t, params, direct, extensions, motors)
-    State, Output, chain, coupled = parts.State, parts.Output, parts.chain, parts.coupled
-    laws, leaving, load, store = parts.laws, parts.leaving, parts.load, parts.store
+    State = parts.State
+    Output = parts.Output
+    chain = parts.chain
+    coupled = parts.coupled
+    laws = parts.laws
+    leaving = parts.leaving
+    load = parts.load
+    store = parts.store
     load_rope, rope_size, scaled, hazards = (
         getattr(parts, name) for name in ("load_rope", "rope_size", "scaled", "hazards")
     )
-    depart, limit = parts.depart, real(st.SPEED_LIMIT)
+    depart = parts.depart
+    limit = real(st.SPEED_LIMIT)
 
     @wp.func
     def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):

@@ -230,11 +230,14 @@ def pack_vehicle(
                 f"vehicle of the kinds {kinds_of(vehicle)} in a batch of {kinds}; expected the same"
                 " blocks"
             )
-        rotors, thrust = vehicle.rotors, vehicle.thrust
+        rotors = vehicle.rotors
+        thrust = vehicle.thrust
         P.require("vehicle.thrust", thrust, positive="torque_ratio")  # the mixer divides by it
         # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each
         # of shape (4,).
-        x, y, spin = np.asarray(rotors.x), np.asarray(rotors.y), np.asarray(rotors.spin)
+        x = np.asarray(rotors.x)
+        y = np.asarray(rotors.y)
+        spin = np.asarray(rotors.spin)
         row["mixer"]["roll"], row["mixer"]["pitch"] = (
             y / (4 * np.mean(y**2)),
             -x / (4 * np.mean(x**2)),
@@ -296,8 +299,10 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
     are combined here."""
     rows = pack(t.Rope, *ropes)
     for row, rope in zip(rows, ropes, strict=True):
-        length, mass = rope.segment_length, rope.segment_mass
-        ball, last_mass = length + rope.payload_offset, mass + rope.payload_mass
+        length = rope.segment_length
+        mass = rope.segment_mass
+        ball = length + rope.payload_offset
+        last_mass = mass + rope.payload_mass
         row["segment_length"], row["segment_mass"], row["segment_inertia"] = (
             length,
             mass,

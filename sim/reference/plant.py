@@ -153,7 +153,8 @@ class ReferencePlant:
         rotation = rotation_from_quat(values["quat_wb"])
         offset_w = turned(rotation, self._errors.com_offset)
         offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
-        pos, vel = values["pos_w"] + offset_w, values["vel_w"] + offset_vel
+        pos = values["pos_w"] + offset_w
+        vel = values["vel_w"] + offset_vel
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
         n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)

@@ -118,7 +118,8 @@ def crossing(
             (1.0 - s) * (step * vel_0 - (pos_1 - pos_0)) - s * (step * vel_1 - (pos_1 - pos_0))
         )
 
-    low, high = 0.0, 1.0
+    low = 0.0
+    high = 1.0
     if pos_0[2] <= height:
         return 0.0, pos_0
     for _ in range(60):

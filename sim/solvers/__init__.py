@@ -126,8 +126,10 @@ class Exchange:
         device.
         """
         vehicles, ropes, releases, airs = parts
-        period, gravity = sim.params.sim.control_period, sim.gravity
-        h, k = self.world.substep, self.kernels
+        period = sim.params.sim.control_period
+        gravity = sim.gravity
+        h = self.world.substep
+        k = self.kernels
         flags = [self._moves, self._again]
         launch(k.begin, [releases, sim.state, sim.command, sim.release, mask, *flags, sim.out])
         for i in range(self.world.substeps):

@@ -17,13 +17,15 @@ class ChainSolver:
     capturable = True
 
     def __init__(self, world: World) -> None:
-        self.world, self._kernel = world, _kernel(world)
+        self.world = world
+        self._kernel = _kernel(world)
 
     def place(self, mask) -> None:
         """Nothing is to be done: all that it keeps are the arrays of the state."""
 
     def advance(self, duration: float) -> None:
-        w, s = self.world, self.world.params.sim
+        w = self.world
+        s = self.world.params.sim
         numbers = [s.gamma, s.max_turn, w.gravity, duration]
         inputs = [*w.packed, *numbers, w.state, w.bodies, w.wrench]
         wp.launch(self._kernel, w.count, inputs, device=w.device, block_dim=64)
@@ -31,10 +33,19 @@ class ChainSolver:
 
 def _kernel(world: World) -> wp.Kernel:
     """Kernel that advances the bodies of a world."""
-    t, L = world.types, world.params.rope.segments
-    real, vec3, vec4 = t.real, t.vec3, t.vec4
-    Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
-    State, Wrench, Bodies = world.kernels.State, world.kernels.Wrench, world.kernels.Bodies
+    t = world.types
+    L = world.params.rope.segments
+    real = t.real
+    vec3 = t.vec3
+    vec4 = t.vec4
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Air = t.Air
+    QuadState = t.QuadState
+    Flow = t.Flow
+    State = world.kernels.State
+    Wrench = world.kernels.Wrench
+    Bodies = world.kernels.Bodies
     extensions = extensions_of(world.vehicles, world.ropes) | {"push"}
 
     @wp.func

@@ -43,7 +43,9 @@ class MujocoSolver:
     capturable = False  # on a GPU a step is a captured graph of its own
 
     def __init__(self, world: World) -> None:
-        self.world, device, count = world, world.device, world.count
+        self.world = world
+        device = world.device
+        count = world.count
         pairs, model_of = world.models()
         models = [compile_model(vehicle.body, rope) for vehicle, rope in pairs]
         for model in models:
@@ -71,7 +73,8 @@ class MujocoSolver:
         self._kernels = _kernels(world)
 
     def place(self, mask) -> None:
-        w, device = self.world, self.world.device
+        w = self.world
+        device = self.world.device
         end = 2 * w.params.rope.segments
         root = [self.qpos[:, :7], self.qvel[:, :6]]
         rope = [self.qpos[:, 7 : 7 + end], self.qvel[:, 6 : 6 + end]]
@@ -84,7 +87,8 @@ class MujocoSolver:
         self._show()
 
     def advance(self, duration: float) -> None:
-        w, device = self.world, self.world.device
+        w = self.world
+        device = self.world.device
         push = [w.wrench, self._payload_quat, self.ctrl]
         wp.launch(self._kernels["push"], w.count, push, device=device)
         self._step()
@@ -163,11 +167,16 @@ def _clear(
 
 def _kernels(world: World) -> dict[str, Callable]:
     """Kernels between the exchange's arrays and MuJoCo's coordinates."""
-    t, rope = world.types, world.params.rope
-    L, cables, box = rope.segments, rope.cables_apart > 0.0, any(rope.payload_sides)
+    t = world.types
+    rope = world.params.rope
+    L = rope.segments
+    cables = rope.cables_apart > 0.0
+    box = any(rope.payload_sides)
     N = L + 1 if box else L  # the box turns like one more rod
-    Rope, State = t.Rope, world.kernels.State
-    Wrench, Bodies = world.kernels.Wrench, world.kernels.Bodies
+    Rope = t.Rope
+    State = world.kernels.State
+    Wrench = world.kernels.Wrench
+    Bodies = world.kernels.Bodies
 
     @wp.kernel(module="unique", enable_backward=False)
     def pack(

@@ -19,7 +19,8 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
     if rope.cables_apart > 0.0:
         _add_two_cables(spec, vehicle, rope)
     else:
-        ball, mount = not any(rope.payload_sides), list(rope.mount)
+        ball = not any(rope.payload_sides)
+        mount = list(rope.mount)
         last = add_chain(
             spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=ball
         )

@@ -66,7 +66,9 @@ _device: list[str] = []
 
 def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
     """USD text of one vehicle with its rope, level and hanging straight down."""
-    length, mount, body = rope.segment_length, rope.mount, vehicle.body
+    length = rope.segment_length
+    mount = rope.mount
+    body = vehicle.body
     apis = '"PhysicsArticulationRootAPI", "PhysxArticulationAPI", '
     place = {"z": 0.0, "mass": body.mass, "centre": 0.0, "inertia": tuple(body.inertia)}
     parts = [LINK.format(name="vehicle", apis=apis, more=ROOT, **place)]
@@ -102,7 +104,8 @@ class PhysxSolver:
     capturable = False
 
     def __init__(self, world: World) -> None:
-        self.world, self._gpu = world, world.device != "cpu"
+        self.world = world
+        self._gpu = world.device != "cpu"
         ovphysx = _start(world.device)
         import ovstage
         from ovphysx.types import TensorType
@@ -114,14 +117,16 @@ class PhysxSolver:
         head = SCENE.format(
             gravity=world.gravity, gpu=self._gpu, broadphase="GPU" if self._gpu else "MBP"
         )
-        self._physx, stage = _instance(ovphysx, world.device), ovstage.Stage()
+        self._physx = _instance(ovphysx, world.device)
+        stage = ovstage.Stage()
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "scene.usda"
             file.write_text(head + "".join(usd))
             domains = ovstage.PopulationDomain.ALL
             ovstage.population.open_usd(stage, str(file), ordinal=1, domains=domains)
         stage.advance_write_floor(ordinal=1).wait()
-        self._stage, wait = stage, self._physx.wait_task
+        self._stage = stage
+        wait = self._physx.wait_task
         wait(self._physx.attach_ovstage(stage, read_ordinal=1))
         for k, e in enumerate(first):
             copies = [f"/{name(c)}" for c in np.flatnonzero(model_of == k) if c != e]
@@ -163,7 +168,8 @@ class PhysxSolver:
         self._tensors["mass"].read(self._masses)
 
     def place(self, mask) -> None:
-        w, moved = self.world, mask.numpy()[self._order] != 0
+        w = self.world
+        moved = mask.numpy()[self._order] != 0
         if not moved.any():
             return
         names = ("pose", "velocity", "angles", "rates")
@@ -182,7 +188,9 @@ class PhysxSolver:
             self._tensors[name].write(array, mask=rows)
 
     def advance(self, duration: float) -> None:
-        w, arrays, tensors = self.world, self._arrays, self._tensors
+        w = self.world
+        arrays = self._arrays
+        tensors = self._tensors
         inputs = [w.wrench, w.bodies, self._rows, arrays["wrench"]]
         wp.launch(self._kernels["push"], w.count, inputs, device=w.device)
         tensors["wrench"].write(arrays["wrench"])
@@ -227,8 +235,11 @@ def _instance(ovphysx: ModuleType, device: str) -> Any:
 
 def _kernels(world: World) -> dict[str, wp.Kernel]:
     """Kernels between the exchange's arrays and PhysX's tensors."""
-    t, L = world.types, world.params.rope.segments
-    Rope, Wrench, Bodies = t.Rope, world.kernels.Wrench, world.kernels.Bodies
+    t = world.types
+    L = world.params.rope.segments
+    Rope = t.Rope
+    Wrench = world.kernels.Wrench
+    Bodies = world.kernels.Bodies
     loaded = bool(extensions_of(world.vehicles, world.ropes) & LOADS) or bool(world.params.laws)
 
     @wp.kernel(module="unique", enable_backward=False)

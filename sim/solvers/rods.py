@@ -17,11 +17,13 @@ def rod_inertial(rope: RopeParams, last: bool) -> tuple[float, float, float]:
     """Mass [kg], height of the centre of mass above the upper end [m] and transverse inertia about
     it [kg m^2] of a rod; the last one carries the ball.
     """
-    mass, length = rope.segment_mass, rope.segment_length
+    mass = rope.segment_mass
+    length = rope.segment_length
     about_centre = mass * length**2 / 12.0
     if not last:
         return mass, -length / 2, about_centre
-    ball, reach = rope.payload_mass, length + rope.payload_offset
+    ball = rope.payload_mass
+    reach = length + rope.payload_offset
     centre = (mass * length / 2 + ball * reach) / (mass + ball)
     inertia = about_centre + rope.payload_inertia
     inertia += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
@@ -37,7 +39,8 @@ def build_place(world: World, hinges: bool) -> wp.Kernel:
     ``hinges``, as MuJoCo has them, a rod turns by the angles about y, then about x, quaternions are
     wxyz and the roots' angular velocities in the body frame. Environment ``rows[r]`` has row r.
     """
-    L, State = world.params.rope.segments, world.kernels.State
+    L = world.params.rope.segments
+    State = world.kernels.State
     first = 1 if hinges else 0
 
     @wp.func

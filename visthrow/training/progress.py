@@ -133,7 +133,9 @@ class ProgressPicture:
             (float(row["wall_s"]), float(row["error_2m"])) for row in rows if row["error_2m"]
         ]
         self._last: Throws | None = None
-        self._said, self._lines, self._drawn = "no evaluation yet", 0, 0.0
+        self._said = "no evaluation yet"
+        self._lines = 0
+        self._drawn = 0.0
 
     def draw(self, text: str, figures: dict, throws: Throws | None) -> None:
         """Take an iteration's figures; draw where the last picture is old or there are throws."""

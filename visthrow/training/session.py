@@ -258,12 +258,9 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                     with checkpoints.timed():
                         trainer.save(folder / CHECKPOINT)
                     saved = trainer.iteration
-                if args.until and throws is not None and throws.within(args.until):
-                    why = REACHED
-                elif trainer.iteration < last and stop.asked:
-                    why = STOPPED
-                elif trainer.iteration < last and time.perf_counter() > deadline:
-                    why = OUT_OF_TIME
+                reached = bool(args.until and throws is not None and throws.within(args.until))
+                if reached or trainer.iteration < last:
+                    why = _end(reached, stop.asked, time.perf_counter() > deadline)
                 why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:
@@ -274,6 +271,15 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
             f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}"
         ) from error
     return why
+
+
+def _end(reached: bool, stopped: bool, late: bool) -> str:
+    """Return why a loop ends before its last iteration; :data:`DONE` where it does not."""
+    if reached:
+        return REACHED
+    if stopped:
+        return STOPPED
+    return OUT_OF_TIME if late else DONE
 
 
 def _line(throws: Throws) -> str:

@@ -94,7 +94,8 @@ def calibrate(args: argparse.Namespace) -> int:
             f"--out {out}; expected a file that ends in .toml, as every configuration"
         )
     like = config.load(CameraParams, config.find("camera", args.like))
-    first, mount = Path(args.source[0]), None
+    first = Path(args.source[0])
+    mount = None
     if args.board or first.is_dir() or first.suffix.lower() in PICTURES:
         board = board_of(args.board)
         paths, images = pictures_of(args.source)

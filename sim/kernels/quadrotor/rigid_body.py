@@ -98,15 +98,13 @@ def build_flow(
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
     rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
-    Vehicle, Air, QuadState, QuadRate, Flow, vec3, vec4 = (
-        t.Vehicle,
-        t.Air,
-        t.QuadState,
-        t.QuadRate,
-        t.Flow,
-        t.vec3,
-        t.vec4,
-    )
+    Vehicle = t.Vehicle
+    Air = t.Air
+    QuadState = t.QuadState
+    QuadRate = t.QuadRate
+    Flow = t.Flow
+    vec3 = t.vec3
+    vec4 = t.vec4
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
@@ -163,15 +161,13 @@ def build_direct_flow(t: Types):
 
     What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
     """
-    Vehicle, Air, QuadState, Flow, vec3, vec4, real = (
-        t.Vehicle,
-        t.Air,
-        t.QuadState,
-        t.Flow,
-        t.vec3,
-        t.vec4,
-        t.real,
-    )
+    Vehicle = t.Vehicle
+    Air = t.Air
+    QuadState = t.QuadState
+    Flow = t.Flow
+    vec3 = t.vec3
+    vec4 = t.vec4
+    real = t.real
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):

@@ -44,7 +44,10 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
     It puts motors, filters, battery and queue of an environment in hover under a collective thrust
     [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
     rate must have been set before."""
-    Vehicle, real, vec3, vec4 = t.Vehicle, t.real, t.vec3, t.vec4
+    Vehicle = t.Vehicle
+    real = t.real
+    vec3 = t.vec3
+    vec4 = t.vec4
     ideal = vehicle.battery.kind == "ideal"
 
     @wp.func

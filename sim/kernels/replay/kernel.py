@@ -130,8 +130,13 @@ def build_replay(
     """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
     numbers are read at run time.
     """
-    real, vec3 = t.real, t.vec3
-    Vehicle, Rope, Release, Air, QuadState = t.Vehicle, t.Rope, t.Release, t.Air, t.QuadState
+    real = t.real
+    vec3 = t.vec3
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Release = t.Release
+    Air = t.Air
+    QuadState = t.QuadState
     L = segments
     State = st.array_struct(t, "ReplayState", STATE_FIELDS)
     Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
@@ -149,12 +154,10 @@ def build_replay(
     leaving = build_letting_go(t, EVERYTHING)
     fly_ball = build_step_in_flight(t, flight_acceleration)
     sampling = build_sampling(t, Sensing, Windows, Data)
-    Steps, Pointers, sample, copy_samples = (
-        sampling.Steps,
-        sampling.Pointers,
-        sampling.sample,
-        sampling.copy_samples,
-    )
+    Steps = sampling.Steps
+    Pointers = sampling.Pointers
+    sample = sampling.sample
+    copy_samples = sampling.copy_samples
     load_quad, store_quad = st.build_access(t, State)
     Ball = make_struct(
         "Ball",
@@ -179,7 +182,8 @@ def build_replay(
             "at": Pointers,
         },
     )
-    attached_code, loose_code = ATTACHED, LOOSE
+    attached_code = ATTACHED
+    loose_code = LOOSE
 
     @wp.func
     def push_at(air: Air, axis: int, size: real, share: real):

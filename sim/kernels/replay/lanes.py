@@ -57,7 +57,8 @@ class Recording:
             windows: fields of ``kernel.WINDOW_FIELDS``, shape (W,).
             data: fields of ``kernel.DATA_FIELDS``, flights one after the other.
         """
-        self.windows, self.data = windows, data
+        self.windows = windows
+        self.data = data
         self.rows = 2 * windows["vehicle_count"] + windows["payload_count"] + windows["gyro_count"]
         self.seconds = windows["end"] - windows["start"]
         self._there: dict[tuple[rk.ReplayKernel, str], tuple] = {}
@@ -115,7 +116,9 @@ class Replay:
                 f"{len(plants)} plants of {sorted({p.rope.segments for p in plants})} segments with"
                 f" {len(sensings)} sensings: expected one number of segments and a sensing each"
             )
-        self.device, self.segments, self._sim = device, first.rope.segments, first.sim
+        self.device = device
+        self.segments = first.rope.segments
+        self._sim = first.sim
         self._download = download
         self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
         kinds = kinds_of(first.vehicle)
@@ -159,7 +162,8 @@ class Replay:
             knot_spacing: between knots of the latent forces [s].
             knots: rows of the knot arrays.
         """
-        k, t = self.kernel, self.types
+        k = self.kernel
+        t = self.types
         count = len(lanes["window"])
         device = self.device if count > SMALL_BATCH * cores() else "cpu"
         if device != "cpu":  # lanes that wait for others would double the time of the slowest
@@ -172,7 +176,8 @@ class Replay:
             ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
             knot_states = st.allocate(t, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
         else:
-            ends, knot_states = k.State(), k.Knots()
+            ends = k.State()
+            knot_states = k.Knots()
         out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
         moments = knots if np.any(resumed) else 0
@@ -193,7 +198,8 @@ class Replay:
             recording.on(k, t, device),
         )
         before = [*self._plants_on(device), *numerics, begin, windows, flown, data, order]
-        after, first = [ends, knot_states, marks, *left_at, out], 0
+        after = [ends, knot_states, marks, *left_at, out]
+        first = 0
         for rows in launches:
             self._launch(device, first, costs[rows], before, after)
             first += len(rows)
@@ -282,7 +288,8 @@ def _in_order(shared: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.n
     """Lanes that fly, those from a start and those that leave another lane on its way; the rest
     ride along.
     """
-    flies, number = np.ones(len(shared), dtype=bool), np.arange(len(shared))
+    flies = np.ones(len(shared), dtype=bool)
+    number = np.arange(len(shared))
     for lane in np.flatnonzero(shared > 0):
         flies[lane + 1 : lane + 1 + shared[lane]] = False
     return number[flies & ~resumed].astype(np.int32), number[flies & resumed].astype(np.int32)

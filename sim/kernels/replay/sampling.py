@@ -48,7 +48,9 @@ def build_sensing(t: Types, Sensing: type):
     body [m] and its attitude against the quaternion ``reference`` as a rotation vector [rad];
     ``point(sensing, pos_w)`` -> measured position of the payload [m]; ``rate(sensing, rate_b)``
     [rad/s]."""
-    vec3, quat, real = t.vec3, t.quat, t.real
+    vec3 = t.vec3
+    quat = t.quat
+    real = t.real
 
     @wp.func
     def pose(x: Sensing, com: vec3, pos_w: vec3, quat_wb: quat, reference: quat):
@@ -90,8 +92,11 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         t: types of the wanted precision.
         Sensing, Windows, Data: structs of the replay.
     """
-    real, vec3, quat = t.real, t.vec3, t.quat
-    Vehicle, QuadState = t.Vehicle, t.QuadState
+    real = t.real
+    vec3 = t.vec3
+    quat = t.quat
+    Vehicle = t.Vehicle
+    QuadState = t.QuadState
     see_pose, see_point, see_rate = build_sensing(t, Sensing)
     Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
     Pointers = make_struct(

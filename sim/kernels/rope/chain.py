@@ -101,14 +101,14 @@ def build_chain(
         under its pull, ``now`` what it was h seconds before; with h 0 it is at rest).
     """
     L = segments
-    real, vec3, Rope = t.real, t.vec3, t.Rope
+    real = t.real
+    vec3 = t.vec3
+    Rope = t.Rope
     vec2 = wp.types.vector(2, real)
     last = L - 1
-    loaded, rubbing, giving = (
-        bool(extensions & LOADS),
-        "mount_damping" in extensions,
-        "compliance" in extensions,
-    )
+    loaded = bool(extensions & LOADS)
+    rubbing = "mount_damping" in extensions
+    giving = "compliance" in extensions
 
     @wp.func
     def with_load(i: int, at: vec3, arm: real, load: vec3):

@@ -18,7 +18,11 @@ def build_root(t: Types):
     Returns a Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` ->
     acceleration of the centre of mass [m/s^2, world], angular acceleration [rad/s^2, body],
     acceleration of the mount [world], force on the chain [N, world]."""
-    vec3, mat33, Vehicle, Rope, QuadState = t.vec3, t.mat33, t.Vehicle, t.Rope, t.QuadState
+    vec3 = t.vec3
+    mat33 = t.mat33
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    QuadState = t.QuadState
     real = t.real
 
     @wp.func
@@ -78,9 +82,17 @@ def build_coupled_step(
     place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
     momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre,
     world frame)."""
-    vec3, vec4, real = t.vec3, t.vec4, t.real
-    Vehicle, Rope, Air, QuadState, Flow = t.Vehicle, t.Rope, t.Air, t.QuadState, t.Flow
-    vec2, L, loaded = chain.vec2, chain.segments, bool(extensions & LOADS)
+    vec3 = t.vec3
+    vec4 = t.vec4
+    real = t.real
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    Air = t.Air
+    QuadState = t.QuadState
+    Flow = t.Flow
+    vec2 = chain.vec2
+    L = chain.segments
+    loaded = bool(extensions & LOADS)
     root = build_root(t)
 
     @wp.func
@@ -116,7 +128,8 @@ def build_coupled_step(
 
         return load
 
-    load_first, load_second = build_load(chain.speed_first), build_load(chain.speed_second)
+    load_first = build_load(chain.speed_first)
+    load_second = build_load(chain.speed_second)
 
     @wp.func
     def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):

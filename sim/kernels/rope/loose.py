@@ -14,8 +14,13 @@ def build_loose_step(t: Types, chain, payload):
     the coupled step the root's velocity follows from the total momentum. Returns a Warp function
     ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity, gamma, max_turn, h)`` -> position and
     velocity of the upper end; the arrays n, u and stiffness change in place."""
-    vec3, mat33, real, Rope, Air = t.vec3, t.mat33, t.real, t.Rope, t.Air
-    vec2, L = chain.vec2, chain.segments
+    vec3 = t.vec3
+    mat33 = t.mat33
+    real = t.real
+    Rope = t.Rope
+    Air = t.Air
+    vec2 = chain.vec2
+    L = chain.segments
 
     @wp.func
     def free_root(d: vec3, o: vec3, b: vec3):

@@ -18,7 +18,11 @@ def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):
     """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws
     on it included.
     """
-    Rope, Air, vec3, real, in_flight = t.Rope, t.Air, t.vec3, t.real, laws.in_flight
+    Rope = t.Rope
+    Air = t.Air
+    vec3 = t.vec3
+    real = t.real
+    in_flight = laws.in_flight
 
     @wp.func
     def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
@@ -35,7 +39,9 @@ def build_payload(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     Returns a namespace of Warp functions ``hanging(rope, air, vel_w, along_w, jet_w)`` [N]
     (``along_w`` the last segment's direction, ``jet_w`` the force of the rotors on the air [N]) and
     ``free(rope, air, vel_w)`` [N] in flight."""
-    Rope, Air, vec3 = t.Rope, t.Air, t.vec3
+    Rope = t.Rope
+    Air = t.Air
+    vec3 = t.vec3
 
     @wp.func
     def through_air(air: Air, vel_w: vec3):

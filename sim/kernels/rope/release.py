@@ -70,7 +70,10 @@ def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
     at the latch [N], and the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the
     last segment's direction and after ``tail(r, vel_w, com_vel_w)`` with the velocity of the common
     centre of mass of payload and rope. Each does only what ``extensions`` name."""
-    real, vec3, Rope, Release = t.real, t.vec3, t.Rope, t.Release
+    real = t.real
+    vec3 = t.vec3
+    Rope = t.Rope
+    Release = t.Release
 
     @wp.func
     def lag(r: Release, rope: Rope, pull: real, gravity: real):
@@ -104,7 +107,10 @@ def build_step_in_flight(t: Types, acceleration):
         t: types of the wanted precision.
         acceleration: ``(rope, air, vel_w, gravity_w)`` -> [m/s^2], world frame.
     """
-    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
+    real = t.real
+    vec3 = t.vec3
+    Rope = t.Rope
+    Air = t.Air
 
     @wp.func
     def step(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity_w: vec3, h: real):
@@ -141,7 +147,10 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
     """
     if not dragging:
         return SimpleNamespace(time_to_height=time_to_height, after=projectile, clearance=clearance)
-    real, vec3, Rope, Air = t.real, t.vec3, t.Rope, t.Air
+    real = t.real
+    vec3 = t.vec3
+    Rope = t.Rope
+    Air = t.Air
     step = build_step_in_flight(t, acceleration)
 
     @wp.func

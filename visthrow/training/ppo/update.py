@@ -156,7 +156,8 @@ class CapturedPPO(PPO):
         """Let the critic alone learn, its steps not clipped, or both."""
         if held == self._actor_learns:
             self._actor_learns = not held
-            self._graph, self._updates = None, 0
+            self._graph = None
+            self._updates = 0
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are
@@ -164,7 +165,8 @@ class CapturedPPO(PPO):
         """
         result = super().load(loaded_dict, load_cfg, strict)
         self.set_rate(float(self.learning_rate))
-        self._graph, self._updates = None, 0
+        self._graph = None
+        self._updates = 0
         return result
 
     def set_rate(self, rate: float) -> None:
