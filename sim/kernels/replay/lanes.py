@@ -192,11 +192,9 @@ class Replay:
         ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
         numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, GRAVITY]
-        inputs = (k.State, rk.STATE_FIELDS, starts), (k.Lanes, rk.LANE_FIELDS, lanes)
-        (begin, flown), (windows, data) = (
-            (_struct(t, *group, device) for group in inputs),
-            recording.on(k, t, device),
-        )
+        begin = _struct(t, k.State, rk.STATE_FIELDS, starts, device)
+        flown = _struct(t, k.Lanes, rk.LANE_FIELDS, lanes, device)
+        windows, data = recording.on(k, t, device)
         before = [*self._plants_on(device), *numerics, begin, windows, flown, data, order]
         after = [ends, knot_states, marks, *left_at, out]
         first = 0
