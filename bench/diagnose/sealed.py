@@ -245,9 +245,11 @@ def ask(
     return json.loads(answer.read_text())
 
 
-def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[str, float]:
-    """Nats by which the throws held back are explained worse by the model as it was, and by the
-    verdict's sizes, than by the truth.
+def on_held_back(
+    recipe: Recipe, answers: dict[str, dict[str, float]], held: Path
+) -> dict[str, float]:
+    """Return the nats by which the throws held back are explained worse by the model as it was
+    (``before``), and by the sizes of each answer, than by the truth.
 
     See :func:`~bench.diagnose.shortfalls.shortfalls`; the truth is the ``oracle``, with 0, and
     ``samples`` their number. A law outside the catalogue has no size: it is the model as it was
@@ -257,7 +259,7 @@ def on_held_back(recipe: Recipe, theta: dict[str, float], held: Path) -> dict[st
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
 
-    sizes = {"after": theta, "before": {}}
+    sizes = {**answers, "before": {}}
     if not any(name.startswith("law_") for name in recipe.effects):
         sizes["oracle"] = recipe.effects | dust_of(recipe)
     experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
@@ -395,7 +397,8 @@ def run_world(
             return line | {"error": verdict["error"]}
         if recipe.held and (recipe.effects or verdict.get("theta")):
             try:
-                line["held"] = on_held_back(recipe, verdict.get("theta", {}), held)
+                answers = {"after": verdict.get("theta", {})}
+                line["held"] = on_held_back(recipe, answers, held)
             except (VisthrowError, RuntimeError) as error:
                 line["held_error"] = repr(error)
     return line
