@@ -2,8 +2,6 @@
 looked at where they lead.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -54,44 +52,3 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
 
 def test_what_whips_where_nothing_is_hidden_is_not_named():
     assert explained(0.0).overall == result.NO_EFFECT
-
-
-class Levered(SyntheticModel):
-    """A floor of one effect does what three floors of another do, and something of its
-    own besides.
-    """
-
-    by, lever = 1, 3.0
-
-    def _share(self, w):
-        return self.lever * w.effects[:, 3] * EFFECTS[3].floor / EFFECTS[self.by].floor
-
-    def windows(self, theta):
-        own = np.arange(len(EFFECTS)) == self.by
-        found = zip(super().windows(theta), self.residuals(theta))
-        return [
-            replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own)
-            for w, r in found
-        ]
-
-    def residuals(self, theta, about=None):
-        e = EFFECTS[self.by]
-        left = self.truth.get(e.name, 0.0) * e.floor - theta.get(e.name, 0.0)
-        return [r + left * self._share(w) for r, w in zip(super().residuals(theta), self._windows)]
-
-
-def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
-    """The configuration gets the sizes with which the named effects alone explain the flights; a
-    finding tells the cause's own.
-    """
-    off, off_alone = [], []
-    for seed in range(5):
-        truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
-        diagnosis = search.explain(
-            Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False
-        )
-        assert diagnosis.named == (NAME,)
-        size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
-        off.append((own.estimate - size) / own.sd)
-        off_alone.append((diagnosis.theta[NAME] - size) / own.sd)
-    assert abs(np.mean(off)) < 1.0 < 1.5 < np.mean(off_alone), (off, off_alone)

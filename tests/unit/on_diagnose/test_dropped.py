@@ -6,14 +6,12 @@ from functools import cache
 
 import numpy as np
 
-from sim.kernels.replay.lanes import Recording
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from tests.synthetic_diagnosis import SyntheticModel
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, linearise
-from visthrow.diagnose.throw.replay import Lane
 from visthrow.diagnose.throw.throw_model import ThrowModel
 
 SHARE = 0.12
@@ -27,33 +25,6 @@ def model_of(lost: float, throws: int = 2, **theta: float) -> ThrowModel:
         paper_plant(),
         only=ONLY,
     )
-
-
-def test_a_column_is_what_the_missing_command_changes():
-    model = model_of(SHARE, throws=1)
-    columns = model.without_commands({}, range(len(model.windows({}))))
-    (setting, states), flights = model.begun({}), model.flights
-    w = int(model._retained[len(columns) // 2])
-    c = flights.cuts[w]
-    f = flights.flights[c.flight]
-    acts = f.command_time + setting.plant.vehicle.queue.delay
-    first = int(flights.windows["command_first"][w])
-    inside = np.flatnonzero(
-        (np.append(acts[1:], np.inf) > c.start) & (acts < c.end) & (np.arange(len(acts)) > 0)
-    )
-    assert columns[len(columns) // 2].shape[1] == len(inside)
-    lane, largest = [Lane(w, 0, w, rough=True)], 0.0
-    simulation = model.simulation(setting)
-    plain = flights.fly(simulation, states, lane).seen
-    for column, k in zip(columns[len(columns) // 2].T[::9], inside[::9]):
-        sent = flights.recording.data["command"].copy()
-        sent[first + k] = sent[first + k - 1]
-        recording = Recording(flights.recording.windows, flights.recording.data | {"command": sent})
-        seen = flights.fly(simulation, states, lane, recording).seen
-        change = (seen - plain)[: int(flights.rows[w]), 0].ravel()
-        np.testing.assert_allclose(column, change, atol=1e-12)
-        largest = max(largest, np.abs(change).max())
-    assert largest > 1e-3  # a turn of that [rad], else nothing is compared
 
 
 def told(diagnosis):

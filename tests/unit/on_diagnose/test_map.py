@@ -125,19 +125,6 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
     )
 
 
-def test_a_flying_model_carries_the_weight_that_was_weighed():
-    file = REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
-    found = propose(table_of(file), file.name, mass=0.027)
-    assert found.flyer["mass"] == 0.027
-    hover = 4.0 * found.flyer["thrust_map"][1] * 0.68  # of full throttle, by eye
-    assert hover == pytest.approx(0.027 * 9.81, rel=0.2)
-    assert not any("weigh" in question for question in found.questions)
-    assert any(
-        "what does the vehicle weigh? 1 kg" in question
-        for question in propose(table_of(file), file.name).questions
-    )
-
-
 def test_what_is_not_known_is_asked(tmp_path):
     columns = {name: values for name, values in table().items() if name != "millis"}
     found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")
@@ -191,19 +178,6 @@ def test_angles_that_would_turn_a_flight_over_are_in_degrees():
     assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "mm", "quat_wb": "deg"}
     assert "in rad half of the time tilted by more than 93 deg" in found.why["quat_wb"]
     assert not found.questions
-
-
-def test_a_hover_in_millimetres_is_no_flight_of_a_kilometre():
-    """It spans 42 of its units and no name says which; the captured position beside it is in
-    metres.
-    """
-    file = REAL / "payload_cf_single" / "log206.csv.gz"
-    found = propose(table_of(file), file.name)
-    units = {c.name: c.unit for c in found.mapping.channels}
-    assert (units["pos_w"], units["mocap_pos_w"], units["payload_pos_w"]) == ("mm", "m", "mm")
-    assert "mm by gravity" in found.why["pos_w"]
-    assert found.flyer["cable"]["length"] == pytest.approx(0.51, abs=0.01)
-    assert not any("physics speaks against" in question for question in found.questions)
 
 
 def test_what_falls_says_its_unit_and_a_hall_what_it_can():

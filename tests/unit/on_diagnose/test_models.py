@@ -228,13 +228,6 @@ class TestStand:
 
 
 class TestFlyer:
-    def test_the_truth_leaves_noise(self):
-        model = FlyerModel([fly(6.0, drag=0.02)], FLYER)
-        residual = np.concatenate(model.residuals({"rotor_drag_xy": 0.02, "cmd_delay": LATE}))
-        assert np.sqrt(np.mean(residual**2)) == pytest.approx(2e-4, rel=0.1)  # the noise
-        wrong = np.concatenate(model.residuals({}))
-        assert np.sqrt(np.mean(wrong**2)) > 1e-3
-
     @pytest.mark.parametrize("phase", [0.0, 0.003, 0.0085])
     def test_held_commands_pass_the_motors_lag_exactly(self, phase):
         """Closed form: thrust falls to each command by itself, wherever in a step of the
@@ -311,23 +304,6 @@ class TestFlyer:
         assert stated or not named & {"frame_tilt_y", "marker_rot_y"}
         assert ("wind_x" in named) != bool(stated)
 
-    def test_wind_a_late_attitude_and_thrust_that_fades_are_found(self):
-        log = fly(6.0, drag=0.03, wind=1.5, late=0.02, fade=-0.004)
-        params = FlyerParams(**{**vars(FLYER), "drag_xy": 0.03})
-        dark = FlightLog({k: v for k, v in log.channels.items() if k != "battery_voltage"})
-        estimates = found(
-            FlyerModel([dark], params),
-            ["wind_x", "wind_y", "attitude_delay", "thrust_fade", "cmd_delay", "thrust_gain"],
-        )
-        truth = {
-            "wind_x": 1.5,
-            "wind_y": 0.0,
-            "attitude_delay": 0.02,
-            "thrust_fade": -0.004,
-            "cmd_delay": LATE,
-        }
-        assert all(near(estimates, name, size) for name, size in truth.items()), estimates
-
     def test_motor_gains_from_rates(self):
         """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body
         mechanics says.
@@ -372,13 +348,6 @@ class TestFlyer:
                     "torque": TorqueParams((1, 1, 1), 1, 1, 1, (1, 1, 1, 1)),
                 }
             )
-
-    def test_without_voltage_the_battery_cannot_be_seen(self):
-        log = fly(3.0)
-        dark = FlightLog({k: v for k, v in log.channels.items() if k != "battery_voltage"})
-        missing = {e.name: set(e.channels) - {"pos_w"} for e in FlyerModel([dark], FLYER).effects}
-        assert missing["battery_sag"] == {"battery_voltage"}
-        assert not missing["thrust_gain"]
 
 
 TRIM = TrimParams(
@@ -426,17 +395,6 @@ class TestTrim:
         )
         assert estimates["motor_rl"][0] == pytest.approx(-0.2, abs=0.02)
         assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
-
-    def test_a_weight_at_a_motor(self):
-        """2 g at a rotor of a 30 g vehicle: levers give 3/4 of it to that motor, -1/4 to the
-        opposite one, 1/4 to the others.
-        """
-        extra = 2.0 / 30.0
-        log = hover_log((1 + extra, 1 - extra, 1 + 3 * extra, 1 + extra))
-        estimates = found(TrimModel([log], TRIM), ["added_rl"])
-        assert estimates["added_rl"][0] == pytest.approx(0.002, abs=2e-4)
-        residual = np.concatenate(TrimModel([log], TRIM).residuals({"added_rl": 0.002}))
-        assert np.abs(np.mean(residual)) < 0.002
 
 
 class TestGimbal:
@@ -501,17 +459,6 @@ class TestGimbal:
         assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), (
             estimates
         )
-
-    def test_camera_tilt_and_marker_rotation_are_one(self):
-        """With the gimbal at rest a turned camera and a turned marker frame are the same to the
-        last digit.
-        """
-        window = GimbalModel(self.logs(), self.PARAMS).windows({})[0]
-        names = [e.name for e in GimbalModel(self.logs(), self.PARAMS).effects]
-        tilts = window.effects[:, [names.index(f"camera_tilt_{a}") for a in "xyz"]]
-        turns = window.effects[:, [names.index(f"marker_rot_{a}") for a in "xyz"]]
-        left = turns - tilts @ np.linalg.lstsq(tilts, turns, rcond=None)[0]
-        assert np.linalg.norm(left) < 0.06 * np.linalg.norm(turns)  # the rest is the gimbal's lever
 
 
 class TestSetups:

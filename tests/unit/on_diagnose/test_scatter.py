@@ -10,7 +10,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares, varying
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares, varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -68,19 +68,6 @@ def test_what_is_drawn_anew_each_flight_does_not_drift():
     worlds = [on_days(rng, 0.0, 0.012) for _ in range(20)]
     assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
     assert "15 flights" in worlds[0].sentence
-
-
-def test_a_mean_is_as_sure_as_there_are_days():
-    """Three flights of a day tell no more of what all days share than one does."""
-    statistics, days = campaign(np.random.default_rng(10), 5, 0.012, 0.0)
-    size = {0: 6.0}  # floors
-    by_flight, by_day = (
-        freed(statistics, Varies(days, flights=size)),
-        freed(statistics, Varies(days, drifts=size)),
-    )
-    assert len(by_day.flights) == 5
-    sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
-    np.testing.assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
 
 
 def told(rng, **deviation):

@@ -71,20 +71,6 @@ def test_one_effect_is_named_with_its_size_and_interval(sign):
     assert found.nats > diagnosis.threshold
 
 
-TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
-
-
-@pytest.mark.parametrize(("curvature", "steps"), [(0.0, 1), (2.0, 3)])
-def test_three_effects_are_named_at_once_unless_bends_would_fake_one(curvature, steps):
-    """A bend of 2 at 30 floors is taken for more than a third of each size."""
-    model = world(truth=TRIPLE, seed=1, curvature=curvature)
-    diagnosis = search.explain(model, laws=False)
-    assert set(diagnosis.named) == set(TRIPLE)
-    assert len(diagnosis.steps) == steps
-    for name, size in sizes(model, diagnosis).items():
-        assert abs(size - TRIPLE[name]) < 1.5
-
-
 def hiding(own: float, **options) -> SyntheticModel:
     """Flights in which effect 7 undoes effect 3, of the same size, but for its ``own`` share."""
 
@@ -283,22 +269,6 @@ def test_gusts_are_no_causes():
     assert not search.explain(world(gust=2.0, seed=7), laws=False).theta
 
 
-def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
-    rng = np.random.default_rng(0)
-    few, many = (_threshold(count) for count in (4, 400))
-    assert few < many
-    information, priors, least = _information(40), _priors(40), _threshold(40)
-    best = evidence.additions(
-        information, evidence.null_draws(information, 2000, rng), priors, ()
-    ).max(axis=1)
-    assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
-
-
-def _information(count: int) -> np.ndarray:
-    root = np.random.default_rng(count).normal(size=(count, 3 * count))
-    return root @ root.T / 50.0
-
-
 def _priors(count: int) -> Priors:
     return Priors(
         np.ones(count),
@@ -306,16 +276,6 @@ def _priors(count: int) -> Priors:
         np.full(count, -np.inf),
         np.full(count, np.inf),
         np.ones(count, bool),
-    )
-
-
-def _threshold(count: int) -> float:
-    information = _information(count)[None]
-    one = np.zeros((1, count))
-    return evidence.threshold(
-        Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]),
-        _priors(count),
-        np.random.default_rng(1),
     )
 
 

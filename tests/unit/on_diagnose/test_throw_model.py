@@ -21,7 +21,6 @@ from visthrow.config.effects import catalogue
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
-from visthrow.diagnose.throw.replay import STABLE, rough_step
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -91,18 +90,6 @@ def test_silent_at_the_truth(planted):
     assert sum(np.sum(r**2) for r in right) < sum(np.sum(r**2) for r in wrong)
 
 
-@pytest.mark.parametrize("blocks", [{}, {"motor_mixing": 1.0}])
-def test_rough_steps_are_as_short_as_the_controllers_filters_ask(blocks):
-    """Betaflight's gyro filters of 250 and 500 Hz, D's of 150: 2 ms."""
-    setting = setting_with(blocks)
-    vehicle = setting.plant.vehicle
-    quick = dataclasses.replace(
-        vehicle, controller=dataclasses.replace(vehicle.controller, gyro_time_constant=2e-3)
-    )
-    setting = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=quick))
-    assert rough_step(setting, 2e-3) == pytest.approx(STABLE * 2e-3)
-
-
 def test_derivatives_are_derivatives(planted):
     """Central differences of the residuals, with a step four times that of the columns: commands'
     switches make kinks.
@@ -140,21 +127,6 @@ def test_landings_are_predicted_from_before_the_throw(planted):
     assert wrong.errors[0] > 0.03
     assert wrong.released_errors[0] > 0.02
     assert len(model.landings({}, [0]).flights) == 0  # a free flight has none
-
-
-def test_windows_are_whole(planted):
-    _, model = planted
-    windows = model.windows({})
-    assert {w.phase for w in windows} >= {"throw"}
-    for w in windows:
-        samples = len(w.residual)
-        assert w.time.shape == w.channel.shape == w.sigma.shape == (samples,)
-        assert w.nuisance.shape == (samples, len(w.nuisance_sd))
-        assert w.latent.shape == (samples, len(w.latent_block)) == (samples, len(w.latent_time))
-        assert set(w.channel) <= set(range(len(model.channels)))
-        assert {"time", "pos_w", "vel_w", "quat_wb", "rate_b", "thrust"} <= set(w.knots)
-        assert all(len(v) == len(w.knots["time"]) for v in w.knots.values())
-    assert max(model.step_error().values()) < 20.0
 
 
 def test_initial_states_follow_the_effects(planted):

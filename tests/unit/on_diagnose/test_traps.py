@@ -53,17 +53,6 @@ def test_flights_as_they_are(number):
     assert bad(FLIGHTS[number]) == ""
 
 
-@pytest.mark.parametrize(
-    "path", ["nanobench_cf21/B3_figure8_fast_rep1", "payload_cf_two_drones/coltrans_02_cf9"]
-)
-def test_other_flights_as_they_are(path):
-    name = {"nanobench_cf21": "nanobench_cf21", "payload_cf_two_drones": "cf_payload_pair"}[
-        path.split("/")[0]
-    ]
-    (log,) = setup.read_logs([REAL / f"{path}.csv.gz"], name)
-    assert bad(log, setup.known(name)) == ""
-
-
 @pytest.mark.parametrize("number", [204, 205])
 def test_exchanged_axes_are_named_with_their_evidence(number):
     found = bad(changed(FLIGHTS[number], PATHS, lambda v: v[:, [1, 0, 2]]))

@@ -218,16 +218,6 @@ def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> 
     )
 
 
-def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
-    at = beside_a_law(with_a_name_for_the_law(0.1), [1])
-    strongest = terms.strongest_forces(at.nominal)
-    found, beside = (
-        terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1])
-    )
-    assert DRAG in [effect.term for effect in found]
-    assert DRAG not in [effect.term for effect in beside]
-
-
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}

@@ -8,21 +8,16 @@ import pytest
 from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
 from hil.control.recording.record import CONFIG, TICKS, RunRecorder
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import autopilot_record
-from hil.links.backends.base import DryRun
-from hil.links.backends.betaflight import Betaflight
-from hil.links.backends.thrust_curve import LEAST_SHARES
 from hil.params import HilParams
 from hil.poses.pose import VEHICLE
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
-from tests.loopback.wire import peers, pipe
+from tests.loopback.wire import peers
 from visthrow import config
 from visthrow.cli import main
-from visthrow.onboard.policy import Policy, find_policy
 
 QUICK = ("states.check_hold=0.2",)
 NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
@@ -111,26 +106,3 @@ def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
         RunError, match="0 ticks of steady hover before throws; expected 50 or more"
     ):
         hover_of_run(tmp_path)
-
-
-def test_the_summary_keeps_what_the_autopilot_said(run):
-    kept = json.loads((run / "summary.json").read_text())["autopilot"]
-    assert kept["backend"] == "ardupilot"
-    assert kept["parameters"]["found"]["GUID_OPTIONS"] == 8
-    assert kept["parameters"]["problems"] == kept["parameters"]["written"] == []
-    assert kept["release"] == {"state": "idle", "note": "", "sends": 0}
-    assert kept["clocks"]["peers"]["1 at 127.0.0.1:1"]["steps"] == 0
-    assert autopilot_record(DryRun(), None) == {"backend": "dry-run"}
-
-
-def test_an_autopilot_without_settings_to_audit_is_listened_to(capsys):
-    params = config.load(
-        HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]
-    )
-    check = AutopilotCheck(params, Betaflight(pipe()[0], params.betaflight))
-    runner = Runner(params, Policy.load(find_policy("state")), DryRun())
-    check.tick(0.0, runner)
-    assert check.results(0.0, runner.mass) == [
-        (True, f"hover share not measured: 0 of {LEAST_SHARES} values in steady hover")
-    ]
-    assert capsys.readouterr().out == "", "there is no table to show"

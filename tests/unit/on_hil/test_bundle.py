@@ -68,12 +68,6 @@ def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, ca
     assert "the recording ends" in capsys.readouterr().out.splitlines()[-1]
 
 
-def test_a_good_run_did_not_go_wrong(tmp_path, capsys):
-    record_run(tmp_path / "c", saved_policy(tmp_path), seconds=8.0)
-    assert main(["hil", "replay", str(tmp_path / "c")]) == 0
-    assert capsys.readouterr().out.splitlines()[-1].startswith("It did not go wrong")
-
-
 def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
     folder = shutil.copytree(aborted[0], tmp_path / "none")
     (folder / "ticks.jsonl").write_text("")

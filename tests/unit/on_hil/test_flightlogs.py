@@ -128,26 +128,6 @@ def test_the_end_of_a_run_writes_logs_and_pictures(run):
     assert picture.shape[1] > 1500
 
 
-def test_throws_without_a_landing_say_why(tmp_path):
-    never = saved_policy(tmp_path, (-0.1269, 0, 0, 0, -1.0))
-    record_run(tmp_path / "a", never, "throws=2", "states.throw=0.5", seconds=7.0)
-    logs = throws(read(tmp_path / "a"))
-    assert len(logs) == 2
-    assert logs[0]["command"].time[-1] < logs[1]["command"].time[0], "no tick belongs to two throws"
-    for log in logs:
-        assert log.meta["result"]["failure"] == "the policy did not release in time"
-        assert "landing" not in log
-    assert "no landing counted" in finish(tmp_path / "a")[0]
-
-
-def test_a_run_without_a_throw_is_logged_as_a_whole(tmp_path):
-    record_run(tmp_path / "a", saved_policy(tmp_path), seconds=0.6)
-    assert "flight log of the whole run" in finish(tmp_path / "a")[0]
-    log = FlightLog.load(tmp_path / "a" / "flight.npz")
-    assert len(log["pos_w"].time) == len(log["payload_pos_w"].time) > 50
-    assert log.meta["events"][-1][1] == "check"
-
-
 def test_the_log_says_where_nothing_real_flew(run, logs, tmp_path):
     """A run at `visthrow hil fake` is not taken for one of a vehicle."""
     assert logs[0].meta["plant_meaning"] == "poses of mavlink, back-end dry-run"

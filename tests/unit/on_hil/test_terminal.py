@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from hil.control.state_machine import OperatorInput, TickRecord
+from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import require_fake
 from hil.operator_terminal import ENDING, PAUSING, Console, Terminal
@@ -125,23 +125,3 @@ def test_a_terminal_that_takes_nothing_holds_nobody_up(monkeypatch):
     assert time.monotonic() - start < 1.0
     gate.set()
     console.close()
-
-
-def test_a_reason_is_not_said_twice(capsys):
-    console = Console()
-    for state, reason, waits in (
-        ("abort", "no", ""),
-        ("done", "no", ""),
-        ("idle", "start", "no pose"),
-        ("idle", "start", "disarmed"),
-    ):
-        console.decision(TickRecord(1.0, state, reason, waits=waits))
-    console.close()
-    said = [line.split(maxsplit=2)[2] for line in capsys.readouterr().err.splitlines()]
-    assert [" ".join(line.split()) for line in said] == [
-        "abort no",
-        "done",
-        "idle start",
-        "idle waits: no pose",
-        "idle waits: disarmed",
-    ]
