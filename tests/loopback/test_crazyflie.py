@@ -4,6 +4,7 @@ Throws over CRTP, signs, priorities, silence, versions, and what each refuses.
 """
 
 import math
+import socket
 import struct
 import sys
 
@@ -16,7 +17,7 @@ from hil.errors import LinkError
 from hil.links import crtp
 from hil.links.backends import make_backend
 from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
-from hil.links.backends.crazyflie import Crazyflie
+from hil.links.backends.crazyflie import MODES, Crazyflie
 from hil.links.device import Device, UdpPort
 from hil.links.facts import values
 from hil.links.mavlink_link import Link
@@ -233,3 +234,47 @@ def test_by_udp():
     finally:
         backend.close()
         fake.close()
+
+
+def test_nobody_else_speaks_for_a_crazyflie():
+    """Packets from another address neither connect, nor arm, nor release it: each is counted, and
+    their sender said once.
+    """
+    ticks, number, said = 200, free_port(), []
+    params = config.load(
+        HilParams,
+        config.find("hil", "crazyflie"),
+        [f'crazyflie.device="udpout:127.0.0.1:{number}"'],
+    )
+    backend = make_backend(params, tell=said.append)
+    stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    stranger.bind(("127.0.0.2", 0))
+    backend.service(0.0)  # sends, so that there is an address to answer
+    address = ("127.0.0.1", backend._port._open.getsockname()[1])
+    state = FACTS["ask_state"] | FACTS["answer"], FACTS["armed"] | FACTS["flying"]
+    answers = [
+        (FACTS["port_supervisor"], FACTS["channel_info"], struct.pack("<BI", *state)),
+        (
+            FACTS["port_platform"],
+            FACTS["channel_version"],
+            struct.pack("<BI", FACTS["ask_protocol"], FACTS["protocol_state"]),
+        ),
+    ]
+    for name in [*MODES, params.crazyflie.release_parameter]:
+        answer = bytes([FACTS["set_by_name"]]) + crtp.named(name) + b"\0"
+        answers.append((FACTS["port_param"], FACTS["channel_by_name"], answer))
+    for tick in range(ticks):
+        backend.ask(FOLLOW, 0.02 * tick)
+        backend.release(0.0)
+        for answer in answers:
+            stranger.sendto(crtp.Packet(*answer).pack(), address)
+        backend.service(0.02 * tick)
+    status = backend.status(0.02 * ticks)
+    assert (status.connected, status.release) == (False, FAILED)
+    assert "no answer by CRTP" in status.note
+    assert backend.roster.refused == ticks * len(answers)
+    host, port = stranger.getsockname()
+    refusal = f"refused: datagram from {host}:{port}: the device is 127.0.0.1:{number}"
+    assert [text for text in said if "refused" in text] == [refusal]
+    stranger.close()
+    backend.close()

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
-from sim.effects.setting import generalised
+from sim.effects.setting import AERODYNAMICS, generalised
 from sim.params import GRAVITY, SensingParams
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
@@ -158,6 +158,16 @@ def test_what_is_known_of_the_sensors_is_taken_off():
     informed = ThrowModel(logs, paper_plant(), sensing=sensing, only=["rope_length"])
     left = informed.residuals({})
     assert all(np.mean((r / w.sigma) ** 2) < 1.3 for r, w in zip(left, informed.windows({})))
+
+
+def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
+    setting = setting_with({})
+    vehicle = setting.plant.vehicle
+    bare = dataclasses.replace(vehicle, aero=dataclasses.replace(vehicle.aero, kind="none"))
+    plant = dataclasses.replace(setting.plant, vehicle=bare)
+    aero = generalised(dataclasses.replace(setting, plant=plant)).plant.vehicle.aero
+    assert aero.kind == "rotor_drag"
+    assert not any(getattr(aero, name) for name in AERODYNAMICS)
 
 
 def test_the_catalogue_is_sound():
