@@ -37,6 +37,7 @@ from visthrow.logs import read
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 from visthrow.logs.readers import messages
+from visthrow.logs.readers.autopilot_logs import validity
 from visthrow.logs.readers.messages import Fields, Messages
 
 CHANNELS = {
@@ -62,8 +63,6 @@ class PoseMessage:
     vel: Names = ()
     rate: Names = ()
     resets: tuple[str, ...] = ()  # counters; their sum is the pose's
-    # field, and the least value with which the body is seen
-    valid: tuple[tuple[str, float], ...] = ()
     attitude: str = ""  # message of its attitude, of the same vehicle
     rates: str = ""  # likewise of its rates
 
@@ -80,13 +79,10 @@ ODOMETRY = PoseMessage(
     vel=(_index("velocity"), ("vx", "vy", "vz")),
     rate=(_index("angular_velocity"), ("rollspeed", "pitchspeed", "yawspeed")),
     resets=("reset_counter",),
-    valid=(("quality", 0.0),),
 )
 LOCAL_RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "vxy", "z", "vz", "heading"))
 DATAFLASH = {
-    "VISP": PoseMessage(
-        (("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt"), valid=(("Q", 0.0),)
-    ),
+    "VISP": PoseMessage((("PX", "PY", "PZ"),), angles=ANGLES, resets=("Rst", "RstCnt")),
     "XKF1": EKF,
     "NKF1": EKF,
     "POS": PoseMessage((("N", "E", "D"),), attitude="ATT"),
@@ -96,7 +92,6 @@ ULOG = {
         (("x", "y", "z"),),
         vel=(("vx", "vy", "vz"),),
         resets=LOCAL_RESETS,
-        valid=(("xy_valid", 1.0), ("z_valid", 1.0)),
         attitude="vehicle_attitude",
         rates="vehicle_angular_velocity",
     ),
@@ -265,10 +260,7 @@ def _of_messages(log: Messages, body: LogBody, table: dict[str, PoseMessage]) ->
     vel = _in_world(vel, quat, data.get("velocity_frame"))
     counters = [data[name].astype(int) for name in kind.resets if name in data]
     resets = sum(counters) if counters else np.zeros(count, int)
-    valid = np.ones(count, bool)
-    for name, threshold in kind.valid:
-        if name in data:
-            valid &= data[name] >= threshold
+    valid = validity(log.kind, body.message, data)
     return [
         Pose(
             float(stamps[i]),

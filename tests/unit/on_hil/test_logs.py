@@ -28,7 +28,7 @@ YAWED = (QUARTER, 0.0, 0.0, QUARTER)
 """A quarter turn about down, wxyz."""
 
 
-def vision(i, reset=0, quality=100):
+def vision(i, reset=0, quality=100, ignored=0):
     return (
         "VISP",
         (
@@ -44,7 +44,7 @@ def vision(i, reset=0, quality=100):
             0,
             0,
             reset,
-            0,
+            ignored,
             quality,
         ),
     )
@@ -138,10 +138,11 @@ def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
     assert pose.quat == pytest.approx(YAWED)
 
 
-def test_a_vision_pose_of_negative_quality_is_none(tmp_path):
+def test_a_vision_pose_of_negative_quality_or_that_was_ignored_is_none(tmp_path):
     path = tmp_path / "a.BIN"
-    files.write_bin(path, {"VISP": files.VISP}, [vision(0, quality=-1), vision(1, quality=0)])
-    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True]
+    rows = [vision(0, quality=-1), vision(1, quality=0), vision(2, ignored=1)]
+    files.write_bin(path, {"VISP": files.VISP}, rows)
+    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True, False]
 
 
 def test_loggers_of_two_bodies_are_joined_by_a_stated_offset(tmp_path):

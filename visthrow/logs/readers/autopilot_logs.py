@@ -297,7 +297,7 @@ def _channel(
     entry = replace(tap.entry, columns=columns)
     with np.errstate(invalid="ignore"):  # damaged floats
         values = np.column_stack([fields[column] for column in columns]).astype(float)
-    bad = ~_in_range(fields, tap.good)
+    bad = ~in_range(fields, tap.good)
     channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
     notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
     if np.any(bad):
@@ -308,7 +308,16 @@ def _channel(
     return channel, notes
 
 
-def _in_range(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
+def validity(kind: str, message: str, fields: Fields) -> np.ndarray:
+    """Return which rows of a message of poses its source calls valid, bool, shape (T,), in a log
+    of kind "ulog" or "dataflash".
+    """
+    taps = ULOG if kind == "ulog" else DATAFLASH
+    conditions = (tap.good for tap in taps if tap.message == message)
+    return in_range(fields, next(conditions, ()))
+
+
+def in_range(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
     """Whether each row has all of these fields, as far as it has them, in their range."""
     good = np.ones(len(fields["time"]), bool)
     for name, lowest, largest in ranges:
@@ -325,7 +334,7 @@ def _moving(
     candidates = []
     for number, fields in instances.items():
         if all(column in fields for column in columns):
-            rows = _in_range(fields, tap.only)
+            rows = in_range(fields, tap.only)
             if np.any(rows):
                 candidates.append((number, {name: values[rows] for name, values in fields.items()}))
     moving = [
@@ -342,9 +351,7 @@ def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
     for message in dict.fromkeys(tap.message for tap in taps if tap.only):
         ranges = {tap.only[0] for tap in taps if tap.message == message}
         fields = log.first(message)
-        if fields is not None and not any(
-            np.any(_in_range(fields, (bounds,))) for bounds in ranges
-        ):
+        if fields is not None and not any(np.any(in_range(fields, (bounds,))) for bounds in ranges):
             name = next(iter(ranges))[0]
             received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
             accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in sorted(ranges))
@@ -381,7 +388,7 @@ def _flying(log: Messages) -> Channel | None:
         if fields is not None and field in fields:
             order = np.argsort(fields["time"], kind="stable")
             signals.append(
-                (fields["time"][order], _in_range(fields, ((field, lowest, largest),))[order])
+                (fields["time"][order], in_range(fields, ((field, lowest, largest),))[order])
             )
     if not signals:
         return None
