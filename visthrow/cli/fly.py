@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     find_policy(args.policy)  # said before anything heavy is imported
-    from visthrow.common.storage import writable, write_json
+    from visthrow.common.storage import check_place, writable, write_json
     from visthrow.throws.loading import load_policy
     from visthrow.throws.recorded import check_goal, fly
     from visthrow.training.compute_device import resolve
@@ -71,6 +71,7 @@ def run(args: argparse.Namespace) -> int:
     check_goal(loaded, goal)
     writable(Path(args.out))
     if args.save:
+        check_place(args.save)
         loaded.policy.save(args.save)
     if args.plant != "hybrid":
         print("flying on the reference plant; this takes about a minute", file=sys.stderr)
@@ -87,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"{path}  the flight for other programs")
     for path in paths:
         print(f"{path}  {FILES[path.name]}")
+    if args.save:
+        print(f"{args.save}  the policy for these conditions")
     if args.json:
         write_json(
             args.json,

@@ -56,9 +56,14 @@ def loads(schema: type[T], text: str, overrides: Iterable[str] = (), name: str =
 
 
 def _built(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
+    overrides = tuple(overrides)
     for override in overrides:
         _override(schema, tree, override)
-    built: T = _schema.build(schema, tree)
+    try:
+        built: T = _schema.build(schema, tree)
+    except ConfigError as error:
+        changed = f" (with {', '.join(overrides)})" if overrides else ""
+        raise ConfigError(f"{error}{changed}") from None
     return built
 
 
@@ -163,7 +168,7 @@ def _read(schema: type, path: Path, stack: tuple[Path, ...]) -> ConfigTable:
         chain = " -> ".join(_display_path(step) for step in (*stack, resolved))
         raise ConfigError(f"{name}: files that include or build on each other in a circle: {chain}")
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         files = sorted(p.name for p in path.parent.glob("*.toml")) if path.parent.is_dir() else []
         raise ConfigError(f"{name}: no such file; {suggest(path.name, files)}") from None
@@ -179,6 +184,8 @@ def _parse(
         raw = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{name}: no valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{name}: no valid TOML: brackets are nested too deeply") from None
     # A schema may itself have a field called "base"; then the word is an ordinary key.
     base = raw.pop(BASE_KEY, None) if BASE_KEY not in _schema.hints(schema) else None
     tree = _schema.as_table(raw, name)

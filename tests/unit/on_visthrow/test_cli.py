@@ -224,9 +224,14 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
         (["config", "vehicle", "papr"], "did you mean 'paper'"),
         (["config", "vehicle", "paper", "--set", "body.mas=1"], "did you mean 'mass'"),
         (["config", "vehicle", "--set", "body.mass=1"], "--set needs the NAME"),
+        (["config", "vehicle", "paper", "--set", "body.mass=-1"], "above 0 (with body.mass=-1)"),
+        (["config", "vehicle", "deep.toml"], "deep.toml: no valid TOML: brackets are nested too"),
+        (["sweep", "status", "trial", "--out", "deep.toml"], "deep.toml is a file; expected a"),
     ],
 )
-def test_config_mistakes(arguments, said, capsys):
+def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("deep.toml").write_text(f"a = {'[' * 3000}{']' * 3000}")
     assert cli.main(arguments) == 2
     assert said in capsys.readouterr().err
 
@@ -256,6 +261,15 @@ def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, caps
     with pytest.raises(SystemExit, match="2"):
         cli.main(words)
     assert said in capsys.readouterr().err
+
+
+def test_a_file_of_windows_notepad_is_read(tmp_path):
+    from sim.params import VehicleParams
+    from visthrow import config
+
+    path = tmp_path / "bom.toml"
+    path.write_text('base = "vehicle/paper.toml"\n', encoding="utf-8-sig")
+    assert config.load(VehicleParams, path).body.mass == 0.21
 
 
 def test_devices_that_are_not_there_are_refused():

@@ -111,4 +111,4 @@ def test_a_range_error_names_the_one_key(override, message):
 
     with pytest.raises(ConfigError) as caught:
         config.load(HilParams, config.find("hil", "vicon"), [override])
-    assert str(caught.value).endswith(message)
+    assert str(caught.value).endswith(f"{message} (with {override})")

@@ -88,6 +88,8 @@ def run(args: argparse.Namespace) -> int:
         raise ConfigError(f"--minutes {args.minutes:g}; expected more than 0")
     work = load_list(args.list, tuple(args.overrides))
     out = Path(args.out)
+    if out.exists() and not out.is_dir():
+        raise ConfigError(f"--out {out} is a file; expected a folder")
     if args.action == "status":
         lines, done = record.status(work, out)
         print("\n".join(lines))
