@@ -410,7 +410,8 @@ def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
     for key, kind in schema.items():
         if not isinstance(header.get(key), kind):
             raise PolicyError(
-                f"{path}: no policy: header entry '{key}' is {header.get(key)!r}; expected a {kind.__name__}"
+                f"{path}: no policy: header entry '{key}' is {header.get(key)!r}; expected a"
+                f" {kind.__name__}"
             )
     return header
 
