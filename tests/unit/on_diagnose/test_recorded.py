@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -56,3 +57,14 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
     time = record_of(flight(1000.0, 0.02, (4.0, 5.0))).gyro.time
     assert not np.any((time > 4.0) & (time < 5.0))
     assert np.sum(time <= 4.0) == pytest.approx(1000, abs=3)
+
+
+def test_a_log_without_commands_is_told_what_makes_them():
+    """As PX4's, which holds motor outputs, poses and rates."""
+    time = np.arange(20.0)
+    pos = Channel(time, np.zeros((20, 3)), "m", "world")
+    quat = Channel(time, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1)), "1", "world")
+    with pytest.raises(
+        DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"
+    ):
+        record_of(FlightLog({"pos_w": pos, "quat_wb": quat}))
