@@ -265,6 +265,12 @@ def test_causes_at_their_floors_are_not_named():
     assert not search.explain(small_causes(3), laws=False).theta
 
 
+def test_flights_without_a_window_are_counted(monkeypatch):
+    monkeypatch.setattr(search, "check", lambda *_: [])
+    diagnosis = search.diagnose([None] * 9, world(truth={"effect_03": 12.0}, seed=4), laws=False)
+    assert "3 of 9 flights have no window in this answer" in diagnosis.reasons
+
+
 def test_gusts_are_no_causes():
     assert not search.explain(world(gust=2.0, seed=7), laws=False).theta
 

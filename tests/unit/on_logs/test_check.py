@@ -11,10 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from bench import delays
 from visthrow import cli
+from visthrow.diagnose.inputs.setup import VELOCITIES, known
+from visthrow.diagnose.select.search import diagnose, refused_of
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import thrust_checks
 from visthrow.logs.check.relations import derivative, relate
-from visthrow.logs.check.run import check, table
+from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -207,6 +209,35 @@ def test_scrambled_commands_are_caught():
     columns = flight(40.0)
     columns["command"] = flight(40.0, seed=5)["command"]
     assert "command, rate_b: the rates do not follow" in faults(log_of(columns))
+
+
+def test_a_hover_and_a_force_that_no_model_has_refuse_no_log():
+    """Thrust that hardly varies says nothing of its clock; inflow is no delay."""
+    assert not faults(log_of(flight(20.0, scale=0.02)))
+    columns = flight(20.0)
+    level = (columns["vel_w"][:, :2] ** 2).sum(1)
+    columns["command"][:, 0] *= 1.0 - 0.01 * level
+    assert not faults(log_of(columns))
+
+
+def test_a_late_channel_that_no_model_reads_refuses_no_log():
+    columns = flight(20.0)
+    late = Channel(columns["time"] + 0.06, columns.pop("vel_w"), "m/s", "world")
+    checked = check([log_of(columns, vel_w=late)])
+    assert "vel_w" in contradictions(checked)[0]
+    assert not contradictions(checked, VELOCITIES)
+    assert refused_of(checked) == (0,)
+    assert refused_of(checked, known(None)) == ()
+
+
+def test_a_contradiction_is_told_before_a_model_is_built():
+    columns = flight()
+    columns["rate_b"] = columns["rate_b"] * 57.3
+
+    def build():
+        raise AssertionError("the model was built")
+
+    assert diagnose([log_of(columns)], build).overall == "DATA INCONSISTENT"
 
 
 def test_a_pose_stream_of_another_clock_is_told():

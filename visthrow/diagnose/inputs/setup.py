@@ -22,6 +22,7 @@ from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
+VELOCITIES = frozenset({"vel_w", "vel_b", "payload_vel_w"})  # which no model of a vehicle reads
 MODELS = {
     "ball": BallModel,
     "pendulum": PendulumModel,
@@ -101,9 +102,9 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
     flyer = load(name).flyer if name is not None else None
     if flyer is not None:
         length = flyer.cable.length if flyer.cable is not None else 0.0
-        return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map)
+        return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map, VELOCITIES)
     if plant is None:
-        return KnownVehicle()
+        return KnownVehicle(unread=VELOCITIES)
     from visthrow.task import Experiment, plant_of
 
     trained = plant_of(config.load(Experiment, config.find("train", plant)))

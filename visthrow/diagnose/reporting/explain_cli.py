@@ -90,7 +90,7 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
     from visthrow.logs.check.run import check, contradictions
 
     checked = check(test_flights.logs, test_flights.known)
-    for reason in contradictions(checked):
+    for reason in contradictions(checked, test_flights.known.unread):
         print(f"left out of the tested flights: {reason}")
     after = test_flights.model
     before = after.plain()
@@ -98,7 +98,9 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
         after = after.with_laws(
             [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
         )
-    tested = on_others(before, after, diagnosis.theta, diagnosis, refused_of(checked))
+    tested = on_others(
+        before, after, diagnosis.theta, diagnosis, refused_of(checked, test_flights.known)
+    )
     print(
         f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
         f"flights;"

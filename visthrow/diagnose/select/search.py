@@ -53,7 +53,8 @@ def diagnose(
     window, or contradicts itself."""
     say = progress or (lambda _: None)
     checked = check(flights, vehicle)
-    refused, reasons = refused_of(checked), contradictions(checked)
+    refused, reasons = refused_of(checked, vehicle), contradictions(checked, vehicle.unread)
+    unread = [text for text in contradictions(checked) if text not in reasons]
     if len(refused) > MOST_REFUSED * len(flights):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
     model = model() if callable(model) else model
@@ -70,20 +71,28 @@ def diagnose(
         progress=lambda line: say(f"  {line}"),
     )
     notes = [f"left out: {reason}" for reason in reasons]
+    missing = len(flights) - len({*without, *refused, *copied}) - diagnosis.flights
+    if missing > 0:
+        notes.insert(0, f"{missing} of {len(flights)} flights have no window in this answer")
     notes += [
         f"check: {log.name}: {row.text}"
         for log in checked
         for row in log.rows
         if (row.topic, row.verdict) == ("thrust", "warn")
     ]
+    notes += [f"check, of a channel that the model does not read: {text}" for text in unread]
     if (why := model.lawless) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
 
 
-def refused_of(checked: Sequence[Checked]) -> tuple[int, ...]:
-    """Return the numbers of logs whose channels contradict each other."""
-    return tuple(i for i, log in enumerate(checked) if contradictions([log]))
+def refused_of(
+    checked: Sequence[Checked], vehicle: KnownVehicle = UNKNOWN_VEHICLE
+) -> tuple[int, ...]:
+    """Return the numbers of logs whose channels, of those that a model reads, contradict each
+    other.
+    """
+    return tuple(i for i, log in enumerate(checked) if contradictions([log], vehicle.unread))
 
 
 def explain(

@@ -34,6 +34,7 @@ class KnownVehicle:
     thrust_map: tuple[float, float, float] | None = (
         None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
     )
+    unread: frozenset[str] = frozenset()  # channels that the model does not read
 
 
 NOTHING = KnownVehicle()

@@ -1,6 +1,7 @@
 """All checks of several logs; their verdict and table."""
 
 import hashlib
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -53,15 +54,18 @@ and clock.
 """
 
 
-def contradictions(results: Sequence[Checked]) -> list[str]:
-    """Return the reason not to name causes from logs: their channels contradict each other, or
+def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozenset()) -> list[str]:
+    """Return the reasons not to name causes from logs: their channels contradict each other, or
     nothing moved.
-    """
+
+    ``unread``: channels that the model does not read; a bad row about one of them is no reason."""
     return [
         f"{checked.name}: {row.channel + ': ' if row.channel else ''}{row.text}"
         for checked in results
         for row in checked.rows
-        if row.verdict == "bad" and (row.topic in CONTRADICT or "never overlap" in row.text)
+        if row.verdict == "bad"
+        and (row.topic in CONTRADICT or "never overlap" in row.text)
+        and not unread.intersection(re.findall(r"\w+", row.channel))
     ]
 
 
