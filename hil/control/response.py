@@ -25,11 +25,12 @@ DEADS = 6
 """Dead times before an answer that are tried, in ticks: real autopilots are half way after 25 to
 100 ms. Of each sign of an axis the pair of time constant and dead time counts that explains most.
 """
-RATE_NOISE = 0.01  # least change of a reported rate from tick to tick in a hover [rad/s]
+RATE_NOISE = (
+    0.02  # least change of a reported rate from tick to tick that no command explains [rad/s]
+)
 GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
 HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
-FITTED = 3  # numbers that an axis is fitted by: gain, time constant, dead time
-FEWEST_RATES = FITTED + 1  # reported changes that a sign is taken from
+FEWEST_RATES = 4  # reported changes that a sign is taken from
 FALL, FALL_DEAD = 0.4, 2  # time over which the thrust is judged [s], its dead time in ticks
 ANGLE_NOISE, HEIGHT_NOISE = 0.006, 0.002  # of an attitude, a height between poses [rad], [m]
 CERTAIN, CERTAIN_SIGN = 4.0, 5.0  # deviations of the noise beyond which something is known
@@ -215,7 +216,7 @@ def _scores(sums: np.ndarray, variance: np.ndarray, count: int) -> np.ndarray:
     at_rest = sums[2].reshape(-1, 3).min(axis=0)  # an axis that does not turn explains nothing
     best = np.minimum(right, reverse)
     second = np.minimum(np.maximum(right, reverse), at_rest)
-    noise = np.maximum(variance, best / (count - FITTED))
+    noise = np.maximum(variance, best / count)
     better = np.sign(reverse - right) * np.maximum(second - best, 0.0) / noise
     return np.sign(better) * np.sqrt(np.abs(better))
 

@@ -26,7 +26,7 @@ LONGEST = 9.0  # a vehicle that is the policy's has thrown by then [s]
 
 
 SLOW = 0.5  # time constant of a slow yaw [s]; half of a step after 0.35 s, as PX4's SIH has it
-AT_ONCE = 0.12  # in which a sign is seen by reported rates [s]
+AT_ONCE = 0.16  # in which a sign is seen by reported rates [s]
 BY_POSES = 0.5  # and by poses alone [s]
 
 
