@@ -2,6 +2,7 @@
 what else there is.
 """
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -44,9 +45,32 @@ def test_lost_commands_are_found_beside_a_cause():
     assert found.nats > 50.0
 
 
-def test_a_model_without_commands_has_no_verdict_on_them():
-    model = SyntheticModel()
+class Lossy(SyntheticModel):
+    """A model of which each window has eight commands, two of which did not come."""
+
+    def windows(self, theta):
+        return [
+            replace(w, residual=w.residual + columns[:, :2].sum(1))
+            for w, columns in zip(super().windows(theta), self.without_commands(theta))
+        ]
+
+    def without_commands(self, theta, windows=None):
+        rng = np.random.default_rng(0)
+        drawn = [
+            3.0 * w.sigma[:, None] * rng.normal(size=(len(w.residual), 8)) for w in self._windows
+        ]
+        return drawn if windows is None else [drawn[i] for i in windows]
+
+
+def command_verdict(model):
     windows = model.windows({})
     problem = Problem.of(model, windows, range(len(windows)))
     point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    assert dropped.verdict(problem, point, (), 5.0) is None
+    return dropped.verdict(problem, point, (), 5.0)
+
+
+def test_lost_commands_are_found_where_a_model_has_commands():
+    verdict = command_verdict(Lossy())
+    assert verdict.found
+    assert verdict.low < 0.25 < verdict.high
+    assert command_verdict(SyntheticModel()) is None
