@@ -74,7 +74,7 @@ class Agreement:
 
     @property
     def agreed(self) -> int:
-        """What all agreed on for this tick."""
+        """Return what all agreed on for this tick."""
         words = self._words.get(self._now - self.delay, {})
         return min(words.values()) if len(words) == self.team else NOTHING
 
