@@ -9,7 +9,13 @@ Joint damping is applied as couples ``-d (w_i - w_(i-1))`` between neighbours. A
 across its axis."""
 
 import numpy as np
-from mujoco.batch import Batch
+
+try:
+    from mujoco.batch import Batch
+except AttributeError as error:  # MuJoCo 3 was installed over parts of mujoco-core 4
+    raise ModuleNotFoundError(
+        f"mujoco.batch is of another MuJoCo than 'mujoco' here: {error}", name="mujoco.batch"
+    ) from error
 
 from sim.params import BodyParams, RopeParams
 from sim.reference.model import build_attached, build_free

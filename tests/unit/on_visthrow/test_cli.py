@@ -2,6 +2,7 @@
 
 import os
 import re
+import runpy
 import subprocess
 import sys
 import time
@@ -289,3 +290,19 @@ def test_suggestions():
     assert issubclass(ConfigError, VisthrowError)
     with pytest.raises(ConfigError, match="no kind of config 'nothing'"):
         kinds.schema_of("nothing")
+
+
+class MixedMujoco:
+    """What importing mujoco.batch does where MuJoCo 3 was installed over parts of mujoco-core 4."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name == "mujoco.batch":
+            raise AttributeError("mjtState has no attribute 'mjSTATE_PLASTIC'")
+
+
+def test_a_mixed_mujoco_is_named_by_the_reference_plant(monkeypatch):
+    monkeypatch.delitem(sys.modules, "mujoco.batch", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [MixedMujoco(), *sys.meta_path])
+    with pytest.raises(ModuleNotFoundError, match="another MuJoCo") as caught:
+        runpy.run_module("sim.reference.rope")
+    assert caught.value.name == "mujoco.batch"
