@@ -5,7 +5,6 @@ gradients, rates.
 import contextlib
 import copy
 import io
-from itertools import chain
 from types import SimpleNamespace
 
 import pytest
@@ -127,6 +126,21 @@ def test_the_update_is_rsl_rls(changes):
     assert (abs(ours.learning_rate / p.learning_rate - 1.0) > 0.1) == (p.schedule == "adaptive")
 
 
+def test_a_turned_gradient_is_noticed(monkeypatch):
+    """The comparison above would not hold a sign that is wrong."""
+    p = params(schedule="fixed")
+    ours, theirs = build(p, own=True), build(p, own=False)
+    gradients = torch.autograd.grad
+    monkeypatch.setattr(torch.autograd, "grad", lambda *a, **k: [-g for g in gradients(*a, **k)])
+    iterate(ours, 0)
+    iterate(theirs, 0)
+    worst = max(
+        float((a - b).detach().abs().max())
+        for a, b in zip(ours.actor.parameters(), theirs.actor.parameters())
+    )
+    assert worst > 10 * SAME["atol"]
+
+
 def test_products_in_bfloat16_follow_those_in_float32():
     """The same minibatches; weights stay float32 and end within the rounding of the products, moved
     some ten times as far.
@@ -138,7 +152,7 @@ def test_products_in_bfloat16_follow_those_in_float32():
     for seed in range(3):
         iterate(plain, seed)
         iterate(short, seed)
-    assert {w.dtype for w in short.actor.parameters()} == {torch.float32}
+    assert {w.dtype for w in [short._spread, *short._layers]} == {torch.float32}
     off = torch.cat(
         [(a - b).flatten() for a, b in zip(plain.actor.parameters(), short.actor.parameters())]
     ).norm()
@@ -148,7 +162,7 @@ def test_products_in_bfloat16_follow_those_in_float32():
 
 def test_the_critic_learns_alone_while_the_actor_is_held():
     alg = build(params(), own=True)
-    alg.hold_actor(True)
+    alg.actor_learns.zero_()
     held, moving = (
         [w.detach().clone() for w in model.parameters()] for model in (alg.actor, alg.critic)
     )
@@ -165,7 +179,7 @@ def test_a_state_that_was_saved_goes_on_the_same():
     second.load(copy.deepcopy(first.save()), None, True)
     assert second.learning_rate == first.learning_rate != params().learning_rate
     assert iterate(first, 1) == iterate(second, 1)
-    for a, b in zip(first.actor.parameters(), second.actor.parameters()):
+    for a, b in zip(first._layers, second._layers):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
 
 
@@ -199,10 +213,11 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
         assert figures[0] == pytest.approx(figures[1], rel=1e-3, abs=1e-5)
     assert captured._graph is not None
     assert launched._graph is None
-    parameters = (
-        chain(x.actor.parameters(), x.critic.parameters()) for x in (captured, launched, theirs)
-    )
-    for a, b, c in zip(*parameters):
+    for a, b, c in zip(
+        captured._layers,
+        launched._layers,
+        [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()],
+    ):
         torch.testing.assert_close(a, b, **SAME)
         if products == "float32":
             torch.testing.assert_close(a, c, **SAME)

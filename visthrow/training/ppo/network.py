@@ -17,6 +17,10 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
+# columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes
+# or multiples
+ALIGNED = 16
+
 OBSERVED = (
     10**8
     # observations that a policy's normaliser counts for when it is taken up: about those of its
@@ -74,15 +78,7 @@ class Network(MLPModel):
         """Output for observations; a sample of the distribution where
         ``stochastic_output`` is set.
         """
-        x = self.get_latent(obs)
-        x = x.to(torch.bfloat16) if self.bfloat16 else x
-        *layers, last = self.mlp
-        for layer in layers:
-            if isinstance(layer, torch.nn.Linear):
-                x = _Layer.apply(x, layer.weight.to(x.dtype), layer.bias.to(x.dtype))
-            else:
-                x = layer(x)
-        output = last(x.float())
+        output = self.output(self.prepared(obs))
         if self.distribution is None or not stochastic_output:
             return output
         self.distribution.update(output)
@@ -110,6 +106,29 @@ class Network(MLPModel):
             self.obs_normalizer.load_state_dict(
                 normalizer_state(policy.mean, policy.std + (policy.eps - RSL_RL_EPS))
             )
+
+    def prepared(self, obs: TensorDict) -> Tensor:
+        """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up
+        with columns of zeros.
+        """
+        latent = self.get_latent(obs)
+        latent = F.pad(latent, (0, -latent.shape[-1] % ALIGNED)) if latent.is_cuda else latent
+        return latent.to(torch.bfloat16) if self.bfloat16 else latent
+
+    def output(self, latent: Tensor) -> Tensor:
+        """Output of the layers for normalised observations, shape (N, D) or filled up with columns
+        of zeros.
+        """
+        *layers, last = self.mlp
+        x = latent.to(torch.bfloat16) if self.bfloat16 else latent
+        for layer in layers:
+            if isinstance(layer, torch.nn.Linear):
+                filled = x.shape[-1] - layer.in_features
+                weight = F.pad(layer.weight, (0, filled)) if filled else layer.weight
+                x = _Layer.apply(x, weight.to(x.dtype), layer.bias.to(x.dtype))
+            else:
+                x = layer(x)
+        return last(x.float())
 
 
 def cosine_rate(

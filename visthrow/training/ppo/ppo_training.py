@@ -132,7 +132,7 @@ class PPOTraining:
         first = self.experiment.ppo.critic_first
         if first and iteration in (0, first):
             self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
-        self.alg.hold_actor(iteration < first)
+        self.alg.actor_learns.fill_(float(iteration >= first))
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(
