@@ -126,7 +126,7 @@ def test_another_weight_than_the_configuration_says(kind, times):
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize(("kind", "share"), zip(KINDS, (0.8, 1.2, 0.8, 1.2), strict=True))
+@pytest.mark.parametrize(("kind", "share"), list(zip(KINDS, (0.8, 1.2, 0.8, 1.2), strict=True)))
 def test_another_thrust_line(kind, share):
     runner, said, sunk = fly(kind, spoil=bend(share))
     require_refused(runner, said, sunk)

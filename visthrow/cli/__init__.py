@@ -115,7 +115,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         parser = build_parser()
         complete(parser)
         args = parser.parse_args(argv)
-        return run_command(COMMANDS, args.command, args)
+        status = run_command(COMMANDS, args.command, args)
+        sys.stdout.flush()  # a reader that went away shows here, not when Python ends
+        return status
     except KeyboardInterrupt:
         print("visthrow: interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
