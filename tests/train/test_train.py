@@ -95,7 +95,7 @@ def test_exported_policy_equals_the_network(whole):
     with torch.inference_mode():
         difference = (
             (
-                trainer.algorithm.average.module({"actor": obs})
+                trainer.algorithm.alg.actor({"actor": obs})
                 - Policy.load(whole / "policy.npz").act(obs)
             )
             .abs()
