@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from sim.hybrid import rope_variants
 from sim.params import VehicleParams
 from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, Share, contract_of
@@ -62,9 +63,18 @@ LEVELS = 20
 
 
 def layout_of(experiment: TeamExperiment) -> ob.Layout:
-    """Layout of a member's observation: as of a single vehicle, then the others and their age."""
+    """Layout of a member's observation: as of a single vehicle, then the others and their age.
+
+    Raises ConfigError: the observation is to hold a goal that is fitted over a throw.
+    """
+    layout = ob.layout_of(experiment.task.observation)
+    if layout.fits:
+        raise ConfigError(
+            "task.observation.located, or a moving target, in a team; expected neither: no member"
+            " fits the goal over a throw"
+        )
     messages = MESSAGE * (experiment.team.vehicles - 1) + 1
-    return dataclasses.replace(ob.layout_of(experiment.task.observation), setup=messages)
+    return dataclasses.replace(layout, setup=messages)
 
 
 def members(experiment: TeamExperiment) -> dict[str, list[Any]]:

@@ -21,7 +21,6 @@ from visthrow.cooperative.team import TeamExperiment, between, layout_of, member
 from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.onboard.goal_motion import SUMS, fitted_goal
 from visthrow.task import plant_of
 from visthrow.training import rewards, terminations
 from visthrow.training.compute_device import rounded_products
@@ -112,7 +111,6 @@ class TeamEnv(VecEnv):
             "history": (rows, history, payload),
             "true_history": (rows, history, 3),
             "frame_bias": (rows, ob.VEHICLE + 5),
-            "goal_fit": (rows, SUMS),
             "command_bias": (rows, act.COMMANDS),
             "keypoint_bias": (rows, KEYPOINTS, 2),
             "pose_age": (rows,),
@@ -374,13 +372,6 @@ class TeamEnv(VecEnv):
         if self.layout.name == "vision":
             points, valid = self._see(pose, goal)
             frame = torch.cat([frame[:, : ob.VEHICLE], points.flatten(1)], -1)
-        places = None
-        if self.layout.fits:
-            time = self.episode_length_buf * period
-            fits = memory["goal_fit"]
-            fit = fitted_goal(self.layout, frame, valid, self.camera, fits, time, fresh)
-            fits.copy_(fit.sums)
-            _, _, places, frame, valid = fit
         messages = self._messages(poses, frame[:, :3])
         attached = state["attached"].float()
         actor, history = ob.observe(
@@ -391,7 +382,6 @@ class TeamEnv(VecEnv):
             attached,
             memory["history"],
             fresh,
-            places=places,
             setup=messages,
         )
         memory["history"].copy_(history)

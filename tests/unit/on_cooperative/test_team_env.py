@@ -4,9 +4,9 @@ import pytest
 import torch
 
 from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.cooperative.team import TeamExperiment, as_flown, members
 from visthrow.cooperative.team_env import TeamEnv
-from visthrow.onboard.observations import rotation_from_quat
 
 
 def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
@@ -79,32 +79,9 @@ def test_a_camera_sees_keypoints_in_place_of_load_and_goal():
     assert torch.isfinite(observed).all()
 
 
-def test_a_camera_locates_goal_and_load_by_their_keypoints():
-    quiet = [f"task.noise.{name}=0.0" for name in ("observation_step", "observation_bias")]
-    quiet += [f"camera.noise.{name}=0.0" for name in ("step_std", "bias_std")]
-    env = TeamEnv(experiment("pair_located", *quiet, "task.observation.latency=[0.0,0.0]"), count=8)
-    columns = env.layout.columns("located")
-    goal, direction, known = env.get_observations()["actor"][:, columns].split((2, 3, 1), dim=1)
-    pos = env.views.state["pos_w"]
-    assert known.all()
-    torch.testing.assert_close(goal, (env.views.goal_w - pos)[:, :2], atol=5e-3, rtol=0.0)
-    lens = torch.tensor(env.cfg.camera.mount.position_b)
-    load = env._rows(env.load_w) - pos - rotation_from_quat(env.views.state["quat_wb"]) @ lens
-    straight = load / load.norm(dim=-1, keepdim=True)
-    torch.testing.assert_close(direction, straight, atol=0.02, rtol=0.0)
-
-
-def test_a_located_goal_is_the_mean_of_what_was_seen():
-    torch.manual_seed(1)
-    env = TeamEnv(experiment("pair_located"), seed=1, count=64)
-    columns, off = env.layout.columns("located")[:2], []
-    actions = hover(env, -torch.ones(64))
-    for _ in range(10):
-        places = env.get_observations()["actor"][:, columns]
-        goal = (env.views.goal_w - env.views.state["pos_w"])[:, :2]
-        off.append((places - goal).norm(dim=-1).median())
-        env.step(actions)
-    assert off[-1] < 0.7 * off[0]
+def test_a_goal_that_is_fitted_over_a_throw_is_refused():
+    with pytest.raises(ConfigError, match=r"observation\.located"):
+        TeamEnv(experiment("pair_vision", "task.observation.located=true"), count=4)
 
 
 def test_one_policy_of_both_sees_with_both_and_releases_at_once():
