@@ -7,6 +7,13 @@ from pymavlink.generator.mavcrc import x25crc
 
 from hil.links.pymav import mav
 
+SEEDS, EACH = tuple(range(1, 11)), 100_000
+"""Of the long tests: ten seeds of a hundred thousand each make the million, and run side by side.
+
+Seed 0 is the short tests'.
+"""
+
+
 KINDS = tuple(sorted(mav.mavlink_map))
 """Numbers of all messages of the dialect."""
 

@@ -7,6 +7,7 @@ import json
 import os
 import pty
 import re
+import resource
 import signal
 import socket
 import subprocess
@@ -14,8 +15,10 @@ import sys
 import termios
 import time
 
+import numpy as np
 import pytest
 
+from hil.control.recording.playback import replay
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
@@ -233,3 +236,120 @@ def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
     summary = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert summary["reason"] == "the process was told to end (SIGHUP)"
     assert (tmp_path / "run" / "throw-01.npz").is_file()
+
+
+FEW_MISSED = 3
+"""Ticks of a run that may be missed where its throw is to land in its place."""
+
+
+SPEEDS = (1.0, 0.5, 0.25)
+"""Of both processes' clocks: the next one is flown where the machine was too busy for the one
+before; the last one counts as it is.
+"""
+
+
+FULL_DISK = 20_000
+"""Bytes that a file may still grow by: some forty ticks."""
+
+
+def kept_up(folder, fly):
+    """What ``fly(folder, speed)`` gives, with whether the machine was late, at the first of
+    `SPEEDS` at which it was not.
+    """
+    for speed in SPEEDS:
+        place = folder / f"at-{speed:g}"
+        place.mkdir()
+        *found, late = fly(place, speed)
+        if not late:
+            break
+    return *found, place
+
+
+OWN = {
+    "ardupilot": "levelled: no set-points",
+    "px4": "left OFFBOARD: no set-points",
+    "betaflight": "override: the pilot's sticks count again",
+}
+"""What the vehicle does by itself when nobody speaks any more."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
+    def fly(folder, speed):
+        with Pair(folder, kind, never, overrides=QUICK, both=("--speed", str(speed))) as pair:
+            pair.wait_for("throw")
+            pair.wait_for_actions(10)
+            os.kill(pair.runner.pid, signal.SIGKILL)
+            pair.runner.wait(PATIENCE)
+            time.sleep(2.5 / speed)
+            report = pair.report()
+        return report, report["late_periods"] > MOST_LATE
+
+    report, folder = kept_up(tmp_path, fly)
+    assert OWN[kind] in [text for _, text in report["events"]]
+    happened = next(
+        at for at, text in report["events"] if text == OWN[kind] and at > report["last_command"]
+    )
+    assert 0.29 < happened - report["last_command"] < 0.6
+    assert (report["breaches"], report["releases"]) == ([], 0)
+    found = replay(folder / "run")
+    assert found["differences"] == [], "what was written until then runs again to the bit"
+    assert found["actions"] > 5
+
+
+@pytest.mark.slow
+def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
+    """The throw is flown to its end, the next one is not armed, the end of the run says so."""
+    overrides = (*QUICK[:3], "states.throw=4.0", "states.ready=2.0", "states.land=1.0", "throws=2")
+    with Pair(tmp_path, "ardupilot", never, overrides=overrides) as pair:
+        pair.wait_for("throw")
+        room = (tmp_path / "run" / "ticks.jsonl").stat().st_size + FULL_DISK
+        resource.prlimit(pair.runner.pid, resource.RLIMIT_FSIZE, (room, room))
+        out, err = pair.runner.communicate(timeout=PATIENCE)
+        report = pair.report()
+    assert "the policy did not release in time" in err
+    assert "nobody armed a throw" in err, "the next one is not armed"
+    assert "File too large" in out + err + (tmp_path / "run" / "summary.json").read_text()
+    assert (report["breaches"], report["releases"]) == ([], 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("policy", ["state", "vision"])
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+def test_a_throw_with_each_kind(tmp_path, kind, policy):
+    """In real time where the machine keeps up, with the simulator's vehicle and the shipped
+    policies.
+    """
+
+    def fly(folder, speed):
+        both = ("--speed", str(speed))
+        with Pair(
+            folder,
+            kind,
+            policy,
+            plant=("--policy", policy),
+            overrides=("states.abort=0.5",),
+            both=both,
+        ) as pair:
+            out, _ = pair.runner.communicate(timeout=PATIENCE)
+            report = pair.report(end=False)
+        summary = json.loads((folder / "run" / "summary.json").read_text())
+        return (
+            out,
+            report,
+            summary,
+            report["late_periods"] > MOST_LATE or summary["missed"] > FEW_MISSED,
+        )
+
+    out, report, summary, folder = kept_up(tmp_path, fly)
+    assert report["landing_w"] is not None, out
+    assert (report["breaches"], report["releases"]) == ([], 1)
+    assert (summary["latches"], summary["errors"]) == (1, [])
+    autopilot = summary["autopilot"]
+    assert (autopilot["backend"], autopilot["parameters"]["problems"]) == (kind, [])
+    assert autopilot["release"]["state"] == "accepted"
+    assert replay(folder / "run")["differences"] == []
+    # A fake that is late has a clock that stands still and then hurries.
+    assert autopilot["clocks"]["foreign_stamps"] == 0 or kind == "betaflight"
+    assert np.hypot(report["landing_w"][0] - 2.0, report["landing_w"][1]) < ONE_THROW

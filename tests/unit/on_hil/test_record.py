@@ -9,8 +9,9 @@ import pytest
 
 from bench.processes import free_port
 from hil.control.recording.record import RunRecorder, lines, load_run
-from hil.control.runner import Runner
+from hil.control.runner import OperatorInput, Runner
 from hil.errors import RunError
+from hil.links.backends.base import Status
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
@@ -239,3 +240,30 @@ def test_a_device_string_that_would_be_executed_is_refused(tmp_path, capsys):
         )
         assert "device" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
+
+
+def test_a_full_disk_fails_the_recording_and_nothing_else(tmp_path):
+    class Full:
+        def write(self, text):
+            raise OSError(28, "No space left on device")
+
+        def flush(self):
+            pass
+
+        def close(self):
+            pass
+
+    recorder = RunRecorder(tmp_path / "a", params())
+    for writer in recorder._writers.values():
+        writer._file.close()
+        writer._file = Full()
+    runner = Runner(params(), Policy.load(find_policy("state")), Spy())
+    for n in range(3):
+        status, words = Status(True), OperatorInput()
+        recorder.tick(n, [], status, words, True, runner.tick(0.02 * n, [], status, words), {})
+    recorder.close({})
+    assert "No space left" in recorder.failed
+    assert (
+        json.loads((tmp_path / "a" / "summary.json").read_text())["recording_failed"]
+        == recorder.failed
+    )

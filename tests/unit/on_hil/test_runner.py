@@ -457,3 +457,136 @@ def test_another_camera_is_refused():
 def test_wrong_configs(override, message):
     with pytest.raises(ConfigError, match=message):
         config.load(HilParams, config.find("hil", "dry_run"), [override])
+
+
+def test_operators_abort_in_mid_throw():
+    pilot, decisions = thrown(
+        action=NEVER,
+        words=lambda t, s: OperatorInput(arm=s == "ready", abort=s == "throw" and t > 3.0),
+        seconds=8.0,
+    )
+    assert ("abort", "the operator said abort") in changes(decisions)
+    assert pilot.backend.aborts > 0
+
+
+@pytest.mark.parametrize("repeat", [False, True])
+def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
+    _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, repeat), seconds=6.0)
+    assert changes(decisions)[-2:] == [
+        ("recover", "stale poses"),
+        ("abort", "no new pose of the vehicle"),
+    ]
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    levelled = [d for d in decisions if d.note.startswith("level")]
+    assert levelled[0].command[1:] == (0.0, 0.0, 0.0)
+    assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
+
+
+def test_payload_lost_but_not_the_vehicle():
+    _, decisions = thrown(action=NEVER, poses=lost({"payload"}), seconds=6.0)
+    assert ("recover", "stale poses") in changes(decisions)
+    assert "abort" not in [state for state, _ in changes(decisions)]
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+
+
+def test_a_short_gap_is_flown_through():
+    _, decisions = thrown(
+        action=NEVER, poses=lost({"vehicle", "payload"}, until=START + 0.08), seconds=6.0
+    )
+    assert decisions[-1].state == "throw"
+
+
+def spoiled(change, until=99.0):
+    return lambda time, poses: [change(p) if START < time < until else p for p in poses]
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_poses_are_no_poses(name):
+    """Each ends as if none came: the throw is over after 0.1 s, the run after 0.25 s."""
+    pilot, decisions = thrown(action=NEVER, poses=spoiled(BAD[name]), seconds=6.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert sum(pilot.tracks["vehicle"].gate.refused.values()) > 10
+
+
+HARMLESS = {
+    "clock step": lambda time, poses: [
+        dataclasses.replace(p, stamp=p.stamp + (time > START)) for p in poses
+    ],
+    "clock step back": lambda time, poses: [
+        dataclasses.replace(p, stamp=p.stamp - (time > START)) for p in poses
+    ],
+    "doubled": lambda time, poses: [p for p in poses for _ in range(2)],
+    "one bad": spoiled(BAD["jump"], START + 0.02),
+}
+
+
+@pytest.mark.parametrize("name", HARMLESS)
+def test_harmless_faults_end_no_throw(name):
+    _, decisions = thrown(action=NEVER, poses=HARMLESS[name], seconds=6.0)
+    assert decisions[-1].state == "throw"
+
+
+def test_poses_at_5_hz_from_mid_throw_on_end_the_run():
+    kept = {}
+
+    def slow(time, poses):
+        out = [p for p in poses if time < START or time - kept.get(p.body, -1.0) >= 0.2 - 1e-9]
+        kept.update({p.body: time for p in out})
+        return out
+
+    _, decisions = thrown(action=NEVER, poses=slow, seconds=8.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert changes(decisions)[-1] == ("abort", "no new pose of the vehicle")
+    assert when(decisions, "abort") == pytest.approx(START + 0.6, abs=1.5 * TICK)
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.15])
+def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
+    """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the
+    two apart.
+    """
+
+    def spoil(time, poses):
+        if time <= START:
+            return poses
+        return [] if time <= START + gap else [BAD["swapped"](p) for p in poses]
+
+    pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=6.0)
+    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert all(track.gate.refused["swapped"] > 10 for track in pilot.tracks.values())
+
+
+@pytest.mark.parametrize(
+    ("status", "reason"),
+    [
+        (
+            lambda t: Status(t < START, "silent"),
+            "the autopilot is silent, disarmed or in another mode: silent",
+        ),
+        (
+            lambda t: Status(True, "", "failed" if t > START else "idle"),
+            "the release was refused or not answered",
+        ),
+    ],
+)
+def test_an_autopilot_that_goes(status, reason):
+    _, decisions = thrown(action=NEVER, status=status, seconds=5.0)
+    assert changes(decisions)[-1] == ("abort", reason)
+    assert when(decisions, "abort") == pytest.approx(START, abs=1.5 * TICK)
+
+
+def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it():
+    _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
+    assert changes(decisions)[-1][0] == "abort"
+    assert changes(decisions)[-1][1].startswith("fence: ")
+
+
+def test_a_tick_overrun_in_mid_throw():
+    """A tick that comes 0.15 s late: poses have waited, content is as old as it is."""
+    _, decisions = thrown(
+        action=NEVER, late=lambda t: 0.03 if START < t < START + 0.02 else 0.0, seconds=5.0
+    )
+    assert decisions[-1].state == "throw"

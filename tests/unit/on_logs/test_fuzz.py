@@ -3,6 +3,7 @@ what; nothing else, and soon.
 """
 
 import gzip
+import itertools
 import lzma
 import math
 import random
@@ -230,6 +231,9 @@ def all_of(name: str, folder: Path, count: int) -> list[bool]:
     return said
 
 
+MANY = 300
+
+
 @pytest.mark.parametrize("name", list(FORMATS))
 def test_damaged_files(name, tmp_path):
     said = all_of(name, tmp_path, DAMAGES)
@@ -284,3 +288,43 @@ def test_sizes_that_only_another_unit_gives(channel, words):
     for factor, bad in ((1.0, True), (1e-3 if channel.unit == "V" else 1e-5, False)):
         log = FlightLog({name: Channel(channel.time, factor * channel.values, channel.unit)})
         assert any(words in row.text for row in check([log])[0].rows) == bad
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", list(FORMATS))
+def test_many_damaged_files(name, tmp_path):
+    said = all_of(name, tmp_path, MANY)
+    assert not all(said)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
+def test_cut_at_many_places(name, tmp_path):
+    path = tmp_path / name
+    FORMATS[name](path)
+    whole = path.read_bytes()
+    said = []
+    for end in itertools.chain(range(0, 2000, 37), range(2000, len(whole), 211)):
+        path.write_bytes(whole[:end])
+        said.append(looked_at(path))
+    first = said.index(True)
+    assert all(said[first:])  # what was readable when less was there stays so
+
+
+def test_text_where_numbers_stood(tmp_path):
+    path = tmp_path / "export.csv"
+    export(own(), path)
+    path.write_bytes(path.read_bytes().replace(b"True", b"Tr", 1))
+    with pytest.raises(LogError, match="holds text such as 'Tr'"):
+        read(path)
+
+
+def test_stamps_that_are_text(tmp_path):
+    path = tmp_path / "decoded.csv"
+    rows = lines_of("betaflight_bbl", "LOG00037_start.csv.gz").decode().splitlines()
+    at = [name.split(" ")[0] for name in rows[0].split(",")].index("time")
+    cells = rows[5].split(",")
+    cells[at] = "late"
+    path.write_text("\n".join([*rows[:5], ",".join(cells), *rows[6:]]))
+    with pytest.raises(LogError, match="column 'time'"):
+        read(path)

@@ -1,0 +1,166 @@
+"""A sweep in real processes: killed in the middle of its runs, started again, and through submitit.
+
+Tiny networks.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from visthrow.onboard.policy import Policy
+from visthrow.paper.sweep.sweep_record import collect, status
+from visthrow.paper.sweep.work_units import load_list
+from visthrow.throws import results
+
+LIST = """
+changes = [
+    "ppo.environments=32", "ppo.steps=8", "ppo.hidden=[16,16]", "ppo.iterations=30",
+    "ppo.minibatches=4",
+    "task.bounds.time_limit=0.4",
+]
+most_throws = 2
+checkpoint_every = 2
+
+[runs.tiny]
+configs = ["state"]
+seeds = [1, 2]
+throws = ["own"]
+
+[throws.own]
+plant = "hybrid"
+targets = [2.0]
+count = 2
+"""
+PATIENCE = 300.0
+"""Longest wait for what takes seconds on an idle machine [s]."""
+
+
+@pytest.fixture
+def path(tmp_path):
+    found = tmp_path / "list.toml"
+    found.write_text(LIST)
+    return str(found)
+
+
+def sweep(path, out, *extra):
+    words = [
+        sys.executable,
+        "-m",
+        "visthrow.cli",
+        "sweep",
+        "run",
+        path,
+        "--out",
+        str(out),
+        "--devices",
+        "cpu",
+        "--jobs",
+        "1",
+    ]
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+    }  # the same bits need the same number of threads
+    return subprocess.Popen([*words, *extra], env=environment, start_new_session=True)
+
+
+def wait_for(condition):
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.05)
+
+
+def rows(source, out):
+    path = source.folder(out) / "progress.csv"
+    return path.read_text().count("\n") - 1 if path.is_file() else 0
+
+
+def children(process):
+    listed = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(process.pid)], capture_output=True, text=True
+    )
+    return [int(word) for word in listed.stdout.split()]
+
+
+def same(work, one, two):
+    for source in work.sources:
+        a, b = (Policy.load(source.policy(out)).weights for out in (one, two))
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x.numpy(), y.numpy())
+        assert rows(source, two) == 30
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_path):
+    """A SIGKILL of everything, a SIGKILL of the parent alone, a Ctrl-C; the end equals a run
+    without any of it, bit for bit.
+    """
+    work, whole, broken = load_list(path), tmp_path / "whole", tmp_path / "broken"
+    assert sweep(path, whole).wait(PATIENCE) == 0
+    first, second = work.sources
+
+    running = sweep(path, broken)
+    wait_for(lambda: rows(first, broken) >= 7)
+    for pid in [*children(running), running.pid]:
+        os.kill(pid, signal.SIGKILL)
+    running.wait()
+    assert 6 <= rows(first, broken) < 30
+
+    running = sweep(
+        path, broken
+    )  # its children end by themselves, with a checkpoint, when it is gone
+    wait_for(lambda: rows(first, broken) >= 15)
+    orphans = children(running)
+    running.kill()
+    running.wait()
+    assert orphans
+    assert not status(work, broken)[1]
+    running = sweep(path, broken)  # waits until the orphan has let go
+    wait_for(lambda: rows(second, broken) >= 5)
+    before = first.policy(broken).stat().st_mtime_ns
+    running.send_signal(signal.SIGINT)
+    assert running.wait(PATIENCE) == 130
+    kept = rows(second, broken)
+    assert "running" not in "".join(status(work, broken)[0])
+
+    assert sweep(path, broken).wait(PATIENCE) == 0
+    assert kept >= 5
+    same(work, whole, broken)
+    assert first.policy(broken).stat().st_mtime_ns == before, "what is done is not done again"
+    assert status(work, broken)[1]
+    results_before = {p.name: p.stat().st_mtime_ns for p in (broken / "throws").iterdir()}
+    assert len(results_before) == 2
+    assert sweep(path, broken).wait(PATIENCE) == 0
+    assert {p.name: p.stat().st_mtime_ns for p in (broken / "throws").iterdir()} == results_before
+    training, throws = collect(work, broken, tmp_path / "records")
+    assert len(results.load(throws)) == 2
+    assert training.is_file()
+
+
+@pytest.mark.slow
+def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
+    """The same tasks as jobs of submitit's local executor, in pieces so short that each holds one
+    iteration.
+    """
+    pytest.importorskip("submitit")
+    from visthrow.paper.sweep import pool
+    from visthrow.paper.sweep.cluster import Cluster
+
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    monkeypatch.setattr(pool, "BUSY_PAUSE", 0.1)
+    changes = ("runs.tiny.seeds=[1]", 'runs.tiny.changes=["ppo.iterations=3"]')
+    work, out, said = load_list(path, changes), tmp_path / "jobs", []
+    cluster = Cluster(path, out, "local", 1, 1, minutes=0.001, changes=changes)
+    outcome = pool.ProcessPool(work, out, cluster, said.append).run()
+    assert outcome == pool.Outcome()
+    assert status(work, out)[1]
+    pieces = list((work.sources[0].folder(out) / "pieces").iterdir())
+    assert len(pieces) == 3
+    assert rows(work.sources[0], out) == 3
+    assert sum("begins" in line for line in said) == 3
