@@ -4,6 +4,7 @@ the vehicle did without it.
 In every one the fake watches that no command arrives that is not finite or within limits, and that
 the release comes once at most, from an armed vehicle inside its fence."""
 
+import dataclasses
 import errno
 import math
 import time
@@ -328,3 +329,56 @@ def test_the_disk_is_full(tmp_path, full_at):
     recorder.close(summary)
     assert "No space left on device" in recorder.failed
     assert fake.witness.releases == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [(kind, math.nan) for kind in KINDS]
+    + [pytest.param(kind, math.inf, marks=pytest.mark.slow) for kind in KINDS],
+)
+def test_a_policy_that_puts_out_no_numbers(kind, value):
+    def spoil(now, runner, fake):
+        if now >= START and not spoiled:
+            act = runner.pilot.act
+            runner.pilot.act = lambda *args: dataclasses.replace(
+                act(*args), command=np.full((1, 4), value, np.float32), release=np.array([True])
+            )
+            spoiled.append(now)
+
+    spoiled = []
+    fake, summary, told = run(kind, START + 0.5, watch=spoil)
+    assert "is not finite" in reason(told, "abort")
+    assert when(told, "abort") <= START + 2 * TICK
+    assert (fake.witness.releases, summary["guard"]["refused"]) == (0, 1)
+
+
+@pytest.mark.slow
+def test_the_fence_ends_a_policy_at_its_limits():
+    from visthrow.throws.wire_plant import make
+
+    fake, _, told = run(
+        "ardupilot",
+        4.0,
+        loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)),
+        plant=make("state", 0),
+        overrides=("states.quiet=0.02",),
+    )
+    assert reason(told, "abort").startswith("fence: ")
+    assert when(told, "abort") - when(told, "throw") < 0.6
+    assert fake.witness.releases == 0
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_ctrl_c_in_mid_throw(kind):
+    """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is
+    brought down by the runner.
+    """
+    fake, summary, told = run(kind, START + 0.6, operator=OneWord(abort=START))
+    assert reason(told, "abort") == "the operator said abort"
+    assert when(told, "abort") <= START + 2 * TICK
+    assert summary["aborted"]
+    if kind == "betaflight":
+        assert fake.override
+    else:
+        assert fake.events[-1][1] == ("mode 9" if kind == "ardupilot" else "mode 4.6")
+        assert fake.events[-1][0] <= START + 3 * TICK

@@ -119,24 +119,23 @@ def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, tim
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("times", [0.5, 2.0])
+@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
 def test_another_weight_than_the_configuration_says(kind, times):
     runner, said, sunk = fly(kind, times)
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize(("kind", "share"), list(zip(KINDS, (0.8, 1.2, 0.8, 1.2), strict=True)))
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("share", [0.8, 1.2])
 def test_another_thrust_line(kind, share):
     runner, said, sunk = fly(kind, spoil=bend(share))
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize(
-    ("kind", "axis"),
-    [(kind, axis) for kind in KINDS for axis in range(3) if axis == 2 or kind in KINDS[::3]],
-)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("axis", range(3))
 def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
