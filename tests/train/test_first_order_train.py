@@ -67,10 +67,9 @@ def test_its_policy_is_one_like_any_other(whole):
     trainer.load(whole / CHECKPOINT)
     obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
     with torch.inference_mode():
-        normalized = trainer.algorithm.average.module.obs_normalizer(obs)
-        assert (
-            trainer.algorithm.average.module.mlp(normalized) - policy.act(obs)
-        ).abs().max() < 1e-6
+        normalized = trainer.algorithm.network.obs_normalizer(obs)
+        action = trainer.algorithm.network.mlp(normalized)
+    assert (action - policy.act(obs)).abs().max() < 1e-6
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT])

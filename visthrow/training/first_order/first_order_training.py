@@ -21,7 +21,7 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, backward
 from visthrow.training.first_order.surrogate import Course, FlightBatch, course, fit
-from visthrow.training.ppo.network import Network, averaged, cosine_rate
+from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
 ALTITUDE, GROUND, ABOVE, UPRIGHT = 0.15, 0.1, 0.08, 0.15
@@ -33,7 +33,6 @@ ROUND = 0.02
 """Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
 is noise where throws are good.
 """
-AVERAGED = 100  # gradients that the exported weights are a mean of, at most
 OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
 NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
 
@@ -94,7 +93,6 @@ class FirstOrder:
             last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
-        self.average = averaged(self.network, AVERAGED)
         self.flights, (self.adjoint, adjoint) = (
             FlightBatch(env, self.p.horizon),
             course(self.p.horizon, env.num_envs, device),
@@ -353,7 +351,6 @@ class FirstOrder:
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
-        self.average.update_parameters(self.network)
         self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
         return {name: float(value) for name, value in figures.items()} | {
             "learning_rate": rate,
@@ -362,7 +359,7 @@ class FirstOrder:
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(
-            self.average.module.state_dict(), self.cfg.ppo.activation, contract, made_by
+            self.network.state_dict(), self.cfg.ppo.activation, contract, made_by
         )
 
     def take_up(self, policy: Policy) -> None:
@@ -370,17 +367,15 @@ class FirstOrder:
         starts at that of adaptation.
         """
         self.network.take_up(policy)
-        self.average.module.load_state_dict(self.network.state_dict())
         self._adapting = True
 
     def state_dict(self) -> dict:
-        names = ("network", "average", "optimizer", "env")
-        parts = {name: getattr(self, name).state_dict() for name in names}
+        parts = {name: getattr(self, name).state_dict() for name in ("network", "optimizer", "env")}
         return parts | {"adapting": self._adapting, "surrogate": self.surrogate}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         self._adapting = saved["adapting"]
-        for name in ("network", "average", "optimizer", *["env"] * own_throws):
+        for name in ("network", "optimizer", *["env"] * own_throws):
             getattr(self, name).load_state_dict(saved[name])
         for name, value in saved["surrogate"].items():
             self.surrogate[name].copy_(value)

@@ -178,12 +178,9 @@ class CapturedPPO(PPO):
                 self._descend(actor_input, critic_input, samples)
 
     def _descend(self, actor_input: Tensor, critic_input: Tensor, samples: list[Tensor]) -> None:
-        """One gradient step on a minibatch: the networks' inputs, and the
-        samples.
-        """
-        with (
-            self._on_side_stream()
-        ):  # so are their gradients: one multiplies while the other moves memory
+        """Take one gradient step on a minibatch of the networks' inputs and the samples."""
+        # so are their gradients: one multiplies while the other moves memory
+        with self._on_side_stream():
             value = self.critic.output(critic_input)
         mean = self.actor.output(actor_input)
         self.join()
