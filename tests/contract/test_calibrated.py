@@ -81,3 +81,30 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
 def test_what_cannot_be_calibrated_is_refused(change):
     with pytest.raises(ConfigError, match="calibration in the hover"):
         calibrated_start(experiment(change))
+
+
+def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
+    """Rotor drag, the motors' lag and unsteady thrust are in the sway: taken for the ball's motion
+    they turned the pitch by 0.06 deg.
+    """
+    quiet = (
+        "task.noise.observation_step=0.0",
+        "task.noise.observation_bias=0.0",
+        "camera.noise.step_std=0.0",
+        "camera.noise.bias_std=0.0",
+    )
+    changes = [*quiet, "camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
+    flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), changes))
+    torch.manual_seed(0)
+    with torch.inference_mode():
+        env, found = ThrowEnv(flown, "cpu", 0, 6), []
+        env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
+        calibrated_start(flown, found)(env)
+        turn, scale = (
+            env.view.buffers["extrinsic_rotation"].numpy(),
+            env.view.buffers["scale_error"].flatten().numpy(),
+        )
+    off = np.degrees([one.turn_b for one in found]) - np.degrees(turn)
+    assert np.abs(off.mean(0)).max() < 0.025
+    assert np.abs(off).max() < 0.06
+    assert np.abs(np.array([one.scale for one in found]) - scale).max() < 1.5e-3

@@ -60,3 +60,16 @@ def test_single_effects_are_found_and_named_rightly(floors, found):
         wrong += bool(named - set(truth))
     assert binom.cdf(right, SINGLES, found) > SURE
     assert binom.sf(wrong - 1, SINGLES, 0.02) > SURE
+
+
+def test_pairs_are_found_and_intervals_cover():
+    right, inside = 0, []
+    for truth, model in worlds(PAIRS, 2, 12.0, 3):
+        diagnosis = search.explain(model, laws=False)
+        right += set(diagnosis.named) == set(truth)
+        for name, size in truth.items():
+            f = diagnosis[name]
+            if f.verdict == result.FOUND:
+                inside.append(f.low <= size * f.floor <= f.high)
+    assert binom.cdf(right, PAIRS, 0.9) > SURE
+    assert binom.cdf(sum(inside), len(inside), 0.95) > SURE

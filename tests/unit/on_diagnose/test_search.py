@@ -323,3 +323,29 @@ def test_evidence_is_the_integral():
     assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(
         integral(6.0, -1.0, 9.0), abs=1e-6
     )
+
+
+def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
+    rng = np.random.default_rng(0)
+    few, many = (_threshold(count) for count in (4, 400))
+    assert few < many
+    information, priors, least = _information(40), _priors(40), _threshold(40)
+    best = evidence.additions(
+        information, evidence.null_draws(information, 2000, rng), priors, ()
+    ).max(axis=1)
+    assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
+
+
+def _information(count: int) -> np.ndarray:
+    root = np.random.default_rng(count).normal(size=(count, 3 * count))
+    return root @ root.T / 50.0
+
+
+def _threshold(count: int) -> float:
+    information = _information(count)[None]
+    one = np.zeros((1, count))
+    return evidence.threshold(
+        Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]),
+        _priors(count),
+        np.random.default_rng(1),
+    )

@@ -21,7 +21,7 @@ from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
 from hil.params import HilParams
 from hil.poses.sources.open_source import open_source
-from tests.fuzz import any_message, mutated, noise
+from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from visthrow import config
 
 
@@ -246,3 +246,9 @@ def test_a_message_that_cannot_be_packed_is_not_sent(tmp_path):
     assert not link.send(attitude_target(0.0, (1, 1), None, (0.0, 0.0, 0.0)))
     assert link.dropped == 1
     link.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_million_byte_strings(seed):
+    fuzz(EACH, seed)

@@ -347,3 +347,18 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     assert "all bit for bit the same" in capsys.readouterr().out
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == pytest.approx(1.333, abs=0.01), "down became up"
+
+
+def test_damage_in_a_bin_costs_a_few_messages(tmp_path):
+    path = tmp_path / "a.BIN"
+    files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(50)])
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = b"\x00" * 40
+    path.write_bytes(data[:-20])
+    assert 40 <= len(read_bin(path, VEHICLE)) < 50
+
+
+def test_a_vision_pose_of_negative_quality_is_none(tmp_path):
+    path = tmp_path / "a.BIN"
+    files.write_bin(path, {"VISP": files.VISP}, [vision(0, quality=-1), vision(1, quality=0)])
+    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True]

@@ -8,6 +8,7 @@ import pytest
 from hil.links import msp
 from hil.links.backends.betaflight import Betaflight
 from hil.params import HilParams
+from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe
 from visthrow import config
 
@@ -97,3 +98,9 @@ def fuzz(count: int, seed: int) -> None:
 
 def test_no_bytes_make_the_back_end_raise_or_command():
     fuzz(10_000, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_million_byte_strings(seed):
+    fuzz(EACH, seed)

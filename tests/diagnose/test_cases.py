@@ -1,0 +1,190 @@
+"""Symmetries, degenerate pairs and spoiled logs of sealed worlds; the default run tests what they
+are made of.
+"""
+
+import argparse
+import os
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from bench.diagnose import altered, cases
+from bench.diagnose.bad import BAD
+from bench.diagnose.degenerate import PAIRS
+from bench.worlds.follow import ALONE, follow, table_of
+from bench.worlds.world import Recipe
+from visthrow.diagnose.planning.manoeuvres import catalogue
+from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
+from visthrow.diagnose.throw.recorded_flight import carriers, record_of
+from visthrow.logs.flightlog import FlightLog
+
+SMALL = dict(free=1, free_seconds=1.0, throws=2)
+
+
+@pytest.fixture(scope="module")
+def logs() -> list[FlightLog]:
+    return cases.logs_of(Recipe(11, "rod", {"com_y": 1e-3}, **SMALL))
+
+
+def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
+    """A seed, a size or an unmeasured quantity in the logs would give the answer away."""
+    for log in logs:
+        assert not log.meta
+        assert set(log.channels) == {
+            "pos_w",
+            "quat_wb",
+            "payload_pos_w",
+            "command",
+            "release_command",
+            "battery_voltage",
+        }
+    again = cases.logs_of(Recipe(12, "rod", {"com_y": 1e-3}, **SMALL))
+    assert (
+        np.abs(logs[0]["pos_w"].values - again[0]["pos_w"].values).max() > 1e-3
+    )  # another seed is another flight
+
+
+def test_a_mirror_undoes_itself_and_turns_rotations_around(logs):
+    once = altered.mirrored(logs[1])
+    twice = altered.mirrored(once)
+    for name, channel in logs[1].channels.items():
+        np.testing.assert_allclose(twice[name].values, channel.values)
+    rate = lambda log: np.gradient(2.0 * log["quat_wb"].values[:, :3], log["quat_wb"].time, axis=0)  # noqa: E731
+    level = np.abs(logs[1]["quat_wb"].values[:, 3]) > 0.99
+    np.testing.assert_allclose(
+        rate(once)[level], (rate(logs[1]) * [-1.0, 1.0, -1.0])[level], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        once["command"].values, logs[1]["command"].values * [1.0, -1.0, 1.0, -1.0]
+    )
+    assert altered.mirrored_theta({"com_y": 1.0, "motor_1": 2.0, "com_x": 3.0}) == {
+        "com_y": -1.0,
+        "motor_2": 2.0,
+        "com_x": 3.0,
+    }
+
+
+def test_a_turned_hall_keeps_distances_and_heights(logs):
+    turned = altered.turned(logs[1], 0.5 * np.pi, (2.0, -1.0, 0.0))
+    p, q = (log["pos_w"].values - log["payload_pos_w"].values for log in (logs[1], turned))
+    np.testing.assert_allclose(
+        q, p @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), atol=1e-12
+    )
+    back = altered.turned(turned, -0.5 * np.pi, (1.0, 2.0, 0.0))
+    np.testing.assert_allclose(back["pos_w"].values, logs[1]["pos_w"].values, atol=1e-12)
+    alike = np.abs(np.sum(back["quat_wb"].values * logs[1]["quat_wb"].values, axis=1))
+    np.testing.assert_allclose(alike, np.sum(logs[1]["quat_wb"].values ** 2, axis=1), atol=1e-12)
+
+
+def test_scrambled_logs_keep_their_poses_and_exchange_their_commands(logs):
+    mixed = altered.scrambled(logs)
+    np.testing.assert_array_equal(mixed[1]["pos_w"].values, logs[1]["pos_w"].values)
+    np.testing.assert_array_equal(mixed[1]["command"].values, logs[2]["command"].values)
+    np.testing.assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
+
+
+def test_the_tool_is_asked_apart(tmp_path):
+    """What all sealed worlds, cases and bad logs start."""
+    assert "--plant" in cases.tool(tmp_path, "diagnose", "explain", "--help")
+
+
+def test_a_proposed_manoeuvre_is_flown_on_the_plant():
+    """The pilot follows a reference to a decimetre; without payload its log shows none, and such a
+    flight counts as bare.
+    """
+    known = {m.name: m for m in catalogue()}
+    recipe = Recipe(5, "rod", {})
+    for name in ("vertical sine", "hover without payload"):
+        manoeuvre = known[name]
+        table = table_of(manoeuvre.reference().csv(), manoeuvre.payload)
+        (record,) = follow(recipe, [table], 1)
+        begin = 0.0 if manoeuvre.payload else ALONE
+        reference = manoeuvre.reference()
+        want = np.column_stack(
+            [np.interp(record["time"] - begin, reference.time, c) for c in reference.pos_w.T]
+        )
+        assert np.abs(record["pos"] - want).max() < 0.15, name
+        assert record["time"][-1] - record["time"][0] == pytest.approx(manoeuvre.seconds, abs=0.05)
+        assert np.isfinite(record["ball"]).all() == manoeuvre.payload
+    loaded, bare = (
+        cases.flight_log(r)
+        for r in (follow(recipe, [table_of(known["hover"].reference().csv(), True)], 2)[0], record)
+    )
+    assert carriers([record_of(loaded), record_of(bare)]) == [True, False]
+
+
+def test_added_rates_and_thrust_reach_the_commands():
+    known = {m.name: m for m in catalogue()}
+    tables = [
+        table_of(known[name].reference().csv(), True)
+        for name in ("hover", "rate doublets", "thrust steps")
+    ]
+    quiet, rates, thrust = follow(Recipe(5, "rod", {}), tables, 1)
+    assert np.abs(rates["sent"][:, 1]).max() > np.abs(quiet["sent"][:, 1]).max() + 2.0
+    assert thrust["sent"][:, 0].max() > 1.3 * quiet["sent"][:, 0].max()
+
+
+def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
+    """A frame's tilt that was found and applied must not be found again."""
+    from visthrow.diagnose.inputs import model_arguments as opening
+    from visthrow.diagnose.throw import throw_model
+
+    monkeypatch.setattr(
+        throw_model, "ThrowModel", lambda logs, plant, **options: argparse.Namespace(**options)
+    )
+    args = argparse.Namespace(
+        plant="state", overrides=["sensing.frame_tilt=[0.01, 0.0, 0.0]"], only=None, device="cpu"
+    )
+    assert opening.throw_model(args, [])[0].sensing.frame_tilt == (0.01, 0.0, 0.0)
+
+
+def test_of_hours_of_flight_all_throws_are_looked_at():
+    hover = [Cut(0, "hover", float(i), i + 1.0, ATTACHED) for i in range(7200)]
+    throws = [Cut(1, "throw", float(i), i + 1.0, ATTACHED) for i in range(30)]
+    kept = thinned([*hover, *throws])
+    assert len(kept) == 400
+    assert [c for c in kept if c.flight == 1] == throws
+    assert max(b.start - a.start for a, b in pairwise(kept[:370])) < 25.0
+    assert thinned(throws) == throws
+
+
+def run_cases(kinds: list[str], count: int = 1) -> list[dict]:
+    """Cases of worlds drawn now; the seeds are printed."""
+    first = int.from_bytes(os.urandom(4), "little")
+    print(f"first seed {first}")
+    tasks = [
+        cases.Task(kind, cases.draw(kind, first + 100 * k + i), np.inf)
+        for k, kind in enumerate(kinds)
+        for i in range(count)
+    ]
+    return [cases.run_case(task) for task in tasks]
+
+
+def told(line: dict) -> str:
+    """Why a case failed."""
+    return (
+        f"{line['kind']} {line['recipe']}: {line.get('said')} {line.get('error', '')}"
+        f" {line.get('output', '')}"
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(cases.KINDS))
+def test_symmetries_hold(kind):
+    (line,) = run_cases([kind])
+    assert line["passed"], told(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(PAIRS))
+def test_pairs_are_a_class_and_the_plan_separates_them(kind):
+    (line,) = run_cases([kind])
+    assert line["passed"], f"{told(line)}; done: {line.get('done')}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(BAD))
+def test_bad_logs_get_no_name(kind):
+    (line,) = run_cases([kind])
+    assert line["passed"], told(line)
