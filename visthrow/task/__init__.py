@@ -207,13 +207,14 @@ class PPOParams(Bounded):
     learning_rate: Positive
     schedule: Literal["adaptive", "fixed"]
     desired_kl: float  # at the first iteration
-    final_kl: float  # at the last one; linear between
+    final_kl: float  # once settled; linear between
     discount: Share
     gae_lambda: Share
     clip: Positive
     entropy: NotNegative
     value_coefficient: NotNegative
     max_grad_norm: Positive
+    settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
     products: Literal["float32", "bfloat16"] = (
         "float32"  # of the hidden layers; weights are float32 either way
     )
