@@ -114,7 +114,6 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
     def infer() -> None:
         for _ in range(steps):
             alg.act(observations)
-        alg.join()
 
     found = {}
     for name, function in (("simulation", simulate), ("step", steps_of_env), ("inference", infer)):

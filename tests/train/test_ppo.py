@@ -152,7 +152,7 @@ def test_products_in_bfloat16_follow_those_in_float32():
     for seed in range(3):
         iterate(plain, seed)
         iterate(short, seed)
-    assert {w.dtype for w in [short._spread, *short._layers]} == {torch.float32}
+    assert {w.dtype for w in short._parameters} == {torch.float32}
     off = torch.cat(
         [(a - b).flatten() for a, b in zip(plain.actor.parameters(), short.actor.parameters())]
     ).norm()
@@ -179,16 +179,8 @@ def test_a_state_that_was_saved_goes_on_the_same():
     second.load(copy.deepcopy(first.save()), None, True)
     assert second.learning_rate == first.learning_rate != params().learning_rate
     assert iterate(first, 1) == iterate(second, 1)
-    for a, b in zip(first._layers, second._layers):
+    for a, b in zip(first._parameters, second._parameters):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
-
-
-def test_time_outs_are_refused():
-    alg = build(params(), own=True)
-    with pytest.raises(ValueError, match="time_outs"):
-        alg.process_env_step(
-            observations(), torch.zeros(ENVIRONMENTS), torch.zeros(ENVIRONMENTS), {"time_outs": 1}
-        )
 
 
 def test_the_sample_is_the_gaussians():
@@ -214,9 +206,9 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
     assert captured._graph is not None
     assert launched._graph is None
     for a, b, c in zip(
-        captured._layers,
-        launched._layers,
-        [*theirs.actor.mlp.parameters(), *theirs.critic.parameters()],
+        captured._parameters,
+        launched._parameters,
+        [*theirs.actor.parameters(), *theirs.critic.parameters()],
     ):
         torch.testing.assert_close(a, b, **SAME)
         if products == "float32":

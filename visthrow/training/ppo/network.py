@@ -17,10 +17,6 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
-# columns that an input is filled up to a multiple of on a GPU: tensor cores read rows of 16 bytes
-# or multiples
-ALIGNED = 16
-
 OBSERVED = (
     10**8
     # observations that a policy's normaliser counts for when it is taken up: about those of its
@@ -108,24 +104,17 @@ class Network(MLPModel):
             )
 
     def prepared(self, obs: TensorDict) -> Tensor:
-        """Normalised observations as :meth:`output` takes them at its fastest, on a GPU filled up
-        with columns of zeros.
-        """
+        """Normalised observations as :meth:`output` takes them at its fastest."""
         latent = self.get_latent(obs)
-        latent = F.pad(latent, (0, -latent.shape[-1] % ALIGNED)) if latent.is_cuda else latent
         return latent.to(torch.bfloat16) if self.bfloat16 else latent
 
     def output(self, latent: Tensor) -> Tensor:
-        """Output of the layers for normalised observations, shape (N, D) or filled up with columns
-        of zeros.
-        """
+        """Output of the layers for normalised observations, shape (N, D)."""
         *layers, last = self.mlp
-        x = latent.to(torch.bfloat16) if self.bfloat16 else latent
+        x = latent
         for layer in layers:
             if isinstance(layer, torch.nn.Linear):
-                filled = x.shape[-1] - layer.in_features
-                weight = F.pad(layer.weight, (0, filled)) if filled else layer.weight
-                x = _Layer.apply(x, weight.to(x.dtype), layer.bias.to(x.dtype))
+                x = _Layer.apply(x, layer.weight.to(x.dtype), layer.bias.to(x.dtype))
             else:
                 x = layer(x)
         return last(x.float())
