@@ -1,12 +1,17 @@
 """A team's environment: one goal a world, releases that all agree on, ends that all share."""
 
+import math
+
 import pytest
 import torch
 
+from sim.params import GRAVITY
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.cooperative.team import TeamExperiment, as_flown, members
 from visthrow.cooperative.team_env import TeamEnv
+from visthrow.cooperative.team_training import TeamTraining
+from visthrow.onboard.observations import rotation_from_quat
 
 
 def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
@@ -101,3 +106,77 @@ def test_one_policy_of_both_sees_with_both_and_releases_at_once():
 def test_rows_that_are_no_whole_worlds_are_refused():
     with pytest.raises(ValueError, match="7 rows; expected a multiple of 2"):
         TeamEnv(experiment(), count=7)
+
+
+def least_gaps(env: TeamEnv) -> list[tuple[float, str]]:
+    """Least gap of each world and what it is of, by loops over all pairs in float64."""
+    state = {name: value.double() for name, value in env.views.state.items()}
+    reach, rope = env.cfg.team.rotor_reach, env.cfg.rope
+    radius = rope.payload_radius + env.cfg.vehicle.collision_radius
+    least = []
+    for world in range(env.worlds):
+        rows = range(world * env.team, (world + 1) * env.team)
+        gaps = []
+        for a in rows:
+            pos = state["pos_w"][a]
+            gaps.append(((env.load_w[world].double() - pos).norm().item() - radius, "load"))
+            for b in rows:
+                if a == b:
+                    continue
+                other = state["pos_w"][b]
+                gaps.append(((other - pos).norm().item() - 2.0 * reach, "vehicle"))
+                if not state["attached"][b]:
+                    continue
+                turn = rotation_from_quat(state["quat_wb"][b : b + 1])[0]
+                joint = other + turn @ env._mount.double()
+                for direction in state["cable_dir_w"][:, b]:
+                    joint = joint + direction * env._segment[b].double()
+                    gaps.append(((joint - pos).norm().item() - reach, "cable"))
+        least.append(min(gaps))
+    return least
+
+
+@pytest.mark.parametrize("vehicles", [2, 3])
+def test_the_gap_is_the_least_over_all_pairs(vehicles):
+    torch.manual_seed(vehicles)
+    changes = experiment("pair", f"team.vehicles={vehicles}")
+    env = TeamEnv(changes, seed=3, count=40 * vehicles)
+    state = env.views.state
+    state["pos_w"] += 0.4 * torch.randn_like(state["pos_w"])
+    state["attached"].copy_(torch.rand(env.rows) < 0.6)
+    expected = least_gaps(env)
+    assert {kind for _, kind in expected} == {"load", "vehicle", "cable"}
+    torch.testing.assert_close(env.gap().tolist(), [gap for gap, _ in expected], atol=1e-5, rtol=0)
+
+
+def test_three_vehicles_release_when_all_asked_and_land_after_the_last():
+    env = TeamEnv(as_flown(experiment("pair", "team.vehicles=3"), "late"), seed=3, count=12)
+    assert env.get_observations()["actor"].shape == (12, env.layout.dimension)
+    asked = torch.ones(4, 3)
+    asked[0, 2] = asked[1, 1] = asked[2, 0] = -1.0
+    env.step(hover(env, asked.flatten()))
+    env.step(hover(env, -torch.ones(12)))
+    tripped = env._worlds(env.views.state["release_timer"] >= 0.0)
+    assert tripped.tolist() == [[False] * 3] * 3 + [[True] * 3]
+    released = env.last["released"]
+    for _ in range(9):
+        if released[3]:
+            break
+        env.step(hover(env, -torch.ones(12)))
+        released = env.last["released"]
+    assert released.tolist() == [False, False, False, True]
+    last = {name: value[3].double() for name, value in env.last.items()}
+    assert last["apart"] == pytest.approx(0.03, abs=1e-4)
+    pos, vel, height = last["load_w"], last["load_vel_w"], env.cfg.release.landing_height
+    fall = (vel[2] + (vel[2].square() + 2.0 * GRAVITY * (pos[2] - height)).sqrt()) / GRAVITY
+    torch.testing.assert_close(last["landing_w"][:2], (pos + fall * vel)[:2], atol=1e-4, rtol=0.0)
+
+
+def test_three_vehicles_learn():
+    small = ["team.vehicles=3", "ppo.environments=48", "ppo.epochs=1", "ppo.hidden=[32]"]
+    training = TeamTraining(experiment("pair", *small), "cpu", 3)
+    before = training.policy({}).weights[-1].clone()
+    rows = list(training.run(60.0, iterations=3))
+    assert [row["iteration"] for row in rows] == [1, 2, 3]
+    assert all(math.isfinite(value) for row in rows for value in row.values())
+    assert (training.policy({}).weights[-1] != before).any()
