@@ -14,7 +14,8 @@ from bench.diagnose.sealed import flight_log, named_by
 from bench.worlds.follow import follow, table_of
 from bench.worlds.world import Recipe
 from visthrow.diagnose.inputs.measures import MEASUREMENTS
-from visthrow.diagnose.planning.manoeuvres import catalogue
+from visthrow.diagnose.planning.design import OPTIMISED
+from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
 from visthrow.logs.flightlog import FlightLog
 
 ROUNDS = 3
@@ -23,6 +24,11 @@ MOST_FLIGHTS = 4
 """Of one proposal."""
 CLEAR = 3.0
 """Deviations from which a measurement shows that the configured value is off."""
+
+
+def manoeuvre_of(proposal: str) -> Manoeuvre:
+    """Return the manoeuvre of the tool's catalogue that a proposal flies, optimised or not."""
+    return {m.name: m for m in catalogue()}[proposal.removesuffix(OPTIMISED)]
 
 
 @dataclass(frozen=True)
@@ -40,9 +46,8 @@ class Pair:
 
     def run(self, recipe: Recipe, folder: Path) -> dict:
         """Fly, ask, do as told, ask again."""
-        known = {m.name: m for m in catalogue()}
         tables = [
-            table_of(known[name].reference().csv(), self.payload)
+            table_of(manoeuvre_of(name).reference().csv(), self.payload)
             for name in self.flights
             for _ in range(2)
         ]
@@ -59,9 +64,8 @@ class Pair:
                 done.append((proposal["name"], proposal["repeats"]))
                 effect = next((m for m in MEASUREMENTS if m.name == proposal["name"]), None)
                 if effect is None:
-                    logs += self.flown(
-                        recipe, said, proposal, known[proposal["name"]].payload, len(done)
-                    )
+                    payload = manoeuvre_of(proposal["name"]).payload
+                    logs += self.flown(recipe, said, proposal, payload, len(done))
                     continue
                 error = effect.sd * np.random.default_rng([recipe.seed, len(done)]).normal()
                 value = recipe.effects.get(effect.effect, 0.0) + error

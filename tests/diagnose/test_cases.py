@@ -11,9 +11,10 @@ import pytest
 
 from bench.diagnose import altered, cases
 from bench.diagnose.bad import BAD
-from bench.diagnose.degenerate import PAIRS
+from bench.diagnose.degenerate import PAIRS, manoeuvre_of
 from bench.worlds.follow import ALONE, follow, table_of
 from bench.worlds.world import Recipe
+from visthrow.diagnose.planning.design import START, Limits, designed
 from visthrow.diagnose.planning.manoeuvres import catalogue
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
 from visthrow.diagnose.throw.recorded_flight import carriers, record_of
@@ -112,6 +113,13 @@ def test_a_proposed_manoeuvre_is_flown_on_the_plant():
         for r in (follow(recipe, [table_of(known["hover"].reference().csv(), True)], 2)[0], record)
     )
     assert carriers([record_of(loaded), record_of(bare)]) == [True, False]
+
+
+def test_a_design_is_flown_with_the_load_of_its_manoeuvre():
+    for manoeuvre in catalogue():
+        design = designed(manoeuvre, Limits(), START)
+        assert manoeuvre_of(design.name).payload == manoeuvre.payload, design.name
+        assert manoeuvre_of(manoeuvre.name).name == manoeuvre.name
 
 
 def test_added_rates_and_thrust_reach_the_commands():

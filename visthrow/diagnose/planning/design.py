@@ -39,6 +39,7 @@ ADDED = 0.5, 12.0
 the rate of the reference's rows.
 """
 
+OPTIMISED = ", optimised"  # end of a design's name, behind its manoeuvre's
 FADE = 1.0  # in which sweeps begin and end [s]
 YAW_RATE = 1.5  # of the heading's sweep [rad/s]: within what the hover controller asks for
 ABORTED = 1e3  # cost of a flight that is aborted at the limit: above what any other costs [nats/s]
@@ -204,7 +205,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     return replace(
         base,
-        name=f"{base.name}, optimised",
+        name=base.name + OPTIMISED,
         purpose="the most nats a second within the limits",
         rates=rates,
         path=lambda t: ramped(t) + fitting * swept(t),
