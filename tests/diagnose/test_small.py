@@ -171,6 +171,8 @@ def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_p
                 "--config",
                 str(extended),
                 "--no-report",
+                "--out",
+                str(tmp_path),
                 "--json",
                 str(worth),
                 "--test",
@@ -202,7 +204,8 @@ def test_what_cannot_act_is_refused():
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("payload_speed",) * 3),))
 
 
-def test_an_unknown_of_a_model_without_laws_says_so(capsys):
+def test_an_unknown_of_a_model_without_laws_says_so(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
     tests = (
         Path(__file__).resolve().parents[1]
         / "data"

@@ -27,10 +27,8 @@ def explained(logs, folder, *arguments):
     for i, log in enumerate(logs):
         log.save(folder / f"{i}.npz")
     names = [str(folder / f"{i}.npz") for i in range(len(logs))]
-    status = cli.main(
-        ["diagnose", "explain", *names, *MODEL, "--json", str(folder / "said.json"), *arguments]
-    )
-    return status, json.loads((folder / "said.json").read_text())
+    status = cli.main(["diagnose", "explain", *names, *MODEL, "--out", str(folder), *arguments])
+    return status, json.loads((folder / "diagnosis.json").read_text())
 
 
 def in_millimetres(log: FlightLog) -> FlightLog:
@@ -51,7 +49,7 @@ def test_what_was_explained_is_what_training_draws(flights, tmp_path):
     """From flights to the draws of a training, through the files that users pass on."""
     explained(flights, tmp_path)
     out = tmp_path / "mine.toml"
-    assert cli.main(["diagnose", "apply", str(tmp_path / "said.json"), "--out", str(out)]) == 0
+    assert cli.main(["diagnose", "apply", str(tmp_path / "diagnosis.json"), "--out", str(out)]) == 0
     diagnosed = config.load(Experiment, out).diagnosed
     assert diagnosed.effects == ("com_x",)
     (sd,) = np.sqrt(diagnosed.covariance[0])

@@ -183,6 +183,8 @@ def test_explain_leaves_a_copy_out(tmp_path, capsys):
         "--only",
         "rotor_drag_xy",
         "--no-report",
+        "--out",
+        str(tmp_path),
     ]
     assert cli.main(["diagnose", "explain", *names]) == 0
     out = capsys.readouterr().out

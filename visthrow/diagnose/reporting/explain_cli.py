@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 # not follow them
 REFUSED = 1
 
+DIAGNOSIS = "diagnosis.json"  # in the report's folder; `diagnose apply` reads it
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
@@ -38,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--no-report",
         action="store_true",
-        help="print the verdicts only; no gain, no page, no recording",
+        help="print the verdicts and write diagnosis.json; no gain, no page, no recording",
     )
     parser.add_argument(
         "--no-blind", action="store_true", help="leave the detection limits out of the report"
@@ -51,31 +53,28 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.reporting import diagnosis_report as report
 
-    if not args.no_report:
-        check_place(Path(args.out) / "report.html")
+    folder, made_with = Path(args.out), opening.made_with(args)
+    check_place(folder / DIAGNOSIS)
     opened = opening.Opened(args)
     test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))
     diagnosis = opened.diagnose(say=lambda line: print(line, flush=True))
     gain = None
-    if not args.no_report and diagnosis.work is not None:
+    if args.no_report:
+        write_json(folder / DIAGNOSIS, report.to_json(diagnosis, extra=made_with))
+    elif diagnosis.work is not None:
+        limits = not args.no_blind
         gain = write_report(
-            Path(args.out),
-            diagnosis,
-            opened.model,
-            opened.logs,
-            args.seed,
-            not args.no_blind,
-            opening.made_with(args),
+            folder, diagnosis, opened.model, opened.logs, args.seed, limits, made_with
         )
     print("\n" + report.summary(diagnosis, gain))
     tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
-    if not args.no_report and diagnosis.work is not None:
-        print(f"page, JSON, pictures and recording: {args.out}")
+    if args.no_report:
+        print(f"JSON: {folder / DIAGNOSIS}")
+    elif diagnosis.work is not None:
+        print(f"page, JSON, pictures and recording: {folder}")
     if args.json:
-        write_json(
-            args.json,
-            report.to_json(diagnosis, gain, extra={**opening.made_with(args), "tested": tested}),
-        )
+        extra = {**made_with, "tested": tested}
+        write_json(args.json, report.to_json(diagnosis, gain, extra=extra))
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
@@ -168,6 +167,6 @@ def write_report(
     )
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
-    write_json(folder / "diagnosis.json", whole)
+    write_json(folder / DIAGNOSIS, whole)
     recording.write(folder / "diagnosis.rrd", diagnosis, logs)
     return measured
