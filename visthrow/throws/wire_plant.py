@@ -54,7 +54,7 @@ class HybridWirePlant:
 
     def _fine(self, experiment: Experiment) -> Experiment:
         """Return the experiment with this plant's period, nothing measured late."""
-        observation = replace(experiment.task.observation, latency=(0.0, 0.0))
+        observation = replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
         sim = replace(experiment.sim, control_period=self.period)
         task = replace(experiment.task, observation=observation)
         return replace(experiment, sim=sim, task=task)
