@@ -2,6 +2,7 @@
 
 import torch
 from rsl_rl.algorithms import PPO
+from tensordict import TensorDict
 from torch import Tensor
 
 from sim.torch_bridge import captured
@@ -33,6 +34,12 @@ class CapturedPPO(PPO):
         self._totals = torch.zeros(3, **make)
         self._updates = 0
         self._graph: torch.cuda.CUDAGraph | None = None
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns and advantages in place: graphs go on reading the same memory."""
+        advantages = self.storage.advantages
+        super().compute_returns(obs)
+        self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
         """All epochs over the stored samples; returns mean losses.
