@@ -171,6 +171,17 @@ def test_damage_is_said(name, tmp_path):
         table_of(path)
 
 
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_spoilt_byte_of_a_card_is_noticed_by_its_checksum(version, tmp_path):
+    path = tmp_path / "log00"
+    card(path, version)
+    data = bytearray(path.read_bytes())
+    data[-10] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(LogError, match="its checksum is wrong"):
+        table_of(path)
+
+
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     (tmp_path / "a.h5").write_bytes(b"\x89HDF")

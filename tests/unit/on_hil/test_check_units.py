@@ -29,6 +29,21 @@ def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
     assert "vehicle: 100 % of the poses are refused" in fails[1]
 
 
+def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
+    poses = [
+        Pose(0.01 * i, 0.01 * i, body, (1e-4 * i, 0.0, z), (0.0, 0.0, 0.0, 1.0))
+        for i in range(250)
+        for body, z in (("vehicle", 1.333), ("payload", 0.95))
+    ]
+    monkeypatch.setattr("hil.check.open_source", lambda *args: (RecordedSource(poses), None, True))
+    results = [(True, "parameters were read"), (False, "hover share measured 0.9")]
+    monkeypatch.setattr("hil.check.AutopilotCheck.results", lambda *args: results)
+    settings = [word for setting in OURS for word in ("--set", setting)]
+    assert main(["hil", "check", "--seconds", "2.4", *settings]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[-2:] == ["parameters were read", "FAIL  hover share measured 0.9"]
+
+
 @pytest.mark.parametrize("action", ACTIONS)
 def test_each_action_has_an_example(action, capsys):
     with pytest.raises(SystemExit):

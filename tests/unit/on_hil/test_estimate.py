@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hil.poses.body_track import TRUST, Track
+from hil.poses.body_track import MOST_PREDICTION, TRUST, Track
 from hil.poses.estimate import EstimateParams, SlopeFilter, fit_weights
 from hil.poses.frames import FrameParams
 from hil.poses.gate import GateParams
@@ -151,5 +151,6 @@ def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
     np.testing.assert_allclose(
         state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6
     )
+    assert track.state(now, 0.3) == track.state(now, MOST_PREDICTION), "no pose is carried further"
     assert bare.state(now, ahead).rate == (0.0, 0.0, 0.0)
     assert track.state(now, 0.0).vel == pytest.approx((0.0, 0.0, -10.0 * now))

@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 
 from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
+from hil.control.runner import Runner
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
+from tests.hil_flight import Spy, params, simple_policy
 from visthrow.view import parts
 
 BIN = 0.011
@@ -81,3 +83,39 @@ def test_report_and_picture(tmp_path, monkeypatch):
         STAGES[name] for name in ("poll", "observation", "total")
     ]
     draw(tmp_path / "empty.png", Stages(), "nothing flown")
+
+
+def watched(*overrides: str, late: float) -> Runner:
+    """A runner that has taken poses of a vehicle at 1 m/s along x, ``late`` after they held."""
+    given = ("delay.compensate=true", "delay.source=0.0", *overrides)
+    runner = Runner(params(*given), simple_policy(), Spy())
+    for i in range(40):
+        time = 0.01 * i
+        level = (0.0, 0.0, 0.0, 1.0)
+        runner.estimator.take_poses(
+            [
+                Pose(time, time + late, VEHICLE, (time, 0.0, 1.333), level, measured=time),
+                Pose(time, time + late, PAYLOAD, (time, 0.0, 0.95), level, measured=time),
+            ]
+        )
+    return runner
+
+
+@pytest.mark.parametrize("command", [0.0, 0.02])
+def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(command):
+    """By the time from measurement to arrival of each pose, and the delay of the command."""
+    late = 0.03
+    runner = watched(f"delay.command={command}", late=late)
+    now = 0.39 + late
+    estimate = runner.estimator.estimate(now)
+    trained = runner.parts.trained_age
+    assert estimate.vehicle.pos[0] == pytest.approx(now - trained + command, abs=1e-6)
+    assert estimate.shown_age == pytest.approx(min(late, trained))
+
+
+def test_a_detector_is_told_the_payloads_distance_while_it_hangs():
+    runner = watched(late=0.0)
+    hint = runner.estimator.hint(0.39)
+    assert hint.ball_distance == pytest.approx((0.5 * runner.parts.hang, 1.4 * runner.parts.hang))
+    runner.latch.at = 0.39
+    assert runner.estimator.hint(0.39).ball_distance is None

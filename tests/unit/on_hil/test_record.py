@@ -168,6 +168,7 @@ def test_the_folder_holds_config_policy_and_hash(run_folder):
 CSV = "t,x,y,z,qx,qy,qz,qw,px,py,pz\n" + "".join(
     f"{0.01 * i:.3f},{0.3 * i:.2f},0,1333,0,0,0,1,{0.3 * i:.2f},0,950\n" for i in range(300)
 )
+HOLD = ("--set", "states.check_hold=2.0")
 MAPPING = """
 base = "{base}"
 [source]
@@ -222,6 +223,8 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     out = capsys.readouterr().out
     assert "PASS  all checks" in out
     assert "vehicle: 99 poses/s" in out
+    assert main(["hil", "check", "--config", "mine.toml", "--seconds", "1.2", *HOLD]) == 1
+    assert "FAIL  all was well for the last " in capsys.readouterr().out
     wrong = ["--config", "mine.toml", "--set", "check.heading_deg=90.0"]
     assert main(["hil", "check", *wrong]) == 1
     assert "FAIL  heading" in capsys.readouterr().out
@@ -230,6 +233,17 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     assert len(load_run("looked")[2]) == len(ticks)
     assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 2
     assert "holds a run already" in capsys.readouterr().err
+
+
+def test_a_run_whose_poses_cease_in_flight_is_packed_and_fails(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rows = CSV.splitlines(keepends=True)
+    (tmp_path / "poses.csv").write_text("".join([*rows[:220], rows[-1]]))
+    (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
+    command = ["hil", "run", "--config", "mine.toml", "--set", "observe=false", "--out", "run"]
+    assert main(command) == 1
+    assert "run.zip  the run in one file" in capsys.readouterr().out
+    assert (tmp_path / "run.zip").is_file()
 
 
 def test_a_device_string_that_would_be_executed_is_refused(tmp_path, capsys):

@@ -1,11 +1,21 @@
 """The guard's limits and the fence: each axis, both directions, just inside and just outside."""
 
 import math
+from dataclasses import replace
 
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hil.control.safety import FenceParams, Guard, GuardParams, box_violation, fence_violation
+from hil.control.safety import (
+    FenceParams,
+    Guard,
+    GuardParams,
+    box_violation,
+    failed_checks,
+    fence_violation,
+)
 from hil.poses.body_track import BodyState
+from tests.hil_flight import params
 
 DECELERATION = 12.0  # m/s^2
 FENCE = FenceParams(
@@ -100,3 +110,15 @@ def test_what_is_not_finite_is_refused_and_counted(bad, axis):
     command[axis] = bad
     assert guard.check(tuple(command)) is None
     assert guard.refused == 1
+
+
+@pytest.mark.parametrize(
+    ("wanted_deg", "heading_deg", "good"),
+    [(0.0, 9.0, True), (0.0, 11.0, False), (175.0, -176.0, True), (-175.0, 174.0, False)],
+)
+def test_a_heading_is_compared_across_180_degrees(wanted_deg, heading_deg, good):
+    check = replace(params().check, heading_deg=wanted_deg, heading_tolerance_deg=10.0)
+    quat = tuple(Rotation.from_euler("z", heading_deg, degrees=True).as_quat())
+    vehicle, payload = replace(body(), quat=quat), body((0.0, 0.0, 1.0))
+    failed = failed_checks(check, FENCE, vehicle, payload, (1.0, 0.0, 0.0), MIDDLE, 0.5)
+    assert [text.split()[0] for text in failed] == ([] if good else ["heading"])

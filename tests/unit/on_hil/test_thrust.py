@@ -31,11 +31,21 @@ def test_a_lower_battery_gets_more_share():
     params = HoverThrustParams(2.668, 0.2, 1.0, 0.08, 12.0)
     assert params.share(2.668, 12.0) == pytest.approx(0.2)
     assert params.share(2.668, 10.8) == pytest.approx(0.2 / 0.81)
+    assert params.thrust(0.2 / 0.81, 10.8) == pytest.approx(2.668)
     assert params.share(2.668, None) == pytest.approx(0.2), "unknown: not corrected"
     assert params.share(2.668, 0.0) == pytest.approx(0.2 * 1.25**2), (
         "a wrong reading does not run away"
     )
     assert BENT.share(2.668, 5.0) == pytest.approx(0.37), "not corrected where the config says so"
+
+
+def test_a_share_above_the_calibrations_is_said_as_a_surplus():
+    meter = HoverMeter(dataclasses.replace(BENT, tolerance=0.1))
+    for _ in range(LEAST_SHARES):
+        meter.add(1.095 * 0.37)
+    good, text = meter.summary_text(2.668 / GRAVITY)
+    assert good
+    assert "(+9.5 %" in text
 
 
 @pytest.mark.parametrize(

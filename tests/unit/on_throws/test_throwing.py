@@ -10,19 +10,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from scipy.integrate import solve_ivp
 
+from sim.params import GRAVITY
 from visthrow import config
 from visthrow.cli import compare, demo, main
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment, contract_of
+from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
+from visthrow.throws.plants import flown as flown_payload
 from visthrow.throws.recorded import fly
 from visthrow.view.tables import csv_text, markdown
 
@@ -116,6 +119,47 @@ def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
     assert now.attached.tolist() == [False, True]
 
 
+MEASURED_VECTORS = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
+
+
+def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
+    """A vehicle that is told not to turn turns as fast as its bias says."""
+    experiment = config.load(Experiment, config.find("train", "state"))
+    quiet = dataclasses.replace(experiment.task.noise, command_bias=0.0, command_step=0.0)
+    weight = GRAVITY * plant_of(experiment).total_mass
+    still = dataclasses.replace(experiment.task.start, rate_deg=(0.0, 0.0, 0.0))
+    spreads = []
+    for bias in (0.0, 0.03):
+        noise = dataclasses.replace(quiet, command_bias=bias)
+        plant = HybridPlant(experiment, 400, noise=noise, start=still)
+        for _ in range(15):
+            plant.step(np.tile([weight, 0.0, 0.0, 0.0], (400, 1)))
+        spreads.append(plant.state.rate_b[:, 2].std() / experiment.task.action.max_rate[2])
+    assert spreads[0] < 0.005
+    assert spreads[1] == pytest.approx(0.03, rel=0.15)
+
+
+def test_a_payload_flies_under_drag_side_force_lift_and_wind():
+    """Against scipy's integrator: drag against the air, side force to its left, lift up."""
+    plant = plant_of(config.load(Experiment, config.find("train", "state")))
+    mass = plant.rope.payload_mass
+    rope = dataclasses.replace(plant.rope, payload_drag=0.05, payload_side=0.02, payload_lift=0.03)
+    wind = np.array([1.0, -2.0, 0.5])
+    pos, vel, time = np.array([0.0, 0.0, 2.0]), np.array([3.0, 1.0, 2.0]), 0.7
+
+    def derivative(_, state):
+        air = state[3:] - wind
+        left = np.array([-air[1], air[0], 0.0])
+        upward = np.cross(air, left / np.linalg.norm(left))
+        force = np.linalg.norm(air) * (0.02 * left + 0.03 * upward - 0.05 * air)
+        return [*state[3:], *(force / mass - [0.0, 0.0, GRAVITY])]
+
+    wanted = solve_ivp(derivative, (0.0, time), [*pos, *vel], rtol=1e-9, atol=1e-9).y[:, -1]
+    air = dataclasses.replace(plant.air, wind_w=tuple(wind))
+    place, speed = flown_payload(rope, air, pos[None], vel[None], np.array([time]))
+    np.testing.assert_allclose(np.hstack([place[0], speed[0]]), wanted, atol=1e-5)
+
+
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = make_plant("hybrid", experiment, 400)
@@ -123,9 +167,11 @@ def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
         plant.state,
         plant.measured(),
     )  # right after a reset nothing has moved yet, so nothing is late
-    for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
+    for name in MEASURED_VECTORS:
         spread = (getattr(seen, name) - getattr(truth, name)).std()
         assert spread == pytest.approx(experiment.task.noise.observation_step, rel=0.1)
+    errors = [(getattr(seen, name) - getattr(truth, name)).ravel() for name in MEASURED_VECTORS]
+    np.testing.assert_allclose(np.corrcoef(errors), np.eye(4), atol=0.15)
     np.testing.assert_allclose(np.linalg.norm(seen.quat_wb, axis=1), 1.0)
     angle = 2.0 * np.linalg.norm(seen.quat_wb[:, :3], axis=1)
     assert angle.mean() == pytest.approx(
@@ -142,7 +188,7 @@ def test_measurements_of_the_hybrid_plant_are_late():
         before = plant.state
         plant.step(np.tile([8.0, 2.0, 0.0, 0.0], (2, 1)))
     now, seen = plant.state, plant.measured()
-    for name in ("pos_w", "vel_w", "rate_b", "payload_pos_w"):
+    for name in MEASURED_VECTORS:
         middle = 0.5 * (getattr(before, name) + getattr(now, name))
         np.testing.assert_allclose(getattr(seen, name), middle, atol=1e-12)
     np.testing.assert_array_equal(
@@ -160,6 +206,7 @@ def test_a_flight_goes_from_hover_to_hover(flown):
         np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1]))
     )
     fall = np.sqrt(2 * (flown["separation"].values[0, 2] - 0.04) / 9.81)
+    assert result["duration"] == pytest.approx(times["landing"] - times["policy_start"])
     assert times["landing"] - times["separation"] == pytest.approx(fall, abs=0.05), (
         "it is dropped, nearly at rest"
     )
@@ -412,3 +459,12 @@ def test_a_policy_without_its_config_asks_for_one(tmp_path):
 def test_targets_must_differ_from_each_other():
     with pytest.raises(ConfigError):
         compare.check([2.0, 2.0], 10)
+
+
+def test_throws_are_within_an_error_only_where_nearly_all_land():
+    error = np.full(100, 0.1)
+    for failures, within in ((5, True), (6, False)):
+        success = np.arange(100) >= failures
+        throws = Throws(1.5, success, np.zeros((100, 2)), error, error, error, error)
+        assert throws.within(0.11) is within
+        assert not throws.within(0.09)
