@@ -5,9 +5,11 @@ Imports neither torch nor cv2.
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+
+from camera.bounds import Bound, Bounded, Length, NotNegative, Positive, Share
 
 SEEN_AT_LEAST = math.radians(1.0)
 """Angle off the axis that any lens must image [rad]."""
@@ -23,7 +25,7 @@ def monotonic_limit(coefficients: tuple[float, ...]) -> float:
 
 
 @dataclass(frozen=True)
-class FisheyeParams:
+class FisheyeParams(Bounded):
     """Intrinsics of a Kannala-Brandt fisheye camera.
 
     ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3
@@ -35,17 +37,19 @@ class FisheyeParams:
     Source: Kannala and Brandt, "A generic camera model and calibration method", TPAMI 28(8), 2006,
     eq. 6."""
 
-    width: int  # [px]
-    height: int  # [px]
-    fx: float  # [px/rad]
-    fy: float  # [px/rad]
+    width: Annotated[int, Bound(1)]  # [px]
+    height: Annotated[int, Bound(1)]  # [px]
+    fx: Positive  # [px/rad]
+    fy: Positive  # [px/rad]
     cx: float  # [px]
     cy: float  # [px]
     k1: float = 0.0  # [rad^-2]
     k2: float = 0.0  # [rad^-4]
     k3: float = 0.0  # [rad^-6]
     k4: float = 0.0  # [rad^-8]
-    fov_deg: float = 220.0  # full field of view, twice the largest angle off the axis [deg]
+    fov_deg: Annotated[float, Bound(0.0, 360.0, "(]")] = (
+        220.0  # full field of view, twice the largest angle off the axis [deg]
+    )
 
     @property
     def coefficients(self) -> tuple[float, float, float, float]:
@@ -58,21 +62,7 @@ class FisheyeParams:
         return math.radians(self.fov_deg) / 2.0
 
     def __post_init__(self) -> None:
-        for name in ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4", "fov_deg"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(
-                    f"fisheye {name} is {getattr(self, name)}; expected a finite number"
-                )
-        for name in ("width", "height", "fx", "fy"):
-            if getattr(self, name) <= 0:
-                raise ValueError(
-                    f"fisheye {name} is {getattr(self, name)}; expected a number above 0"
-                )
-        if not 0.0 < self.fov_deg <= 360.0:
-            raise ValueError(
-                f"fisheye fov_deg is {self.fov_deg}; expected a full angle above 0 and up to"
-                " 360 deg"
-            )
+        super().__post_init__()
         t2 = SEEN_AT_LEAST**2
         slope = SEEN_AT_LEAST * (
             1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients))
@@ -93,7 +83,7 @@ class FisheyeParams:
 
 
 @dataclass(frozen=True)
-class MountParams:
+class MountParams(Bounded):
     """The camera's place on the body and its rotation.
 
     Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the
@@ -111,12 +101,12 @@ class MountParams:
         0.0,
         0.0,
     )  # roll, pitch, yaw from the downward pose [deg], about body axes
-    rotation_error_std: float = 0.0  # per episode and axis, unknown to the policy [rad]
-    position_error_std: float = 0.0  # per episode and axis, unknown to the policy [m]
+    rotation_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [rad]
+    position_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [m]
 
 
 @dataclass(frozen=True)
-class KeypointNoiseParams:
+class KeypointNoiseParams(Bounded):
     """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field
     of view).
 
@@ -128,17 +118,17 @@ class KeypointNoiseParams:
     dropped-out point reads zero in both: nothing was measured. A wrong point reads a place anywhere
     in the image, and as valid."""
 
-    step_std: float = 0.01  # Gaussian per step, keypoint and axis [-]
-    bias_std: float = 0.001  # Gaussian per episode, keypoint and axis [-]
-    drop_probability: float = 0.0  # per step and keypoint that it reads as invalid [-]
-    latency: float = (
+    step_std: NotNegative = 0.01  # Gaussian per step, keypoint and axis [-]
+    bias_std: NotNegative = 0.001  # Gaussian per episode, keypoint and axis [-]
+    drop_probability: Share = 0.0  # per step and keypoint that it reads as invalid [-]
+    latency: NotNegative = (
         0.0  # age of the keypoints that the policy sees, fractions interpolated [policy steps]
     )
-    wrong_probability: float = 0.0  # per step and keypoint that something else is taken for it [-]
-    held_probability: float = 0.0  # per step that the last image's keypoints come again [-]
-    scale_std: float = 0.0  # Gaussian per episode: relative error of the focal length [-]
+    wrong_probability: Share = 0.0  # per step and keypoint that something else is taken for it [-]
+    held_probability: Share = 0.0  # per step that the last image's keypoints come again [-]
+    scale_std: NotNegative = 0.0  # Gaussian per episode: relative error of the focal length [-]
     # of the image beyond which nothing is seen: a narrower lens, read by its own calibration [-]
-    seen_radius: float = 1.0
+    seen_radius: Annotated[float, Bound(0.0, 1.0, "(]")] = 1.0
     invalid_reads: Literal["edge", "zero"] = "edge"
 
     @property
@@ -147,22 +137,7 @@ class KeypointNoiseParams:
         return int(-(-self.latency // 1)) + 1
 
     def __post_init__(self) -> None:
-        for name in ("step_std", "bias_std", "latency", "scale_std"):
-            if not getattr(self, name) >= 0.0:
-                raise ValueError(
-                    f"keypoint noise {name} is {getattr(self, name)}; expected a number of at"
-                    " least 0"
-                )
-        for name in ("drop_probability", "wrong_probability", "held_probability"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(
-                    f"keypoint noise {name} is {getattr(self, name)}; expected a number in [0, 1]"
-                )
-        if not 0.0 < self.seen_radius <= 1.0:
-            raise ValueError(
-                f"keypoint noise seen_radius is {self.seen_radius}; expected a number above 0 and"
-                " up to 1"
-            )
+        super().__post_init__()
         if self.invalid_reads not in ("edge", "zero"):
             raise ValueError(
                 f"keypoint noise invalid_reads is {self.invalid_reads!r}; expected one of 'edge',"
@@ -171,18 +146,11 @@ class KeypointNoiseParams:
 
 
 @dataclass(frozen=True)
-class CameraParams:
+class CameraParams(Bounded):
     """The whole camera as a policy is trained on it; an exported policy carries these values."""
 
     fisheye: FisheyeParams
     mount: MountParams
     noise: KeypointNoiseParams
-    goal_side: float  # side of the ground square around the target whose corners are seen [m]
-    payload_radius: float  # radius of the ball whose bounding box is seen [m]
-
-    def __post_init__(self) -> None:
-        for name in ("goal_side", "payload_radius"):
-            if not getattr(self, name) > 0.0:
-                raise ValueError(
-                    f"camera {name} is {getattr(self, name)}; expected a length above 0 m"
-                )
+    goal_side: Length  # side of the ground square around the target whose corners are seen [m]
+    payload_radius: Length  # radius of the ball whose bounding box is seen [m]

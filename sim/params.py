@@ -7,71 +7,67 @@ value below is documented as ``[unit]``; vectors are in the body frame (x forwar
 with the origin at the vehicle's centre of mass unless said otherwise."""
 
 import math
-import sys
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
+
+from camera.bounds import (
+    Arm,
+    Bounded,
+    Duration,
+    Lag,
+    Length,
+    Mass,
+    NotNegative,
+    Positive,
+    Share,
+)
 
 GRAVITY = 9.81
 """Standard acceleration of free fall used by every plant of the project [m/s^2]."""
 
-
-def require(
-    owner: str, instance: Any, *, positive: str = "", not_negative: str = "", finite: str = ""
-) -> None:
-    """Raise ValueError for the first of an owner's fields, by their names, that is not so; of a
-    tuple every number counts, None passes.
-    """
-    kinds = (
-        (positive, "above 0", math.ulp(0.0)),
-        (not_negative, "0 or more", 0.0),
-        (finite, "a finite value", -sys.float_info.max),
-    )
-    for names, expected, lowest in kinds:
-        for name in names.split():
-            value = getattr(instance, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not lowest <= number < math.inf:  # true for NaN
-                    raise ValueError(f"{owner}.{name} is {number}; expected {expected}")
+LEAST_GYRATION = 0.01  # radius of gyration of a vehicle over the reach of its rotors [-]
 
 
 @dataclass(frozen=True)
-class BodyParams:
+class BodyParams(Bounded):
     """Rigid body of the vehicle, rotors included.
 
     ``m v' = R F_b + m g``, ``J w' = tau_b - w x J w``.
     """
 
-    mass: float  # [kg]
-    inertia: tuple[float, float, float]  # principal moments about the centre of mass [kg m^2]
+    mass: Mass  # [kg]
+    inertia: tuple[
+        Positive, Positive, Positive
+    ]  # principal moments about the centre of mass [kg m^2]
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)  # see VehicleParams [m]
 
 
 @dataclass(frozen=True)
-class RotorParams:
+class RotorParams(Bounded):
     """Geometry of the four rotors.
 
     Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen
     from above, so that its drag torque on the body points along +z."""
 
-    x: tuple[float, float, float, float]  # [m]
-    y: tuple[float, float, float, float]  # [m]
-    z: float  # height of the rotor plane above the centre of mass [m]
+    x: tuple[Arm, Arm, Arm, Arm]  # [m]
+    y: tuple[Arm, Arm, Arm, Arm]  # [m]
+    z: Arm  # height of the rotor plane above the centre of mass [m]
     spin: tuple[float, float, float, float]  # s_i, +1 or -1
-    radius: float  # propeller radius [m]
-    inertia: float  # J_r of one propeller and bell about its shaft [kg m^2]
+    radius: Length  # propeller radius [m]
+    inertia: NotNegative  # J_r of one propeller and bell about its shaft [kg m^2]
 
 
 @dataclass(frozen=True)
-class QueueParams:
+class QueueParams(Bounded):
     """Command queue: the command given at t acts from t + delay on, held until the next one
     (zero-order hold).
     """
 
-    delay: float  # tau_d, transmission and actuation [s]
+    delay: Lag  # tau_d, transmission and actuation [s]
 
 
 @dataclass(frozen=True)
-class ControllerParams:
+class ControllerParams(Bounded):
     """Body-rate controller.
 
     ``betaflight``: with the delayed command (c, w_cmd), measured rate w, filtered set-point r,
@@ -113,27 +109,27 @@ class ControllerParams:
     k_f)``."""
 
     kind: Literal["betaflight", "motor_mixing", "geometric"]
-    p_gain: tuple[float, float, float]  # [N m s/rad]
-    i_gain: tuple[float, float, float]  # [N m/rad]
-    d_gain: tuple[float, float, float]  # [N m s^2/rad]
-    feedforward_gain: tuple[float, float, float]  # [N m s^2/rad]
-    integral_limit: tuple[float, float, float]  # [N m]
-    setpoint_time_constant: float  # [s]
-    gyro_time_constant: float  # [s]
-    min_thrust: float  # f_min a motor, idle [N]
-    max_thrust: float  # f_max a motor at u_ref [N]
+    p_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s/rad]
+    i_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m/rad]
+    d_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s^2/rad]
+    feedforward_gain: tuple[NotNegative, NotNegative, NotNegative]  # [N m s^2/rad]
+    integral_limit: tuple[NotNegative, NotNegative, NotNegative]  # [N m]
+    setpoint_time_constant: Duration  # [s]
+    gyro_time_constant: Duration  # [s]
+    min_thrust: NotNegative  # f_min a motor, idle [N]
+    max_thrust: Positive  # f_max a motor at u_ref [N]
     voltage_compensation: float  # 0: none, 1: full [-]
-    geometric_gain: float  # [1/s]
-    mix_thrust: float = (
+    geometric_gain: NotNegative  # [1/s]
+    mix_thrust: Positive = (
         0.667  # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
     )
-    calibration_voltage: float = (
+    calibration_voltage: Positive = (
         15.2  # at which a command of ``motor_mixing`` gives the thrust that it names [V]
     )
-    relax_threshold: float = (
+    relax_threshold: Positive = (
         0.698  # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
     )
-    gyro_share: tuple[float, float, float] = (
+    gyro_share: tuple[NotNegative, NotNegative, NotNegative] = (
         1.0,
         1.0,
         1.0,
@@ -141,7 +137,7 @@ class ControllerParams:
 
 
 @dataclass(frozen=True)
-class MotorParams:
+class MotorParams(Bounded):
     """Motor speed:
 
     ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*``
@@ -151,12 +147,12 @@ class MotorParams:
     speed."""
 
     kind: Literal["first_order", "instant", "asymmetric"]
-    time_constant: float  # [s]
-    time_constant_down: float = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
+    time_constant: Duration  # [s]
+    time_constant_down: Lag = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
 
 
 @dataclass(frozen=True)
-class BatteryParams:
+class BatteryParams(Bounded):
     """Battery of one pack.
 
     State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i /
@@ -166,38 +162,38 @@ class BatteryParams:
     u_ref, q = 0 always."""
 
     kind: Literal["sag", "ideal"]
-    capacity: float  # [A h]
+    capacity: Positive  # [A h]
     ocv: tuple[float, float, float, float]  # polynomial in the used fraction [V]
-    resistance: float  # [Ohm]
-    time_constant: float  # of the load-dependent sag [s]
-    idle_power: float  # P_0, electronics [W]
-    efficiency: float  # motor and speed controller [-]
-    reference_voltage: float  # u_ref: voltage at which the thrust map was taken [V]
+    resistance: NotNegative  # [Ohm]
+    time_constant: Positive  # of the load-dependent sag [s]
+    idle_power: NotNegative  # P_0, electronics [W]
+    efficiency: Positive  # motor and speed controller [-]
+    reference_voltage: Positive  # u_ref: voltage at which the thrust map was taken [V]
 
 
 @dataclass(frozen=True)
-class ThrustParams:
+class ThrustParams(Bounded):
     """Thrust and torque of rotor i from its speed and the battery voltage.
 
     ``f_i = gain_i (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``,
     ``tau_i = torque_ratio torque_gain f_i``. The controller knows of neither gain.
     """
 
-    k_f: float  # thrust coefficient [N s^2/rad^2]
+    k_f: Positive  # thrust coefficient [N s^2/rad^2]
     k_1: float  # linear term [N s/rad]
     voltage_coefficient: float  # [1/V]
-    torque_ratio: float  # kappa [m]
-    gain: tuple[float, float, float, float] = (
+    torque_ratio: NotNegative  # kappa [m]
+    gain: tuple[Positive, Positive, Positive, Positive] = (
         1.0,
         1.0,
         1.0,
         1.0,
     )  # of each rotor against the controller's map [-]
-    torque_gain: float = 1.0  # of the drag torque likewise [-]
+    torque_gain: Positive = 1.0  # of the drag torque likewise [-]
 
 
 @dataclass(frozen=True)
-class AeroParams:
+class AeroParams(Bounded):
     """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and
     the rate w.
 
@@ -224,7 +220,7 @@ class AeroParams:
 
 
 @dataclass(frozen=True)
-class VehicleParams:
+class VehicleParams(Bounded):
     """A quadrotor: the seven blocks of Table I of the paper and the rigid body.
 
     The composer adds them up: ``F_b = (0, 0, sum f_i) + dF``,
@@ -245,31 +241,30 @@ class VehicleParams:
     battery: BatteryParams
     thrust: ThrustParams
     aero: AeroParams
-    collision_radius: float  # sphere about the centre of mass that the payload must not enter [m]
+    collision_radius: (
+        NotNegative  # sphere about the centre of mass that the payload must not enter [m]
+    )
 
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
-        body = self.body
-        rotors = self.rotors
-        c = self.controller
-        cell = self.battery
-        require("vehicle.body", body, positive="mass inertia")
-        require(
-            "vehicle.thrust",
-            self.thrust,
-            positive="k_f gain torque_gain",
-            not_negative="torque_ratio",
-        )
-        asymmetric = self.motor.kind == "asymmetric"
-        require(
-            "vehicle.motor",
-            self.motor,
-            positive="time_constant time_constant_down" if asymmetric else "time_constant",
-        )
-        above = "setpoint_time_constant gyro_time_constant max_thrust"
-        require("vehicle.controller", c, positive=above, not_negative="min_thrust")
-        above = "capacity time_constant efficiency reference_voltage"
-        require("vehicle.battery", cell, positive=above, not_negative="resistance idle_power")
+        super().__post_init__()
+        c, rotors = self.controller, self.rotors
+        if self.motor.kind == "asymmetric" and not self.motor.time_constant_down:
+            raise ValueError("motor.time_constant_down is 0.0; expected above 0")
+        if 4.0 * c.max_thrust <= self.body.mass * GRAVITY:
+            raise ValueError(
+                f"controller.max_thrust is {c.max_thrust:g} N a motor; expected more than a quarter"
+                f" of the vehicle's weight, {self.body.mass * GRAVITY / 4.0:.3g} N"
+            )
+        reach = max(map(math.hypot, rotors.x, rotors.y)) + rotors.radius
+        for inertia in self.body.inertia:
+            gyration = math.sqrt(inertia / self.body.mass)
+            if not LEAST_GYRATION * reach <= gyration <= reach:
+                raise ValueError(
+                    f"body.inertia {inertia:g} kg m^2 puts {self.body.mass:g} kg {gyration:.3g} m"
+                    f" from its middle; expected {LEAST_GYRATION * reach:.3g} m to"
+                    f" {reach:.3g} m, where the rotors end"
+                )
         if not c.min_thrust < c.max_thrust:
             raise ValueError(
                 f"vehicle.controller.min_thrust is {c.min_thrust} N; expected less than max_thrust"
@@ -283,7 +278,7 @@ class VehicleParams:
 
 
 @dataclass(frozen=True)
-class RopeParams:
+class RopeParams(Bounded):
     """Rope of rigid slender segments on universal joints, and the payload rigidly on the last one.
 
     Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass
@@ -304,40 +299,39 @@ class RopeParams:
     bounce of the payload on the rope (20 Hz at 1 mm/N), whose own inertia is left out."""
 
     segments: int  # L, 1 to 64
-    length: float  # of the rope, without the payload [m]
-    rope_mass: float  # [kg]
-    payload_mass: float  # [kg]
-    payload_inertia: float  # transverse, about the payload's centre [kg m^2]
-    payload_offset: float  # [m]
-    payload_radius: float  # of the ball, for drawing, keypoints and collisions [m]
-    joint_damping: float  # [N m s]
+    length: Length  # of the rope, without the payload [m]
+    rope_mass: Mass  # [kg]
+    payload_mass: Mass  # [kg]
+    payload_inertia: NotNegative  # transverse, about the payload's centre [kg m^2]
+    payload_offset: NotNegative  # [m]
+    payload_radius: NotNegative  # of the ball, for drawing, keypoints and collisions [m]
+    joint_damping: NotNegative  # [N m s]
     mount: tuple[float, float, float]  # rope attachment in the body frame [m]
-    payload_drag: float = 0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
-    mount_damping: float = 0.0  # of the uppermost joint, besides joint_damping [N m s]
-    swing_damping: float = 0.0  # [N s/m]
-    downwash: float = 0.0  # [-]
+    payload_drag: NotNegative = (
+        0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
+    )
+    mount_damping: NotNegative = 0.0  # of the uppermost joint, besides joint_damping [N m s]
+    swing_damping: NotNegative = 0.0  # [N s/m]
+    downwash: NotNegative = 0.0  # [-]
     payload_side: float = 0.0  # 1/2 rho C_L A across the path, in flight [kg/m]
     payload_lift: float = 0.0  # the same upwards in the path's vertical plane [kg/m]
-    compliance: float = 0.0  # lengthening for every newton of pull [m/N]
+    compliance: NotNegative = 0.0  # lengthening for every newton of pull [m/N]
     # of a box that swings about its upper face, homogeneous [m]; 0: a ball, rigid on the rope
-    payload_sides: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    payload_sides: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
     # of two cables without mass, along body x, that hold the box in the rope's place [m]; 0: a rope
-    cables_apart: float = 0.0
-    gripper_mass: float = 0.0  # at the rope's lower end, which holds the payload [kg]
+    cables_apart: NotNegative = 0.0
+    gripper_mass: NotNegative = 0.0  # at the rope's lower end, which holds the payload [kg]
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if not 1 <= self.segments <= 64:
             raise ValueError(f"rope of {self.segments} segments; expected 1 to 64")
-        require(
-            "rope",
-            self,
-            positive="length rope_mass payload_mass",
-            finite="payload_side payload_lift",
-            not_negative=(
-                "payload_inertia payload_offset joint_damping payload_drag mount_damping"
-                " swing_damping downwash compliance payload_sides cables_apart gripper_mass"
-            ),
-        )
+        most = self.payload_mass * self.length**2
+        if self.payload_inertia > most:
+            raise ValueError(
+                f"rope.payload_inertia is {self.payload_inertia:g} kg m^2; expected at most"
+                f" payload_mass times length squared, {most:.3g} kg m^2"
+            )
         box = any(self.payload_sides)
         if box and abs(self.payload_sides[2] - 2.0 * self.payload_offset) > 1e-9:
             raise ValueError(
@@ -378,7 +372,7 @@ class RopeParams:
 
 
 @dataclass(frozen=True)
-class AirParams:
+class AirParams(Bounded):
     """The air that vehicle and payload move in:
 
     ``v_air = v - wind_w``, in the place of v in every force of the air.
@@ -390,12 +384,9 @@ class AirParams:
     wind_w: tuple[float, float, float] = (0.0, 0.0, 0.0)  # constant wind, world frame [m/s]
     ground_effect: float = 0.0  # [-]
 
-    def __post_init__(self) -> None:
-        require("air", self, finite="wind_w ground_effect")
-
 
 @dataclass(frozen=True)
-class ReleaseParams:
+class ReleaseParams(Bounded):
     """Release mechanism and the flight that follows.
 
     The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload
@@ -409,10 +400,10 @@ class ReleaseParams:
     loose rope itself."""
 
     threshold: float  # [-]
-    lag: float  # [s]
+    lag: Lag  # [s]
     landing_height: float  # z of the payload's centre at impact [m]
     clearance_samples: int  # K points of the flight at which the distance to the vehicle is taken
-    clearance_margin: float  # d_m [m]
+    clearance_margin: NotNegative  # d_m [m]
     # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
     lag_tension: float = 0.0
     kick_w: tuple[float, float, float] = (
@@ -421,14 +412,10 @@ class ReleaseParams:
         0.0,
     )  # speed that the mechanism gives the payload, world frame [m/s]
     kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
-    rope_tail: float = 0.0  # share of the rope that leaves with the payload [-]
+    rope_tail: Share = 0.0  # share of the rope that leaves with the payload [-]
 
     def __post_init__(self) -> None:
-        require(
-            "release", self, not_negative="lag rope_tail", finite="lag_tension kick_w kick_along"
-        )
-        if self.rope_tail > 1.0:
-            raise ValueError(f"release.rope_tail is {self.rope_tail}; expected a share from 0 to 1")
+        super().__post_init__()
         if self.clearance_samples < 2:
             raise ValueError(
                 f"release.clearance_samples is {self.clearance_samples}; expected 2 or more"
@@ -436,23 +423,22 @@ class ReleaseParams:
 
 
 @dataclass(frozen=True)
-class SimParams:
+class SimParams(Bounded):
     """Numerics of the batched simulator."""
 
-    control_period: float  # of the policy [s]
-    substep: float  # largest integration step [s]
-    gamma: float  # of the ROS2 W-method [-]
-    max_turn: float  # a segment that turns more in one substep falls back to the first stage [rad]
+    control_period: Duration  # of the policy [s]
+    substep: Duration  # largest integration step [s]
+    gamma: Positive  # of the ROS2 W-method [-]
+    max_turn: (
+        Positive  # a segment that turns more in one substep falls back to the first stage [rad]
+    )
     precision: Literal["float32", "float64"] = "float32"
     # engine of the bodies: the fused kernel, or one of sim.solvers.SOLVERS
     solver: Literal["chain", "exchanged_chain", "physx", "mujoco_warp"] = "chain"
 
-    def __post_init__(self) -> None:
-        require("sim", self, positive="control_period substep gamma max_turn")
-
 
 @dataclass(frozen=True)
-class LawParams:
+class LawParams(Bounded):
     """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the
     names of :mod:`sim.kernels.laws`.
 
@@ -490,7 +476,7 @@ class PlantParams:
 
 
 @dataclass(frozen=True)
-class SensingParams:
+class SensingParams(Bounded):
     """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
 
     With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of
@@ -524,7 +510,7 @@ class SensingParams:
 
 
 @dataclass(frozen=True)
-class RandomizationParams:
+class RandomizationParams(Bounded):
     """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
 
     The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the
@@ -532,22 +518,22 @@ class RandomizationParams:
     on top of the body's."""
 
     spawn_height: float  # of the vehicle's centre of mass [m]
-    position: tuple[float, float, float]  # +- [m]
-    velocity: tuple[float, float, float]  # +- [m/s]
-    attitude_deg: tuple[float, float, float]  # +- roll, pitch, yaw [deg]
-    rate_deg: tuple[float, float, float]  # +- body rates [deg/s]
-    mass: float  # +- fraction of the vehicle's mass
-    cable_angle_deg: float  # +- roll of the cable [deg]
-    cable_rate_deg: float  # +- rates of its roll and yaw [deg/s]
+    position: tuple[NotNegative, NotNegative, NotNegative]  # +- [m]
+    velocity: tuple[NotNegative, NotNegative, NotNegative]  # +- [m/s]
+    attitude_deg: tuple[NotNegative, NotNegative, NotNegative]  # +- roll, pitch, yaw [deg]
+    rate_deg: tuple[NotNegative, NotNegative, NotNegative]  # +- body rates [deg/s]
+    mass: NotNegative  # +- fraction of the vehicle's mass
+    cable_angle_deg: NotNegative  # +- roll of the cable [deg]
+    cable_rate_deg: NotNegative  # +- rates of its roll and yaw [deg/s]
     tether_variants: int  # number of cable lengths, one for each environment for good
-    tether_spread: float  # the lengths span +- this fraction
-    battery_used: float  # fraction of charge used is drawn from 0 to this
+    tether_spread: NotNegative  # the lengths span +- this fraction
+    battery_used: NotNegative  # fraction of charge used is drawn from 0 to this
     goal_radius: (
         float  # goals are uniform on a ground disk of this radius about the spawn point [m]
     )
     payload_variants: int = (
         1  # number of payload masses, and of drags, in every combination with the cable lengths
     )
-    payload_spread: float = 0.0  # the masses span +- this fraction
-    drag_spread: float = 0.0  # the payload's drags span +- this fraction
-    cable_yaw_deg: float = 15.0  # +- yaw of the cable [deg]
+    payload_spread: NotNegative = 0.0  # the masses span +- this fraction
+    drag_spread: NotNegative = 0.0  # the payload's drags span +- this fraction
+    cable_yaw_deg: NotNegative = 15.0  # +- yaw of the cable [deg]

@@ -11,14 +11,15 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, require
+from camera.bounds import Bounded, Positive
+from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams
 from sim.units import Units, in_units
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class FleetParams:
+class FleetParams(Bounded):
     """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to
     the known vehicle made to size.
 
@@ -28,10 +29,10 @@ class FleetParams:
     count: int  # vehicles drawn; 0: the experiment's own, which is stated in SI units
     first: int  # number of the first one: vehicle k is the same in every draw
     seed: int
-    rope_length: float  # [m]
-    total_mass: float  # vehicle and all that hangs on it [kg]
+    rope_length: Positive  # [m]
+    total_mass: Positive  # vehicle and all that hangs on it [kg]
     # full thrust over the weight of all, of the heaviest payload that a vehicle is given [-]
-    least_thrust: float
+    least_thrust: Positive
     mass: Range  # of the vehicle [kg]
     thrust: Range  # factor of the full thrust
     arm: Range  # factor
@@ -56,7 +57,7 @@ class FleetParams:
     rope_mass: Range  # factor of the mass for a length
     mount: Range  # factor of the mount's distance from the centre of mass
     lag: Range  # of the release [s]
-    yaw_loop: float | None = (
+    yaw_loop: Positive | None = (
         # with it, yaw gains are turned down until :func:`yaw_rate` is this times the known
         # vehicle's at most
         None
@@ -64,7 +65,7 @@ class FleetParams:
 
     def __post_init__(self) -> None:
         """Raise ValueError for ranges that nothing can be drawn from."""
-        require("fleet", self, positive="rope_length total_mass least_thrust yaw_loop")
+        super().__post_init__()
         if self.count < 0 or self.first < 0 or self.seed < 0:
             raise ValueError(
                 f"fleet.count is {self.count}, first {self.first}, seed {self.seed}; expected 0 or"

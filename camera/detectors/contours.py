@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from camera.bounds import Bounded, Positive, Share
 from camera.detectors.edges import (
     circles_of,
     colour_maps,
@@ -48,7 +49,7 @@ DISTANCE_ERROR = 0.15
 
 
 @dataclass(frozen=True)
-class DetectorParams:
+class DetectorParams(Bounded):
     """The looks of ball and goal."""
 
     ball_hue_deg: tuple[float, float] = (
@@ -56,15 +57,15 @@ class DetectorParams:
         88.0,
     )  # tennis ball: 62 to 68, and what a wrong white balance makes of it
     goal_hue_deg: tuple[float, float] = (105.0, 165.0)  # the green field of the square; as above
-    saturation: float = 0.3  # least share of colour in a pixel [-]
-    brightness: float = 0.06  # least value of a pixel [-]
-    ball_distance: tuple[float, float] = (0.15, 4.0)  # of the ball from the lens [m]
-    field_share: float = (
+    saturation: Share = 0.3  # least share of colour in a pixel [-]
+    brightness: Share = 0.06  # least value of a pixel [-]
+    ball_distance: tuple[Positive, Positive] = (0.15, 4.0)  # of the ball from the lens [m]
+    field_share: Positive = (
         0.84  # side of the goal's coloured field over that of the square with its rim [-]
     )
-    coverage: float = 0.35  # share of the ball's outline that must be seen
-    misfit: float = 0.1  # largest RMS of the outline from its cone, in half-angles
-    side_tolerance: float = (
+    coverage: Share = 0.35  # share of the ball's outline that must be seen
+    misfit: Positive = 0.1  # largest RMS of the outline from its cone, in half-angles
+    side_tolerance: Positive = (
         0.3  # of the goal's sides from what they must be where height and attitude are known [-]
     )
 

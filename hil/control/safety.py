@@ -108,17 +108,17 @@ def fence_violation(
 
 
 @dataclass(frozen=True)
-class CheckParams:
+class CheckParams(Bounded):
     """Limits of the pre-throw checks; each catches a mistake that no single pose shows."""
 
-    tilt_deg: float  # of the vehicle: a wrong quaternion order stands it on its head
+    tilt_deg: Positive  # of the vehicle: a wrong quaternion order stands it on its head
     # that the vehicle is put up with: 90 or 180 deg off, an axis or a quaternion is exchanged
     heading_deg: float
-    heading_tolerance_deg: float
+    heading_tolerance_deg: Positive
     # between payload and vehicle against the rope's length [m]: bodies exchanged, marker lost
-    rope_tolerance: float
-    home_radius: float  # of the vehicle from its hover point [m]
-    speed: float  # of the vehicle, noise included [m/s]
+    rope_tolerance: Positive
+    home_radius: Positive  # of the vehicle from its hover point [m]
+    speed: Positive  # of the vehicle, noise included [m/s]
     # body rates of a doublet in the first hover, by which signs are seen [rad/s]; 0: none
     probe: NotNegative = 0.0
 

@@ -21,11 +21,12 @@ from scipy.spatial.transform import Rotation
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import conjugate, cross_one, multiply, rotate_one
+from visthrow.config.bounds import Bounded
 from visthrow.logs.axes import turn_of
 
 
 @dataclass(frozen=True)
-class FrameParams:
+class FrameParams(Bounded):
     """Conventions of a source's poses.
 
     Every entry is stated; none has a default. Raises `FrameError` for axes that are no turn.
@@ -41,6 +42,7 @@ class FrameParams:
     ]  # of the tracked point from the centre of mass [m], our body frame
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         try:
             turn_of(self.axes), turn_of(self.body_axes)
         except ValueError as error:

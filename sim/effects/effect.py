@@ -10,12 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from camera.bounds import Bounded, Positive
 from sim.effects.blocks import CONDITIONS, SWITCHES
 from sim.effects.setting import Setting
 
 
 @dataclass(frozen=True)
-class Effect:
+class Effect(Bounded):
     """One cause that reality may have and the model lacks, or has with another size.
 
     The size theta is a *deviation*: 0 means that the model is right as it stands.
@@ -27,9 +28,9 @@ class Effect:
     unit: str  # of theta
     block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
     bounds: tuple[float, float]  # physically possible values of theta
-    prior_sd: float  # spread of theta where the effect is present
+    prior_sd: Positive  # spread of theta where the effect is present
     # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
-    floor: float
+    floor: Positive
     channels: tuple[str, ...]  # channels of the log without which it cannot be seen
     source: str  # of equation and prior
     confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
@@ -40,7 +41,7 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Change:
+class Change(Bounded):
     """A number of a setting that an effect changes."""
 
     path: str  # such as plant.vehicle.thrust.gain
@@ -77,7 +78,7 @@ def _replaced(owner: Any, names: list[str], new: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Lowest:
+class Lowest(Bounded):
     """A lower limit for a number of the setting: theta is at least ``least - share * number /
     factor``.
     """
@@ -96,7 +97,7 @@ class SettingEffect(Effect):
     changes and switch."""
 
     changes: tuple[Change, ...] = ()
-    step: float = 0.25  # of theta for derivatives, in floors
+    step: Positive = 0.25  # of theta for derivatives, in floors
     needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
     simpler: bool = (
         False  # a switch to a simpler block: left out unless asked for, as each compiles a kernel
@@ -104,6 +105,7 @@ class SettingEffect(Effect):
     lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, choices in ((self.needs, CONDITIONS), (self.switch, {"": None, **SWITCHES})):
             if name not in choices:
                 raise ValueError(
@@ -133,7 +135,7 @@ class SettingEffect(Effect):
 
 
 @dataclass(frozen=True)
-class RandomEffect:
+class RandomEffect(Bounded):
     """A quantity that is drawn anew in every flight, from a normal distribution about its mean."""
 
     name: str
@@ -142,8 +144,8 @@ class RandomEffect:
     of: tuple[str, ...]  # effects, in whose unit it is; of several one deviation for all
     unit: str
     block: str
-    prior_sd: float  # of the half-normal deviation, where the quantity varies
-    floor: float
+    prior_sd: Positive  # of the half-normal deviation, where the quantity varies
+    floor: Positive
     source: str
     confused_with: tuple[str, ...] = ()
     manoeuvres: tuple[str, ...] = ()

@@ -232,7 +232,8 @@ def pack_vehicle(
             )
         rotors = vehicle.rotors
         thrust = vehicle.thrust
-        P.require("vehicle.thrust", thrust, positive="torque_ratio")  # the mixer divides by it
+        if not thrust.torque_ratio:  # the mixer divides by it
+            raise ValueError("vehicle.thrust.torque_ratio is 0.0; expected above 0")
         # Thrust of each rotor [N] that makes 1 N m about x, y and z without changing the sum; each
         # of shape (4,).
         x = np.asarray(rotors.x)

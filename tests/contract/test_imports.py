@@ -27,7 +27,7 @@ ONBOARD = (
 
 MAY_USE = {
     "camera": {"camera"},
-    "sim": {"sim", "camera.warp_start"},
+    "sim": {"sim", "camera.warp_start", "camera.bounds"},
     "visthrow": {"visthrow", "sim", "camera"},
     "hil": {"hil", "camera", *ONBOARD},
 }

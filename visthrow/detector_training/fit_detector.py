@@ -33,6 +33,7 @@ from camera.detectors.learnt import (
 )
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
+from visthrow.config.bounds import Bounded, Positive, Share
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
@@ -40,7 +41,7 @@ MATCH_RADIUS = 0.5  # a finding within this many sizes of the thing is of it
 
 
 @dataclass(frozen=True)
-class FitParams:
+class FitParams(Bounded):
     """A training; one file of ``configs/detector``.
 
     Raises ValueError: a count below 1, or more fresh frames than the pool holds.
@@ -53,12 +54,13 @@ class FitParams:
     reuse: int  # steps between two renderings
     pool: int  # frames that are kept
     samples: int  # rays a pixel
-    learning_rate: float  # at its highest; one cycle
-    lenses: float  # share of rendered batches with another lens than the camera's
+    learning_rate: Positive  # at its highest; one cycle
+    lenses: Share  # share of rendered batches with another lens than the camera's
     calibration: int  # frames that confidences are calibrated on
     seed: int
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         counts = {
             name: getattr(self, name)
             for name in (

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.logs.axes import turn_of
 from visthrow.logs.flightlog import FRAMES, STANDARD_CHANNELS
 from visthrow.logs.unit_names import to_si
@@ -15,7 +16,7 @@ _WIDTH = {"quaternion": (4,), "euler": (3,), "rotvec": (3,), "matrix": (9,), "ve
 
 
 @dataclass(frozen=True)
-class TimeColumn:
+class TimeColumn(Bounded):
     """A clock: a column of stamps, or rows that are evenly spaced.
 
     Raises ConfigError: neither or both of them, or no unit of time.
@@ -23,12 +24,13 @@ class TimeColumn:
 
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
-    row_period: float = 0.0  # between two rows [s], where there is no column
+    row_period: NotNegative = 0.0  # between two rows [s], where there is no column
     offset: float = (
         0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if bool(self.column) == (self.row_period > 0.0):
             raise ConfigError("time: give either a column or a row_period above 0 s")
         if to_si(self.unit, "time")[0] != "s":
@@ -36,7 +38,7 @@ class TimeColumn:
 
 
 @dataclass(frozen=True)
-class ChannelMap:
+class ChannelMap(Bounded):
     """Columns of one channel.
 
     Raises ConfigError: a unit, frame, number of columns or order of axes that the channel cannot
@@ -64,6 +66,7 @@ class ChannelMap:
     clock: str = ""  # of the setup's further clocks; "": the main one
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         where = f"channel '{self.name}'"
         to_si(self.unit, where)
         if not self.columns:
@@ -95,12 +98,12 @@ class ChannelMap:
 
 
 @dataclass(frozen=True)
-class Split:
+class Split(Bounded):
     """The rule that splits one table into several logs."""
 
     column: str = ""  # a log for each of its values; "": one
-    gap: float = 0.0  # a new log begins where no row comes for so long [s]; 0: never
-    shortest: float = 0.0  # shorter ones are left out [s]
+    gap: NotNegative = 0.0  # a new log begins where no row comes for so long [s]; 0: never
+    shortest: NotNegative = 0.0  # shorter ones are left out [s]
 
 
 @dataclass(frozen=True)

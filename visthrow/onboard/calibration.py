@@ -33,6 +33,7 @@ from camera.mount import rotation_from_vector
 from camera.params import CameraParams
 from visthrow.common.errors import VisthrowError
 from visthrow.common.free_fall import GRAVITY
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.observations import rotation_from_quat
 
 STATE = {"pos": 3, "vel": 3, "turn": 3, "swing": 2, "swing_rate": 2}
@@ -69,34 +70,34 @@ OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
 
 
 @dataclass(frozen=True)
-class Spreads:
+class Spreads(Bounded):
     """Standard deviations.
 
     Of what is measured, each axis and step; of constants that are not asked for; of the model.
     """
 
-    pos: float = 0.01  # [m]
-    vel: float = 0.01  # [m/s]
-    attitude: float = 0.01  # [rad]
+    pos: Positive = 0.01  # [m]
+    vel: Positive = 0.01  # [m/s]
+    attitude: Positive = 0.01  # [rad]
     # of attitude about the body's z over that about x and y, bias too [-]: two columns of the
     # rotation tell it
-    heading: float = 0.7071
-    rate: float = 0.01  # [rad/s]
-    keypoint: float = 0.01  # normalised [-]
-    pose_bias: float = 0.001  # of attitude and gyro [rad, rad/s]
-    keypoint_bias: float = 0.001  # each keypoint [-]
-    lens: float = 0.0003  # place of the lens on the body [m]
-    goal: float = 0.001  # place of the goal [m]
-    length: float = 0.03  # of the rope, relative [-]
-    drag: float = 0.3  # of the rotors, over the mass [1/s]
-    wind: float = 0.01  # steady horizontal push [m/s^2]
-    push: float = 0.1  # unsteady one on both bodies, each step [m/s^2]
-    lift: float = 0.5  # likewise along the body's z, where thrust is late and unsteady
-    pendulum: float = 0.05  # of the ball's equation of motion, each step [m/s^2]
-    tilt: float = 0.2  # before anything is known [rad]
-    scale: float = 0.03  # of the focal length, likewise, relative [-]
-    latency: float = 0.05  # likewise [s]
-    thrust: float = 0.3  # likewise, relative [-]
+    heading: Positive = 0.7071
+    rate: Positive = 0.01  # [rad/s]
+    keypoint: Positive = 0.01  # normalised [-]
+    pose_bias: Positive = 0.001  # of attitude and gyro [rad, rad/s]
+    keypoint_bias: Positive = 0.001  # each keypoint [-]
+    lens: Positive = 0.0003  # place of the lens on the body [m]
+    goal: Positive = 0.001  # place of the goal [m]
+    length: Positive = 0.03  # of the rope, relative [-]
+    drag: Positive = 0.3  # of the rotors, over the mass [1/s]
+    wind: Positive = 0.01  # steady horizontal push [m/s^2]
+    push: Positive = 0.1  # unsteady one on both bodies, each step [m/s^2]
+    lift: Positive = 0.5  # likewise along the body's z, where thrust is late and unsteady
+    pendulum: Positive = 0.05  # of the ball's equation of motion, each step [m/s^2]
+    tilt: Positive = 0.2  # before anything is known [rad]
+    scale: Positive = 0.03  # of the focal length, likewise, relative [-]
+    latency: Positive = 0.05  # likewise [s]
+    thrust: Positive = 0.3  # likewise, relative [-]
 
 
 @dataclass(frozen=True)

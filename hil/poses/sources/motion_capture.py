@@ -32,6 +32,7 @@ from hil.poses.sources.capture import PAUSE, listen
 from hil.poses.sources.pose_source import Source
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.extras import load_extra
+from visthrow.config.bounds import Bounded, Positive
 
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
@@ -57,7 +58,7 @@ class RigidBody:
 
 
 @dataclass(frozen=True)
-class MocapParams:
+class MocapParams(Bounded):
     """The address of the motion-capture system."""
 
     # "natnet" through the package natnet, "ros2" through cyclonedds, all others through
@@ -79,7 +80,7 @@ class MocapParams:
     host: str
     local: str = "127.0.0.1"  # natnet: address of our own network card
     multicast: bool = True  # natnet: as Motive's transmission type
-    timeout: float = 5.0  # to connect [s]
+    timeout: Positive = 5.0  # to connect [s]
     settings: dict[str, str] = field(
         default_factory=dict
     )  # further options of motioncapture.connect; for ros2 domain

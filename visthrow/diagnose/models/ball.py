@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.rotations import cross
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
@@ -38,13 +39,13 @@ KNOTS = 9  # of the latent force over a free flight
 
 
 @dataclass(frozen=True)
-class BallParams:
+class BallParams(Bounded):
     """The ball that is assumed before anything is found."""
 
-    gravity: float  # [m/s^2]
-    drag: float  # k / m of the quadratic drag k |v| v [1/m]
-    edge: float  # cut off at either end of a free flight [s]
-    shortest: float  # free flights [s]
+    gravity: Positive  # [m/s^2]
+    drag: NotNegative  # k / m of the quadratic drag k |v| v [1/m]
+    edge: NotNegative  # cut off at either end of a free flight [s]
+    shortest: Positive  # free flights [s]
     every: int = 1  # the samples taken: each so-manieth
 
 

@@ -8,34 +8,35 @@ from typing import Literal
 import numpy as np
 
 from visthrow.common.errors import ConfigError
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 MOST_LATE = 0.15  # by which attitudes may be late or early [s]
 MOTORS = ("fl", "fr", "rl", "rr")
 
 
 @dataclass(frozen=True)
-class CableParams:
+class CableParams(Bounded):
     """Payload on a massless cable at the vehicle's centre of mass."""
 
-    length: float  # to the payload's centre [m]
-    mass: float  # of the payload [kg]
+    length: Positive  # to the payload's centre [m]
+    mass: Positive  # of the payload [kg]
 
 
 @dataclass(frozen=True)
-class TorqueParams:
+class TorqueParams(Bounded):
     """A map from commands of single motors to rates."""
 
-    inertia: tuple[float, float, float]  # [kg m^2]
-    arm_x: float  # of each rotor from the centre of mass, along x and along y [m]
-    arm_y: float
-    torque_ratio: float  # drag torque over thrust [m]
+    inertia: tuple[Positive, Positive, Positive]  # [kg m^2]
+    arm_x: Positive  # of each rotor from the centre of mass, along x and along y [m]
+    arm_y: Positive
+    torque_ratio: NotNegative  # drag torque over thrust [m]
     spin: tuple[
         float, float, float, float
     ]  # +1 turns clockwise seen from above; order of the rotors as everywhere
 
 
 @dataclass(frozen=True)
-class FlyerParams:
+class FlyerParams(Bounded):
     """The vehicle that is assumed first.
 
     Raises ConfigError where torque has no motors' commands, or the map does not rise.
@@ -46,23 +47,23 @@ class FlyerParams:
     ]  # channel of the commands
     position: str  # channel of the measured position
     attitude: str  # channel of the measured attitude
-    mass: float  # of the vehicle alone [kg]
-    gravity: float  # [m/s^2]
+    mass: Positive  # of the vehicle alone [kg]
+    gravity: Positive  # [m/s^2]
     thrust_map: tuple[
         float, float, float
     ]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
-    motor_time_constant: float  # [s]
-    command_delay: float  # [s]
-    reference_voltage: float  # at which the map holds [V]
+    motor_time_constant: NotNegative  # [s]
+    command_delay: NotNegative  # [s]
+    reference_voltage: Positive  # at which the map holds [V]
     voltage_coefficient: float  # thrust changes by this share a volt [1/V]
-    drag_xy: float  # rotor drag [kg/s]
-    drag_z: float  # [kg/s]
+    drag_xy: NotNegative  # rotor drag [kg/s]
+    drag_z: NotNegative  # [kg/s]
     lowest: float  # windows keep above this height [m]
-    window: float  # [s]
-    step: float  # of the integration [s]
+    window: Positive  # [s]
+    step: Positive  # of the integration [s]
     every: int  # the position samples taken: each so-manieth
     most_windows: int  # spread evenly over all logs
-    estimator_rate: float = (
+    estimator_rate: Positive = (
         1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
     )
     torque: TorqueParams | None = None  # None: rates are not simulated
@@ -83,6 +84,7 @@ class FlyerParams:
         return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
             raise ConfigError(
                 f"torque needs commands of single motors; the input is '{self.input}'"

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.check.relations import on_grid
@@ -27,7 +28,7 @@ MARGIN = (
 
 
 @dataclass(frozen=True)
-class GimbalParams:
+class GimbalParams(Bounded):
     """The assumed pose of the camera."""
 
     base_b: tuple[float, float, float]  # the gimbal's centre in the body frame [m]
@@ -36,13 +37,13 @@ class GimbalParams:
         float, float, float
     ]  # gimbal to camera: turns about fixed x, y, z in this order [deg]
     marker_z: float  # the marker over the payload's tracked centre, along the vertical [m]
-    sigma_across: float  # of the marker's direction times distance [m]
-    sigma_along: float  # of its distance [m]
+    sigma_across: Positive  # of the marker's direction times distance [m]
+    sigma_along: Positive  # of its distance [m]
     # whether the gimbal's angles are against the horizon (then only the vehicle's yaw turns it)
     stabilised: bool
-    window: float  # [s]
+    window: Positive  # [s]
     every: int  # the samples taken: each so-manieth
-    largest: float  # detections further than this from the prediction are of something else [m]
+    largest: Positive  # detections further than this from the prediction are of something else [m]
 
 
 class GimbalModel(NumericModel):

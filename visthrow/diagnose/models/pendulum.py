@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.common.errors import LogError
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
@@ -37,18 +38,18 @@ SMOOTH = 0.02
 
 
 @dataclass(frozen=True)
-class PendulumParams:
+class PendulumParams(Bounded):
     """The pendulum that is assumed before anything is found."""
 
-    gravity: float  # [m/s^2]
+    gravity: Positive  # [m/s^2]
     # of the equivalent simple pendulum, inertia about the pivot over mass times lever [m]
-    length: float
+    length: Positive
     hanging: float  # what the encoder says where it hangs [rad]
-    viscous: float  # friction in proportion to the rate, per inertia [1/s]
-    coulomb: float  # dry friction per inertia [rad/s^2]
-    quadratic: float  # air drag per inertia [1/rad]
-    window: float  # [s]
-    step: float  # of the integration [s]
+    viscous: NotNegative  # friction in proportion to the rate, per inertia [1/s]
+    coulomb: NotNegative  # dry friction per inertia [rad/s^2]
+    quadratic: NotNegative  # air drag per inertia [1/rad]
+    window: Positive  # [s]
+    step: Positive  # of the integration [s]
     every: int  # the samples taken: each so-manieth
 
     @property

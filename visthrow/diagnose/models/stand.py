@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.flightlog import FlightLog
@@ -18,19 +19,19 @@ NEEDED = ("rotor_speed", "thrust", "supply_voltage", "current")
 
 
 @dataclass(frozen=True)
-class StandParams:
+class StandParams(Bounded):
     """The motor and propeller that are assumed before anything is found."""
 
-    k_f: float  # thrust over speed squared [N s^2/rad^2]
-    k_p: float  # electric power over speed cubed [W s^3/rad^3]
-    idle_power: float  # [W]
-    resistance: float  # of motor and leads [Ohm]
-    reference_voltage: float  # [V]
-    thrust_sd: float  # of the load cell [N]
-    thrust_share: float  # and of the reading [1]
-    current_sd: float  # [A]
-    current_share: float  # [1]
-    lowest_speed: float  # steps below are left out [rad/s]
+    k_f: Positive  # thrust over speed squared [N s^2/rad^2]
+    k_p: Positive  # electric power over speed cubed [W s^3/rad^3]
+    idle_power: NotNegative  # [W]
+    resistance: NotNegative  # of motor and leads [Ohm]
+    reference_voltage: Positive  # [V]
+    thrust_sd: Positive  # of the load cell [N]
+    thrust_share: NotNegative  # and of the reading [1]
+    current_sd: Positive  # [A]
+    current_share: NotNegative  # [1]
+    lowest_speed: NotNegative  # steps below are left out [rad/s]
 
 
 class StandModel(NumericModel):

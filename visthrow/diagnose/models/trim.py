@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
@@ -17,27 +18,27 @@ from visthrow.logs.flightlog import FlightLog
 
 
 @dataclass(frozen=True)
-class TrimParams:
+class TrimParams(Bounded):
     """The vehicle as it was before: from its own unharmed flights."""
 
     command: str  # channel of the motors' commands
     position: str  # channel of the measured position
     velocity: str  # channel of the measured velocity
-    mass: float  # [kg]
-    gravity: float  # [m/s^2]
+    mass: Positive  # [kg]
+    gravity: Positive  # [m/s^2]
     thrust_map: tuple[float, float, float]  # thrust of a motor by powers of its command [N]
-    reference_voltage: float  # [V]
+    reference_voltage: Positive  # [V]
     voltage_coefficient: float  # [1/V]
-    motor_scale: tuple[float, float, float, float]  # each motor's thrust over the map
-    arm: float  # of each rotor along x and along y [m]
-    torque_ratio: float  # [m]
+    motor_scale: tuple[Positive, Positive, Positive, Positive]  # each motor's thrust over the map
+    arm: Positive  # of each rotor along x and along y [m]
+    torque_ratio: NotNegative  # [m]
     spin: tuple[float, float, float, float]
     lowest: float  # [m]
-    slowest_window: float  # windows' length [s]
-    fastest: float  # mean speed of a window [m/s]
-    spread: float  # of a window's mean command, by draught and control [1]
-    motor_spread: float  # of an unharmed vehicle's thrusts from one flight to the next [1]
-    com_spread: float  # of its centre of mass: the pack is not where it was [m]
+    slowest_window: Positive  # windows' length [s]
+    fastest: Positive  # mean speed of a window [m/s]
+    spread: Positive  # of a window's mean command, by draught and control [1]
+    motor_spread: Positive  # of an unharmed vehicle's thrusts from one flight to the next [1]
+    com_spread: Positive  # of its centre of mass: the pack is not where it was [m]
 
 
 class TrimModel(NumericModel):

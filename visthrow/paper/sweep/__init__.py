@@ -8,15 +8,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.config.bounds import Bounded, Positive
 from visthrow.throws.plants import known_plant
 
 
 @dataclass(frozen=True)
-class ThrowParams:
+class ThrowParams(Bounded):
     """Throws of every policy that names them."""
 
     plant: str  # of visthrow.throws.plants.PLANTS
-    targets: tuple[float, ...]  # along x [m]
+    targets: tuple[Positive, ...]  # along x [m]
     count: int  # of each policy at each target
     seed: int = 0  # of starts and noise
     fly_in: Literal["own", "full"] = (
@@ -28,6 +29,7 @@ class ThrowParams:
     ] = ()  # parts of the policy's contract that may be broken so; recorded as departures
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         known_plant(self.plant)
         if self.count < 1 or not self.targets:
             raise ConfigError(

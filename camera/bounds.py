@@ -1,0 +1,82 @@
+"""Bounds of numbers, declared where the field is:
+
+``lag: NotNegative``, ``angle: Annotated[float, Bound(0.0, 180.0)]``. A number without a bound must
+be finite. Onboard-safe.
+"""
+
+import math
+import typing
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Any, ClassVar
+
+
+@dataclass(frozen=True)
+class Bound:
+    """An interval; of a tuple every number lies in it, None passes."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    ends: str = "[]"  # as intervals are written: "(" and ")" leave an end out
+
+    def holds(self, value: float) -> bool:
+        """Whether a finite number lies within."""
+        above = value > self.low if self.ends[0] == "(" else value >= self.low
+        below = value < self.high if self.ends[1] == ")" else value <= self.high
+        return above and below and math.isfinite(value)
+
+    def __str__(self) -> str:
+        if self.ends == "[]" and math.isfinite(self.low + self.high):
+            return f"{self.low:g} to {self.high:g}"
+        low = f"above {self.low:g}" if self.ends[0] == "(" else f"{self.low:g} or more"
+        high = f"below {self.high:g}" if self.ends[1] == ")" else f"at most {self.high:g}"
+        limits = [text for text, end in ((low, self.low), (high, self.high)) if math.isfinite(end)]
+        return " and ".join(limits) or "a finite number"
+
+
+Positive = Annotated[float, Bound(0.0, ends="(]")]
+NotNegative = Annotated[float, Bound(0.0)]
+Share = Annotated[float, Bound(0.0, 1.0)]
+# Of anything that flies in a hall: what lies beyond is a wrong unit.
+Mass = Annotated[float, Bound(0.0, 1e3, "(]")]  # [kg]
+Length = Annotated[float, Bound(0.0, 1e3, "(]")]  # [m]
+Arm = Annotated[float, Bound(-10.0, 10.0)]  # of a rotor [m]
+Duration = Annotated[float, Bound(0.0, 5.0, "(]")]  # of a filter, a lag or a step [s]
+Lag = Annotated[float, Bound(0.0, 5.0)]  # the same, or none [s]
+
+
+class Bounded:
+    """Base of dataclasses whose annotations state bounds; raises `error` for a number outside."""
+
+    error: ClassVar[type[Exception]] = ValueError
+
+    def __post_init__(self) -> None:
+        for name, bound in _bounds(type(self)).items():
+            value = getattr(self, name)
+            if not all(map(bound.holds, _numbers(value))):
+                raise self.error(f"{name} is {value}; expected {bound}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Yield the numbers in a value of a field."""
+    if isinstance(value, tuple | list | dict):
+        for item in value.values() if isinstance(value, dict) else value:
+            yield from _numbers(item)
+    elif isinstance(value, int | float):
+        yield value
+
+
+@cache
+def _bounds(schema: type) -> dict[str, Bound]:
+    bounds = {
+        name: _bound(hint)
+        for name, hint in typing.get_type_hints(schema, include_extras=True).items()
+    }
+    return {name: bound for name, bound in bounds.items() if bound is not None}
+
+
+def _bound(hint: Any) -> Bound | None:
+    notes = [note for note in getattr(hint, "__metadata__", ()) if isinstance(note, Bound)]
+    inner = [bound for part in typing.get_args(hint) if (bound := _bound(part)) is not None]
+    return next(iter([*notes, *inner]), Bound() if hint is float else None)

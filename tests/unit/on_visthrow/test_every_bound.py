@@ -1,0 +1,101 @@
+"""Every number of every configuration: NaN, infinity and what lies outside its bound is refused."""
+
+import dataclasses
+import math
+import typing
+from functools import cache
+
+import pytest
+
+from camera import bounds
+from visthrow import config
+from visthrow.common.errors import VisthrowError
+from visthrow.config import kinds, schema
+
+
+def hold_float(hint: typing.Any) -> bool:
+    return hint is float or any(hold_float(part) for part in typing.get_args(hint))
+
+
+def tables(value: typing.Any):
+    """Yield the dataclasses within a loaded configuration."""
+    if dataclasses.is_dataclass(value):
+        yield value
+        value = [getattr(value, name) for name in schema.hints(type(value))]
+    for item in (
+        value.values()
+        if isinstance(value, dict)
+        else value
+        if isinstance(value, list | tuple)
+        else ()
+    ):
+        yield from tables(item)
+
+
+@cache
+def examples() -> dict[type, typing.Any]:
+    """Return one instance of each dataclass that a shipped configuration fills."""
+    found = {}
+    for path in sorted(config.configs_root().rglob("*.toml")):
+        loaded = config.load(kinds.schema_of(path.parent.name, path.stem), path)
+        found |= {type(table): table for table in tables(loaded)}
+    return found
+
+
+def numbers() -> list:
+    return [
+        (table, name)
+        for table in examples().values()
+        for name, hint in schema.hints(type(table)).items()
+        if hold_float(hint) and getattr(table, name) not in (None, (), {})
+    ]
+
+
+def put(value: typing.Any, number: float) -> typing.Any:
+    """Replace the first number of a value."""
+    if isinstance(value, dict):
+        first = next(iter(value))
+        return value | {first: put(value[first], number)}
+    return (put(value[0], number), *value[1:]) if isinstance(value, tuple) else number
+
+
+def test_the_configurations_hold_hundreds_of_numbers():
+    assert len(numbers()) > 300
+
+
+@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -1.0, 0.0])
+def test_a_number_outside_its_bound_is_refused(wrong):
+    accepted = []
+    for table, name in numbers():
+        bound = bounds._bounds(type(table)).get(name, bounds.Bound())
+        if bound.holds(wrong):
+            continue
+        try:
+            dataclasses.replace(table, **{name: put(getattr(table, name), wrong)})
+            message = "accepted"
+        except (VisthrowError, ValueError) as error:
+            message = str(error)
+        if "expected" not in message:
+            accepted.append(f"{type(table).__name__}.{name}: {message}")
+    assert accepted == []
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "override", "message"),
+    [
+        (
+            "vehicle",
+            "paper",
+            "body.inertia=[1e-12, 1e-12, 1e-12]",
+            "0.21 kg 2.18e-06 m from its middle",
+        ),
+        ("vehicle", "paper", "body.mass=1e9", "mass is .*; expected above 0 and at most 1000"),
+        ("vehicle", "paper", "controller.max_thrust=0.1", "a quarter of the vehicle's weight"),
+        ("rope", "paper", "length=0", "length is 0.0; expected above 0"),
+        ("rope", "paper", "payload_inertia=1.0", "payload_inertia"),
+        ("diagnose", "cf_payload", "flyer.mass=0", "mass is 0.0; expected above 0"),
+    ],
+)
+def test_absurd_quantities_are_refused(kind, name, override, message):
+    with pytest.raises(config.ConfigError, match=message):
+        config.load(kinds.schema_of(kind), config.find(kind, name), [override])
