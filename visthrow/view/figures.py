@@ -200,6 +200,8 @@ def scatter(
             labels,
             loc=f"outside {'lower' if heading else 'upper'} center",
             ncols=min(len(labels), 3),
+            markerscale=2.5,
+            title="small marks: landings; large marks: their means",
         )
     if heading:
         figure.suptitle(heading, fontsize=11.5)
