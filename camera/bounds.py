@@ -39,7 +39,7 @@ Positive = Annotated[float, Bound(0.0, ends="(]")]
 NotNegative = Annotated[float, Bound(0.0)]
 Share = Annotated[float, Bound(0.0, 1.0)]
 # Of anything that flies in a hall: what lies beyond is a wrong unit.
-Mass = Annotated[float, Bound(0.0, 1e3, "(]")]  # [kg]
+Mass = Annotated[float, Bound(0.0, 1e5, "(]")]  # [kg]
 Length = Annotated[float, Bound(0.0, 1e3, "(]")]  # [m]
 Arm = Annotated[float, Bound(-10.0, 10.0)]  # of a rotor [m]
 Duration = Annotated[float, Bound(0.0, 5.0, "(]")]  # of a filter, a lag or a step [s]

@@ -147,8 +147,8 @@ class MotorParams(Bounded):
     speed."""
 
     kind: Literal["first_order", "instant", "asymmetric"]
-    time_constant: Duration  # [s]
-    time_constant_down: Lag = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
+    time_constant: Positive  # [s]
+    time_constant_down: NotNegative = 0.0  # of slowing down [s]; ``asymmetric`` alone reads it
 
 
 @dataclass(frozen=True)

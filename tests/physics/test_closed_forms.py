@@ -30,8 +30,11 @@ def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
     """Rope under a vehicle too heavy to move, carried by a force of its own weight and
     the load's.
     """
-    body = BodyParams(HELD, (HELD, HELD, HELD))
-    vehicle = dataclasses.replace(plant.vehicle, body=body, queue=QueueParams(0.0))
+    body = BodyParams(HELD, (0.01 * HELD,) * 3)
+    strong = dataclasses.replace(plant.vehicle.controller, max_thrust=HELD * GRAVITY)
+    vehicle = dataclasses.replace(
+        plant.vehicle, body=body, controller=strong, queue=QueueParams(0.0)
+    )
     changed = dataclasses.replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
     sim = HybridSim(
         PlantParams(vehicle, changed, plant.release, numerics(substep, "float64")), 1, direct=True

@@ -405,6 +405,12 @@ def _out_of_place(e: Experiment) -> Iterator[str]:
             f" starts at {start.spawn_height:g} m (task.start.spawn_height); expected it above the"
             " ground"
         )
+    lag = e.vehicle.motor.time_constant
+    if lag >= bounds.time_limit:
+        yield (
+            f"vehicle.motor.time_constant is {lag:g} s; expected less than task.bounds.time_limit,"
+            f" {bounds.time_limit:g} s"
+        )
 
 
 def _no_vehicle(e: Experiment) -> Iterator[str]:

@@ -55,7 +55,7 @@ from visthrow.task import Experiment
             "train",
             "state",
             "vehicle.motor.time_constant=33",
-            "motor: time_constant is 33.0; expected above 0 and at most 5",
+            "vehicle.motor.time_constant is 33 s",
         ),
         (
             "train",
