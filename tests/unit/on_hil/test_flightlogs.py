@@ -3,6 +3,7 @@ recorded.
 """
 
 import argparse
+import dataclasses
 import json
 import math
 import shutil
@@ -17,7 +18,7 @@ import pytest
 
 from hil.control.latch import PayloadFlight, separation
 from hil.control.recording import flightlogs, view
-from hil.control.recording.flightlogs import read, throws
+from hil.control.recording.flightlogs import measured, read, throws
 from hil.control.recording.record import load_run
 from hil.control.recording.run_report import finish
 from hil.errors import RunError
@@ -136,6 +137,20 @@ def test_the_log_says_where_nothing_real_flew(run, logs, tmp_path):
     summary = json.loads(path.read_text())
     path.write_text(json.dumps({**summary, "links": [{"simulated": False}, {"simulated": True}]}))
     assert throws(read(tmp_path / "a"))[0].meta["plant_meaning"].endswith("of a simulated vehicle")
+
+
+def test_poses_of_a_clock_that_drifts_are_dated_by_their_arrivals(tmp_path):
+    """Stamps that gain a millisecond a second; by one offset a run's ends would be 3 ms off."""
+
+    def drifting(time, poses):
+        return [dataclasses.replace(pose, stamp=1.001 * pose.stamp + 40.0) for pose in poses]
+
+    record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, poses=drifting)
+    played = read(tmp_path / "a")
+    samples = [sample for tick in played.ticks for sample in tick.samples]
+    off = [sample.time - measured(sample, played.playback.params) for sample in samples]
+    assert len(off) > 500
+    assert np.abs(off).max() < 1e-3
 
 
 def test_a_killed_run_and_no_run(tmp_path):

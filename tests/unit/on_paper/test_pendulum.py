@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from sim.params import GRAVITY
+from tests.plants import paper_plant
 from visthrow.paper.baseline import pendulum_model as pm
+from visthrow.paper.baseline.mpc import MPCParams
 from visthrow.paper.baseline.pendulum_model import DIR, QUAT, RATE, VEL, Pendulum
 
 MODEL = Pendulum(0.21, 0.06, 0.36)
@@ -127,3 +129,22 @@ def test_impossible_pendulums_are_refused(values):
 def test_arrays_of_another_width_are_refused():
     with pytest.raises(ValueError, match="expected"):
         pm.step(MODEL, np.zeros(15), np.zeros(4), 0.02)
+
+
+def test_the_pendulum_of_a_plant_has_half_of_the_rope_at_each_end():
+    plant = paper_plant()
+    pendulum = pm.pendulum_of(plant)
+    half = 0.5 * plant.rope.rope_mass
+    assert half > 0.0
+    assert pendulum.vehicle_mass == pytest.approx(plant.vehicle.body.mass + half)
+    assert pendulum.payload_mass == pytest.approx(plant.rope.payload_mass + half)
+    assert pendulum.weight == pytest.approx(GRAVITY * plant.total_mass)
+
+
+def test_an_error_as_large_as_its_scale_costs_one():
+    params = MPCParams()
+    errors = [params.position, params.velocity, params.direction, params.rate, params.attitude]
+    costs = params.state_weights * np.repeat(errors, [3, 3, 3, 3, 4]) ** 2
+    np.testing.assert_allclose(costs, 1.0)
+    inputs = np.array([params.thrust, *[params.body_rate] * 3])
+    np.testing.assert_allclose(params.input_weights * inputs**2, 1.0)

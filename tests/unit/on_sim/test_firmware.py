@@ -46,6 +46,10 @@ def test_a_gain_is_the_torque_that_the_motors_make_of_it():
     assert c.i_gain[2] / c.p_gain[2] == pytest.approx(2.5 * 0.244381 * 80 / (0.032029 * 45))
     assert c.gyro_time_constant == pytest.approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
     assert c.min_thrust == pytest.approx(3.5 * 0.055**2)
+    assert c.gyro_share == pytest.approx([(1 / 250 + 1 / 500) / (1 / 250 + 1 / 500 + 1 / 150)] * 3)
+    c = controller_of(vehicle, SETTINGS | {"yaw_lowpass_hz": "300"}, 0.66, 11.1)
+    both = 1 / 250 + 1 / 500 + 1 / 300
+    assert c.gyro_share[2] == pytest.approx(both / (1 / 250 + 1 / 500 + 1 / 150))
 
 
 def test_the_voltage_of_a_hover():

@@ -211,6 +211,21 @@ def test_commands_by_hand():
     assert low == pytest.approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
 
 
+@pytest.mark.parametrize("axis", range(3))
+def test_the_integral_is_limited_alike_both_ways(axis):
+    """A vehicle that is held beside its goal for long: mirrored, the same push."""
+    level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
+    pushes = []
+    for side in (-1.0, 1.0):
+        controller = HoverController(HoverParams(), PERIOD)
+        goal = 0.1 * side * np.eye(3)[axis]
+        for _ in range(2000):
+            command = controller.step(still, level, still, goal, 0.27)[0]
+        pushes.append(command - [0.27 * GRAVITY, 0.0, 0.0, 0.0])
+    assert np.abs(pushes[0]).max() > 0.05
+    np.testing.assert_allclose(pushes[0], -pushes[1], atol=1e-9)
+
+
 def test_limits_hold_for_any_state():
     params = HoverParams()
     rng = np.random.default_rng(0)
