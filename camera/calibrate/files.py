@@ -1,7 +1,7 @@
 """Calibration files of the field, as our lens: which tool wrote a file is told from its keys.
 
 Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, OKVIS,
-vikit, ORB-SLAM, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's
+vikit, ORB-SLAM and stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's
 FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or several cameras. A box
 says where the numbers of a camera stand; `camera.calibrate.foreign` knows the models.
 
@@ -207,6 +207,8 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
     elif isinstance(tree, dict):
         if isinstance(tree.get("intrinsics"), list) and "resolution" in tree:
             tree = _unzipped(tree)
+        if {"model", "fx", "cols"} <= tree.keys():
+            tree = {f"Camera.{key}": entry for key, entry in tree.items()}
         keys = {str(key) for key in tree}
         box = next((box for box, (matches, _) in BOXES.items() if matches(keys)), "")
         if box:
@@ -223,7 +225,7 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
 
 def _unzipped(tree: Node) -> Node:
     """Basalt's cameras, whose intrinsics and resolutions stand in two lists."""
-    if not all(isinstance(entry, dict) for entry in tree["intrinsics"]):
+    if not tree["intrinsics"] or not isinstance(tree["intrinsics"][0], dict):
         return tree
     sizes = tree["resolution"]
     return {
@@ -312,7 +314,9 @@ def _model(core: str, distortion: str, values: Values, coefficients: list[float]
 
 
 def _kalibr(node: Node) -> Camera:
-    core = str(_any(node, "camera_model", "model")).lower()
+    core = str(node.get("camera_model", node.get("model", "pinhole"))).lower()
+    if "omni_affine" in node:
+        raise ValueError("Kimera's omni, a polynomial of its own; export it as Kalibr's omni-radtan")
     names = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
     if core not in names:
         raise ValueError(f"camera_model is {core!r}; expected one of {list(names)}")
@@ -434,7 +438,8 @@ def _matrix(node: Node) -> Camera:
 
 def _orbslam(node: Node) -> Camera:
     head = "Camera1" if "Camera1.fx" in node else "Camera"
-    fisheye = "kannala" in str(node.get("Camera.type", "")).lower()
+    kind = str(node.get("Camera.type", node.get("Camera.model", ""))).lower()
+    fisheye = "kannala" in kind or kind == "fisheye"
     plain = {
         key.partition(".")[2]: entry for key, entry in node.items() if key.startswith(head + ".")
     }
@@ -442,6 +447,28 @@ def _orbslam(node: Node) -> Camera:
     coefficients = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
     values = _named(plain, "fx fy cx cy")
     return _model("pinhole", "kb4" if fisheye else "radtan", values, coefficients)
+
+
+BOOFCV = {
+    "pinhole": ("pinhole", ""),
+    "pinhole_radial_tangential": ("pinhole", ""),
+    "omnidirectional_universal": ("omni", "mirror_offset"),
+}
+"""``model`` -> our core, and where its parameter stands."""
+
+
+def _boofcv(node: Node) -> Camera:
+    kind = str(node["model"])
+    if kind not in BOOFCV:
+        raise ValueError(f"model is {kind!r}; expected one of {list(BOOFCV)}")
+    core, offset = BOOFCV[kind]
+    values = _named(node, "fx fy cx cy skew", "pinhole")
+    if offset:
+        values["xi"] = _floats([_any(node, offset)], offset)[0]
+    bent = node.get("radial_tangential") or {}
+    radial = [*_floats(bent.get("radial") or [], "radial"), 0.0, 0.0, 0.0][:3]
+    tangential = _floats([bent.get("t1", 0.0), bent.get("t2", 0.0)], "t1 t2")
+    return _model(core, "radtan", values, [*radial[:2], *tangential, radial[2]])
 
 
 def _basalt(node: Node) -> Camera:
@@ -486,8 +513,8 @@ def _has(*names: str) -> Callable[[set[str]], bool]:
 
 
 BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = {
-    "basalt": (_has("camera_type"), _basalt),
-    "kalibr": (_has("camera_model", "intrinsics"), _kalibr),
+    "basalt": (_has("camera_type", "intrinsics"), _basalt),
+    "kalibr": (_has("camera_model distortion_model", "intrinsics"), _kalibr),
     "camodocal": (_has("model_type cam_model", "image_width"), _camodocal),
     "svo": (_has("type", "intrinsics"), _svo),
     "okvis": (_has("focal_length", "principal_point"), _okvis),
@@ -497,6 +524,7 @@ BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = 
         _matrix,
     ),
     "orb-slam": (_has("Camera.fx Camera1.fx"), _orbslam),
+    "boofcv": (_has("pinhole", "model"), _boofcv),
     "ocam": (_has("taylor_coefficient ocam_lines"), _ocam),
 }
 """Tool -> whether a mapping with these keys is a camera of its, and what reads it."""
@@ -510,6 +538,8 @@ def _size(node: Node) -> tuple[int, int] | None:
     if "ocam_lines" in node:
         height, width = _floats(node["ocam_lines"][4], "height and width", (2,))
         return int(width), int(height)
+    if "pinhole" in node:
+        node = node["pinhole"]
     pair = (
         "resolution",
         "cameraResolution",
@@ -522,8 +552,8 @@ def _size(node: Node) -> tuple[int, int] | None:
     if value is not None:
         width, height = _floats(value, "image size", (2,))
         return int(width), int(height)
-    sides = [("image_width", "width", "cam_width", "Camera.width", "image_Width")]
-    sides.append(("image_height", "height", "cam_height", "Camera.height", "image_Height"))
+    sides = [("image_width", "width", "cam_width", "Camera.width", "Camera.cols", "image_Width")]
+    sides.append(("image_height", "height", "cam_height", "Camera.height", "Camera.rows", "image_Height"))
     sizes = [next((node[n] for n in names if n in node), None) for names in sides]
     if None in sizes:
         return None

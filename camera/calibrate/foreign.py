@@ -234,7 +234,8 @@ def fit_fisheye(
     narrow = FisheyeParams(width, height, **lens, fov_deg=2.0 * math.degrees(min(folds, 0.1)))
     fov = min(image_fov_deg(narrow), 2.0 * math.degrees(folds))
     off = theta[error > HOLDS_PX]
-    holds = 2.0 * math.degrees(float(off.min())) if len(off) else fov
+    step = math.pi / (ANGLES - 1)
+    holds = 2.0 * math.degrees(max(float(off.min()) - step, 0.0)) if len(off) else fov
     remarks = []
     if samples.fold < math.pi and limit == samples.fold:
         remarks.append(

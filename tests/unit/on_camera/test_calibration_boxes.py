@@ -17,7 +17,7 @@ EXACT_PX = 1e-9
 RAYS = 200
 W, H, FX, FY, CX, CY = 640, 480, 191.2, 191.0, 319.6, 241.1
 KB = (-0.0132, -0.0041, 0.0017, -0.0005)
-GRID_PX = 0.02  # between the rays on which the fit was made
+GRID_PX = 0.02  # of the worst over the image, between the rays on which the fit was made
 WORST_PX = {
     "pinhole.<locals>.<lambda>": 0.45,  # tangential distortion, which our model has not: 0.40 px
     "omni.<locals>.<lambda>": 0.2,
@@ -313,6 +313,30 @@ LENSES = {
         f"Camera.height: {H}\n",
         kb(KB),
     ),
+    "stella_vslam": (
+        f"Camera:\n  name: a\n  model: fisheye\n  fx: {FX}\n  fy: {FY}\n  cx: {CX}\n  cy: {CY}\n"
+        + "".join(f"  k{i}: {k}\n" for i, k in enumerate(KB, start=1))
+        + f"  cols: {W}\n  rows: {H}\n",
+        kb(KB),
+    ),
+    "okvis2": (
+        f"%YAML:1.0\ncameras:\n - {{image_dimension: [{W}, {H}], distortion_coefficients:"
+        f" {[*KB]}, distortion_type: equidistant, focal_length: [{FX}, {FY}],"
+        f" principal_point: [{CX}, {CY}], camera_type: gray}}\n",
+        kb(KB),
+    ),
+    "mins": (
+        f"cam0:\n  intrinsics: {[FX, FY, CX, CY]}\n  distortion_coeffs: {[*KB]}\n"
+        f"  distortion_model: equidistant\n  resolution: [{W}, {H}]\n",
+        kb(KB),
+    ),
+    "boofcv": (
+        f"pinhole: {{fx: 560.0, fy: 560.0, cx: {CX}, cy: {CY}, width: {W}, height: {H},"
+        " skew: 0.0}\nmodel: omnidirectional_universal\n"
+        f"radial_tangential: {{radial: {[*MEI[1:3]]}, t1: {MEI[3]}, t2: {MEI[4]}}}\n"
+        f"mirror_offset: {MEI[0]}\n",
+        omni(*MEI, f=(560.0, 560.0)),
+    ),
     "vikit": (
         f"cam_model: Pinhole\ncam_width: {W}\ncam_height: {H}\ncam_fx: 458.0\ncam_fy: 457.0\n"
         f"cam_cx: {CX}\ncam_cy: {CY}\n" + "".join(f"cam_d{i}: {k}\n" for i, k in enumerate(RT)),
@@ -358,7 +382,7 @@ def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
         assert np.max(error[inside]) < EXACT_PX
         return
     holds = rays[:, 2] > math.cos(math.radians(report.holds_deg) / 2.0)
-    assert np.max(error[inside & holds], initial=0.0) < HOLDS_PX + GRID_PX
+    assert np.max(error[inside & holds], initial=0.0) < HOLDS_PX
     assert np.max(error[inside]) < report.max_px + GRID_PX
     assert report.max_px < WORST_PX.get(published.__qualname__, HOLDS_PX)
 
@@ -451,6 +475,8 @@ def test_numbers_that_contradict_their_label_are_named(text, said, tmp_path):
             "no name of their model; say it with --model",
         ),
         (svo("pinhole", WIDE[:3], "none", []), "'pinhole' with 3 intrinsics"),
+        ("model: kannala_brandt\npinhole: {fx: 1.0}\n", "model is 'kannala_brandt'"),
+        ("resolution: [2, 2]\nintrinsics: []\ndistortion_model: omni\nomni_affine: [0]", "Kimera"),
         ("a: [1, 2", "no complete YAML"),
         ("<a><b>", "no complete XML"),
     ],

@@ -21,7 +21,8 @@ _NATS = 10.0  # of likelihood that a peak must have over its sides, so that nois
 # where the rest goes together by so much, a block that leaves so many times the middle one is of
 # something else, as a crash
 _TOGETHER, _TUMBLE = 0.7, 25.0
-_STUDENT = 2.131 / 1.960  # 95 % of Student's t of 15 degrees of freedom over the normal's
+# 95 % of Student's t over the normal's, of 7 degrees of freedom: as many as pairs of blocks, less one
+_STUDENT = 2.365 / 1.960
 
 INDEPENDENT = (
     0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
@@ -183,7 +184,7 @@ def _delay(
     Each block has a noise of its own: a tumble, after which nothing follows anything, weighs as
     little as its noise is large. A parabola is laid through the peak of the correlation; how much
     the blocks disagree about its slope is the deviation, whatever the noise is correlated with, as
-    long as a block lasts longer.
+    long as two blocks last longer.
 
     Args:
         xx: Power of the first signal in each block, shape (K,).
@@ -263,7 +264,10 @@ def _vertex(
         if nats < _NATS or abs(vertex - slope / bend) > half:
             return vertex, np.inf
         vertex -= slope / bend
-    return vertex, _STUDENT * float(np.sqrt(np.sum(slopes**2) * BLOCKS / (BLOCKS - 1)) / -bend)
+    # noise may last longer than a block: neighbours count together, paired in both ways
+    pairs = np.convolve(slopes, [1.0, 1.0])
+    variance = 0.5 * np.sum(pairs**2) * BLOCKS / (BLOCKS - 2)
+    return vertex, _STUDENT * float(np.sqrt(variance) / -bend)
 
 
 def _centred(values: np.ndarray) -> np.ndarray:
