@@ -1,9 +1,10 @@
 """Calibration files of the field, as our lens: which tool wrote a file is told from its keys.
 
 Kalibr and OpenVINS chains, EuRoC's sensor.yaml, camodocal and VINS-Fusion, SVO and maplab, OKVIS,
-vikit, ORB-SLAM and stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as ``topic echo`` prints it), OpenCV's
-FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one or several cameras. A box
-says where the numbers of a camera stand; `camera.calibrate.foreign` knows the models.
+vikit, ORB-SLAM, stella_vslam, MINS, BoofCV, basalt, ROS camera_info (as a file or as ``topic
+echo`` prints it), OpenCV's FileStorage, OCamCalib and py-OCamCalib; in YAML, JSON or XML, with one
+or several cameras. A box says where the numbers of a camera stand; `camera.calibrate.foreign`
+knows the models.
 
 Convention: pixel (0, 0) is the centre of the top left pixel, x right, y down, z forward, as in
 `FisheyeParams`. None of the files holds a field of view; it is read from an extra key ``fov_deg``,
@@ -316,7 +317,7 @@ def _model(core: str, distortion: str, values: Values, coefficients: list[float]
 def _kalibr(node: Node) -> Camera:
     core = str(node.get("camera_model", node.get("model", "pinhole"))).lower()
     if "omni_affine" in node:
-        raise ValueError("Kimera's omni, a polynomial of its own; export it as Kalibr's omni-radtan")
+        raise ValueError("Kimera's omni, a polynomial that is not read; expected omni-radtan")
     names = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
     if core not in names:
         raise ValueError(f"camera_model is {core!r}; expected one of {list(names)}")
@@ -552,8 +553,11 @@ def _size(node: Node) -> tuple[int, int] | None:
     if value is not None:
         width, height = _floats(value, "image size", (2,))
         return int(width), int(height)
-    sides = [("image_width", "width", "cam_width", "Camera.width", "Camera.cols", "image_Width")]
-    sides.append(("image_height", "height", "cam_height", "Camera.height", "Camera.rows", "image_Height"))
+    ends = ("image_{}", "{}", "cam_{}", "Camera.{}")
+    sides = [
+        (*(end.format(side) for end in ends), f"image_{side.title()}", f"Camera.{lines}")
+        for side, lines in (("width", "cols"), ("height", "rows"))
+    ]
     sizes = [next((node[n] for n in names if n in node), None) for names in sides]
     if None in sizes:
         return None

@@ -125,6 +125,12 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
     )
 
 
+def test_rows_that_share_a_stamp_have_a_clock():
+    time = np.repeat(0.01 * np.arange(200), 3)
+    table = {"time": time, "x": np.sin(time), "y": np.cos(time), "z": 1.0 + 0.1 * time}
+    assert propose(table, "a.csv").why["time"].endswith("100 Hz")
+
+
 def test_what_is_not_known_is_asked(tmp_path):
     columns = {name: values for name, values in table().items() if name != "millis"}
     found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")

@@ -180,7 +180,8 @@ def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
         points = np.zeros((2, 5))
         points[0, :3], points[0, 3] = place, -1.0 if 100 <= i < 150 else 0.5
         writer.add_frames([(points, np.zeros((1, 1)))])
-    writer.set_point_labels(["ball", "tip"])
+    writer.set_point_labels(["ball", "tip", "of no point"])
+    writer.analog_group.set_empty_array("SCALE", "left out", 4)
     path = tmp_path / "a.c3d"
     with path.open("wb") as file:
         writer.write(file)

@@ -169,7 +169,8 @@ def _clock(
             " a guess"
         )
         return TimeColumn(row_period=0.01), 0.01 * np.arange(count)
-    step = float(np.nanmedian(np.diff(numbers[name])))
+    steps = np.diff(numbers[name])
+    step = float(np.median(steps[steps > 0.0]))  # several rows may bear one stamp
     suffix = stated_unit or _split_unit(name)[1] or _SUFFIX.get(_words(name)[-1], "")
     rate = re.search(r"(\d+) ?hz", name, re.IGNORECASE)
     if rate and f"1/{rate[1]} s" in UNITS:

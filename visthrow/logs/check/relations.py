@@ -21,7 +21,7 @@ _NATS = 10.0  # of likelihood that a peak must have over its sides, so that nois
 # where the rest goes together by so much, a block that leaves so many times the middle one is of
 # something else, as a crash
 _TOGETHER, _TUMBLE = 0.7, 25.0
-# 95 % of Student's t over the normal's, of 7 degrees of freedom: as many as pairs of blocks, less one
+# 95 % of Student's t of 7 degrees of freedom, those of 8 pairs of blocks, over the normal's
 _STUDENT = 2.365 / 1.960
 
 INDEPENDENT = (

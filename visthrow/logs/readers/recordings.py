@@ -332,7 +332,13 @@ def _c3d(path: Path) -> Table:
     with path.open("rb") as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         reader = c3d.Reader(file)
-        labels = [label.strip() for label in reader.point_labels]
+        if not reader.point_used:
+            raise LogError(f"{path}: a C3D file without markers")
+        # analog channels are not read: their scales, which some writers leave out, do not count
+        plain = (1.0, np.ones(reader.analog_used), np.zeros(reader.analog_used))
+        reader.get_analog_transform_parameters = lambda: plain
+        # a list of labels may be longer than that of the points
+        labels = [label.strip() for label in reader.point_labels[: reader.point_used]]
         units = reader.get("POINT:UNITS")
         unit = units.string_value.strip() if units is not None else "mm"
         frames = [(number, points[:, :4].copy()) for number, points, _ in reader.read_frames()]
