@@ -540,6 +540,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
 def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():
     """MSP_SERVO does not show them; a good release is none that moved nothing."""
     desk = Desk("betaflight", parameters={"channel_forwarding": 1}).follow()
+    assert desk.backend.voltage == pytest.approx(11.1), "sent in hundredths of a volt"
     desk.backend.release(desk.now)
     desk.turn(1.0, HOVER)
     assert (desk.status.release, desk.fake.witness.releases) == ("accepted", 1)

@@ -233,6 +233,11 @@ class TestStand:
 
 
 class TestFlyer:
+    @pytest.mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
+    def test_a_map_without_thrust_is_refused(self, thrust_map):
+        with pytest.raises(ConfigError, match="thrust_map"):
+            replace(FLYER, thrust_map=thrust_map)
+
     @pytest.mark.parametrize("phase", [0.0, 0.003, 0.0085])
     def test_held_commands_pass_the_motors_lag_exactly(self, phase):
         """Closed form: thrust falls to each command by itself, wherever in a step of the
