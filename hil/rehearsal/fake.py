@@ -27,6 +27,7 @@ from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, mav.MAV_COMP_ID_USER1)
 MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
 
+NEVER = 1e9  # a time after every flight [s]
 MOST_EVENTS = 200
 ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
 MOST_KEPT = 100  # breaches
@@ -89,8 +90,8 @@ class FakeOptions(Bounded):
     # [s]
     mechanism: NotNegative = 0.0
     clock_offset: float = 0.0  # of its clock [s]
-    silent_after: float = float("inf")  # it says nothing any more from this time on [s]
-    taken_after: float = float("inf")  # when the pilot takes the vehicle over [s]
+    silent_after: float = NEVER  # it says nothing any more from this time on [s]
+    taken_after: float = NEVER  # when the pilot takes the vehicle over [s]
     pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = (
         "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
     )
