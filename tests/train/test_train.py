@@ -245,8 +245,6 @@ def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
     [
         (["--iterations", "-3"], "--iterations -3"),
         (["--evaluate-every", "-1"], "--evaluate-every -1"),
-        (["--minutes", "0"], "--minutes 0"),
-        (["--until", "-0.1"], "--until -0.1"),
         (["--until", "4"], "--until 4 m; throws are at 2 m"),  # centimetres
         (["--set", "vehicle.body.mass=-1"], "mass"),
         (["--set", "rope.length=-0.2"], "length"),

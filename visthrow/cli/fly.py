@@ -14,6 +14,13 @@ FILES = {
     "pixels.png": "frames of the throw with what the detector saw",
 }
 
+EXPORTS = {
+    ".csv": ("csv", ""),
+    ".parquet": ("pyarrow", "view"),
+    ".mcap": ("mcap.writer", "recordings"),
+}
+"""Ending of a file -> the module that writes it, and the extra that brings it."""
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -104,7 +111,7 @@ def run(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> None:
     """Raise ConfigError for arguments that no flight follows."""
     from visthrow.common.errors import ConfigError
-    from visthrow.logs.export import FORMATS
+    from visthrow.common.extras import load_extra
     from visthrow.throws.plants import known_plant
 
     known_plant(args.plant)
@@ -112,13 +119,13 @@ def _check(args: argparse.Namespace) -> None:
         raise ConfigError(
             f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y"
         )
-    formats = (*FORMATS, ".mcap")
     for path in args.export:
-        if Path(path).suffix not in formats:
+        ending = Path(path).suffix
+        if ending not in EXPORTS:
             raise ConfigError(
-                f"--export {path}: ending '{Path(path).suffix}'; expected one of"
-                f" {', '.join(formats)}"
+                f"--export {path}: ending '{ending}'; expected one of {', '.join(EXPORTS)}"
             )
+        load_extra(*EXPORTS[ending], f"--export {path}", ConfigError)
     for override in args.overrides:
         if override.startswith("task.noise.command"):
             raise ConfigError(

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import fields
 from typing import Any
 
-from visthrow.common.arguments import NUMBER, SOLVER, WHOLE, add_common
+from visthrow.common.arguments import ABOVE_ZERO, SOLVER, WHOLE, add_common
 
 EXAMPLES = (
     "examples:\n  visthrow train laptop                          a state policy on the cores of"
@@ -47,10 +47,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="stop after iteration N (default: the configuration's last)",
     )
-    add("--minutes", type=NUMBER, metavar="T", help="stop after this time")
+    add("--minutes", type=ABOVE_ZERO, metavar="T", help="stop after this time")
     add(
         "--until",
-        type=NUMBER,
+        type=ABOVE_ZERO,
         metavar="ERROR",
         help="stop once throws at 2.0 m land so near on average [m]",
     )

@@ -3,6 +3,7 @@ tables beside it.
 """
 
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -100,3 +101,11 @@ def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
 def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, capsys):
     assert main(["fly", "--out", str(tmp_path), "--set", "task.noise.command_step=0"]) == 2
     assert "fly sends commands as they are" in capsys.readouterr().err
+
+
+def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "mcap.writer", None)
+    folder = tmp_path / "flown"
+    assert main(["fly", "--out", str(folder), "--export", str(tmp_path / "flight.mcap")]) == 2
+    assert "visthrow[recordings]" in capsys.readouterr().err
+    assert not folder.exists()

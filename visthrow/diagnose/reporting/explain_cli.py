@@ -26,7 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n  visthrow diagnose explain flights/*.npz                      throws of ours,"
         " against the training simulator\n  visthrow diagnose explain flights --plant mine.toml    "
         "     against a vehicle and rope of your own\n  visthrow diagnose explain swing.csv"
-        " --config pendulum       another model, tables read by its mapping\n"
+        " --config pendulum_encoder  another model, tables read by its mapping\n"
     )
     shared(parser)
     parser.add_argument(
