@@ -26,8 +26,7 @@ LONGEST = 9.0  # a vehicle that is the policy's has thrown by then [s]
 
 
 SLOW = 0.5  # time constant of a slow yaw [s]; half of a step after 0.35 s, as PX4's SIH has it
-AT_ONCE = {"ardupilot": 0.10, "crazyflie": 0.10, "px4": 0.12, "betaflight": 0.16}
-"""Autopilot -> time in which a sign is judged by the rates that it reports [s]."""
+AT_ONCE = 0.10  # time in which a sign is judged by the rates that an autopilot reports [s]
 BY_POSES = 0.5  # and by poses alone [s]
 
 
@@ -140,7 +139,7 @@ def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
     assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in said
-    most = AT_ONCE[kind] if runner.parts.response.reported else BY_POSES
+    most = AT_ONCE if runner.parts.response.reported else BY_POSES
     assert runner.parts.response.time <= most + 1e-9
 
 

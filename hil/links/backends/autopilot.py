@@ -225,47 +225,44 @@ class MavlinkAutopilot(Autopilot, ABC):
         return self.texts[-1] if self.texts else "no text"
 
     def _note(self, host_time: float) -> tuple[str, str]:
-        p, beat = self.params, self._heartbeat
-        if beat is None or host_time - self._heard > p.heartbeat_timeout:
-            return (
-                "no heartbeat"
-                if beat is None
-                else f"no heartbeat for {host_time - self._heard:.1f} s"
-            ), WAIT
+        beat = self._heartbeat
+        if beat is None:
+            return "no heartbeat", WAIT
+        silent = host_time - self._heard
+        if silent > self.params.heartbeat_timeout:
+            return f"no heartbeat for {silent:.1f} s", WAIT
         if not self.audit.done:
             return "parameters are being read", WAIT
         role, armed = self._role(beat.custom_mode), bool(beat.base_mode & ARMED)
+        mode = self._mode_text(beat.custom_mode)
         if self._wanted is None:
-            if not armed and not p.arm:
-                return "disarmed", WAIT
-            if not armed and not self._may_arm:
-                return f"its checks before arming fail: {self._last_text()}", WAIT
-            ready = role == FOLLOW or (p.take and role == HOLD)
-            return (
-                ("", role)
-                if ready
-                else (
-                    (
-                        f"in mode {self._mode_text(beat.custom_mode)}; expected"
-                        f" {self._expected_modes()}"
-                    ),
-                    WAIT,
-                )
-            )
+            return self._note_before(role, mode, armed)
         if self._taken_over:
-            return (
-                (
-                    f"in mode {self._mode_text(beat.custom_mode)}, which the runner did not ask"
-                    " for: pilot or failsafe has it"
-                ),
-                WAIT,
-            )
-        if armed or self._wanted == LAND:  # on the ground it disarms itself
-            spools_up = p.arm and self._exact and not self.share
-            return "", WAIT if spools_up and role == FOLLOW else role or WAIT
-        if self._was_armed or self._arm_refused or not p.arm:
-            return self._arm_refused or "disarmed", WAIT
-        return "", WAIT
+            who = "which the runner did not ask for: pilot or failsafe has it"
+            return f"in mode {mode}, {who}", WAIT
+        return self._note_taken(role, armed)
+
+    def _note_before(self, role: str | None, mode: str, armed: bool) -> tuple[str, str]:
+        """Return the note of a vehicle that the runner has not taken."""
+        p = self.params
+        if not armed and not p.arm:
+            return "disarmed", WAIT
+        if not armed and not self._may_arm:
+            return f"its checks before arming fail: {self._last_text()}", WAIT
+        if role == FOLLOW or (p.take and role == HOLD):
+            return "", role
+        return f"in mode {mode}; expected {self._expected_modes()}", WAIT
+
+    def _note_taken(self, role: str | None, armed: bool) -> tuple[str, str]:
+        """Return the note of a vehicle that the runner has taken."""
+        p = self.params
+        if not armed and self._wanted != LAND:  # on the ground it disarms itself
+            arms = p.arm and not self._was_armed and not self._arm_refused
+            return "" if arms else self._arm_refused or "disarmed", WAIT
+        spools_up = p.arm and self._exact and not self.share
+        if role is None or (spools_up and role == FOLLOW):
+            return "", WAIT
+        return "", role
 
     def _flies_itself(self) -> bool:
         beat = self._heartbeat
@@ -289,9 +286,8 @@ class MavlinkAutopilot(Autopilot, ABC):
     def ask(self, mode: str, host_time: float) -> None:
         """Ask until the heartbeat shows the mode."""
         if mode != self._wanted:
-            if (
-                self._wanted is None and self._heartbeat is not None
-            ):  # the first one that is ours was the pilot's
+            first = self._wanted is None and self._heartbeat is not None
+            if first:  # the mode before it was the pilot's
                 self._may.add(self._role(self._heartbeat.custom_mode))
             self._may.add(mode)
             self._wanted, self._reached, self._asked_at = mode, False, -1e9

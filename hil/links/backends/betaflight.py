@@ -126,18 +126,16 @@ class Betaflight(OnPort):
             self._write_setting if write else None,
             tell,
         )
-        self._order: list[
-            int
-        ] = []  # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not told yet
+        # rcmap: where roll, pitch, yaw, throttle stand in a frame; empty: not reported yet
+        self._order: list[int] = []
         self._boxes: tuple[int, ...] = ()
         self._tuning = b""
         self._polled = dict.fromkeys(POLLS, -1e9)
         self._framed = self._boxed = self._read_back = -1e9
         self._followed_at: float | None = None  # since when it has followed [s]
         self._flags = self._blocks = 0
-        self._free_since: float | None = (
-            None  # since when nothing speaks against arming, with ARM low
-        )
+        # since when nothing speaks against arming, with ARM low
+        self._free_since: float | None = None
         self._sticks_us = (MIDDLE, MIDDLE, MIDDLE, LOW)  # roll, pitch, yaw, throttle
         self._pilots_us = LOW  # throttle that the pilot flew with
         self._opened: float | None = None
@@ -210,28 +208,22 @@ class Betaflight(OnPort):
         return not self._taken and self._box(BOX_ARM) and not self._box(BOX_OVERRIDE)
 
     def _known(self) -> tuple[str, str]:
-        p = self.params
         if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
-        armed, ours = self._box(BOX_ARM), p.arm_channel > 0 or self._box(BOX_OVERRIDE)
+        own = self.params.arm_channel > 0  # all channels are ours
+        armed, ours = self._box(BOX_ARM), own or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
             self._raised = True
             return "", FOLLOW
         if self._taken and self._raised:
-            return ("disarmed" if not armed else "MSP OVERRIDE is off: the pilot has it"), WAIT
-        if p.arm_channel:
-            return (
-                f"arming disabled: {blocked(self._blocks)}"
-                if self._blocks and not self._taken
-                else ""
-            ), WAIT
+            return "MSP OVERRIDE is off: the pilot has it" if armed else "disarmed", WAIT
+        if own:
+            blocks = self._blocks and not self._taken
+            return f"arming disabled: {blocked(self._blocks)}" if blocks else "", WAIT
         if not armed:
             return "disarmed", WAIT
-        return (
-            "MSP OVERRIDE is on before the runner is ready: switch it off"
-            if ours and not self._taken
-            else ""
-        ), WAIT
+        early = ours and not self._taken
+        return "MSP OVERRIDE is on before the runner is ready: switch it off" if early else "", WAIT
 
     def _box(self, number: int) -> bool:
         return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
@@ -240,9 +232,8 @@ class Betaflight(OnPort):
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us
-        waiting = self.params.arm_channel and not self._box(
-            BOX_ARM
-        )  # arming wants the throttle low
+        # arming wants the throttle low
+        waiting = self.params.arm_channel and not self._box(BOX_ARM)
         throttle = LOW if waiting else round(low + share * (HIGH - low))
         self._sticks_us = (*(self.sticks.position(i, r) for i, r in enumerate(rates)), throttle)
         return self._frame(host_time)
@@ -291,40 +282,44 @@ class Betaflight(OnPort):
                     self.refused += 1
         if self._raised and self._followed_at is None:
             self._followed_at = host_time
+        self._poll(host_time)
+        if self._boxes and self._heard > 0.0:  # while it is armed nothing may be written
+            self.audit.service(host_time)
+        self._serve_release(host_time)
+        ours = self.params.arm_channel and not self._taken and not self._over
+        if ours and host_time - self._framed >= KEEP_ALIVE:
+            self._frame(host_time)
+
+    def _poll(self, host_time: float) -> None:
+        """Ask for what is due."""
         judged = self._followed_at is not None and host_time - self._followed_at <= RATES_TIME
         periods = POLLS | ({msp.RAW_IMU: RATES_PERIOD} if judged else {})
+        if not self.release_record.read_back:
+            del periods[msp.SERVO]
         for command, period in periods.items():
-            if host_time - self._polled[command] >= period - ROUNDING and (
-                command != msp.SERVO or self.release_record.read_back
-            ):
+            if host_time - self._polled[command] >= period - ROUNDING:
                 self._polled[command] = host_time
                 self._write(command)
         if not (self._boxes and self._order) and host_time - self._boxed >= 0.5:
             self._boxed = host_time
             self._write(msp.BOXIDS)
             self._write(msp.RX_MAP)
-        if (
-            self._boxes and self._heard > 0.0
-        ):  # whether it is armed must be known: then nothing is written
-            self.audit.service(host_time)
+
+    def _serve_release(self, host_time: float) -> None:
+        """Open the mechanism, ask whether it has opened, and close it after a while."""
         if self.release_record.due(host_time) and self._opened is None:
             self._opened = host_time
             self._frame(host_time)
-        waits = self.release_record.state == PENDING and self._opened is not None
+        if self._opened is None:
+            return
+        waits = self.release_record.state == PENDING
         if waits and host_time - self._read_back >= READ_BACK:
             self._read_back = host_time
             if self.release_record.read_back:
                 self._write(msp.SERVO)
             self._write(msp.RC)
-        if self._opened is not None and host_time - self._opened > OPEN_TIME:
+        if host_time - self._opened > OPEN_TIME:
             self._opened = None
-        if (
-            self.params.arm_channel
-            and not self._taken
-            and not self._over
-            and host_time - self._framed >= KEEP_ALIVE
-        ):
-            self._frame(host_time)
 
     @property
     def _expires(self) -> bool:
@@ -357,13 +352,10 @@ class Betaflight(OnPort):
         if frame.command == msp.STATUS:
             self._heard = host_time
             self._hear_status(frame)
-            self._free_since = (
-                None
-                if self._blocks
-                else host_time
-                if self._free_since is None
-                else self._free_since
-            )
+            if self._blocks:
+                self._free_since = None
+            elif self._free_since is None:
+                self._free_since = host_time
         elif frame.command == msp.RC:
             self._hear_channels(frame.words())
         elif frame.command == msp.RAW_IMU and len(frame.payload) >= IMU.size:
