@@ -9,9 +9,12 @@ from hil.commands import examples
 from visthrow.common.arguments import add_commands, run_command
 
 ACTIONS = {
-    "run": ("fly, or run dry, by a config of configs/hil", "hil.commands.run_command"),
+    "run": (
+        "fly, or compute commands without sending them (a dry run)",
+        "hil.commands.run_command",
+    ),
     "view": (
-        "look at a run in 3D: live, or from its folder as a recording, pictures and flight logs",
+        "show a run in 3D while it flies, or write a recording, pictures and flight logs of it",
         "hil.commands.view_command",
     ),
     "replay": (
@@ -19,7 +22,7 @@ ACTIONS = {
         "hil.commands.replay_command",
     ),
     "check": (
-        "check the poses that arrive, and what forbids a throw",
+        "check the incoming poses, and print what prevents a throw",
         "hil.commands.check_command",
     ),
     "calibrate": (
@@ -27,11 +30,11 @@ ACTIONS = {
         "hil.commands.calibrate_command",
     ),
     "record": (
-        "record the poses that arrive and what the policy would make of them; never arms",
+        "record incoming poses and the policy's commands for them; never arms",
         "hil.commands.record_command",
     ),
     "fake": (
-        "a fake autopilot with the simulator's vehicle, to throw over the wire",
+        "run a fake autopilot that flies the simulated vehicle over UDP",
         "hil.rehearsal.fake_command",
     ),
 }

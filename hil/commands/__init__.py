@@ -11,11 +11,11 @@ EXAMPLES = """
   visthrow hil run --config fake --auto-arm     a throw; needs `visthrow hil fake` in a terminal
   visthrow hil run --config mine.toml --out runs/first
   visthrow hil record --config mine.toml --seconds 60
-  visthrow hil calibrate --config mine.toml     a hover by which the camera's tilt is told
-  visthrow hil replay runs/first                the same actions again?
+  visthrow hil calibrate --config mine.toml     estimate the camera's tilt in a hover
+  visthrow hil replay runs/first                check that the policy repeats its actions
   visthrow hil view runs/first                  a recording, a picture and a log of each throw
-  visthrow hil check --seconds 5                what comes, how old, how often, and the checks
-  visthrow hil check --hand-carry               carry the vehicle about: which axes fit?
+  visthrow hil check --seconds 5                rate and age of incoming poses, and the checks
+  visthrow hil check --hand-carry               carry the vehicle by hand to check its axes
   visthrow hil fake --seconds 60                flies for `visthrow hil run --config fake`
 """
 

@@ -36,15 +36,15 @@ COMMANDS = {
     ),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
     "baseline": (
-        "throw with trajectory optimisation and MPC; its front against the policies",
+        "throw with trajectory optimisation and MPC, and compare it with the policies",
         "visthrow.paper.commands.baseline_command",
     ),
     "diagnose": (
-        "say what the simulation gets wrong, from measured flights",
+        "find what the simulation gets wrong about measured flights",
         "visthrow.diagnose.cli",
     ),
     "sweep": (
-        "work a list of training runs and throws, on several GPUs or a cluster",
+        "run a list of trainings and throws, on several GPUs or a cluster",
         "visthrow.paper.commands.sweep_command",
     ),
     "report": (
@@ -52,7 +52,7 @@ COMMANDS = {
         "visthrow.paper.commands.report_command",
     ),
     "camera": (
-        "make a camera configuration from a calibration, check it, look at what it sees",
+        "make a camera configuration from a calibration, check it, and draw its view",
         "visthrow.cli.camera",
     ),
     "policy": ("export a policy's network as ONNX or C", "visthrow.cli.policy_command"),

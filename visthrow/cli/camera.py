@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     check = actions.add_parser(
         "check",
         help=(
-            "state a config's reprojection error on pictures of a board, and whether its lens fits"
+            "print a configuration's reprojection error on pictures of a board, and judge its lens"
         ),
     )
     check.add_argument("config", metavar="CONFIG", help="camera config: a shipped name or a file")

@@ -27,14 +27,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " throws at each of three targets\n  visthrow compare vision runs/v2/policy.npz     a"
         " shipped policy against one of your own\n  visthrow compare state baseline --throws 50   "
         " against trajectory optimisation and MPC on the same throws\n  visthrow compare --plant"
-        " reference-realistic --throws 50   on the stand-in for a real vehicle (minutes)\n "
+        " reference-realistic --throws 50   on the independent plant (minutes)\n "
         " visthrow compare --from runs/hil/*              throws of HIL runs, from their"
         " folders\n\nA throw starts in hover with the payload near z = 0.95 m. The landing error is"
-        " the horizontal distance\nfrom the target, the duration counts from the policy's start to"
-        " the landing, smoothness is the root mean\nsquare change of the normalised commands from"
-        " step to step. The policy 'baseline' stands for four rows: in the\ncontroller's own model,"
-        " an idealised bound, and on the plant with no, most or all of the known delays\nmade up"
-        " for.\n"
+        " the horizontal distance\nfrom the target. The duration runs from the policy's start to"
+        " the landing. Smoothness is the root mean square\nchange of the normalised commands from"
+        " step to step. The policy 'baseline' gives four rows: one in the\ncontroller's own model,"
+        " an idealised bound, and three on the plant that compensate no, most or all known\n"
+        "delays.\n"
     )
     add = parser.add_argument
     add(

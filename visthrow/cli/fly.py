@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "examples:\n  visthrow fly                                   the shipped vision policy"
         " throws at a target 2 m ahead\n  visthrow fly --policy state --target 1.5\n  visthrow fly"
         " --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n  visthrow"
-        " fly --plant reference-realistic       on the stand-in for a real vehicle (about a"
+        " fly --plant reference-realistic       on the independent plant (about a"
         " minute)\n\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
         " controller brings it back.\n"
     )
@@ -48,11 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="distance ahead, or x and y [m] (default: 2.0)",
     )
     add_conditions(parser, "the policy's")
-    pixels = "keypoints by a detector from rendered pictures, in place of projected ones"
+    pixels = "detect keypoints in rendered pictures instead of projecting them"
     add("--pixels", choices=("learnt", "contours"), help=pixels)
     saved = (
-        "write the policy as it is flown here: one for any vehicle becomes one for this vehicle, as"
-        " hil takes it"
+        "write the policy for these conditions: one for any vehicle becomes one for this vehicle,"
+        " which hil can fly"
     )
     add("--save", metavar="FILE", help=saved)
     add_out(parser, "out/fly", "for the files")

@@ -47,12 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="stop after iteration N (default: the configuration's last)",
     )
-    add("--minutes", type=ABOVE_ZERO, metavar="T", help="stop after this time")
+    add("--minutes", type=ABOVE_ZERO, metavar="T", help="stop after this time [min]")
     add(
         "--until",
         type=ABOVE_ZERO,
         metavar="ERROR",
-        help="stop once throws at 2.0 m land so near on average [m]",
+        help="stop once the mean landing error at 2.0 m is below this [m]",
     )
     add(
         "--evaluate-every",
@@ -74,7 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="show a throw of each evaluation in this machine's browser",
     )
-    add("--resume", action="store_true", help="go on from the folder's checkpoint")
+    add("--resume", action="store_true", help="continue from the folder's checkpoint")
     add("--solver", **SOLVER)
     add_common(parser)
 

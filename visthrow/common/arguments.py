@@ -78,7 +78,7 @@ SOLVER: Mapping[str, Any] = {
     "default": [],
     "type": "sim.solver={}".format,
     "metavar": "NAME",
-    "help": "engine that holds vehicle and rope, of sim.solver",
+    "help": "physics engine of vehicle and rope (sim.solver)",
 }
 """Option of a command that flies the training simulator."""
 
@@ -99,11 +99,11 @@ def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
         metavar="NAME",
         help="hybrid (the training simulator, the default), reference, or reference-realistic",
     )
-    add("--seed", type=WHOLE, default=0, help="of starts, noise and plant (default: 0)")
+    add("--seed", type=WHOLE, default=0, help="seed of starts, noise and plant (default: 0)")
     add("--config", metavar="NAME", help=f"fly in this train config instead of {whose} own")
     allow = (
-        "part of a policy's contract that --config and --set may break (vehicle, rope.length),"
-        " which is told; may be repeated"
+        "permit this difference from the conditions of the policy's training (vehicle,"
+        " rope.length); may be repeated"
     )
     add("--allow", action="append", default=[], metavar="KEY", help=allow)
     add("--solver", **SOLVER)

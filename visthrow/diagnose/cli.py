@@ -9,19 +9,19 @@ from visthrow.common.arguments import add_commands, run_command
 
 ACTIONS = {
     "check": (
-        "look at logs: clocks, units, frames, gaps, what is excited, what they can answer",
+        "check logs: clocks, units, frames, gaps, excitation, and what they can answer",
         "visthrow.diagnose.inputs.check_cli",
     ),
     "map": (
-        "propose how a foreign table's columns are read, and ask what it cannot know",
+        "propose a mapping for the columns of a table, and ask for what it cannot infer",
         "visthrow.diagnose.inputs.map_cli",
     ),
     "explain": (
-        "say what the simulation gets wrong about flights, and what that is worth",
+        "find what the simulation gets wrong about flights, and how much it matters",
         "visthrow.diagnose.reporting.explain_cli",
     ),
     "apply": (
-        "write the configuration that a diagnosis asks for, ready to train in",
+        "write the corrected configuration of a diagnosis, ready for training",
         "visthrow.diagnose.extend.apply_cli",
     ),
     "fit": (
@@ -29,11 +29,11 @@ ACTIONS = {
         "visthrow.diagnose.inputs.fit_cli",
     ),
     "plan": (
-        "find the flight that tells most of what could not be told",
+        "propose the next flight: the one expected to give the most evidence",
         "visthrow.diagnose.reporting.plan_cli",
     ),
     "blind": (
-        "hide effects in your own noise: which sizes would be named",
+        "hide effects in your own noise, and report which sizes would be named",
         "visthrow.diagnose.reporting.blind_cli",
     ),
 }

@@ -225,7 +225,10 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
         (["config", "vehicle", "papr"], "did you mean 'paper'"),
         (["config", "vehicle", "paper", "--set", "body.mas=1"], "did you mean 'mass'"),
         (["config", "vehicle", "--set", "body.mass=1"], "--set needs the NAME"),
-        (["config", "vehicle", "paper", "--set", "body.mass=-1"], "above 0 (with body.mass=-1)"),
+        (
+            ["config", "vehicle", "paper", "--set", "body.mass=-1"],
+            "above 0 and at most 100000 (with body.mass=-1)",
+        ),
         (["config", "vehicle", "deep.toml"], "deep.toml: no valid TOML: brackets are nested too"),
         (["sweep", "status", "trial", "--out", "deep.toml"], "deep.toml is a file; expected a"),
     ],
