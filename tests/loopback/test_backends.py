@@ -400,13 +400,20 @@ def test_without_the_audit_the_traps_are_what_they_are():
     assert desk.backend.release_record.note == "accepted, but nothing moved within 0.5 s"
 
 
+ACTUATOR = (
+    'px4.release="actuator"',
+    'px4.output_parameter="PWM_AUX_FUNC1"',
+    "px4.servo_open_us=2000",
+)
+
+
 @pytest.mark.parametrize(
     ("kind", "overrides", "parameters"),
     [
         ("ardupilot", (), {}),
         ("ardupilot", ('ardupilot.release="servo"',), {"SERVO9_FUNCTION": 0.0}),
         ("px4", (), {}),
-        ("px4", ('px4.release="actuator"', "px4.servo_open_us=2000"), {"PWM_AUX_FUNC1": 301.0}),
+        ("px4", ACTUATOR, {"PWM_AUX_FUNC1": 301.0}),
         ("betaflight", (), {}),
         ("betaflight", ("betaflight.servo_output=0",), {}),
     ],

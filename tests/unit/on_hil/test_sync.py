@@ -5,7 +5,7 @@ of another clock.
 import numpy as np
 import pytest
 
-from hil.links.clock import TimeSync
+from hil.links.clock import ManualClock, Ticker, TimeSync
 from hil.links.mavlink_link import LATE, Link, LinkSync
 from hil.links.pymav import mav
 from hil.poses.sources.mavlink import BodyIds, MavlinkSource
@@ -37,6 +37,26 @@ def test_the_shortest_round_trip_is_taken():
     assert abs(errors[-1]) <= 0.5 * sync.round_trip
     assert sync.round_trip < 8e-3, "of 50 exchanges the best"
     assert (TimeSync().offset, TimeSync().round_trip) == (None, None)
+
+
+def test_a_longer_round_trip_that_comes_later_does_not_count():
+    sync, true_offset = TimeSync(), 3.0
+    for sent, out, back in ((0.0, 0.002, 0.002), (0.1, 0.009, 0.001)):
+        answered = sent + out + true_offset
+        sync.take(int(answered * 1e9), TimeSync.stamp(sent), sent + out + back)
+    assert sync.offset == pytest.approx(true_offset, abs=1e-6)
+
+
+def test_a_late_tick_skips_those_that_it_missed():
+    clock = ManualClock(1.0)
+    ticker = Ticker(clock, 0.02)
+    ticker.take()
+    clock.time = ticker.due() + 0.05
+    ticker.take()
+    assert (ticker.index, ticker.missed) == (3, 2)
+    assert ticker.late == pytest.approx(0.01)
+    assert ticker.worst == pytest.approx(0.05)
+    assert ticker.due() == pytest.approx(1.08)
 
 
 @pytest.mark.parametrize("drift", [100e-6, -100e-6])

@@ -104,6 +104,17 @@ def test_commands_stay_within_bounds(plan):
     assert np.all(np.abs(command[1:]) <= np.array(params.max_rate) + 1e-6)
 
 
+@pytest.mark.parametrize(("below", "limit"), [(2.0, 3.5), (-2.0, 2.0)])
+def test_thrust_stops_at_its_limit(below, limit):
+    model, params = pm.Pendulum(0.212, 0.06, 0.363), MPCParams(min_thrust=2.0, max_thrust=3.5)
+    count = params.stages
+    states, inputs = pm.hover(model, np.tile([0.0, 0.0, 3.0], (count + 1, 1)))
+    start = states[0].copy()
+    start[2] -= below
+    command = MPC(model, params).step(start, (states, inputs[:count]))
+    assert command[0] == pytest.approx(limit, abs=1e-3)
+
+
 def test_the_sign_of_a_quaternion_does_not_matter(plan):
     states, inputs = plan.reference(0.1, 0.02, 62)
     start = states[0].copy()
