@@ -68,3 +68,14 @@ def test_a_log_without_commands_is_told_what_makes_them():
         DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"
     ):
         record_of(FlightLog({"pos_w": pos, "quat_wb": quat}))
+
+
+def test_rounding_counts_as_noise_of_a_twelfth_of_its_steps_square():
+    """A gyro that writes whole hundredths of a rad/s, and one that is exact."""
+    log = flight(200.0, 0.0)
+    step = 0.01
+    at = log["rate_b"].time
+    ramp = np.round(0.2 * at[:, None] * [1.0, 1.1, 1.2] / step) * step
+    log.channels["rate_b"] = Channel(at, ramp, "rad/s", "body")
+    sigma = record_of(log).gyro.sigma
+    assert sigma == pytest.approx(step * 12**-0.5, rel=0.5)

@@ -132,6 +132,7 @@ class FakeStarter:
 
     def start(self, task, device, minutes):
         self.started.append((task.name, device))
+        self.minutes = minutes
         run = FakeRun(self, task)
         self.alive = [*(other for other in self.alive if other.status is None), run]
         kinds = [other.task.gpu for other in self.alive]
@@ -187,6 +188,11 @@ def run(path, out, minutes=None, **told):
     work = load_list(path)
     starter = FakeStarter(work, out, told.pop("devices", ["a", "b"]), 3, **told)
     return starter, pool.ProcessPool(work, out, starter, lambda text: None).run(minutes)
+
+
+def test_a_task_is_told_how_many_minutes_are_left(path, tmp_path):
+    starter, _ = run(path, tmp_path, minutes=9.0)
+    assert starter.minutes == pytest.approx(9.0, abs=0.5)
 
 
 def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tmp_path):

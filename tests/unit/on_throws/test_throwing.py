@@ -271,6 +271,19 @@ def test_fly_writes_its_files(dropper, tmp_path, capsys):
     assert verified.returncode == 0, verified.stderr
 
 
+def test_compare_flies_the_state_and_the_vision_policy_unless_others_are_named(monkeypatch):
+    asked = []
+
+    def load(name, *args):
+        asked.append(name)
+        if name != "state":
+            raise ConfigError("enough")
+
+    monkeypatch.setattr("visthrow.throws.loading.load_policy", load)
+    assert main(["compare"]) == main(["compare", "vision_located"]) == 2
+    assert asked == ["state", "vision", "vision_located"]
+
+
 def test_compare_prints_and_writes(dropper, tmp_path, capsys):
     out = tmp_path / "out"
     words = [
