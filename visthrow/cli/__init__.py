@@ -133,7 +133,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if error.name == "mujoco.batch":
             return _refuse(
                 "the package 'mujoco' here has no mujoco.batch, which mujoco-core 4 brings: MuJoCo"
-                " 3, which mjlab, newton and Isaac Lab ask for, was installed over it; install"
+                " 3, which another package here asks for, was installed over it; install"
                 " 'visthrow[reference]' in an environment of its own"
             )
         package = (error.name or "").split(".")[0]

@@ -125,6 +125,17 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
     )
 
 
+def test_a_marker_in_millimetres_is_no_velocity_of_another():
+    """Two markers a quarter of a turn apart on a turning body: one goes as the other's derivative."""
+    time = 0.01 * np.arange(500)
+    table = {"time [s]": time}
+    for body, phase in (("drone", 0.0), ("ball", 0.5 * np.pi)):
+        turn = 3.0 * time + phase
+        path = np.column_stack([np.cos(turn), np.sin(turn), 1.0 + 0.0 * turn])
+        table |= {f"{body}.{axis} [mm]": 500.0 * c for axis, c in zip("XYZ", path.T)}
+    assert [c.name for c in propose(table, "a.csv").mapping.channels] == ["pos_w"]
+
+
 def test_rows_that_share_a_stamp_have_a_clock():
     time = np.repeat(0.01 * np.arange(200), 3)
     table = {"time": time, "x": np.sin(time), "y": np.cos(time), "z": 1.0 + 0.1 * time}

@@ -304,9 +304,12 @@ class MixedMujoco:
             raise AttributeError("mjtState has no attribute 'mjSTATE_PLASTIC'")
 
 
-def test_a_mixed_mujoco_is_named_by_the_reference_plant(monkeypatch):
+def test_a_mixed_mujoco_is_named_by_plants_and_solvers(monkeypatch):
     monkeypatch.delitem(sys.modules, "mujoco.batch", raising=False)
     monkeypatch.setattr(sys, "meta_path", [MixedMujoco(), *sys.meta_path])
     with pytest.raises(ModuleNotFoundError, match="another MuJoCo") as caught:
         runpy.run_module("sim.reference.rope")
     assert caught.value.name == "mujoco.batch"
+    solver = runpy.run_module("sim.solvers.mujoco")
+    with pytest.raises(ModuleNotFoundError, match="another MuJoCo"):
+        solver["_on_cpu"](None, {}, 1, "cpu")

@@ -700,6 +700,8 @@ class _Chooser:
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
     def _relation(self, path: Group, rate: Group, threshold: float) -> relations.Relation | None:
+        if rate.unit in unit_evidence.LENGTHS:
+            return None  # a length is no velocity, whatever it goes with
         time, columns = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
         if len(time) < 100:
             return None
