@@ -126,7 +126,7 @@ def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
 
 
 def test_a_marker_in_millimetres_is_no_velocity_of_another():
-    """Two markers a quarter of a turn apart on a turning body: one goes as the other's derivative."""
+    """On a turning body, a quarter of a turn apart, one goes as the other's derivative."""
     time = 0.01 * np.arange(500)
     table = {"time [s]": time}
     for body, phase in (("drone", 0.0), ("ball", 0.5 * np.pi)):

@@ -87,44 +87,18 @@ def layout_of(text: str, name: str = "") -> TextTable:
     """Lay out a text table that messages call by a name; without a line of numbers its rows are
     empty.
     """
-    lines = text.splitlines()
-    mark = _separator(lines)
+    mark = _separator(text.splitlines())
     blank = mark == " "
-    counted_lines = counted(io.StringIO(text, newline=""), len(text), name)
-    reader = csv.reader(counted_lines, delimiter=mark, skipinitialspace=blank)
-    rows = []
-    empty_before = []
-    last = 0
-    for cells in reader:
-        cells = [cell.strip() for cell in cells]
-        if blank and cells and cells[-1] == "":
-            cells.pop()
-        if any(cells):
-            empty_before.append(reader.line_num > last + 1)
-            rows.append((reader.line_num, cells))
-            last = reader.line_num
-    rows, left_out = _section(rows)
+    rows, left_out = _section(_cells(text, mark, name))
     widths = Counter(len(cells) for _, cells in rows[-1000:] if _holds_numbers(cells))
     if not widths:
         return TextTable(rows[0][1] if rows else [], [], False)
     width = widths.most_common(1)[0][0]
-    good = [_holds_numbers(cells) for _, cells in rows]
-    fits = [len(cells) == width and valid for (_, cells), valid in zip(rows, good)]
-    # identifiers above the numbers are numbers too: three lines of them, or all that there are
-    start = next(
-        (i for i in range(len(rows)) if fits[i] and all(good[i : i + 3])), fits.index(True)
-    )
-    head = rows[:start]
-    body = rows[start:]
-    cut = max((i + 1 for i in range(len(head)) if empty_before[i + 1]), default=0)
-    if cut == len(head):
-        cut = 0  # the empty line stands between the names and the numbers
-    named, settings, rate = _sorted_head(head, cut, width, blank)
-    if (
-        len(body) > 1
-        and all(cells[-1] == "" for _, cells in body)
-        and width > len(named[-1] if named else [])
-    ):
+    start = _first_row(rows, width)
+    head, body = rows[:start], rows[start:]
+    named, settings, rate = _sorted_head(head, _names_start(rows, start), width, blank)
+    unnamed = width > len(named[-1] if named else [])
+    if unnamed and len(body) > 1 and all(cells[-1] == "" for _, cells in body):
         body = [(line, cells[:-1]) for line, cells in body]  # each line ends with a separator
         width -= 1
     names = _names(named, width, settings) if named else _marker_names(width, settings)
@@ -133,6 +107,40 @@ def layout_of(text: str, name: str = "") -> TextTable:
 
 
 Rows = list[tuple[int, list[str]]]
+"""Numbers of lines, and their cells."""
+
+
+def _cells(text: str, mark: str, name: str) -> Rows:
+    """Cells of each line that holds any."""
+    blank = mark == " "
+    lines = counted(io.StringIO(text, newline=""), len(text), name)
+    reader = csv.reader(lines, delimiter=mark, skipinitialspace=blank)
+    rows = []
+    for cells in reader:
+        cells = [cell.strip() for cell in cells]
+        if blank and cells and cells[-1] == "":
+            cells.pop()
+        if any(cells):
+            rows.append((reader.line_num, cells))
+    return rows
+
+
+def _first_row(rows: Rows, width: int) -> int:
+    """Return the row at which the numbers begin: identifiers above them are numbers too, but three
+    rows of numbers in a line are the table.
+    """
+    good = [_holds_numbers(cells) for _, cells in rows]
+    fits = [len(cells) == width and valid for (_, cells), valid in zip(rows, good)]
+    firm = (i for i in range(len(rows)) if fits[i] and all(good[i : i + 3]))
+    return next(firm, fits.index(True))
+
+
+def _names_start(rows: Rows, start: int) -> int:
+    """Return the row at which the names of the columns begin: below the last empty line, if that
+    does not stand between the names and the numbers.
+    """
+    below_gap = [i for i in range(1, start + 1) if rows[i][0] > rows[i - 1][0] + 1]
+    return below_gap[-1] if below_gap and below_gap[-1] < start else 0
 
 
 def _section(rows: Rows) -> tuple[Rows, list[str]]:
@@ -194,17 +202,13 @@ def _sorted_head(
 ) -> tuple[list[list[str]], dict[str, str], float]:
     """Lines above the numbers: those that name columns, the settings, and the rate."""
     named = []
-    settings = {}
+    settings: dict[str, str] = {}
     rate = 0.0
     for i, (_, cells) in enumerate(head):
-        if cells[0].startswith(("#", "%")):
-            cells = [cells[0].lstrip("#% "), *cells[1:]]
-            cells = cells if cells[0] else cells[1:]
-            if not any(cells):
-                continue
+        cells = _uncommented(cells, width)
         filled = [cell for cell in cells if cell]
-        while len(cells) > width and not cells[-1]:
-            cells.pop()
+        if not filled:
+            continue
         if len(filled) == 1 and is_number(filled[0]):
             rate = float(filled[0])
         elif blank and len(cells) != width:
@@ -216,49 +220,66 @@ def _sorted_head(
         else:
             settings |= dict(zip(cells[::2], cells[1::2]))
             settings.setdefault(cells[0], "\t".join(cells[1:]))
-    for key in RATES:
-        if not rate and is_number(settings.get(key, "")):
-            rate = float(settings[key])
-    return named, settings, rate
+    stated = (float(settings[key]) for key in RATES if is_number(settings.get(key, "")))
+    return named, settings, rate or next(stated, 0.0)
+
+
+def _uncommented(cells: list[str], width: int) -> list[str]:
+    """Cells of a line of the head without the mark of a comment and surplus blanks at its end."""
+    if cells[0].startswith(("#", "%")):
+        first = cells[0].lstrip("#% ")
+        cells = [first, *cells[1:]] if first else cells[1:]
+    while len(cells) > width and not cells[-1]:
+        cells.pop()
+    return cells
 
 
 def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list[str]:
     """Names of columns, of all lines that name them, unlike each other."""
+    several = len(named) > 1
     units = [""] * width
     parts: list[list[str]] = [[] for _ in range(width)]
     for row in named:
-        filled = [cell for cell in row if cell]
-        if (len(filled) > 1 and all(_IDS.fullmatch(c) for c in filled[1:])) or (
-            len(named) > 1 and filled and _KINDS.issuperset(filled)
-        ):
-            continue
-        if len(named) > 1 and filled and all(unit_of(cell) is not None for cell in filled):
+        if several and _all_units(row):
             units = [unit_of(cell) or "" for cell in row]
-            continue
-        last = ""
-        for i, cell in enumerate(row):
-            # a body's name stands above the first of its columns alone
-            last = cell or ("" if row[0] else last)
-            if last and last not in parts[i]:
-                parts[i].append(last)
+        elif not _identifies(row, several):
+            _add_names(parts, row)
+    final = next((row for row in reversed(named) if not _all_units(row)), named[-1])
     names = []
-    final = next(
-        (r for r in reversed(named) if not all(unit_of(c) is not None for c in r if c)), named[-1]
-    )
     for i, part in enumerate(parts):
-        unit_line = final[i]
-        name = unit_line if _FRAME.fullmatch(unit_line) or i == 0 else ".".join(part)
-        names.append(
-            _joined(
-                name.replace(":", ".") if len(named) > 1 else name, unit_line, units[i], settings
-            )
-        )
+        alone = _FRAME.fullmatch(final[i]) or i == 0
+        name = final[i] if alone else ".".join(part)
+        name = name.replace(":", ".") if several else name
+        names.append(_joined(name, units[i], settings))
     if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings:
         names = _prefixed(names)
     return [name or f"column {i}" for i, name in enumerate(names, start=1)]
 
 
-def _joined(name: str, last: str, unit: str, settings: dict[str, str]) -> str:
+def _all_units(row: list[str]) -> bool:
+    """Whether every filled cell of a row is a unit."""
+    return all(unit_of(cell) is not None for cell in row if cell)
+
+
+def _identifies(row: list[str], several: bool) -> bool:
+    """Whether a row holds identifiers, or kinds of Motive's assets, and names nothing."""
+    filled = [cell for cell in row if cell]
+    numbers = len(filled) > 1 and all(_IDS.fullmatch(cell) for cell in filled[1:])
+    return numbers or (several and bool(filled) and _KINDS.issuperset(filled))
+
+
+def _add_names(parts: list[list[str]], row: list[str]) -> None:
+    """Add a row's words to the names of their columns: where the row's first cell is empty, a
+    body's name stands above the first of its columns alone.
+    """
+    last = ""
+    for i, cell in enumerate(row):
+        last = cell or ("" if row[0] else last)
+        if last and last not in parts[i]:
+            parts[i].append(last)
+
+
+def _joined(name: str, unit: str, settings: dict[str, str]) -> str:
     """Return a name with its unit; a subject that bears the name of its body is named once."""
     parts = name.split(".")
     name = ".".join(p for i, p in enumerate(parts) if i == 0 or p != parts[i - 1])
