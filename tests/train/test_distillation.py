@@ -65,7 +65,7 @@ def whole(tmp_path_factory):
     return folder
 
 
-def trained(iterations, sign=1.0):
+def trained(iterations, sign=1.0, *extra):
     """Trainer after so many iterations of a short schedule; ``sign`` turns every gradient."""
     sets = (
         *SMALL[:2],
@@ -75,6 +75,7 @@ def trained(iterations, sign=1.0):
         "distillation.memory=64",
         "distillation.epochs=2",
         "distillation.learning_rate=0.005",
+        *extra,
     )
     trainer = Trainer(config.load(Experiment, config.find("train", "vision_ideal"), sets), "cpu", 1)
     for parameter in trainer.algorithm.network.parameters():
@@ -94,6 +95,30 @@ def test_it_learns():
     assert summary["error_mean"] < 0.5  # untrained it drops the payload at once, 2.0 m off
     _, wrong = trained(4, sign=-1.0)
     assert wrong[-1] > losses[0]
+
+
+def test_the_teachers_action_is_learnt_where_it_has_a_weight():
+    networks = []
+    for weight in (0.0, 10.0):
+        trainer, _ = trained(1, 1.0, f"distillation.action_weight={weight}")
+        networks.append(
+            torch.cat([p.detach().flatten() for p in trainer.algorithm.network.parameters()])
+        )
+    assert float((networks[0] - networks[1]).abs().max()) > 1e-3
+
+
+def test_the_targets_are_as_old_as_the_poses_that_the_teacher_learnt_from(monkeypatch):
+    ages, exact = set(), ThrowEnv.exact_frame
+
+    def noted(env, age):
+        ages.add(age)
+        return exact(env, age)
+
+    monkeypatch.setattr(ThrowEnv, "exact_frame", noted)
+    trainer, _ = trained(1)
+    latency = trainer.algorithm.teacher.contract["observation"]["latency"]
+    assert sorted(ages) == pytest.approx([np.mean(latency)])
+    assert max(latency) > 0.0
 
 
 def test_the_exported_policy_remembers_as_the_network_does(whole):

@@ -1,6 +1,7 @@
 """Renderer, overlay and image side: what is drawn lies where the keypoints say."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,6 +101,9 @@ def test_overlay_marks_invalid_points_even_far_outside():
     assert image[:8, -8:].max() > 100, "cut off to the image's corner"
     with pytest.raises(ValueError, match="expected \\(320, 320, 3\\)"):
         draw_overlay(CAMERA, points, valid, np.zeros((10, 10, 3), np.uint8))
+    lens = replace(LENS, width=480, cx=239.5)
+    wide = KeypointCamera(replace(CAMERA.params, fisheye=lens), dtype=torch.float64)
+    assert draw_overlay(wide, points, valid)[:8, -8:].max() > 100
 
 
 def test_rectified_view_has_straight_lines():
