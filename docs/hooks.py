@@ -17,8 +17,9 @@ import typing
 from pathlib import Path
 from typing import Any
 
+from camera import bounds
 from visthrow import cli, config
-from visthrow.config import bounds, kinds, schema
+from visthrow.config import kinds, schema
 
 os.environ["COLUMNS"] = "88"
 HELP, KEYS = "<!-- help -->", re.compile(r"<!-- keys: (\w+) (\w+) ?(\w*) -->")
