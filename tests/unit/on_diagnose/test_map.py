@@ -136,6 +136,17 @@ def test_a_marker_in_millimetres_is_no_velocity_of_another():
     assert [c.name for c in propose(table, "a.csv").mapping.channels] == ["pos_w"]
 
 
+def test_the_imu_of_euroc_is_proposed(tmp_path):
+    time = 0.005 * np.arange(400)
+    rates = np.column_stack([np.sin(3.0 * time), np.cos(2.0 * time), 0.1 * time])
+    acc = np.column_stack([0.3 * np.sin(time), 0.3 * np.cos(time), 9.81 + 0.2 * np.sin(5.0 * time)])
+    table = {"timestamp [ns]": 1e9 * time}
+    table |= {f"w_RS_S_{axis} [rad s^-1]": c for axis, c in zip("xyz", rates.T)}
+    table |= {f"a_RS_S_{axis} [m s^-2]": c for axis, c in zip("xyz", acc.T)}
+    found = propose(table, "data.csv").mapping
+    assert {"rate_b", "acc_b"} <= {channel.name for channel in found.channels}
+
+
 def test_rows_that_share_a_stamp_have_a_clock():
     time = np.repeat(0.01 * np.arange(200), 3)
     table = {"time": time, "x": np.sin(time), "y": np.cos(time), "z": 1.0 + 0.1 * time}

@@ -390,12 +390,16 @@ class TestTables:
             ([""], "no header"),
             (["t,w", "0,1"], "no column 'v'"),
             (["t,v", "0,fast"], "holds text such as 'fast'"),
-            (["t,v,v", "0,1,1"], "stands twice"),
         ],
     )
     def test_bad_tables(self, tmp_path, rows, message):
         with pytest.raises(LogError, match=message):
             read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
+
+    def test_a_name_that_stands_twice_is_numbered(self, tmp_path):
+        path = written(tmp_path, ["t,v,v", "0,1,5", "1,2,6"])
+        (log,) = read(path, mapping(ChannelMap("x", ("v (2)",), "m")))
+        assert log["x"].values.ravel().tolist() == [5.0, 6.0]
 
     def test_a_table_cut_while_written_loses_its_last_row(self, tmp_path):
         (log,) = read(

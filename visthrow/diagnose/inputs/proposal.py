@@ -49,8 +49,8 @@ _NOT_VEHICLE = re.compile(r"payload|load|ball|(^|[._])l_|cam|object|tag|marker",
 _ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)
 _CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
 _HINTS = (
-    ("acc_b", r"acc|imu.*a[xyz]?$"),
-    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$|(^|[._])r_rpy$"),
+    ("acc_b", r"acc|imu.*a[xyz]?$|^a_rs"),
+    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$|^w_rs|(^|[._])r_rpy$"),
     ("velocity", r"vel|(^|[._])v$|speed"),
     ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
     (

@@ -34,6 +34,8 @@ _UNIT_WORDS = {
     "m/s2": "m/s^2",
     "mm/s²": "mm/s^2",
     "rad/s": "rad/s",
+    "rad s^-1": "rad/s",
+    "m s^-2": "m/s^2",
     "deg/s": "deg/s",
     "°": "deg",
     "": "",

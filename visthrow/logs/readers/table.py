@@ -9,6 +9,7 @@ import lzma
 import math
 import re
 import zlib
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -91,9 +92,10 @@ def read_table(path: str | Path) -> Columns:
         raise LogError(
             f"{path}: line {wrong[0]} has {len(wrong[1])} cells; the header has {len(header)}"
         )
-    twice = {name for name in header if header.count(name) > 1}
-    if twice:
-        raise LogError(f"{path}: column '{min(twice)}' stands twice in the header")
+    counts: Counter[str] = Counter()
+    for i, name in enumerate(header):
+        counts[name] += 1
+        header[i] = name if counts[name] == 1 else f"{name} ({counts[name]})"
     table = Columns()
     table.settings = layout.settings
     table.left_out = layout.left_out
