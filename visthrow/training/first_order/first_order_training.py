@@ -73,10 +73,17 @@ class FirstOrder:
         self._shares = [
             math.prod((remainder - b) / (a - b) for b in NODES if b != a) for a in NODES
         ]
-        blind = dataclasses.replace(
-            experiment, ppo=dataclasses.replace(p, privileged=())
-        )  # there is no critic
-        self.env = env = ThrowEnv(blind, device, seed)
+        simulated = dataclasses.replace(
+            experiment,
+            ppo=dataclasses.replace(p, privileged=()),  # there is no critic
+            rope=dataclasses.replace(
+                experiment.rope, segments=min(self.p.segments, experiment.rope.segments)
+            ),
+            sim=dataclasses.replace(
+                experiment.sim, substep=max(self.p.substep, experiment.sim.substep)
+            ),
+        )
+        self.env = env = ThrowEnv(simulated, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
         shape = {
             "hidden_dims": p.hidden,
