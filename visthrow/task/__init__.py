@@ -249,8 +249,8 @@ class FirstOrderParams(Bounded):
 
     iterations: Count = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    # rope segments at most, and least substep [s], of the simulator that learns; throws are measured
-    # on the plant's own
+    # rope segments at most and least substep [s] of the simulator that gradients come from; throws
+    # are measured in the plant's own
     segments: Count = 5
     substep: Positive = 0.004
     decay: Positive = 0.985  # of derivatives, per step backward
