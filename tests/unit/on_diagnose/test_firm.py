@@ -63,6 +63,18 @@ def test_a_cause_that_all_flights_show_is_confirmed():
     assert diagnosis["effect_05"].verdict == result.FOUND
 
 
+def test_of_what_flights_hardly_show_no_size_is_claimed():
+    """An effect a millionth as strong: its interval would be the prior's."""
+    weak = EFFECTS[7]
+    weak = replace(weak, prior_sd=1e-6 * weak.floor, floor=1e-6 * weak.floor)
+    effects = (*EFFECTS[:7], weak, *EFFECTS[8:])
+    model = SyntheticModel(effects=effects, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis[weak.name].verdict == result.NOT_IDENTIFIABLE
+    assert "hardly more than was known" in diagnosis[weak.name].sentence
+    assert diagnosis["effect_01"].verdict != result.NOT_IDENTIFIABLE
+
+
 def judged(monkeypatch, truth, **changes):
     """A diagnosis whose held-out flights say something else."""
     plain = held_out.measure
