@@ -4,11 +4,19 @@ plain NumPy.
 
 import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sim.hybrid import HybridSim
-from sim.params import BodyParams, PlantParams, QueueParams, RopeParams, SimParams
+from sim.params import (
+    BodyParams,
+    PlantParams,
+    QueueParams,
+    RopeParams,
+    SimParams,
+    VehicleParams,
+)
 from tests.plants import paper_plant
 from tests.scenes import Scene, wrench_at
 
@@ -28,6 +36,21 @@ def numerics(
     return dataclasses.replace(
         paper_plant().sim, substep=substep, precision=precision, control_period=control_period
     )
+
+
+def bare_quadrotor(
+    vehicle: VehicleParams,
+    count: int = 1,
+    integrator: str = "rk4",
+    step: float = 0.002,
+    precision: str = "float32",
+    control_period: float = 0.02,
+    **options: Any,
+) -> HybridSim:
+    """Return quadrotors without a rope."""
+    sim = numerics(step, precision, control_period)
+    plant = dataclasses.replace(paper_plant(), vehicle=vehicle, sim=sim)
+    return HybridSim(plant, count, without_rope=integrator, **options)
 
 
 def scene_plant(

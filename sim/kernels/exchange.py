@@ -81,6 +81,7 @@ def build_exchange(
     hanging = parts.payload.hanging
     rope_size = parts.rope_size
     scaled = parts.scaled
+    pushed = parts.pushed
     hazards = parts.hazards
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
@@ -160,7 +161,7 @@ def build_exchange(
         active, _until = held(state.queue, env, whole, switch, time + half, period)
         s = load(state, env)
         law_factors = laws.on(
-            p, rope, airs[env % airs.shape[0]], s, n, u, stiffness, active, state.attached[env]
+            p, rope, pushed(airs, state, env), s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
             s = coupled.step_alone(p, law_factors, s, active, g, h)

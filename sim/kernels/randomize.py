@@ -22,8 +22,8 @@ class ResetKernels:
     randomize: wp.Kernel
 
 
-def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
-    """Build the reset kernels for a number of segments."""
+def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> ResetKernels:
+    """Build the reset kernels for a number of segments; ``hangs``: whether a rope does."""
     real = t.real
     vec3 = t.vec3
     quat = t.quat
@@ -32,11 +32,14 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
     Randomization = t.Randomization
     L = params.rope.segments
     start = build_start(t, params.vehicle, State)
+    attached = int(hangs)
 
     @wp.func
     def rest(p: Vehicle, rope: Rope, state: State, env: int, used: real, gravity: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
-        mass = p.body.mass * state.mass_scale[env] + rope.total_mass
+        mass = p.body.mass * state.mass_scale[env]
+        if wp.static(hangs):
+            mass = mass + rope.total_mass
         start(p, state, env, mass * gravity, used)
         below = rope.last_mass * rope.last_center
         state.stiffness[L - 1, env] = below * gravity
@@ -48,7 +51,7 @@ def build_reset(t: Types, params: PlantParams, State: type) -> ResetKernels:
             )
             hanging += rope.segment_mass
         state.release_timer[env] = real(-1.0)
-        state.attached[env] = 1
+        state.attached[env] = attached
         state.status[env] = 0
 
     @wp.kernel(module="unique", enable_backward=False)

@@ -35,6 +35,8 @@ STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a
     "release_timer": ("real", False),  # time to separation [s]; negative: not latched
     "attached": ("int", False),
     "status": ("int", False),
+    "force_w": ("vec3", False),  # from outside [N], where the extension "push" is built in
+    "torque_b": ("vec3", False),  # likewise [N m], about the centre of mass
 }
 
 OUTPUT_FIELDS = {

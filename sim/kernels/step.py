@@ -40,14 +40,15 @@ def build_parts(
     direct: bool = False,
     extensions: frozenset[str] = frozenset(),
     motors: bool = False,
+    integrator: str = "heun",
 ) -> SimpleNamespace:
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
     ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``,
-    ``hazards``; ``depart``, which writes what follows when the payload separates with a stated
-    velocity."""
+    ``pushed``, ``hazards``; ``depart``, which writes what follows when the payload separates with a
+    stated velocity."""
     real = t.real
     vec3 = t.vec3
     Vehicle = t.Vehicle
@@ -63,7 +64,9 @@ def build_parts(
         flow = build_direct_flow(t)
     chain = build_chain(t, L, extensions)
     payload = build_payload(t, extensions)
-    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
+    coupled = build_coupled_step(
+        t, flow, rate, motor_advance, chain, payload, extensions, integrator
+    )
     laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
     through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(
         law.block == "payload force" for law in params.laws
@@ -99,6 +102,15 @@ def build_parts(
         p = vehicle[env % vehicle.shape[0]]
         p.body.mass = p.body.mass * state.mass_scale[env]
         return p
+
+    @wp.func
+    def pushed(airs: wp.array(dtype=Air), state: State, env: int):
+        """The air about an environment, with the wrench from outside."""
+        air = airs[env % airs.shape[0]]
+        if wp.static("push" in extensions):
+            air.push_w = air.push_w + state.force_w[env]
+            air.twist_b = air.twist_b + state.torque_b[env]
+        return air
 
     @wp.func
     def hazards(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), payload_pos: vec3):
@@ -162,6 +174,7 @@ def build_parts(
         load_rope=load_rope,
         rope_size=rope_size,
         scaled=scaled,
+        pushed=pushed,
         hazards=hazards,
         depart=depart,
     )
@@ -173,6 +186,7 @@ def build_step(
     direct: bool = False,
     extensions: frozenset[str] = frozenset(),
     motors: bool = False,
+    integrator: str = "heun",
 ) -> StepKernels:
     """Compose the kernel for the kinds and the number of segments of ``params``.
 
@@ -184,6 +198,7 @@ def build_step(
         extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in; the others cost
             nothing.
         motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
+        integrator: of a vehicle that carries nothing.
     """
     real = t.real
     vec3 = t.vec3
@@ -196,7 +211,7 @@ def build_step(
     L = params.rope.segments
     nonfinite = st.NONFINITE
     fallback = st.FALLBACK
-    parts = build_parts(t, params, direct, extensions, motors)
+    parts = build_parts(t, params, direct, extensions, motors, integrator)
     State = parts.State
     Output = parts.Output
     chain = parts.chain
@@ -205,9 +220,11 @@ def build_step(
     leaving = parts.leaving
     load = parts.load
     store = parts.store
-    load_rope, rope_size, scaled, hazards = (
-        getattr(parts, name) for name in ("load_rope", "rope_size", "scaled", "hazards")
-    )
+    load_rope = parts.load_rope
+    rope_size = parts.rope_size
+    scaled = parts.scaled
+    pushed = parts.pushed
+    hazards = parts.hazards
     depart = parts.depart
     limit = real(st.SPEED_LIMIT)
 
@@ -265,7 +282,7 @@ def build_step(
         p = scaled(vehicle, state, env)
         natural = ropes[env % ropes.shape[0]]
         r = releases[env % releases.shape[0]]
-        air = airs[env % airs.shape[0]]
+        air = pushed(airs, state, env)
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)

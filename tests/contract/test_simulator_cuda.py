@@ -10,9 +10,8 @@ import warp as wp
 
 from sim.hybrid import HybridSim
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
-from sim.standalone import QuadSim
 from tests.plants import paper_plant
-from tests.simulators import numerics, random_commands
+from tests.simulators import bare_quadrotor, numerics, random_commands
 from visthrow import config
 from visthrow.task import TaskParams
 
@@ -82,7 +81,7 @@ def test_cuda_agrees_with_the_cpu():
 
 def test_quadrotor_alone():
     sims = [
-        QuadSim(paper_plant().vehicle, COUNT, device=device, precision="float64")
+        bare_quadrotor(paper_plant().vehicle, COUNT, device=device, precision="float64")
         for device in (DEVICE, "cpu")
     ]
     for command in random_commands(2, STEPS, COUNT):

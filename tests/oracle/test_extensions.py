@@ -13,8 +13,8 @@ from sim.hybrid import HybridSim
 from sim.params import GRAVITY, AirParams
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
-from sim.standalone import QuadSim
 from tests.plants import EVERYTHING, paper_plant, plain_vehicle
+from tests.simulators import bare_quadrotor
 from visthrow.throws.plants import flown
 
 STEPS = 12  # of 20 ms
@@ -315,10 +315,9 @@ def test_ground_effect_lifts_as_the_formula_says():
     thrust = vehicle.body.mass * GRAVITY
     rise = []
     for air in (AirParams(), AirParams(ground_effect=effect)):
-        sim = QuadSim(vehicle, 1, precision="float64", air=air)
+        sim = bare_quadrotor(vehicle, 1, precision="float64", control_period=1e-3, airs=[air])
         sim.place(np.array([[0.0, 0.0, height]]))
         sim.set_command(np.array([[thrust, 0.0, 0.0, 0.0]]))
-        sim.control_period = 1e-3
         sim.step()
         rise.append(sim.get("vel_w")[0, 2] / 1e-3)
     ratio = vehicle.rotors.radius / (4 * height)
@@ -328,7 +327,9 @@ def test_ground_effect_lifts_as_the_formula_says():
 def test_asymmetric_motor_is_first_order_one_way():
     vehicle = plain_vehicle(paper_plant().vehicle)
     slow = dataclasses.replace(vehicle.motor, kind="asymmetric", time_constant_down=0.1)
-    sim = QuadSim(dataclasses.replace(vehicle, motor=slow), 1, precision="float64", step=5e-4)
+    sim = bare_quadrotor(
+        dataclasses.replace(vehicle, motor=slow), 1, precision="float64", step=5e-4
+    )
     sim.place(np.array([[0.0, 0.0, 1.0]]))
     before = sim.get("motor_speed")[0, 0]
     sim.set_command(np.array([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]]))

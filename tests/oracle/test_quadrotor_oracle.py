@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from sim.hybrid import HybridSim
 from sim.params import QueueParams, VehicleParams
-from sim.standalone import QuadSim
 from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import paper_plant
-from tests.simulators import random_commands
+from tests.simulators import bare_quadrotor, random_commands
 
 WITHIN = 1e-3
 """After a second of full-range commands [m]; the vehicles tumble, so errors of the first instants
@@ -62,9 +62,9 @@ def all_commands(steps: int) -> np.ndarray:
     return np.concatenate([random_commands(seed, steps, COUNT) for seed in SEEDS], axis=1)
 
 
-def flown(vehicle: VehicleParams, step: float, steps: int, precision: str) -> QuadSim:
+def flown(vehicle: VehicleParams, step: float, steps: int, precision: str) -> HybridSim:
     commands = all_commands(steps)
-    sim = QuadSim(vehicle, commands.shape[1], "rk4", step, precision=precision)
+    sim = bare_quadrotor(vehicle, commands.shape[1], "rk4", step, precision=precision)
     for command in commands:
         sim.set_command(command)
         sim.step()
@@ -129,7 +129,7 @@ def test_orders_of_the_integrators():
     vehicle = vehicle_with(0.0213)
 
     def end(integrator, step):
-        sim = QuadSim(vehicle, 1, integrator, step, precision="float64")
+        sim = bare_quadrotor(vehicle, 1, integrator, step, precision="float64")
         for command in ([3.0, 1.0, -0.5, 0.3], [2.0, -1.0, 0.5, -0.2], [2.5, 0.3, 1.0, 0.1]):
             sim.set_command([command])
             sim.step()

@@ -10,9 +10,8 @@ from scipy.special import ellipk
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
-from sim.standalone import QuadSim
 from tests.plants import paper_plant, plain_vehicle
-from tests.simulators import numerics, rods
+from tests.simulators import bare_quadrotor, numerics, rods
 
 PERIOD = 1e-4
 """Of a pendulum's period; order 2 at 2 ms leaves (w h)^2 = 2e-4 of the phase, less by the method's
@@ -180,7 +179,7 @@ def test_motor_step():
     """
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
     vehicle = dataclasses.replace(vehicle, queue=QueueParams(0.0))
-    sim = QuadSim(vehicle, 1, "rk4", 0.001, precision="float64")
+    sim = bare_quadrotor(vehicle, 1, "rk4", 0.001, precision="float64")
     first = sim.get("motor_speed")[0, 0]
     sim.set_command([[8.0, 0.0, 0.0, 0.0]])
     last = np.sqrt(2.0 / vehicle.thrust.k_f)
@@ -196,7 +195,7 @@ def test_battery_sags_to_where_source_and_load_meet():
     vehicle = dataclasses.replace(vehicle, aero=dataclasses.replace(vehicle.aero, kind="none"))
     endless = dataclasses.replace(vehicle.battery, capacity=1e9)
     vehicle = dataclasses.replace(vehicle, battery=endless, queue=QueueParams(0.0))
-    sim = QuadSim(vehicle, 1, "rk4", 0.002, precision="float64")
+    sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
     start = sim.get("voltage")[0]
     sim.set_command([[10.0, 0.0, 0.0, 0.0]])
     advance(sim, 100)
@@ -219,10 +218,10 @@ def test_battery_counts_its_charge():
     """The used fraction grows by the current: power over voltage over capacity, in hover steady but
     for the sag.
     """
-    sim = QuadSim(
+    sim = bare_quadrotor(
         dataclasses.replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64"
     )
-    vehicle = sim.vehicle
+    vehicle = sim.vehicles[0]
     weight = vehicle.body.mass * GRAVITY
     sim.set_command([[weight, 0.0, 0.0, 0.0]])
     voltage, speed = sim.get("voltage")[0], sim.get("motor_speed")[0, 0]
@@ -251,7 +250,7 @@ def test_gyroscopic_torques_do_no_work():
     inertia = np.array(vehicle.body.inertia)
 
     def run(speeds):
-        sim = QuadSim(vehicle, 1, "rk4", 0.0005, precision="float64", gravity=0.0)
+        sim = bare_quadrotor(vehicle, 1, "rk4", 0.0005, precision="float64", gravity=0.0)
         sim.place(np.zeros((1, 3)), rate_b=rate)
         sim.state.motor_speed.assign(np.array([speeds]))
         advance(sim, 50)
@@ -289,7 +288,7 @@ def test_quadrotor_without_thrust_falls_freely():
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
     idle = dataclasses.replace(vehicle.controller, min_thrust=0.0)
     vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
-    sim = QuadSim(vehicle, 1, "rk4", 0.002, precision="float64")
+    sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
     advance(sim, 25)
     np.testing.assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, -0.5 * GRAVITY * 0.25], atol=1e-12)
 
@@ -299,7 +298,7 @@ def test_external_wrench():
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
     idle = dataclasses.replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
     vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
-    sim = QuadSim(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
+    sim = bare_quadrotor(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
     sim.set_wrench([[0.3, -0.2, 0.1], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
     advance(sim, 10)
     time = 0.2

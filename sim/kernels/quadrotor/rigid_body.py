@@ -1,7 +1,7 @@
 """The quadrotor's state as one struct: derivative from the blocks, advance along a derivative.
 
 ``build_flow`` composes the seven blocks for one choice of kinds; the result is what both the hybrid
-simulator and the quadrotor alone integrate."""
+simulator and a quadrotor without a rope integrate."""
 
 from typing import Any
 

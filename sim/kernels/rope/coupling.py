@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from sim.kernels.quadrotor.integrators import build_quad_step
 from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration, blend
 from sim.kernels.rope.payload import LOADS
 from sim.kernels.structs import Types
@@ -71,6 +72,7 @@ def build_coupled_step(
     chain: SimpleNamespace,
     payload: SimpleNamespace,
     extensions: frozenset[str],
+    integrator: str = "heun",
 ):
     """One step of h seconds of vehicle and chain.
 
@@ -79,9 +81,9 @@ def build_coupled_step(
     so it is conserved to round-off. Where a rod turns more than ``max_turn`` in the step, the first
     stage alone (linearly implicit Euler) is kept. Returns a namespace of Warp functions ``step``
     (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in
-    place), ``step_alone`` (the vehicle after the payload has left), ``momentum`` (total linear
-    momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its centre,
-    world frame)."""
+    place), ``step_alone`` (the vehicle without the rope, by the ``integrator``), ``momentum`` (total
+    linear momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its
+    centre, world frame)."""
     vec3 = t.vec3
     vec4 = t.vec4
     real = t.real
@@ -220,25 +222,9 @@ def build_coupled_step(
         out.vel_w = root_velocity(p, rope, out, new_total, relative)
         return out, new_total, fell_back
 
-    @wp.func
-    def step_alone(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
-        """Heun step of the vehicle after the payload has left."""
-        f1 = flow(p, air, s, command)
-        inv_mass = real(1.0) / p.body.mass
-        acc1 = inv_mass * wp.quat_rotate(s.quat_wb, f1.force_b) + gravity
-        r1 = rate(p, s, f1, acc1, angular_acceleration(p, s.rate_b, f1.torque_b))
-        s2 = advance(s, r1, h)
-        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
-        f2 = flow(p, air, s2, command)
-        acc2 = inv_mass * wp.quat_rotate(s2.quat_wb, f2.force_b) + gravity
-        r2 = rate(p, s2, f2, acc2, angular_acceleration(p, s2.rate_b, f2.torque_b))
-        out = advance(s, blend(r1, real(0.5), r2, real(0.5)), h)
-        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
-        return out
-
     return SimpleNamespace(
         step=step,
-        step_alone=step_alone,
+        step_alone=build_quad_step(t, flow, rate, motor_advance, integrator),
         mount_velocity=mount_velocity,
         momentum=momentum,
         payload=payload_state,
