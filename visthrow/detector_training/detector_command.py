@@ -202,7 +202,7 @@ def throw(args: argparse.Namespace) -> int:
         raise VisthrowError(f"{options}; expected 1 or more of each, and a vision policy")
     looks = {
         "device": resolve(args.device),
-        "by": args.by,
+        "method": args.by,
         "weights": args.weights,
         "nuisances": args.nuisances,
     }

@@ -81,9 +81,9 @@ def build_coupled_step(
     so it is conserved to round-off. Where a rod turns more than ``max_turn`` in the step, the first
     stage alone (linearly implicit Euler) is kept. Returns a namespace of Warp functions ``step``
     (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in
-    place), ``step_alone`` (the vehicle without the rope, by the ``integrator``), ``momentum`` (total
-    linear momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity of its
-    centre, world frame)."""
+    place), ``step_alone`` (the vehicle without the rope, by the ``integrator``), ``momentum``
+    (total linear momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity
+    of its centre, world frame)."""
     vec3 = t.vec3
     vec4 = t.vec4
     real = t.real
