@@ -240,16 +240,21 @@ class HybridSim:
         """Copy the parameters to the device."""
         t = self.types
         laws = [self.params.laws] * len(airs)
-        rows = (
-            (t.Vehicle, pack_vehicle(t, self.vehicles, kinds_of(self.params.vehicle))),
-            (t.Rope, pack_rope(t, ropes)),
-            (t.Air, pack_air(t, airs, laws)),
-            (t.Release, pack(t.Release, *releases)),
-        )
-        arrays: list[Any] = [
-            wp.array(packed, dtype=struct, device=self.device) for struct, packed in rows
-        ]
-        self._vehicles, self._ropes, self._airs, self._release = arrays
+        rows = {
+            "vehicles": (t.Vehicle, pack_vehicle(t, self.vehicles, kinds_of(self.params.vehicle))),
+            "ropes": (t.Rope, pack_rope(t, ropes)),
+            "airs": (t.Air, pack_air(t, airs, laws)),
+            "releases": (t.Release, pack(t.Release, *releases)),
+        }
+        self._plants = t.Plants()
+        for name, (struct, packed) in rows.items():
+            setattr(self._plants, name, wp.array(packed, dtype=struct, device=self.device))
+        s = self.params.sim
+        self._plants.period = s.control_period
+        self._plants.substep = s.substep
+        self._plants.gamma = s.gamma
+        self._plants.max_turn = s.max_turn
+        self._plants.gravity = self.gravity
 
     def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
         """Return the solver of the plant's bodies with what it exchanges; None for the fused
@@ -269,7 +274,7 @@ class HybridSim:
             "types": self.types,
             "vehicles": self.vehicles,
             "ropes": ropes,
-            "packed": (self._vehicles, self._ropes),
+            "packed": (self._plants.vehicles, self._plants.ropes),
             "gravity": self.gravity,
             "state": self.state,
         }
@@ -315,32 +320,18 @@ class HybridSim:
         """Advance every plant by one control period under ``command`` and ``release``; with a
         ``mask``, shape (E,), where it is not 0.
         """
-        s = self.params.sim
-        parts = [self._vehicles, self._ropes, self._release, self._airs]
         mask = self._all if mask is None else mask
         if self._exchange is not None:
-            self._exchange.step(self._launch, self, parts, mask)
+            self._exchange.step(self._launch, self, self._plants, mask)
             return
-        numerics = [s.control_period, s.substep, s.gamma, s.max_turn, self.gravity]
-        self._launch(
-            self._step.step,
-            [*parts, *numerics, self.state, self.command, self.release, mask, self.out],
-            block_dim=64,
-        )
+        inputs = [self._plants, self.state, self.command, self.release, mask, self.out]
+        self._launch(self._step.step, inputs, block_dim=64)
 
     def foresee(self) -> None:
         """Write into ``foreseen`` what follows if every payload separates now; the plants stay as
         they are.
         """
-        inputs = [
-            self._vehicles,
-            self._ropes,
-            self._release,
-            self._airs,
-            self.gravity,
-            self.state,
-            self.foreseen,
-        ]
+        inputs = [self._plants, self.state, self.foreseen]
         self._launch(self._step.foresee, inputs, block_dim=64, work=LOOK)
 
     def randomize(self, spreads: RandomizationParams, mask: "wp.array[Any] | None" = None) -> None:
@@ -355,10 +346,8 @@ class HybridSim:
             )
         mask = self._all if mask is None else mask
         inputs = [
-            self._vehicles,
-            self._ropes,
+            self._plants,
             self._spreads[1],
-            self.gravity,
             self.seed,
             self.state,
             self.episode,
@@ -403,7 +392,7 @@ class HybridSim:
         st.put(self.types, self.state, values, self.count)
         self.state.mass_scale.fill_(1.0)
         self._used.fill_(battery_used)
-        inputs = [self._vehicles, self._ropes, self.gravity, self.state, self._all, self._used]
+        inputs = [self._plants, self.state, self._all, self._used]
         wp.launch(self._reset.place, self.count, inputs, device=self.device)
         self.adopt()
 
@@ -412,9 +401,10 @@ class HybridSim:
         the payload follows from them.
         """
         if self._exchange is None:
-            self._launch(self._step.payload, [self._ropes, self.state, self.out], work=LOOK)
+            self._launch(self._step.payload, [self._plants, self.state, self.out], work=LOOK)
         else:
-            self._exchange.place(self._launch, self, self._all if mask is None else mask)
+            mask = self._all if mask is None else mask
+            self._exchange.place(self._launch, self, self._plants, mask)
 
     def _launch(
         self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0
@@ -440,8 +430,8 @@ class HybridSim:
         """Parameters of vehicle and rope of every environment as the kernels read them: structured
         arrays, shape (E,).
         """
-        vehicles = self._vehicles.numpy()
-        ropes = self._ropes.numpy()
+        vehicles = self._plants.vehicles.numpy()
+        ropes = self._plants.ropes.numpy()
         rows = np.arange(self.count)
         return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
@@ -483,7 +473,7 @@ class HybridSim:
         """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3),
         world frame.
         """
-        ropes = self._ropes.numpy()
+        ropes = self._plants.ropes.numpy()
         rows = np.arange(self.count) % len(ropes)
         q = self.get("quat_wb").astype(float)
         r = ropes["mount"][rows].astype(float)

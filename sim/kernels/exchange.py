@@ -80,15 +80,15 @@ def build_exchange(
     depart = parts.depart
     hanging = parts.payload.hanging
     rope_size = parts.rope_size
-    scaled = parts.scaled
-    pushed = parts.pushed
+    vehicle_of = parts.vehicle_of
+    rope_of = parts.rope_of
+    release_of = parts.release_of
+    air_of = parts.air_of
     hazards = parts.hazards
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Ints = wp.array(dtype=wp.int32)
-    Vehicles, Ropes, Releases, Airs = (
-        wp.array(dtype=kind) for kind in (t.Vehicle, t.Rope, t.Release, t.Air)
-    )
+    Plants = t.Plants
     Wrench = st.array_struct(t, "Wrench", {k: (v, False) for k, v in WRENCH_FIELDS.items()})
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     tiny = real(1.0e-6)
@@ -97,7 +97,7 @@ def build_exchange(
     def begin_kernel(
         # Params:
         first: int,
-        releases: Releases,
+        plants: Plants,
         # State in:
         state: State,
         # In:
@@ -121,19 +121,15 @@ def build_exchange(
             state.status[env] = nonfinite
         out.separated[env] = 0
         if release[env] != 0 and state.release_timer[env] < real(0.0) and state.attached[env] != 0:
-            state.release_timer[env] = releases[env % releases.shape[0]].lag
+            state.release_timer[env] = release_of(plants, env).lag
 
     @wp.kernel(module="unique", enable_backward=False)
     def wrench_kernel(
         # Params:
         first: int,
-        vehicle: Vehicles,
-        ropes: Ropes,
-        airs: Airs,
-        period: real,
+        plants: Plants,
         time: real,
         h: real,
-        gravity: real,
         # State in:
         state: State,
         moves: Ints,
@@ -149,19 +145,19 @@ def build_exchange(
         wrench.load_w[env] = vec3()
         if moves[env] == 0:
             return
-        p = scaled(vehicle, state, env)
-        rope = ropes[env % ropes.shape[0]]
+        p = vehicle_of(plants, state, env)
+        rope = rope_of(plants, env)
         half = real(0.5) * h
-        g = vec3(real(0.0), real(0.0), -gravity)
+        g = vec3(real(0.0), real(0.0), -plants.gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
-        whole, switch = split_delay(p, period)
-        active, _until = held(state.queue, env, whole, switch, time + half, period)
+        whole, switch = split_delay(p, plants.period)
+        active, _until = held(state.queue, env, whole, switch, time + half, plants.period)
         s = load(state, env)
         law_factors = laws.on(
-            p, rope, pushed(airs, state, env), s, n, u, stiffness, active, state.attached[env]
+            p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
             s = coupled.step_alone(p, law_factors, s, active, g, h)
@@ -194,13 +190,9 @@ def build_exchange(
     def take_kernel(
         # Params:
         first: int,
-        vehicle: Vehicles,
-        ropes: Ropes,
-        releases: Releases,
-        airs: Airs,
+        plants: Plants,
         time: real,
         h: real,
-        gravity: real,
         # State in:
         state: State,
         moves: Ints,
@@ -233,10 +225,10 @@ def build_exchange(
             moves[env] = 0
             redrawn[env] = 1
             return
-        body = scaled(vehicle, state, env).body
+        body = vehicle_of(plants, state, env).body
         mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
         body_force_w = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
-        fall = vec3(real(0.0), real(0.0), gravity)
+        fall = vec3(real(0.0), real(0.0), plants.gravity)
         wrench.pull_w[env] = body.mass * ((s.vel_w - state.vel_w[env]) / h + fall) - body_force_w
         momentum = wp.cw_mul(body.inertia, (s.rate_b - state.rate_b[env]) / h)
         gyroscopic = wp.cross(mean_b, wp.cw_mul(body.inertia, mean_b))
@@ -254,14 +246,14 @@ def build_exchange(
             remaining_time = (one - part) * h
             acc = (vel - before) / h
             depart(
-                ropes[env % ropes.shape[0]],
-                releases[env % releases.shape[0]],
-                airs[env % airs.shape[0]],
+                rope_of(plants, env),
+                release_of(plants, env),
+                air_of(plants, state, env),
                 s,
                 pos - remaining_time * vel + (real(0.5) * remaining_time * remaining_time) * acc,
                 vel - remaining_time * acc,
                 n[L - 1],
-                gravity,
+                plants.gravity,
                 out,
                 env,
                 wp.max(timer, real(0.0)),
@@ -275,9 +267,7 @@ def build_exchange(
     def end_kernel(
         # Params:
         first: int,
-        vehicle: Vehicles,
-        ropes: Ropes,
-        period: real,
+        plants: Plants,
         # State in:
         state: State,
         # In:
@@ -288,21 +278,21 @@ def build_exchange(
         if mask[env] == 0:
             return
         if state.release_timer[env] >= real(0.0):
-            state.release_timer[env] = wp.max(state.release_timer[env] - period, real(0.0))
+            state.release_timer[env] = wp.max(state.release_timer[env] - plants.period, real(0.0))
         if state.attached[env] != 0:
             s = load(state, env)
             n = wp.zeros(shape=(L,), dtype=vec3)
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
-            p = scaled(vehicle, state, env)
-            hazard_bits = hazards(p, ropes[env % ropes.shape[0]], s, n, out.payload_pos_w[env])
+            p = vehicle_of(plants, state, env)
+            hazard_bits = hazards(p, rope_of(plants, env), s, n, out.payload_pos_w[env])
             state.status[env] = state.status[env] | hazard_bits
 
     @wp.kernel(module="unique", enable_backward=False)
     def show_kernel(
         # Params:
         first: int,
-        ropes: Ropes,
+        plants: Plants,
         # In:
         state: State,
         mask: Ints,
@@ -326,7 +316,7 @@ def build_exchange(
         bodies.quat_wb[env] = s.quat_wb
         bodies.vel_w[env] = s.vel_w
         bodies.rate_b[env] = s.rate_b
-        pos, vel = coupled.payload(ropes[env % ropes.shape[0]], s, n, u)
+        pos, vel = coupled.payload(rope_of(plants, env), s, n, u)
         bodies.payload_pos_w[env] = pos
         bodies.payload_vel_w[env] = vel
         wrench.pull_w[env] = vec3()

@@ -268,6 +268,8 @@ def build_laws(
     attached)`` -> air whose pushes hold the laws' forces besides its own, and ``in_flight(air,
     vel_w)`` [N] on a payload that has left. Without laws both do nothing."""
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     vec4 = t.vec4
     real = t.real
     Vehicle = t.Vehicle
@@ -282,9 +284,9 @@ def build_laws(
             rope: Rope,
             air: Air,
             s: QuadState,
-            n: wp.array(dtype=vec3),
-            u: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real),
+            n: Vectors,
+            u: Vectors,
+            stiffness: Reals,
             command: vec4,
             attached: int,
         ):
@@ -342,9 +344,9 @@ def build_laws(
         rope: Rope,
         air: Air,
         s: QuadState,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
         command: vec4,
         attached: int,
     ):

@@ -26,17 +26,21 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     """Build the reset kernels for a number of segments; ``hangs``: whether a rope does."""
     real = t.real
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     quat = t.quat
-    Vehicle = t.Vehicle
-    Rope = t.Rope
+    Plants = t.Plants
     Randomization = t.Randomization
     L = params.rope.segments
     start = build_start(t, params.vehicle, State)
     attached = int(hangs)
 
     @wp.func
-    def rest(p: Vehicle, rope: Rope, state: State, env: int, used: real, gravity: real):
+    def rest(plants: Plants, state: State, env: int, used: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
+        p = plants.vehicles[env % plants.vehicles.shape[0]]
+        rope = plants.ropes[env % plants.ropes.shape[0]]
+        gravity = plants.gravity
         mass = p.body.mass * state.mass_scale[env]
         if wp.static(hangs):
             mass = mass + rope.total_mass
@@ -57,28 +61,23 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     @wp.kernel(module="unique", enable_backward=False)
     def place_kernel(
         # Params:
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        gravity: real,
+        plants: Plants,
         # State in:
         state: State,
         # In:
         mask: wp.array(dtype=wp.int32),
-        used: wp.array(dtype=real),
+        used: Reals,
     ):
         env = wp.tid()
         if mask[env] != 0:
-            p = vehicle[env % vehicle.shape[0]]
-            rest(p, ropes[env % ropes.shape[0]], state, env, used[env], gravity)
+            rest(plants, state, env, used[env])
 
     @wp.kernel(module="unique", enable_backward=False)
     def randomize_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
+        plants: Plants,
         spreads: wp.array(dtype=Randomization),
-        gravity: real,
         seed: int,
         # State in:
         state: State,
@@ -86,12 +85,10 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         # In:
         mask: wp.array(dtype=wp.int32),
         # Out:
-        goal_w: wp.array(dtype=vec3),
+        goal_w: Vectors,
     ):
         env = wp.tid() + first
         if mask[env] != 0:
-            p = vehicle[env % vehicle.shape[0]]
-            rope = ropes[env % ropes.shape[0]]
             z = spreads[0]
             rng = wp.rand_init(seed * 9781 + episode[env], env)
             episode[env] = episode[env] + 1
@@ -142,6 +139,6 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             radius = z.goal_radius * wp.sqrt(real(wp.randf(rng)))
             angle = real(wp.randf(rng)) * real(6.283185307179586)
             goal_w[env] = vec3(radius * wp.cos(angle), radius * wp.sin(angle), real(0.0))
-            rest(p, rope, state, env, real(wp.randf(rng)) * z.battery_used, gravity)
+            rest(plants, state, env, real(wp.randf(rng)) * z.battery_used)
 
     return ResetKernels(place_kernel, randomize_kernel)

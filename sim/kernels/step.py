@@ -46,15 +46,18 @@ def build_parts(
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
-    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``scaled``,
-    ``pushed``, ``hazards``; ``depart``, which writes what follows when the payload separates with a
-    stated velocity."""
+    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``hazards``;
+    ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an environment;
+    ``depart``, which writes what follows when the payload separates with a stated velocity."""
     real = t.real
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
     Air = t.Air
+    Plants = t.Plants
     QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
@@ -76,7 +79,7 @@ def build_parts(
     load, store = st.build_access(t, State)
 
     @wp.func
-    def rope_size(u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
+    def rope_size(u: Vectors, n: Vectors):
         """Sum of the sizes of the rope's state."""
         total = real(0.0)
         for i in range(L):
@@ -87,9 +90,9 @@ def build_parts(
     def load_rope(
         state: State,
         env: int,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
     ):
         for i in range(L):
             n[i] = state.cable_dir_w[i, env]
@@ -97,23 +100,31 @@ def build_parts(
             stiffness[i] = state.stiffness[i, env]
 
     @wp.func
-    def scaled(vehicle: wp.array(dtype=Vehicle), state: State, env: int):
+    def vehicle_of(plants: Plants, state: State, env: int):
         """Parameters of an environment's vehicle, with its mass."""
-        p = vehicle[env % vehicle.shape[0]]
+        p = plants.vehicles[env % plants.vehicles.shape[0]]
         p.body.mass = p.body.mass * state.mass_scale[env]
         return p
 
     @wp.func
-    def pushed(airs: wp.array(dtype=Air), state: State, env: int):
+    def rope_of(plants: Plants, env: int):
+        return plants.ropes[env % plants.ropes.shape[0]]
+
+    @wp.func
+    def release_of(plants: Plants, env: int):
+        return plants.releases[env % plants.releases.shape[0]]
+
+    @wp.func
+    def air_of(plants: Plants, state: State, env: int):
         """The air about an environment, with the wrench from outside."""
-        air = airs[env % airs.shape[0]]
+        air = plants.airs[env % plants.airs.shape[0]]
         if wp.static("push" in extensions):
             air.push_w = air.push_w + state.force_w[env]
             air.twist_b = air.twist_b + state.torque_b[env]
         return air
 
     @wp.func
-    def hazards(p: Vehicle, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), payload_pos: vec3):
+    def hazards(p: Vehicle, rope: Rope, s: QuadState, n: Vectors, payload_pos: vec3):
         """Bits of the status: the payload strikes the vehicle; a joint of the rope stands within a
         propeller disc, one centimetre thick."""
         status = int(0)
@@ -173,8 +184,10 @@ def build_parts(
         store=store,
         load_rope=load_rope,
         rope_size=rope_size,
-        scaled=scaled,
-        pushed=pushed,
+        vehicle_of=vehicle_of,
+        rope_of=rope_of,
+        release_of=release_of,
+        air_of=air_of,
         hazards=hazards,
         depart=depart,
     )
@@ -202,11 +215,12 @@ def build_step(
     """
     real = t.real
     vec3 = t.vec3
+    Vectors = t.Vectors
     vec4 = t.vec4
-    Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
     Air = t.Air
+    Plants = t.Plants
     QuadState = t.QuadState
     L = params.rope.segments
     nonfinite = st.NONFINITE
@@ -222,26 +236,27 @@ def build_step(
     store = parts.store
     load_rope = parts.load_rope
     rope_size = parts.rope_size
-    scaled = parts.scaled
-    pushed = parts.pushed
+    vehicle_of = parts.vehicle_of
+    rope_of = parts.rope_of
+    release_of = parts.release_of
+    air_of = parts.air_of
     hazards = parts.hazards
     depart = parts.depart
     limit = real(st.SPEED_LIMIT)
 
     @wp.func
-    def sane(s: QuadState, u: wp.array(dtype=vec3), n: wp.array(dtype=vec3)):
+    def sane(s: QuadState, u: Vectors, n: Vectors):
         """Finite and below the speed limit; a comparison with NaN is false."""
         return st.size(s) + rope_size(u, n) < limit
 
     @wp.func
     def separate(
-        p: Vehicle,
         rope: Rope,
         r: Release,
         air: Air,
         s: QuadState,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        n: Vectors,
+        u: Vectors,
         gravity: real,
         out: Output,
         env: int,
@@ -258,15 +273,7 @@ def build_step(
     def step_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        releases: wp.array(dtype=Release),
-        airs: wp.array(dtype=Air),
-        period: real,
-        substep: real,
-        gamma: real,
-        max_turn: real,
-        gravity: real,
+        plants: Plants,
         # State in:
         state: State,
         # In:
@@ -279,10 +286,12 @@ def build_step(
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        p = scaled(vehicle, state, env)
-        natural = ropes[env % ropes.shape[0]]
-        r = releases[env % releases.shape[0]]
-        air = pushed(airs, state, env)
+        p = vehicle_of(plants, state, env)
+        natural = rope_of(plants, env)
+        r = release_of(plants, env)
+        air = air_of(plants, state, env)
+        period = plants.period
+        gravity = plants.gravity
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
@@ -306,13 +315,13 @@ def build_step(
         total = coupled.momentum(p, rope, s, u)
         time = real(0.0)
         if attached != 0 and timer >= real(0.0) and timer < tiny:
-            separate(p, rope, r, air, s, n, u, gravity, out, env, time)
+            separate(rope, r, air, s, n, u, gravity, out, env, time)
             attached = int(0)
         while time < period - tiny:
             active, until = held(state.queue, env, whole, switch, time, period)
             if attached != 0 and timer > time + tiny:
                 until = wp.min(until, timer)
-            count = int(wp.ceil((until - time) / substep - real(1.0e-3)))
+            count = int(wp.ceil((until - time) / plants.substep - real(1.0e-3)))
             h = (until - time) / real(float(count))
             for k in range(count):
                 if attached != 0:
@@ -330,8 +339,8 @@ def build_step(
                         u,
                         stiffness,
                         g,
-                        gamma,
-                        max_turn,
+                        plants.gamma,
+                        plants.max_turn,
                         h,
                     )
                     if fell_back:
@@ -340,7 +349,7 @@ def build_step(
                     s = coupled.step_alone(p, law_factors, s, active, g, h)
             time = until
             if attached != 0 and timer >= real(0.0) and time > timer - tiny:
-                separate(p, rope, r, air, s, n, u, gravity, out, env, time)
+                separate(rope, r, air, s, n, u, gravity, out, env, time)
                 attached = int(0)
 
         if timer >= real(0.0):
@@ -368,14 +377,14 @@ def build_step(
     def payload_kernel(
         # Params:
         first: int,
-        ropes: wp.array(dtype=Rope),
+        plants: Plants,
         # State in:
         state: State,
         # Out:
         out: Output,
     ):
         env = wp.tid() + first
-        natural = ropes[env % ropes.shape[0]]
+        natural = rope_of(plants, env)
         s = load(state, env)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
@@ -391,37 +400,22 @@ def build_step(
     def foresee_kernel(
         # Params:
         first: int,
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        releases: wp.array(dtype=Release),
-        airs: wp.array(dtype=Air),
-        gravity: real,
+        plants: Plants,
         # State in:
         state: State,
         # Out:
         out: Output,
     ):
         env = first + wp.tid()
-        p = vehicle[env % vehicle.shape[0]]
-        natural = ropes[env % ropes.shape[0]]
+        natural = rope_of(plants, env)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
         rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
-        r = releases[env % releases.shape[0]]
-        separate(
-            p,
-            rope,
-            r,
-            airs[env % airs.shape[0]],
-            load(state, env),
-            n,
-            u,
-            gravity,
-            out,
-            env,
-            real(0.0),
-        )
+        s = load(state, env)
+        r = release_of(plants, env)
+        air = air_of(plants, state, env)
+        separate(rope, r, air, s, n, u, plants.gravity, out, env, real(0.0))
 
     return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output, parts)

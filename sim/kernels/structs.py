@@ -46,6 +46,10 @@ ROPE_NUMBERS = (
 """Scalars of the device's rope, beside its mount."""
 
 
+PLANT_ROWS = ("vehicles", "ropes", "releases", "airs")
+PLANT_NUMBERS = ("period", "substep", "gamma", "max_turn", "gravity")
+"""Arrays and numbers of a batch's parameters."""
+
 QUAD_STATE = {
     "pos_w": "vec3",
     "quat_wb": "quat",
@@ -86,6 +90,9 @@ class Types:
             what pushes from outside
             during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
                 mass, ``payload_push_w`` [N].
+        Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
+            an entry for one environment or all, and the numerics.
+        Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.
         QuadState, QuadRate: state of the quadrotor alone and its time derivative.
     """
 
@@ -107,6 +114,11 @@ class Types:
         }
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})
+        rows = (self.Vehicle, self.Rope, self.Release, self.Air)
+        arrays = {name: wp.array(dtype=row) for name, row in zip(PLANT_ROWS, rows, strict=True)}
+        self.Plants = make_struct("Plants", arrays | dict.fromkeys(PLANT_NUMBERS, real))
+        self.Vectors = wp.array(dtype=self.vec3)
+        self.Reals = wp.array(dtype=real)
         self.QuadState, self.QuadRate, self.Flow = (
             make_struct(name, {k: getattr(self, kind) for k, kind in fields.items()})
             for name, fields in (

@@ -120,32 +120,28 @@ class Exchange:
         self._moves, self._again = (wp.zeros(count, dtype=wp.int32, device=device) for _ in "ma")
 
     def step(
-        self, launch: Callable[..., None], sim: Any, parts: Sequence[Any], mask: "wp.array[Any]"
+        self, launch: Callable[..., None], sim: Any, plants: Any, mask: "wp.array[Any]"
     ) -> None:
-        """Advance by one control period; ``parts``: vehicles, ropes, releases and airs on the
-        device.
-        """
-        vehicles, ropes, releases, airs = parts
-        period = sim.params.sim.control_period
-        gravity = sim.gravity
+        """Advance by one control period; ``plants``: a struct ``types.Plants``."""
         h = self.world.substep
         k = self.kernels
         flags = [self._moves, self._again]
-        launch(k.begin, [releases, sim.state, sim.command, sim.release, mask, *flags, sim.out])
+        launch(k.begin, [plants, sim.state, sim.command, sim.release, mask, *flags, sim.out])
         for i in range(self.world.substeps):
-            time = [period, i * h, h, gravity]
             wrench = [sim.state, self._moves, sim.out, self.world.wrench]
-            launch(k.wrench, [vehicles, ropes, airs, *time, *wrench])
+            launch(k.wrench, [plants, i * h, h, *wrench])
             self.solver.advance(h)
             taken = [sim.state, *flags, self.world.wrench, self.world.bodies, sim.out]
-            launch(k.take, [*parts, (i + 1) * h, h, gravity, *taken])
-        launch(k.end, [vehicles, ropes, period, sim.state, mask, sim.out])
-        self.place(launch, sim, self._again)
+            launch(k.take, [plants, (i + 1) * h, h, *taken])
+        launch(k.end, [plants, sim.state, mask, sim.out])
+        self.place(launch, sim, plants, self._again)
 
-    def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
+    def place(
+        self, launch: Callable[..., None], sim: Any, plants: Any, mask: "wp.array[Any]"
+    ) -> None:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
         shared = [self.world.bodies, self.world.wrench]
-        launch(self.kernels.show, [self.world.packed[1], sim.state, mask, *shared])
+        launch(self.kernels.show, [plants, sim.state, mask, *shared])
         self.solver.place(mask)
         launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
 

@@ -132,6 +132,7 @@ def build_replay(
     """
     real = t.real
     vec3 = t.vec3
+    Vectors = t.Vectors
     Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
@@ -207,9 +208,7 @@ def build_replay(
         )
 
     @wp.func
-    def let_go(
-        r: Release, rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)
-    ):
+    def let_go(r: Release, rope: Rope, s: QuadState, n: Vectors, u: Vectors):
         """The payload and the loose rope at the separation."""
         ball = Ball()
         ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)

@@ -103,6 +103,8 @@ def build_chain(
     L = segments
     real = t.real
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     Rope = t.Rope
     vec2 = wp.types.vector(2, real)
     last = L - 1
@@ -160,28 +162,28 @@ def build_chain(
 
     def build_stage(second: bool):
         @wp.func
-        def direction(n: wp.array(dtype=vec3), n2: wp.array(dtype=vec3), i: int):
+        def direction(n: Vectors, n2: Vectors, i: int):
             return n2[i] if wp.static(second) else n[i]
 
         @wp.func
-        def rate(u: wp.array(dtype=vec3), k1: wp.array(dtype=vec3), h: real, i: int):
+        def rate(u: Vectors, k1: Vectors, h: real, i: int):
             return u[i] + h * k1[i] if wp.static(second) else u[i]
 
         @wp.func
         def up(
             rope: Rope,
-            n: wp.array(dtype=vec3),
-            u: wp.array(dtype=vec3),
-            n2: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3),
-            stiffness: wp.array(dtype=real),
+            n: Vectors,
+            u: Vectors,
+            n2: Vectors,
+            k1: Vectors,
+            stiffness: Reals,
             root_rate_w: vec3,
             gravity: vec3,
             load: vec3,
             gamma: real,
             h: real,
-            c1: wp.array(dtype=vec3),
-            c2: wp.array(dtype=vec3),
+            c1: Vectors,
+            c2: Vectors,
             hs: wp.array(dtype=vec2),
         ):
             l = rope.segment_length
@@ -277,8 +279,8 @@ def build_chain(
         def speed(
             rope: Rope,
             mount_vel_w: vec3,
-            u: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3),
+            u: Vectors,
+            k1: Vectors,
             h: real,
         ):
             """Velocity of the payload's centre [m/s], world frame."""
@@ -301,16 +303,16 @@ def build_chain(
     @wp.func
     def down_first(
         rope: Rope,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        n: Vectors,
+        u: Vectors,
         mount_acc_w: vec3,
         gamma: real,
         h: real,
-        c1: wp.array(dtype=vec3),
-        c2: wp.array(dtype=vec3),
+        c1: Vectors,
+        c2: Vectors,
         hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3),
-        k1: wp.array(dtype=vec3),
+        n2: Vectors,
+        k1: Vectors,
     ):
         """Fill k1 and n2; return the largest squared rate [1/s^2] of the state and the predicted
         state.
@@ -331,20 +333,20 @@ def build_chain(
     @wp.func
     def down_second(
         rope: Rope,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
         mount_acc_w: vec3,
         mount_force_w: vec3,
         gravity: vec3,
         load: vec3,
         gamma: real,
         h: real,
-        c1: wp.array(dtype=vec3),
-        c2: wp.array(dtype=vec3),
+        c1: Vectors,
+        c2: Vectors,
         hs: wp.array(dtype=vec2),
-        n2: wp.array(dtype=vec3),
-        k1: wp.array(dtype=vec3),
+        n2: Vectors,
+        k1: Vectors,
     ):
         """Advance n, u, stiffness; ``mount_force_w`` is the vehicle's force on the chain. Return
         the new momentum.
@@ -380,11 +382,11 @@ def build_chain(
 
     @wp.func
     def fall_back(
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        n: Vectors,
+        u: Vectors,
         h: real,
-        n2: wp.array(dtype=vec3),
-        k1: wp.array(dtype=vec3),
+        n2: Vectors,
+        k1: Vectors,
     ):
         """Advance n and u by the first stage alone, linearly implicit Euler; the
         stiffness stays.
@@ -399,8 +401,8 @@ def build_chain(
         rope: Rope,
         mount_pos_w: vec3,
         mount_vel_w: vec3,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
+        n: Vectors,
+        u: Vectors,
     ):
         pos = mount_pos_w
         vel = mount_vel_w
@@ -412,7 +414,7 @@ def build_chain(
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
 
     @wp.func
-    def momentum(rope: Rope, u: wp.array(dtype=vec3)):
+    def momentum(rope: Rope, u: Vectors):
         """Linear momentum [N s] of the chain in a frame that moves with the mount."""
         total = vec3()
         for i in range(L):
@@ -421,12 +423,12 @@ def build_chain(
         return total
 
     @wp.func
-    def com_velocity(rope: Rope, mount_vel_w: vec3, u: wp.array(dtype=vec3)):
+    def com_velocity(rope: Rope, mount_vel_w: vec3, u: Vectors):
         """Velocity [m/s] of the centre of mass of rope and payload, world frame."""
         return mount_vel_w + momentum(rope, u) * (real(1.0) / rope.total_mass)
 
     @wp.func
-    def pull(rope: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3)):
+    def pull(rope: Rope, stiffness: Reals, u: Vectors):
         """Force [N] along the rope at the mount.
 
         Of many rods from the geometric stiffness of the first (tension times length): half of what
@@ -440,9 +442,7 @@ def build_chain(
             )
 
     @wp.func
-    def stretched(
-        natural: Rope, now: Rope, stiffness: wp.array(dtype=real), u: wp.array(dtype=vec3), h: real
-    ):
+    def stretched(natural: Rope, now: Rope, stiffness: Reals, u: Vectors, h: real):
         if wp.static(giving):
             if natural.compliance != real(0.0):
                 out = natural

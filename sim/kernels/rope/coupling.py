@@ -85,6 +85,8 @@ def build_coupled_step(
     (total linear momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity
     of its centre, world frame)."""
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     vec4 = t.vec4
     real = t.real
     Vehicle = t.Vehicle
@@ -102,7 +104,7 @@ def build_coupled_step(
         return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
 
     @wp.func
-    def payload_state(rope: Rope, s: QuadState, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3)):
+    def payload_state(rope: Rope, s: QuadState, n: Vectors, u: Vectors):
         return chain.payload(
             rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u
         )
@@ -114,9 +116,9 @@ def build_coupled_step(
             air: Air,
             s: QuadState,
             f: Flow,
-            n: wp.array(dtype=vec3),
-            u: wp.array(dtype=vec3),
-            k1: wp.array(dtype=vec3),
+            n: Vectors,
+            u: Vectors,
+            k1: Vectors,
             h: real,
         ):
             """Force on the payload [N], world frame."""
@@ -134,7 +136,7 @@ def build_coupled_step(
     load_second = build_load(chain.speed_second)
 
     @wp.func
-    def momentum(p: Vehicle, rope: Rope, s: QuadState, u: wp.array(dtype=vec3)):
+    def momentum(p: Vehicle, rope: Rope, s: QuadState, u: Vectors):
         return (
             p.body.mass * s.vel_w
             + rope.total_mass * mount_velocity(rope, s)
@@ -162,9 +164,9 @@ def build_coupled_step(
         s: QuadState,
         total: vec3,
         command: vec4,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
         gravity: vec3,
         gamma: real,
         max_turn: real,

@@ -15,6 +15,8 @@ def build_loose_step(t: Types, chain, payload):
     ``step(rope, air, pos_w, vel_w, n, u, stiffness, gravity, gamma, max_turn, h)`` -> position and
     velocity of the upper end; the arrays n, u and stiffness change in place."""
     vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
     mat33 = t.mat33
     real = t.real
     Rope = t.Rope
@@ -32,9 +34,9 @@ def build_loose_step(t: Types, chain, payload):
         air: Air,
         pos_w: vec3,
         vel_w: vec3,
-        n: wp.array(dtype=vec3),
-        u: wp.array(dtype=vec3),
-        stiffness: wp.array(dtype=real),
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
         gravity: vec3,
         gamma: real,
         max_turn: real,
