@@ -11,7 +11,7 @@ from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow import cli
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, beyond, result_set, throws, trade
+from visthrow.paper.report import ablations, result_set, throws, trade
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page
@@ -168,27 +168,6 @@ def test_hypervolume_of_one_setting_is_its_rectangle():
     expected = (2.5 - found.of("duration").mean()) * (0.5 - found.of("error").mean())
     assert volume.value == pytest.approx(expected)
     assert expected in volume
-
-
-def test_bars_are_judged_by_the_mean(full):
-    said = "\n".join(
-        part.text
-        for part in beyond.section(full).parts
-        if isinstance(part, Text) and part.kind == "finding"
-    )
-    assert re.search(r"state_moving-1 at targets.*under 0\.12 m, reached", said)
-    high = only(
-        made_up.policy(
-            np.random.default_rng(5),
-            "state_payload-1",
-            "state",
-            "hybrid",
-            2.0,
-            0.2,
-            variant="payload",
-        )
-    )
-    assert "missed by" in texts(beyond.section(high), "finding")
 
 
 def test_the_page_stands_alone(written):

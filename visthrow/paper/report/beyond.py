@@ -16,12 +16,6 @@ from visthrow.view.parts import Grid, Picture, Section, Text
 
 TARGET = 2.0
 SPEED_KEY = "task.target.speed"
-MOVING_BAR, PAYLOAD_BAR = (
-    0.12,
-    0.10,
-    # mean errors that were asked for: targets that move at 0.5 m/s; payloads that vary, both at 2.0
-    # m [m]
-)
 
 VARIANTS = ("moving", "payload", "drag", "far")
 TITLES = {
@@ -64,10 +58,7 @@ def section(thrown: ResultSet) -> Section:
         )
         note = "'its own': the conditions of its own training; else what was changed."
         table = Grid("Payload, drag and distance", head, tuple(rows), note, heads=4)
-    findings = (Text(text, "finding") for text in _bars(thrown))
-    return parts.section(
-        "beyond", "Beyond the paper", lead, *moving, table, *findings, missing=missing
-    )
+    return parts.section("beyond", "Beyond the paper", lead, *moving, table, missing=missing)
 
 
 def _is_beyond(result: Result) -> bool:
@@ -191,35 +182,6 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
         head = ("policy", "plant", "speed [m/s]", "throws", "landed", "landing error [m]")
         content.append(Grid("Moving targets", head, tuple(rows)))
     return content
-
-
-def _bars(thrown: ResultSet) -> list[str]:
-    """Return each requirement and whether it was reached."""
-    sentences = []
-    for policy, points in _speeds(
-        thrown, sorted({r.unit["policy"] for r in thrown.matching(variant="moving")}), "hybrid"
-    ).items():
-        for speed, r in points:
-            if speed == 0.5:
-                sentences.append(
-                    _judged(f"{policy} at targets that move at 0.5 m/s", r, MOVING_BAR)
-                )
-    for r in thrown.matching(
-        kind="policy", variant="payload", plant="hybrid", target=TARGET, departures={}
-    ):
-        sentences.append(
-            _judged(f"{r.unit['policy']} with varied payload and cable", r, PAYLOAD_BAR)
-        )
-    return sentences
-
-
-def _judged(what: str, r: Result, bar: float) -> str:
-    error = st.mean(r.of("error"))
-    verdict = "reached" if error.value < bar else f"missed by {error.value - bar:.3f} m"
-    return (
-        f"**{what}**: {error.text()} m in the training simulator with noise; asked for: under"
-        f" {bar:.2f} m, {verdict}."
-    )
 
 
 def training_section(thrown: ResultSet) -> Section:
