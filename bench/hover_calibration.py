@@ -5,7 +5,7 @@
 Each draw hovers, sways and is calibrated as :mod:`visthrow.throws.calibrated` does it, with all the
 training's noise; then what was found is compared with what was drawn. ``--plant
 reference-realistic`` does so on the reference plant: poses with its noise, keypoints of what was
-exposed with half a pixel of noise, as the OpenCV detector has (``visthrow detector check``)."""
+exposed with half a pixel of noise, as the OpenCV detector has (``python -m bench.detector``)."""
 
 import argparse
 from functools import partial
