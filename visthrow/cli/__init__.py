@@ -31,7 +31,7 @@ COMMANDS = {
         "visthrow.cli.compare",
     ),
     "detector": (
-        "train the keypoint detector on rendered frames, and check it",
+        "train the keypoint detector on rendered frames, and throw with it",
         "visthrow.detector_training.detector_command",
     ),
     "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
