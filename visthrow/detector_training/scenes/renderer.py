@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from camera.params import FisheyeParams
-from visthrow.detector_training.scenes.scene import Scenes
+from visthrow.detector_training.scenes.scene import SCENE_ROWS, Scenes
 from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 
@@ -54,38 +54,34 @@ class Renderer:
         """
         import warp as wp
 
-        from visthrow.detector_training.scenes.scene_kernel import render
+        from visthrow.detector_training.scenes.scene_kernel import SceneRow, ThingRow, render
 
         p = self.lens
         image = torch.empty(
             scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device
         )
         s = scenes.to(self.device)
-        rows = [
-            s.lens,
-            s.pose,
-            s.shutter,
-            s.ball,
-            s.goal,
-            s.ground,
-            s.walls,
-            s.light,
-            s.rope,
-            s.sensor,
-            s.things,
-        ]
-        arrays = [row.float().contiguous() for row in rows]
+        table = torch.cat([getattr(s, name) for name in SCENE_ROWS], -1).float().contiguous()
+        things = s.things.float().contiguous()
+
+        def rows(tensor: torch.Tensor, struct: type) -> wp.array:
+            """View of a tensor whose last axis holds the numbers of a struct."""
+            shape = tensor.shape[:-1]
+            return wp.array(ptr=tensor.data_ptr(), dtype=struct, shape=shape, device=self.device)
 
         def launch(part: slice) -> None:
-            inputs = [wp.from_torch(row[part]) for row in arrays]
-            out = wp.from_torch(image[part])
-            dim = (out.shape[0], p.height, p.width)
             wp.launch(
                 render,
-                dim=dim,
+                dim=(len(table[part]), p.height, p.width),
                 device=self.device,
-                inputs=[seed, self.samples, *inputs, self._pixels],
-                outputs=[out],
+                inputs=[
+                    seed,
+                    self.samples,
+                    rows(table[part], SceneRow),
+                    rows(things[part], ThingRow),
+                    self._pixels,
+                ],
+                outputs=[wp.from_torch(image[part])],
             )
 
         if self.device.startswith("cuda"):

@@ -17,6 +17,20 @@ from camera.params import CameraParams, FisheyeParams
 
 THINGS = 10  # most things on the ground and about the hall
 
+SCENE_ROWS = (
+    "lens",
+    "pose",
+    "shutter",
+    "ball",
+    "goal",
+    "ground",
+    "walls",
+    "light",
+    "rope",
+    "sensor",
+)
+"""Tables of `Scenes` with one row a scene, in the order in which the kernel reads them."""
+
 
 @dataclass(frozen=True)
 class Scenes:
