@@ -1,18 +1,14 @@
-"""Progress of a training run: a picture on the terminal, lines where there is none, a CSV row an
-iteration.
-"""
+"""Progress of a training run: printed lines, and a CSV row an iteration."""
 
 import csv
 import io
-import sys
+import math
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
 from visthrow.common.storage import atomic_write
 from visthrow.task.measurement import Throws
-from visthrow.view import terminal
 
 COLUMNS = (
     "iteration",
@@ -32,11 +28,7 @@ COLUMNS = (
     "landed_2m",
 )
 
-REDRAWN = 0.5  # between two pictures [s]
-
-CURVE, SCATTER = (56, 10), (22, 10)  # width and height of the two plots, in characters
-
-REACH = 0.3  # half of the square about the target that the scatter shows [m]
+SAID_EVERY = 25  # iterations between two lines
 
 
 class TrainLog:
@@ -66,7 +58,6 @@ class TrainLog:
         writer.writerows(rows)
         atomic_write(path, text.getvalue())
         self._before = float(rows[-1]["wall_s"]) if rows else 0.0
-        self._picture = ProgressPicture(rows) if sys.stdout.isatty() else None
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(
@@ -101,14 +92,12 @@ class TrainLog:
         text = (
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
-            f" {terminal.clock(figures['wall_s'])},"
-            f" {terminal.clock(self._remaining(figures['iteration'], elapsed))} left"
+            f" {clock(figures['wall_s'])},"
+            f" {clock(self._remaining(figures['iteration'], elapsed))} left"
         )
-        if self._picture is not None:
-            self._picture.draw(text, figures, throws)
-        elif throws is not None:
+        if throws is not None:
             print(f"{text}  at 2.0 m: {figures_text(figures)}", flush=True)
-        elif figures["iteration"] % 25 == 0:
+        elif figures["iteration"] % SAID_EVERY == 0:
             print(text, flush=True)
 
     def _remaining(self, iteration: int, elapsed: float) -> float:
@@ -117,56 +106,13 @@ class TrainLog:
         return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed)
 
 
-class ProgressPicture:
-    """Landing error against wall time, and where the last evaluation's throws landed, drawn over
-    itself.
-    """
-
-    def __init__(self, rows: Sequence[dict]):
-        """Begin with the rows of a resumed run."""
-        self._training = [
-            (float(row["wall_s"]), float(row["landing_error"]))
-            for row in rows
-            if row["landing_error"]
-        ]
-        self._thrown = [
-            (float(row["wall_s"]), float(row["error_2m"])) for row in rows if row["error_2m"]
-        ]
-        self._last: Throws | None = None
-        self._said = "no evaluation yet"
-        self._lines = 0
-        self._drawn = 0.0
-
-    def draw(self, text: str, figures: dict, throws: Throws | None) -> None:
-        """Take an iteration's figures; draw where the last picture is old or there are throws."""
-        self._training.append((figures["wall_s"], figures["landing_error"]))
-        if throws is not None:
-            self._thrown.append((figures["wall_s"], figures["error_2m"]))
-            self._last = throws
-            self._said = figures_text(figures)
-        drawn_at = time.perf_counter()
-        if throws is None and drawn_at - self._drawn < REDRAWN:
-            return
-        self._drawn = drawn_at
-        lines = [text, *self.lines()]
-        up = f"\x1b[{self._lines}A" if self._lines else ""
-        print(up + "".join(f"\x1b[2K{line}\n" for line in lines), end="", flush=True)
-        self._lines = len(lines)
-
-    def lines(self) -> list[str]:
-        """Return the picture without its head line."""
-        chart = terminal.curve([(".", self._training), ("o", self._thrown)], *CURVE, "[m]")
-        points = []
-        last = self._last
-        if last is not None:
-            offsets = last.landing_w - ((last.target, 0.0) if last.goal_w is None else last.goal_w)
-            points = [(-float(y), float(x)) for x, y in offsets[last.success]]
-        right = terminal.scatter(points, REACH, *SCATTER)
-        heads = (
-            "landing error: . training, o throws at 2.0 m",
-            f"landings within {REACH:g} m: {self._said}",
-        )
-        return terminal.side_by_side([heads[0], *chart], [heads[1], *right])
+def clock(seconds: float) -> str:
+    """Return a duration as minutes and seconds, hours where there are any."""
+    if not math.isfinite(seconds):
+        return "-"
+    minutes, seconds_left = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds_left:02d}" if hours else f"{minutes}:{seconds_left:02d}"
 
 
 def evaluated(throws: Throws) -> dict[str, float]:
