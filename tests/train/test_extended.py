@@ -50,8 +50,8 @@ def test_training_in_an_extended_simulator():
         "compliance",
     }
     assert (
-        len(trainer.algorithm.env.sim._vehicles.numpy())
-        == len(trainer.algorithm.env.sim._ropes.numpy())
+        len(trainer.algorithm.env.sim._plants.vehicles.numpy())
+        == len(trainer.algorithm.env.sim._plants.ropes.numpy())
         > 4
     )
 
