@@ -1,40 +1,30 @@
-"""``visthrow report``: one page with the paper's evidence and ours, from records or from throws
-made now.
-"""
+"""``visthrow report``: one page with the paper's evidence and ours, from records."""
 
 import argparse
-import sys
 import time
 from pathlib import Path
 
 from visthrow.common.arguments import add_out
-from visthrow.common.errors import StorageError, VisthrowError
+from visthrow.common.errors import StorageError
 
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
-UNITS = "throws"  # folder of single results, in the output folder
 
-# list of ``configs/sweep`` for ``--quick``; the full report reads what the lists ``paper`` and
-# ``gap`` made
-QUICK_LIST = "quick"
-
-NO_REFERENCE = (
-    'runs.shipped.throws=["own"]',
-)  # changes of the quick list where MuJoCo is not installed
+LEAD = (
+    "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no"
+    " vehicle was flown for this project**, and the reference plants (MuJoCo, own code of"
+    " every block, effects that the training lacks) stand in for one. Every row says on which"
+    " plant it was measured. Brackets are 95 % bootstrap intervals."
+)
+"""The page's introduction."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
         "examples:\n  visthrow report                                the page, from the committed"
-        " records\n  visthrow report --quick                        few throws of the shipped"
-        " policies and the baseline, made now\n  visthrow report --results runs/sweep/throws   "
-        " with throws of your own sweep on top\n\nEverything is a unit of work that is kept when it"
-        " is done: killed at any moment and started again, the command goes\non where it was."
-        " Trainings and throws of policies are the matter of 'visthrow sweep run paper' and"
-        " 'gap'.\n"
-    )
-    parser.add_argument(
-        "--quick", action="store_true", help="throw now, few throws, instead of reading records"
+        " records\n  visthrow report --results runs/sweep/throws    with throws of your own sweep"
+        " besides\n\nThrows of few minutes are made by 'visthrow sweep run quick', those of the"
+        " page by 'visthrow sweep run paper' and\n'gap'.\n"
     )
     parser.add_argument(
         "--results",
@@ -47,36 +37,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--records", metavar="FOLDER", help="folder of records (default: those of the package)"
     )
-    parser.add_argument(
-        "--jobs", type=int, metavar="N", help="processes at once (default: one a core)"
-    )
     add_out(parser, "out/report", "for page, tables and pictures")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Throw if asked to, read, write."""
+    """Read and write."""
     from visthrow.common.storage import writable
     from visthrow.paper import RECORDS
     from visthrow.paper.report import result_set
-    from visthrow.training import compute_device
     from visthrow.view import page
 
     begin = time.perf_counter()
-    if args.jobs is not None and args.jobs < 1:
-        raise VisthrowError(f"--jobs {args.jobs}; expected 1 or more")
     out = Path(args.out)
-    jobs = args.jobs or compute_device.cores()
     records = _records(args.records) if args.records else RECORDS
     folders = [_folder(name) for name in args.results]
     writable(out)
-    if args.quick:
-        quick(out, jobs)
-        thrown = result_set.read(
-            (), [out / "quick" / UNITS, *folders], "quick: few throws, wide intervals"
-        )
-    else:
-        thrown = result_set.read([records], folders)
-    paths = page.write(out, TITLE, lead(thrown), sections(thrown))
+    thrown = result_set.read([records], folders)
+    paths = page.write(out, TITLE, LEAD, sections(thrown))
     print(summary(thrown))
     for path in paths[:2]:
         print(path)
@@ -112,69 +89,6 @@ def _folder(name: str) -> Path:
             f"--results {name}: {actual}; expected one with results of throws, as runs/sweep/throws"
         )
     return path
-
-
-def quick(out: Path, jobs: int) -> None:
-    """Make the few throws of ``configs/sweep/quick.toml`` and of the baseline, as far as they are
-    not there.
-
-    Raises VisthrowError: throws that failed; the message names them.
-    """
-    from importlib.util import find_spec
-
-    from visthrow.paper.sweep.pool import Local, ProcessPool
-    from visthrow.paper.sweep.work_units import load_list
-    from visthrow.throws import results
-
-    folder = out / "quick"
-    changes = ()
-    if find_spec("mujoco") is None:
-        changes = NO_REFERENCE
-        _say("the reference plant is left out: it needs MuJoCo, pip install 'visthrow[reference]'")
-    local = Local(QUICK_LIST, folder, ["cpu"], jobs, changes)
-    outcome = ProcessPool(load_list(QUICK_LIST, changes), folder, local, _say).run(None)
-    if outcome.failed:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in outcome.failed.items())
-        raise VisthrowError(
-            f"throws failed: {reasons}; all that was printed is in {folder / 'logs'}"
-        )
-    if outcome.stopped:
-        raise KeyboardInterrupt
-    if find_spec("piqp") is None:
-        _say("the baseline is left out: it needs piqp, pip install 'visthrow[paper]'")
-        return
-    from visthrow.paper.baseline.thrower import fly_unit
-
-    results.work(
-        quick_units(), folder / UNITS, fly_unit, None, jobs, lambda text: _say(f"TO+MPC: {text}")
-    )
-
-
-def quick_units() -> list[dict]:
-    """Few throws of the baseline, for a look within minutes."""
-    from visthrow.paper.baseline.front import FRONT_TARGET
-    from visthrow.paper.baseline.thrower import IDEAL, unit
-    from visthrow.task.measurement import TARGETS
-
-    units = [unit(IDEAL, "none", target, 5) for target in TARGETS]
-    return units + [
-        unit("hybrid", compensation, FRONT_TARGET, 10) for compensation in ("both", "delay")
-    ]
-
-
-def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def lead(thrown) -> str:
-    """Return the page's introduction."""
-    note = f" **{thrown.note[0].upper() + thrown.note[1:]}.**" if thrown.note else ""
-    return (
-        "Zhai et al., Learning to Throw, table by table. Ours is simulated throughout: **no"
-        " vehicle was flown for this project**, and the reference plants (MuJoCo, own code of"
-        " every block, effects that the training lacks) stand in for one. Every row says on which"
-        f" plant it was measured. Brackets are 95 % bootstrap intervals.{note}"
-    )
 
 
 def sections(thrown) -> list:
@@ -215,4 +129,4 @@ def summary(thrown) -> str:
     grids = [part for part in throws_section(thrown).parts if isinstance(part, Grid)]
     if grids:
         return grids[0].markdown() + "\n"
-    return "no throws of the shipped policies are recorded; see --quick\n"
+    return "no throws of the shipped policies are recorded; see visthrow sweep run quick\n"

@@ -28,7 +28,6 @@ class ResultSet:
     findings: dict[str, str] = field(
         default_factory=dict
     )  # section -> text that somebody wrote beside the data
-    note: str = ""  # on the number of throws, where these are few
 
     def policies(
         self,
@@ -104,9 +103,7 @@ class ResultSet:
         )
 
 
-def read(
-    records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = (), note: str = ""
-) -> ResultSet:
+def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = ()) -> ResultSet:
     """Read committed records, folders with ``throws``, ``training`` and ``findings``, and folders
     of single results, ``<key>.json``.
 
@@ -124,7 +121,7 @@ def read(
         for path in sorted((place / PARTS[2]).glob("*.md")):
             findings[path.stem] = path.read_text(encoding="utf-8").strip()
     today = [result for result in collected if result.unit.get("protocol") == PROTOCOL]
-    return ResultSet(tuple(join(today)), tuple(runs.values()), findings, note)
+    return ResultSet(tuple(join(today)), tuple(runs.values()), findings)
 
 
 def runs_of(path: Path) -> list[dict[str, Any]]:
