@@ -3,10 +3,7 @@ checkpoints, resume.
 """
 
 import argparse
-import contextlib
-from collections.abc import Callable, Iterator
 from dataclasses import fields
-from typing import Any
 
 from visthrow.common.arguments import ABOVE_ZERO, SOLVER, WHOLE, add_common
 
@@ -60,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=(
             "throw 200 times every N iterations (default: a twentieth of the time on a terminal,"
-            " with --until and --view)"
+            " and with --until)"
         ),
     )
     add(
@@ -68,11 +65,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         metavar="N",
         help="iterations between checkpoints (default: a hundredth of the time)",
-    )
-    add(
-        "--view",
-        action="store_true",
-        help="show a throw of each evaluation in this machine's browser",
     )
     add("--resume", action="store_true", help="continue from the folder's checkpoint")
     add("--solver", **SOLVER)
@@ -86,35 +78,4 @@ def run(args: argparse.Namespace) -> int:
     options = session.Options(
         **{item.name: getattr(args, item.name) for item in fields(session.Options)}
     )
-    return session.run(options, viewer if args.view else None)
-
-
-@contextlib.contextmanager
-def viewer(trainer: Any) -> Iterator[Callable[[Any], None]]:
-    """Function that shows an evaluation in rerun: one of its throws, and where all came down."""
-    import numpy as np
-    import torch
-
-    from visthrow.task import contract_of
-    from visthrow.throws.loading import Loaded
-    from visthrow.throws.recorded import fly
-    from visthrow.view import live, rerun_view
-
-    with live.served() as address:
-
-        def show(throws) -> None:
-            policy = trainer.algorithm.export(contract_of(trainer.experiment), {})
-            with torch.random.fork_rng(devices=[]):
-                log = fly(
-                    Loaded("training", policy, trainer.experiment),
-                    np.array([throws.target, 0.0, 0.0]),
-                )
-            name = (
-                f"iteration {trainer.iteration}:"
-                f" {throws.summary().get('error_mean', float('nan')):.3f} m"
-            )
-            rerun_view.show(
-                address, name, log, trainer.experiment, throws.landing_w[throws.success]
-            )
-
-        yield show
+    return session.run(options)

@@ -12,8 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,11 +59,10 @@ class Options:
     json: str | None = None
 
 
-Viewer = Callable[[Any], AbstractContextManager[Callable[[Any], None]]]
 """Of a trainer: while it is entered, a function that shows an evaluation's throws."""
 
 
-def run(args: Options, viewer: Viewer | None = None) -> int:
+def run(args: Options) -> int:
     """Train; returns the exit status of the command."""
     _check(args)
     experiment, policy, folder, seed = _resumed(args) if args.resume else _begun(args)
@@ -87,7 +85,7 @@ def run(args: Options, viewer: Viewer | None = None) -> int:
             }
             summary["from"] = {"policy": Path(args.start).name, **files}
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **summary)
-    why = _loop(args, trainer, folder, last, viewer)
+    why = _loop(args, trainer, folder, last)
     if ranks.lead:
         _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
     iteration = trainer.iteration
@@ -219,7 +217,7 @@ class Regularly:
         self._wait = (self._after - begin) / self._share if self._share else FIRST
 
 
-def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None) -> str:
+def _loop(args: Options, trainer, folder: Path, last: int) -> str:
     """Train with log, evaluation and checkpoints, the last one at the end; return why it ended.
 
     TrainError where a file cannot be written; what the last checkpoint holds is not lost.
@@ -230,20 +228,17 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
     ranks = trainer.ranks
     evaluations = Regularly(
         args.evaluate_every,
-        EVALUATION_SHARE if args.until or viewer or sys.stdout.isatty() else 0.0,
+        EVALUATION_SHARE if args.until or sys.stdout.isatty() else 0.0,
     )
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
-    picture = contextlib.nullcontext(lambda throws: None)
     log = None
     if ranks.lead:
         samples = trainer.algorithm.samples
         log = TrainLog(folder / "progress.csv", samples, last, saved, args.minutes)
-        picture = viewer(trainer) if viewer else picture
     try:
         with (
             log or contextlib.nullcontext(),
             StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop,
-            picture as show,
         ):
             while trainer.iteration < last and why == DONE:
                 figures = trainer.step()
@@ -251,7 +246,6 @@ def _loop(args: Options, trainer, folder: Path, last: int, viewer: Viewer | None
                 if ranks.lead and evaluations.due(trainer.iteration):
                     with evaluations.timed():
                         throws = trainer.throw(EVALUATION_TARGET)
-                        show(throws)
                 if log:
                     log.row(figures, throws)
                 if ranks.agree(checkpoints.due(trainer.iteration)):

@@ -19,11 +19,13 @@ WEB_PORT, DATA_PORT = (
 
 
 @contextmanager
-def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str]:
-    """Serve the viewer and say where; gives the address that streams connect to.
+def web_viewer(layout: Any, web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
+    """Serve the viewer with one recording and say where; gives the stream that it shows.
 
     DeviceError where a port is taken.
     """
+    import rerun as rr
+
     command = [
         sys.executable,
         "-m",
@@ -49,22 +51,13 @@ def served(web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[str
             file=sys.stderr,
             flush=True,
         )
-        yield data
-    finally:
-        server.terminate()
-        server.wait(5)
-
-
-@contextmanager
-def web_viewer(layout: Any, web_port: int = WEB_PORT, data_port: int = DATA_PORT) -> Iterator[Any]:
-    """Serve the viewer with one recording; gives the stream that it shows."""
-    import rerun as rr
-
-    with served(web_port, data_port) as data:
         stream = rr.RecordingStream("visthrow", recording_id=None)
         stream.connect_grpc(data, default_blueprint=layout)
         yield stream
         stream.flush()
+    finally:
+        server.terminate()
+        server.wait(5)
 
 
 def _answers(server: subprocess.Popen, port: int) -> bool:

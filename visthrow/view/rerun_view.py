@@ -40,28 +40,6 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
         whole(stream, log, experiment)
 
 
-def show(address: str, name: str, log: FlightLog, experiment: Any, landings_w: np.ndarray) -> None:
-    """Send a flight to the viewer at an address (:func:`visthrow.view.live.served`) as a recording
-    of its own.
-
-    Where other throws came down is drawn with it: ``landings_w`` [m], shape (N, 2).
-    """
-    stream = rr.RecordingStream("visthrow", recording_id=name)
-    stream.connect_grpc(
-        address, default_blueprint=blueprint(np.array(log.meta["goal_w"]), set(log.channels))
-    )
-    stream.send_recording_name(name)
-    whole(stream, log, experiment)
-    places = np.column_stack((landings_w, np.full(len(landings_w), 0.004))).astype(np.float32)
-    stream.log(
-        "world/landings",
-        rr.Points3D(places, radii=0.008, colors=[colour_code(style.PAYLOAD, 150)]),
-        static=True,
-    )
-    stream.flush()
-    stream.disconnect()
-
-
 def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
     """Send all of a flight; arguments as of :func:`write`."""
     still(stream, log.meta["goal_w"], experiment)
