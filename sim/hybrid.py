@@ -193,25 +193,18 @@ class HybridSim:
             count: number of environments E.
             device: Warp device, "cpu" or "cuda:0".
             seed: of :meth:`randomize`.
-            vehicles: parameters of environment e at ``e % len(vehicles)``; default
-                ``[params.vehicle]``.
-            ropes: likewise; all with the same number of segments.
-            airs: likewise; default ``[params.air]``.
-            releases: likewise; default ``[params.release]``.
+            vehicles: of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
+            ropes, airs, releases: likewise; all ropes with the same number of segments.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
-            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s]; a
-                firmware flies the vehicle.
+            motors: by-pass the rate controller: commands are motor-speed set-points [rad/s].
             without_rope: simulate quadrotors without rope and payload, by this one of
                 :data:`INTEGRATORS`; :meth:`set_wrench` pushes them.
-            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, to build in besides those that
-                the parameters need.
-            gravity: acceleration of free fall, along -z [m/s^2].
-            threads: at most, of a CPU; default all its cores. The bits do not depend on it.
+            extensions: of :data:`sim.kernels.structs.EXTENSIONS`, besides what parameters need.
+            gravity: of free fall, along -z [m/s^2]. threads: at most, of a CPU; default all cores.
         """
         if without_rope is not None:
             params = dataclasses.replace(params, rope=dataclasses.replace(params.rope, segments=1))
-            extensions = extensions | {"push"}
-            ropes = None
+            extensions, ropes = extensions | {"push"}, None
         vehicles = vehicles or [params.vehicle]
         ropes = ropes or [params.rope]
         airs = airs or [params.air]
@@ -225,9 +218,8 @@ class HybridSim:
         self.gravity = gravity
         self.threads = threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
-        self.types, self._step, self._reset = _kernels(
-            params, direct, motors, self.extensions, without_rope
-        )
+        kernels = _kernels(params, direct, motors, self.extensions, without_rope)
+        self.types, self._step, self._reset = kernels
         ropes = ropes_on(vehicles, ropes)
         self._pack(ropes, airs, releases)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
