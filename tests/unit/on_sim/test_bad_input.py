@@ -83,6 +83,15 @@ def test_bad_options_of_the_quadrotor(options, message):
         bare_quadrotor(paper_plant().vehicle, **{"count": 1, **options})
 
 
+def test_wrenches_and_engines_that_do_not_fit():
+    plant = paper_plant()
+    with pytest.raises(ValueError, match="extension 'push'"):
+        HybridSim(plant, 1).set_wrench(np.zeros((1, 3)), np.zeros((1, 3)))
+    exchanged = changed("sim.solver", "exchanged_chain")
+    with pytest.raises(ValueError, match=r"without a rope in sim\.solver 'exchanged_chain'"):
+        HybridSim(exchanged, 1, without_rope="rk4")
+
+
 def test_a_batch_of_no_environments():
     with pytest.raises(ValueError, match="0 environments; expected 1 or more"):
         HybridSim(paper_plant(), 0)
