@@ -73,8 +73,8 @@ def test_bad_vehicles_are_refused_alone_too(path, value, message):
     [
         ({"count": 0}, "0 environments; expected 1 or more"),
         ({"integrator": "rk5"}, r"'rk5'; expected one of \('euler', 'rk4'\)"),
-        ({"step": 0.0}, "sim.substep"),
-        ({"control_period": NAN}, "sim.control_period"),
+        ({"step": 0.0}, "substep is 0.0"),
+        ({"control_period": NAN}, "control_period is nan"),
         ({"precision": "half"}, "'half'; expected 'float32' or 'float64'"),
     ],
 )
