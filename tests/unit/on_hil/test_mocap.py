@@ -302,3 +302,12 @@ def test_wrong_names_hosts_and_missing_packages(monkeypatch):
         monkeypatch.setitem(__import__("sys").modules, package, None)
         with pytest.raises(SourceError, match=rf"pip install 'visthrow\[{package}\]'"):
             open_mocap(MocapParams(system, "127.0.0.1"), bodies, time.monotonic, False)
+
+
+def test_a_motion_capture_on_another_machine_needs_the_configs_leave(monkeypatch):
+    source = "hil.poses.sources.open_source.MotionCaptureSource"
+    monkeypatch.setattr(source, lambda params, *args, **options: params.host)
+    params = MocapParams("vicon", "192.0.2.1", timeout=1.0)
+    assert open_mocap(params, IDS, time.monotonic, True) == "192.0.2.1"
+    with pytest.raises(LinkError, match="remote"):
+        open_mocap(params, IDS, time.monotonic, False)
