@@ -201,6 +201,23 @@ def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_f
     assert "never overlap" not in str(check([log])[0].rows)
 
 
+def test_a_ground_stations_heartbeat_is_not_the_vehicles(tmp_path):
+    """The station is heard first, and is not armed."""
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    path, station = (
+        write_tlog(tmp_path / "a.tlog", lambda mav, i: []),
+        dialect.MAVLink(None, 255, 0),
+    )
+    first = struct.pack(">Q", int(1.7e9 * 1e6)) + bytes(
+        station.heartbeat_encode(6, 8, 0, 0, 4).pack(station)
+    )
+    path.write_bytes(first + path.read_bytes())
+    log = read(path)[0]
+    assert log["flying"].values.all()
+    assert not any("HEARTBEAT" in part for part in log.meta["left_out"])
+
+
 def test_another_senders_messages_are_left_out_by_name(tmp_path):
     from pymavlink.dialects.v20 import ardupilotmega as dialect
 

@@ -126,6 +126,12 @@ def test_a_rotor_that_reads_unlike_the_others_is_named(factor, verdict):
     assert all(f"rear left reads {factor:.2f}" in text for text in texts)
 
 
+def test_telemetry_at_3_hz_is_of_no_other_flight():
+    columns = {name: values[::33] for name, values in flight(seconds=120.0).items()}
+    assert "of another flight" not in faults(log_of(columns)) + faults(log_of(columns), "warn")
+    assert "too seldom to be held against the force" in faults(log_of(columns), "warn")
+
+
 def test_thrust_in_pulses_follows_past_a_crash():
     """A flight of pulses from 1000 us that begins on the ground and ends upside down on it."""
     columns = flight(40.0)

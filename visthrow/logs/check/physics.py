@@ -321,7 +321,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     turn = relations.attitude_at(time_q, q, time)
     if "acc_b" in log:
         time_a, force_b = log["acc_b"].samples()
-        if len(time_a) < 50:
+        if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
             return []
         pushed = relations.attitude_at(time_q, q, time_a).apply(force_b) - [0.0, 0.0, GRAVITY]
         pushed = relations.mean_over(time_a, pushed, time, _SPAN)
@@ -346,6 +346,13 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         if wrong is not None
         else _pushed(relation, acc, pushed, channels, force_b is not None)
     )
+
+
+def sparse(time: np.ndarray) -> bool:
+    """Return whether samples are so far apart that single ones say nothing about the mean force
+    between them.
+    """
+    return len(time) > 1 and float(np.median(np.diff(time))) > relations.INDEPENDENT
 
 
 def _exchanged_body(

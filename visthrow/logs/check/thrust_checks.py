@@ -5,7 +5,7 @@ and rotor against rotor.
 import numpy as np
 
 from visthrow.logs.check import relations
-from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, usable
+from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import FlightLog
 
@@ -121,6 +121,10 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     name, time, command = thrust
     mass = mass_of(log, vehicle)
     rows = [_weight(mass, vehicle, f"{name}, acc_b")] if mass is not None else []
+    if sparse(time):
+        every = 1e3 * float(np.median(np.diff(time)))
+        text = f"comes every {every:.0f} ms: too seldom to be held against the force"
+        return [*rows, Row("thrust", name, "warn", text)]
     correlations = [
         (felt, *c)
         for felt in ("acc_b", "path")
@@ -167,6 +171,8 @@ def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the times [s] and specific force along body z [m/s^2], shape (N, 1), by the
     accelerometer or by the path.
     """
+    if felt == "acc_b" and "acc_b" in log and sparse(log["acc_b"].time):
+        return None
     if felt == "acc_b":
         if "acc_b" in log:
             time, force_b = log["acc_b"].samples()

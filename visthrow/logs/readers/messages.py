@@ -138,6 +138,10 @@ def _next_message(log: Any, names: list[str], columns: "_Columns") -> Any:
         return None
 
 
+NO_AUTOPILOT = 8
+"""MAV_AUTOPILOT_INVALID: the sender of a heartbeat flies nothing."""
+
+
 def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
     """Read messages of a ``.tlog``, of the first sender of each, on one clock.
 
@@ -156,6 +160,8 @@ def read_telemetry(path: str | Path, names: Collection[str]) -> Messages:
         used += 8 + len(message.get_msgbuf())
         if name not in names:
             continue
+        if name == "HEARTBEAT" and message.autopilot == NO_AUTOPILOT:
+            continue  # of a ground station or a camera
         whose = (message.get_srcSystem(), message.get_srcComponent())
         if sender.setdefault(name, whose) != whose:
             unread[f"{name} of system {whose[0]}, component {whose[1]}"] += 1
