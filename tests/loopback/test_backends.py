@@ -420,6 +420,7 @@ ACTUATOR = (
 )
 def test_every_way_to_release(kind, overrides, parameters):
     desk = Desk(kind, *overrides, parameters=parameters).follow()
+    assert desk.backend.audit.fault() is None
     when = desk.now + 0.05
     desk.backend.release(when)
     while desk.status.release == "idle" or desk.fake.release_time is None:
