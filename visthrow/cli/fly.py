@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " throws at a target 2 m ahead\n  visthrow fly --policy state --target 1.5\n  visthrow fly"
         " --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n  visthrow"
         " fly --plant reference-realistic       on the independent plant (about a"
-        " minute)\n\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
+        " minute)\n  visthrow fly --no-rope --target 1.5            the vehicle alone\n\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
         " controller brings it back.\n"
     )
     add = parser.add_argument
@@ -49,6 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_conditions(parser, "the policy's")
     pixels = "detect keypoints in rendered pictures instead of projecting them"
+    alone = (
+        "fly the vehicle alone from hover to above the target, without rope, payload or policy;"
+        " integrated by rk4 (the default) or euler"
+    )
+    add("--no-rope", nargs="?", const="rk4", choices=("rk4", "euler"), help=alone)
     add("--pixels", choices=("learnt", "contours"), help=pixels)
     saved = (
         "write the policy for these conditions: one for any vehicle becomes one for this vehicle,"
@@ -77,6 +82,8 @@ def run(args: argparse.Namespace) -> int:
     goal = [args.target[0], args.target[1] if len(args.target) == 2 else 0.0, 0.0]
     check_goal(loaded, goal)
     writable(Path(args.out))
+    if args.no_rope:
+        return _fly_alone(args, loaded.experiment, goal)
     if args.save:
         check_place(args.save)
         loaded.policy.save(args.save)
@@ -126,12 +133,28 @@ def _check(args: argparse.Namespace) -> None:
                 f"--export {path}: ending '{ending}'; expected one of {', '.join(EXPORTS)}"
             )
         load_extra(*EXPORTS[ending], f"--export {path}", ConfigError)
+    if args.no_rope and (args.pixels or args.save or args.export or args.plant != "hybrid"):
+        raise ConfigError("--no-rope with --pixels, --save, --export or --plant; expected it alone")
     for override in args.overrides:
         if override.startswith("task.noise.command"):
             raise ConfigError(
                 f"--set {override}: fly sends commands as they are, without training's noise;"
                 " compare throws with it"
             )
+
+
+def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
+    """Fly without a rope; write the log and print where the vehicle ended."""
+    from visthrow.throws.alone import SECONDS, fly_alone
+    from visthrow.training.compute_device import resolve
+
+    log = fly_alone(experiment, (goal[0], goal[1]), args.no_rope, resolve(args.device))
+    path = Path(args.out) / "flight.npz"
+    log.save(path)
+    error = log.meta["result"]["error"]
+    print(f"after {SECONDS:g} s the vehicle hovers {error:.3f} m from the point above the target")
+    print(f"{path}  {FILES[path.name]}")
+    return 0
 
 
 def _rendered_eyes(loaded, method: str, seed: int):

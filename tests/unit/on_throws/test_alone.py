@@ -1,0 +1,25 @@
+"""The vehicle without a rope."""
+
+import numpy as np
+
+from visthrow import cli
+from visthrow.logs.flightlog import FlightLog
+
+
+def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
+    ends = {}
+    for name in ("rk4", "euler"):
+        words = ["fly", "--no-rope", name, "--target", "1", "0.5", "--out", str(tmp_path / name)]
+        assert cli.main([*words, "--policy", "state", "--device", "cpu"]) == 0
+        log = FlightLog.load(tmp_path / name / "flight.npz")
+        assert "payload_pos_w" not in log
+        ends[name] = log["pos_w"].values
+        assert np.linalg.norm(ends[name][-1, :2] - (1.0, 0.5)) < 0.03
+    apart = np.linalg.norm(ends["rk4"] - ends["euler"], axis=1)
+    assert 0.0 < apart.max() < 0.02
+
+
+def test_it_takes_no_option_of_a_throw(tmp_path, capsys):
+    words = ["fly", "--no-rope", "--save", str(tmp_path / "a.npz"), "--out", str(tmp_path)]
+    assert cli.main(words) == 2
+    assert "--no-rope" in capsys.readouterr().err
