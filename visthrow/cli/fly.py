@@ -29,7 +29,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " throws at a target 2 m ahead\n  visthrow fly --policy state --target 1.5\n  visthrow fly"
         " --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n  visthrow"
         " fly --plant reference-realistic       on the independent plant (about a"
-        " minute)\n  visthrow fly --no-rope --target 1.5            the vehicle alone\n\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
+        " minute)\n  visthrow fly --no-rope --target 1.5            the vehicle alone\n"
+        "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
         " controller brings it back.\n"
     )
     add = parser.add_argument

@@ -10,7 +10,7 @@ from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, plant_of
 
 SECONDS = 6.0
-CHANNELS = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed", "battery_voltage")
+CHANNELS = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
 
 
 def fly_alone(
