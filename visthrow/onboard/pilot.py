@@ -4,7 +4,7 @@ The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.on
 the training environment calls, with a batch of one on board; only the noise is missing."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -101,7 +101,11 @@ class Pilot:
     """
 
     def __init__(
-        self, policy: Policy, camera_params: CameraParams | None = None, count: int = 1
+        self,
+        policy: Policy,
+        camera_params: CameraParams | None = None,
+        count: int = 1,
+        allow: Collection[str] = (),
     ) -> None:
         """Read the conditions of the policy's contract.
 
@@ -113,7 +117,7 @@ class Pilot:
             policy: on the CPU.
             camera_params: a vision policy's camera; with a state policy keypoints are computed for
                 whoever draws them.
-            count: E.
+            count: E. allow: parts of the camera that may differ, as of :meth:`Policy.require`.
         """
         if count < 1:
             raise ValueError(f"pilot of {count} vehicles; expected 1 or more")
@@ -140,7 +144,8 @@ class Pilot:
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
             camera_params = by_own_rule(policy, camera_params)
-            policy.require({"camera": camera_conditions(camera_params)}, sections={"camera"})
+            seen = {"camera": camera_conditions(camera_params)}
+            policy.require(seen, sections={"camera"}, allow=allow)
         self.policy = policy
         self.count = count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)

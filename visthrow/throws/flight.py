@@ -125,7 +125,7 @@ class Policies(Pilots):
             draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded
         ]
         self.pilots = [
-            Pilot(item.policy, item.experiment.camera if look else None, share)
+            Pilot(item.policy, item.experiment.camera if look else None, share, item.departures)
             for item, look in zip(loaded, looks)
         ]
         super().__init__(

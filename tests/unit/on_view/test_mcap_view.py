@@ -109,3 +109,17 @@ def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, cap
     assert main(["fly", "--out", str(folder), "--export", str(tmp_path / "flight.mcap")]) == 2
     assert "visthrow[recordings]" in capsys.readouterr().err
     assert not folder.exists()
+
+
+def test_fly_takes_another_camera_by_the_allowance_that_it_advises(tmp_path):
+    words = [
+        "fly",
+        "--device",
+        "cpu",
+        "--out",
+        str(tmp_path),
+        "--set",
+        "camera.fisheye.fov_deg=190",
+    ]
+    assert main([*words, "--allow", "camera"]) in (0, 1)
+    assert (tmp_path / "flight.npz").exists()
