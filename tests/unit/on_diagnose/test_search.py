@@ -251,8 +251,8 @@ def test_catalogues_that_contradict_themselves_are_refused():
     twice = (*EFFECTS, EFFECTS[0])
     with pytest.raises(DiagnoseError, match="share a name: effect_00"):
         Priors.of(twice, ("pos_w", "payload_pos_w"))
-    with pytest.raises(DiagnoseError, match="floor 0"):
-        Priors.of((replace(EFFECTS[0], floor=0.0),), ("pos_w",))
+    with pytest.raises(ValueError, match=r"floor is 0\.0; expected above 0"):
+        replace(EFFECTS[0], floor=0.0)
 
 
 def small_causes(seed: int) -> SyntheticModel:
