@@ -191,6 +191,18 @@ def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
     assert table["time [s]"][-1] == pytest.approx(3.99)
 
 
+def test_a_table_of_matlab_is_refused_by_its_kind(tmp_path):
+    """The file of an object has an array without a name, as MATLAB writes it."""
+    scipy_io = pytest.importorskip("scipy.io")
+    path = tmp_path / "a.mat"
+    scipy_io.savemat(path, {"a": np.arange(3.0)})
+    data = bytearray(path.read_bytes())
+    data[128 + 8 + 8] = 17  # the class of the array: an opaque object
+    path.write_bytes(bytes(data))
+    with pytest.raises(LogError, match="an object of MATLAB"):
+        table_of(path)
+
+
 @pytest.mark.parametrize("mode", ["all zero", "position zero", "held"])
 def test_a_body_that_the_capture_lost_is_a_gap(mode, tmp_path):
     pos, quat = POS.copy(), QUATS.copy()

@@ -141,6 +141,11 @@ def _matlab(path: Path) -> Table:
         return _flat(loadmat(path, simplify_cells=True))
     except NotImplementedError:  # version 7.3 is HDF5
         return _hdf5(path)
+    except TypeError as error:
+        raise LogError(
+            f"{path}: holds an object of MATLAB, such as a table; expected arrays and structs, as"
+            " table2struct(T, 'ToScalar', true) makes them"
+        ) from error
 
 
 def _hdf5(path: Path) -> Table:
