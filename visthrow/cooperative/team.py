@@ -63,7 +63,8 @@ LEVELS = 20
 
 
 def layout_of(experiment: TeamExperiment) -> ob.Layout:
-    """Layout of a member's observation: as of a single vehicle, then the others and their age.
+    """Layout of a member's observation: as of a single vehicle, then the others, their age, and
+    the control steps since the latches tripped.
 
     Raises ConfigError: the observation is to hold a goal that is fitted over a throw.
     """
@@ -73,7 +74,7 @@ def layout_of(experiment: TeamExperiment) -> ob.Layout:
             "task.observation.located, or a moving target, in a team; expected neither: no member"
             " fits the goal over a throw"
         )
-    messages = MESSAGE * (experiment.team.vehicles - 1) + 1
+    messages = MESSAGE * (experiment.team.vehicles - 1) + 2
     return dataclasses.replace(layout, setup=messages)
 
 

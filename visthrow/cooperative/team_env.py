@@ -118,6 +118,7 @@ class TeamEnv(VecEnv):
             "poses": (rows, steps, ob.VEHICLE + 3),
             "requests": (worlds, steps),
             "first": (worlds,),
+            "tripped": (worlds,),
         }
         memory = {name: torch.zeros(shape, **make) for name, shape in shapes.items()}
         memory["totals"] = torch.zeros(1 + len(RESULTS), dtype=torch.float64, **make)
@@ -200,6 +201,8 @@ class TeamEnv(VecEnv):
         steps = (memory["age"] / self.cfg.sim.control_period - 1e-3).ceil().long()
         agreed = memory["requests"].gather(1, steps[:, None])[:, 0] > 0.5
         self.views.release.copy_(self._rows(agreed))
+        tripped = memory["tripped"]
+        tripped += (agreed | (tripped > 0.0)).float()
         with on_torch_stream(self.device):
             self.sim.step()
         self.episode_length_buf += 1
@@ -305,6 +308,7 @@ class TeamEnv(VecEnv):
         torch.where(rows[:, None], self._start_action, previous, out=previous)
         memory["requests"].masked_fill_(fresh[:, None], 0.0)
         memory["first"].masked_fill_(fresh, 1e6)
+        memory["tripped"].masked_fill_(fresh, 0.0)
         spreads = {
             "frame_bias": noise.observation_bias,
             "command_bias": noise.command_bias,
@@ -390,7 +394,9 @@ class TeamEnv(VecEnv):
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
     def _messages(self, poses: Tensor, pos_w: Tensor) -> Tensor:
-        """Poses of the other vehicles, as old as they are, and their age in control periods."""
+        """Poses of the other vehicles, as old as they are, their age in control periods, and
+        the control steps since the latches tripped.
+        """
         noise = self.cfg.task.noise.observation_step
         age = self._rows(self._memory["age"]) / self.cfg.sim.control_period
         late = hist.at_latency(poses, age)
@@ -399,7 +405,7 @@ class TeamEnv(VecEnv):
             neighbour = self._neighbour(late, k)
             place = neighbour[:, :3] + torch.randn_like(pos_w) * noise - pos_w
             parts += [place, neighbour[:, 9 : ob.VEHICLE]]
-        return torch.cat([*parts, age[:, None]], -1)
+        return torch.cat([*parts, age[:, None], self._rows(self._memory["tripped"])[:, None]], -1)
 
     def _see(self, pose: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints of goal and load in each vehicle's camera, with noise."""

@@ -14,8 +14,8 @@ def test_the_shipped_policy_lands_under_every_fault(tmp_path, capsys):
     rows = {row["fault"]: row for row in json.loads(file.read_text())}
     assert "late" in capsys.readouterr().out
     assert all(row["landed"] == 1.0 and row["contact"] == 0.0 for row in rows.values())
-    assert rows["none"]["error_mean"] < 0.06
-    assert max(row["error_mean"] for row in rows.values()) < 0.12
+    assert rows["none"]["error_mean"] < 0.03
+    assert max(row["error_mean"] for row in rows.values()) < 0.04
     assert rows["late"]["apart_mean"] == pytest.approx(0.03, abs=1e-3)
 
 

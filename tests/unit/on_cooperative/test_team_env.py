@@ -41,6 +41,8 @@ def test_vehicles_of_a_world_start_around_one_load_with_one_goal(env):
     assert len(goals[:, 0].unique(dim=0)) == env.worlds
     separation = env._worlds(state["pos_w"]).diff(dim=1).norm(dim=-1)
     assert (separation > 0.4).all()
+    heights = state["pos_w"][:, 2] - env.cfg.task.start.spawn_height
+    assert (heights.abs() < 0.1).all()
 
 
 def test_a_latch_trips_only_where_both_asked_a_message_ago(env):
@@ -180,3 +182,42 @@ def test_three_vehicles_learn():
     assert [row["iteration"] for row in rows] == [1, 2, 3]
     assert all(math.isfinite(value) for row in rows for value in row.values())
     assert (training.policy({}).weights[-1] != before).any()
+
+
+def test_an_actor_sees_how_long_ago_its_latch_tripped():
+    env = TeamEnv(as_flown(experiment(), "none"), seed=3, count=4)
+    counts = []
+    for k in range(6):
+        asked = torch.tensor([1.0, 1.0, 1.0, -1.0]) if k != 4 else -torch.ones(4)
+        observed = env.step(hover(env, asked))[0]["actor"]
+        counts.append(observed[:, -1].tolist())
+    assert counts == [[0.0] * 4] + [[k, k, 0.0, 0.0] for k in (1.0, 2.0, 3.0, 4.0, 5.0)]
+
+
+def test_the_load_clears_the_vehicle_that_it_flies_past():
+    env = TeamEnv(as_flown(experiment(), "none"), seed=3, count=4)
+    env.views.state["pos_w"].copy_(torch.tensor([[0.9, 0.1, 1.2], [9.0, 0.0, 1.0]] * 2))
+    env.load_w.copy_(torch.tensor([[0.0, 0.0, 1.0], [0.9, 0.1, 0.4]]))
+    env.load_vel_w.copy_(torch.tensor([[2.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
+    time = torch.linspace(0.0, 0.55, 2000, dtype=torch.float64)
+    height = 1.0 + 2.0 * time - 0.5 * GRAVITY * time.square()
+    passing = ((2.0 * time - 0.9).square() + 0.01 + (height - 1.2).square()).sqrt().min().item()
+    clearance = env._clearance(torch.tensor([0.55, 0.2])).tolist()
+    assert clearance == pytest.approx([passing, 0.8], abs=0.01)
+
+
+@pytest.mark.parametrize(("cost", "reach"), [("contact_cost", 0.33), ("margin_cost", 0.26)])
+def test_what_comes_too_near_costs(cost, reach):
+    rewards = []
+    for value in (0.0, 50.0):
+        torch.manual_seed(3)
+        changes = experiment("pair", f"team.{cost}={value}", f"team.rotor_reach={reach}")
+        env = TeamEnv(as_flown(changes, "none"), seed=3, count=4)
+        rewards.append(env.step(hover(env, -torch.ones(4)))[1])
+    missing = env.cfg.team.margin - env.last["gap"]
+    assert (missing > 0.01).all()
+    assert torch.equal(env.last["contact"], missing > env.cfg.team.margin)
+    expected = env.last["contact"].float() if cost == "contact_cost" else missing
+    costs = (rewards[0] - rewards[1]) / (50.0 * env.cfg.task.reward.scale)
+    torch.testing.assert_close(costs, env._rows(expected), atol=1e-4, rtol=0.0)
+    assert expected.min() > 0.01
