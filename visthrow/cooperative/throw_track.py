@@ -58,7 +58,8 @@ def record_throw(
 
     values = fly(experiment, policy, count=1, record=record, **options)
     time = experiment.sim.control_period * np.arange(len(rows) + 1)
-    flight = np.linspace(0.0, max(float(values["time_to_impact"][0]), 0.0), 30)[:, None]
+    end = max(float(values["duration"][0]), time[-1])
+    flight = np.linspace(0.0, end - time[-1], 30)[:, None]
     fall = np.array([0.0, 0.0, -0.5 * GRAVITY]) * flight**2
     released = bool(values["released"][0])
     return ThrowTrack(
