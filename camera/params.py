@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 
-from camera.bounds import Bound, Bounded, Length, NotNegative, Positive, Share
+from camera.field_bounds import Bound, BoundedFields, Length, NotNegative, Positive, Share
 
 SEEN_AT_LEAST = math.radians(1.0)
 """Angle off the axis that any lens must image [rad]."""
@@ -25,7 +25,7 @@ def monotonic_limit(coefficients: tuple[float, ...]) -> float:
 
 
 @dataclass(frozen=True)
-class FisheyeParams(Bounded):
+class FisheyeParams(BoundedFields):
     """Intrinsics of a Kannala-Brandt fisheye camera.
 
     ``theta = atan2(sqrt(x^2 + y^2), z)``, ``theta_d = theta (1 + k1 theta^2 + k2 theta^4 + k3
@@ -83,7 +83,7 @@ class FisheyeParams(Bounded):
 
 
 @dataclass(frozen=True)
-class MountParams(Bounded):
+class MountParams(BoundedFields):
     """The camera's place on the body and its rotation.
 
     Convention: with ``rpy_deg`` zero the camera looks down and the top of the image is the
@@ -106,7 +106,7 @@ class MountParams(Bounded):
 
 
 @dataclass(frozen=True)
-class KeypointNoiseParams(Bounded):
+class KeypointNoiseParams(BoundedFields):
     """Imperfections of the keypoints, in normalised image coordinates (1 at the edge of the field
     of view).
 
@@ -146,7 +146,7 @@ class KeypointNoiseParams(Bounded):
 
 
 @dataclass(frozen=True)
-class CameraParams(Bounded):
+class CameraParams(BoundedFields):
     """The whole camera as a policy is trained on it; an exported policy carries these values."""
 
     fisheye: FisheyeParams

@@ -17,7 +17,7 @@ import typing
 from pathlib import Path
 from typing import Any
 
-from camera import bounds
+from camera import field_bounds
 from visthrow import cli, config
 from visthrow.config import kinds, schema
 
@@ -110,7 +110,7 @@ def _over(below: dict[str, Any], above: dict[str, Any]) -> dict[str, Any]:
 def _tables(cls: type, values: Any, raw: Any, sources: dict[str, str], head: str):
     """Yield the heading and the text of a table's keys, then of the tables in it."""
     meanings, inner, rows = _comments(cls), [], []
-    limits = bounds._bounds(cls) if issubclass(cls, bounds.Bounded) else {}
+    limits = field_bounds._bounds(cls) if issubclass(cls, field_bounds.BoundedFields) else {}
     for key, annotation in schema.hints(cls).items():
         value = values.get(key) if isinstance(values, dict) else None
         stated = raw.get(key) if isinstance(raw, dict) else None

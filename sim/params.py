@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
-from camera.bounds import (
+from camera.field_bounds import (
     Arm,
-    Bounded,
+    BoundedFields,
     Duration,
     Lag,
     Length,
@@ -29,7 +29,7 @@ LEAST_GYRATION = 0.01  # radius of gyration of a vehicle over the reach of its r
 
 
 @dataclass(frozen=True)
-class BodyParams(Bounded):
+class BodyParams(BoundedFields):
     """Rigid body of the vehicle, rotors included.
 
     ``m v' = R F_b + m g``, ``J w' = tau_b - w x J w``.
@@ -43,7 +43,7 @@ class BodyParams(Bounded):
 
 
 @dataclass(frozen=True)
-class RotorParams(Bounded):
+class RotorParams(BoundedFields):
     """Geometry of the four rotors.
 
     Rotor i sits at ``r_i = (x_i, y_i, z)`` and turns with sense ``s_i``: +1 turns clockwise seen
@@ -58,7 +58,7 @@ class RotorParams(Bounded):
 
 
 @dataclass(frozen=True)
-class QueueParams(Bounded):
+class QueueParams(BoundedFields):
     """Command queue: the command given at t acts from t + delay on, held until the next one
     (zero-order hold).
     """
@@ -67,7 +67,7 @@ class QueueParams(Bounded):
 
 
 @dataclass(frozen=True)
-class ControllerParams(Bounded):
+class ControllerParams(BoundedFields):
     """Body-rate controller.
 
     ``betaflight``: with the delayed command (c, w_cmd), measured rate w, filtered set-point r,
@@ -137,7 +137,7 @@ class ControllerParams(Bounded):
 
 
 @dataclass(frozen=True)
-class MotorParams(Bounded):
+class MotorParams(BoundedFields):
     """Motor speed:
 
     ``Omega' = (Omega* - Omega) / time_constant`` (``first_order``) or ``Omega = Omega*``
@@ -152,7 +152,7 @@ class MotorParams(Bounded):
 
 
 @dataclass(frozen=True)
-class BatteryParams(Bounded):
+class BatteryParams(BoundedFields):
     """Battery of one pack.
 
     State: fraction used q, terminal voltage u. Electrical power ``P = P_0 + sum_i |tau_i| Omega_i /
@@ -172,7 +172,7 @@ class BatteryParams(Bounded):
 
 
 @dataclass(frozen=True)
-class ThrustParams(Bounded):
+class ThrustParams(BoundedFields):
     """Thrust and torque of rotor i from its speed and the battery voltage.
 
     ``f_i = gain_i (k_f Omega_i^2 + k_1 Omega_i) (1 + voltage_coefficient (u - u_ref))``,
@@ -193,7 +193,7 @@ class ThrustParams(Bounded):
 
 
 @dataclass(frozen=True)
-class AeroParams(Bounded):
+class AeroParams(BoundedFields):
     """Aerodynamics of the vehicle, from the velocity v_b of the centre of mass through the air and
     the rate w.
 
@@ -220,7 +220,7 @@ class AeroParams(Bounded):
 
 
 @dataclass(frozen=True)
-class VehicleParams(Bounded):
+class VehicleParams(BoundedFields):
     """A quadrotor: the seven blocks of Table I of the paper and the rigid body.
 
     The composer adds them up: ``F_b = (0, 0, sum f_i) + dF``,
@@ -278,7 +278,7 @@ class VehicleParams(Bounded):
 
 
 @dataclass(frozen=True)
-class RopeParams(Bounded):
+class RopeParams(BoundedFields):
     """Rope of rigid slender segments on universal joints, and the payload rigidly on the last one.
 
     Segment i has length ``length / segments`` and mass ``rope_mass / segments``, its centre of mass
@@ -372,7 +372,7 @@ class RopeParams(Bounded):
 
 
 @dataclass(frozen=True)
-class AirParams(Bounded):
+class AirParams(BoundedFields):
     """The air that vehicle and payload move in:
 
     ``v_air = v - wind_w``, in the place of v in every force of the air.
@@ -386,7 +386,7 @@ class AirParams(Bounded):
 
 
 @dataclass(frozen=True)
-class ReleaseParams(Bounded):
+class ReleaseParams(BoundedFields):
     """Release mechanism and the flight that follows.
 
     The latch trips when the release command exceeds ``threshold`` and does not untrip; the payload
@@ -423,7 +423,7 @@ class ReleaseParams(Bounded):
 
 
 @dataclass(frozen=True)
-class SimParams(Bounded):
+class SimParams(BoundedFields):
     """Numerics of the batched simulator."""
 
     control_period: Duration  # of the policy [s]
@@ -438,7 +438,7 @@ class SimParams(Bounded):
 
 
 @dataclass(frozen=True)
-class LawParams(Bounded):
+class LawParams(BoundedFields):
     """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the
     names of :mod:`sim.kernels.laws`.
 
@@ -476,7 +476,7 @@ class PlantParams:
 
 
 @dataclass(frozen=True)
-class SensingParams(Bounded):
+class SensingParams(BoundedFields):
     """Motion capture and gyro, as a log holds them. Zero everywhere is an ideal sensor.
 
     With the frame's rotation F of the rotation vector ``frame_tilt``, the marker body's M of
@@ -510,7 +510,7 @@ class SensingParams(Bounded):
 
 
 @dataclass(frozen=True)
-class RandomizationParams(Bounded):
+class RandomizationParams(BoundedFields):
     """Uniform distributions of an episode's start (the paper, Sec. III-C, "Domain randomization").
 
     The vehicle starts at ``(0, 0, spawn_height)`` plus offsets; the cable hangs straight from the

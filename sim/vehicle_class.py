@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from camera.bounds import Bounded, Positive
+from camera.field_bounds import BoundedFields, Positive
 from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams
 from sim.units import Units, in_units
 
@@ -19,7 +19,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class FleetParams(Bounded):
+class FleetParams(BoundedFields):
     """Ranges that vehicle, rope and release are drawn from, log-uniform; factors are relative to
     the known vehicle made to size.
 

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from camera.bounds import Bounded, Positive, Share
 from camera.detectors.edges import (
     circles_of,
     colour_maps,
@@ -26,6 +25,7 @@ from camera.detectors.edges import (
     polar_edge,
     rays_of,
 )
+from camera.field_bounds import BoundedFields, Positive, Share
 from camera.fisheye import Fisheye
 from camera.keypoints import (
     GOAL_KEYPOINTS,
@@ -49,7 +49,7 @@ DISTANCE_ERROR = 0.15
 
 
 @dataclass(frozen=True)
-class DetectorParams(Bounded):
+class DetectorParams(BoundedFields):
     """The looks of ball and goal."""
 
     ball_hue_deg: tuple[float, float] = (

@@ -10,13 +10,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from camera.bounds import Bounded, Positive
+from camera.field_bounds import BoundedFields, Positive
 from sim.effects.blocks import CONDITIONS, SWITCHES
 from sim.effects.setting import Setting
 
 
 @dataclass(frozen=True)
-class Effect(Bounded):
+class Effect(BoundedFields):
     """One cause that reality may have and the model lacks, or has with another size.
 
     The size theta is a *deviation*: 0 means that the model is right as it stands.
@@ -41,7 +41,7 @@ class Effect(Bounded):
 
 
 @dataclass(frozen=True)
-class Change(Bounded):
+class Change(BoundedFields):
     """A number of a setting that an effect changes."""
 
     path: str  # such as plant.vehicle.thrust.gain
@@ -78,7 +78,7 @@ def _replaced(owner: Any, names: list[str], new: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Lowest(Bounded):
+class Lowest(BoundedFields):
     """A lower limit for a number of the setting: theta is at least ``least - share * number /
     factor``.
     """
@@ -135,7 +135,7 @@ class SettingEffect(Effect):
 
 
 @dataclass(frozen=True)
-class RandomEffect(Bounded):
+class RandomEffect(BoundedFields):
     """A quantity that is drawn anew in every flight, from a normal distribution about its mean."""
 
     name: str

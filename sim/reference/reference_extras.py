@@ -4,14 +4,14 @@ default.
 
 from dataclasses import dataclass
 
-from camera.bounds import Bounded, NotNegative, Positive
+from camera.field_bounds import BoundedFields, NotNegative, Positive
 
 Vector = tuple[float, float, float]
 Spread = tuple[NotNegative, NotNegative, NotNegative]
 
 
 @dataclass(frozen=True)
-class ReferenceExtras(Bounded):
+class ReferenceExtras(BoundedFields):
     """Switchable effects of the reference plant.
 
     Fields that end in ``_sigma`` are standard deviations of a normal draw at each reset, one an

@@ -27,7 +27,7 @@ ONBOARD = (
 
 MAY_USE = {
     "camera": {"camera"},
-    "sim": {"sim", "camera.warp_start", "camera.bounds"},
+    "sim": {"sim", "camera.warp_start", "camera.field_bounds"},
     "visthrow": {"visthrow", "sim", "camera"},
     "hil": {"hil", "camera", *ONBOARD},
 }

@@ -146,7 +146,7 @@ def _check(args: argparse.Namespace) -> None:
 
 def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
     """Fly without a rope; write the log and print where the vehicle ended."""
-    from visthrow.throws.alone import SECONDS, fly_alone
+    from visthrow.throws.vehicle_alone import SECONDS, fly_alone
     from visthrow.training.compute_device import resolve
 
     log = fly_alone(experiment, (goal[0], goal[1]), args.no_rope, resolve(args.device))

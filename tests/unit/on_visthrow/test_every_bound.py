@@ -7,7 +7,7 @@ from functools import cache
 
 import pytest
 
-from camera import bounds
+from camera import field_bounds
 from visthrow import config
 from visthrow.common.errors import VisthrowError
 from visthrow.config import kinds, schema
@@ -67,7 +67,7 @@ def test_the_configurations_hold_hundreds_of_numbers():
 def test_a_number_outside_its_bound_is_refused(wrong):
     accepted = []
     for table, name in numbers():
-        bound = bounds._bounds(type(table)).get(name, bounds.Bound())
+        bound = field_bounds._bounds(type(table)).get(name, field_bounds.Bound())
         if bound.holds(wrong):
             continue
         try:

@@ -46,7 +46,7 @@ Duration = Annotated[float, Bound(0.0, 5.0, "(]")]  # of a filter, a lag or a st
 Lag = Annotated[float, Bound(0.0, 5.0)]  # the same, or none [s]
 
 
-class Bounded:
+class BoundedFields:
     """Base of dataclasses whose annotations state bounds; raises `error` for a number outside."""
 
     error: ClassVar[type[Exception]] = ValueError
