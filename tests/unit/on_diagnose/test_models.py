@@ -4,6 +4,7 @@ parameters found again.
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
+from tests.plants import paper_plant
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
@@ -477,6 +479,14 @@ class TestSetups:
             setups.Setup("", ball=BALL, stand=STAND)
         with pytest.raises(ConfigError, match="has no model"):
             setups.model_of(setups.Setup("bare"), [])
+
+    def test_a_simulated_vehicle_gets_what_a_flight_showed(self):
+        sizes = {"motor_tau": 0.007, "mass_quad": 0.01, "rotor_drag_xy": 0.02}
+        found = SimpleNamespace(names=tuple(sizes), theta=np.array(list(sizes.values())))
+        vehicle = fitting.vehicle_of(setups.Setup("", flyer=FLYER), found, paper_plant().vehicle)
+        assert vehicle.motor.time_constant == pytest.approx(FLYER.motor_time_constant + 0.007)
+        assert vehicle.body.mass == pytest.approx(FLYER.mass + 0.01)
+        assert vehicle.aero.drag_x == vehicle.aero.drag_y == pytest.approx(FLYER.drag_xy + 0.02)
 
     def test_fit_refuses_what_is_not_there(self):
         model = BallModel([ball_log()], BALL)
