@@ -341,21 +341,10 @@ def small_task():
     )
 
 
-def thrown(turn):
-    """Share released and mean landing error over the last of 60 iterations; ``turn`` alters the
-    surrogate.
-    """
-    trainer = Trainer(small_task(), "cpu", 1)
-    turn(trainer.algorithm.surrogate)
-    figures = [trainer.step() for _ in range(60)][-5:]
-    return tuple(
-        sum(row[name] for row in figures) / len(figures) for name in ("released", "landing_error")
-    )
-
-
-def learnt(released, error):
-    return released > 0.9 and error < LEARNT
-
-
-def test_it_learns():
-    assert learnt(*thrown(lambda surrogate: None))
+@pytest.mark.parametrize("seed", range(5))
+def test_every_seed_learns(seed):
+    """Of the last five of 35 iterations nearly all flights release, and land near."""
+    trainer = Trainer(small_task(), "cpu", seed)
+    figures = [trainer.step() for _ in range(35)][-5:]
+    assert sum(row["released"] for row in figures) / 5 > 0.9
+    assert sum(row["landing_error"] for row in figures) / 5 < LEARNT
