@@ -295,7 +295,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
 
 
 def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
-    """Fewer segments and longer steps give three times as many flights."""
+    """Fewer segments and longer steps give more than twice as many flights."""
     experiment = config.load(Experiment, config.find("train", "state"))
     coarse = first_order("state").env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
