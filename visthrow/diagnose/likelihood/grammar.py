@@ -74,6 +74,9 @@ class TermEffect(Effect):
     term: Term | None = None
     price: float = 0.0  # of its name, beyond the threshold [nats]
 
+    def __post_init__(self) -> None:
+        """Accept any bounds: a coefficient has none."""
+
 
 def forces(window: Window, effects: Sequence[TermEffect]) -> np.ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
