@@ -5,8 +5,8 @@
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
 Each world is flown once, by this checkout, and its logs are handed to both tools in processes of
-their own, on the same core one after the other. Worlds come in a random order that the seeds fix,
-so that whatever was answered before the time is over is a random part of the banks.
+their own, on the same core one after the other. Worlds come in an order that the seeds fix,
+so that whatever was answered before the time is over is a balanced part of the banks.
 """
 
 import argparse
@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -156,7 +157,9 @@ def one(task: tuple[tuple, list[str], float, float]) -> dict | None:
 
 
 def worlds_of(banks: Iterable[str], foreign_lists: Iterable[str]) -> list[tuple]:
-    """Return the worlds of banks and seed lists, mixed by the first seed."""
+    """Return the worlds of banks and seed lists, in an order whose every beginning is balanced.
+
+    Each kind is spread over the order evenly; the first seed fixes how the kinds are mixed."""
     worlds: list[tuple] = []
     first = 0
     for path in banks:
@@ -171,8 +174,22 @@ def worlds_of(banks: Iterable[str], foreign_lists: Iterable[str]) -> list[tuple]
         first = first or seed
     for path in foreign_lists:
         worlds += [("foreign", int(word)) for word in Path(path).read_text().split()]
-    random.Random(first).shuffle(worlds)
-    return worlds
+    rng = random.Random(first)
+    rng.shuffle(worlds)
+    kinds = [kind_of(world) for world in worlds]
+    sizes, placed = Counter(kinds), Counter()
+    places = []
+    for kind in kinds:
+        places.append((placed[kind] + rng.random()) / sizes[kind])
+        placed[kind] += 1
+    return [world for _, world in sorted(zip(places, worlds), key=lambda item: item[0])]
+
+
+def kind_of(world: tuple) -> str:
+    """Return what a world hides: its kind, or ``null`` or ``hidden`` of the other author."""
+    if world[0] == "foreign":
+        return "foreign" if foreign.drawn(world[1])[1] else "foreign null"
+    return world[1]
 
 
 def answer(args: argparse.Namespace) -> None:
