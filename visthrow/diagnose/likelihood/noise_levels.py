@@ -8,7 +8,6 @@ it, so that the forces have Student's heavy tails), and every level is bounded."
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import lapack
@@ -22,7 +21,7 @@ from visthrow.diagnose.likelihood.marginal import (
     left_of,
     without_effects,
 )
-from visthrow.diagnose.likelihood.stack import Same, Stack
+from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.logs.check.signals import MAD_TO_SIGMA
@@ -165,32 +164,15 @@ class _Layout:
 
     @staticmethod
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
-        """Number the parameters: of the same windows, once."""
-        count, phases = sum(gram.count for gram in grams), tuple(gram.phase for gram in grams)
-        latents, measured = (
-            Same([gram.latent_block for gram in grams]),
-            tuple(np.flatnonzero(count > 0).tolist()),
-        )
-        return _Layout._numbered(
-            latents, phases, tuple(sorted(noise.latent_sd)), measured, len(count)
-        )
-
-    @staticmethod
-    @lru_cache(maxsize=8)
-    def _numbered(
-        latents: Same, names: tuple, keys: tuple, channels: tuple[int, ...], count: int
-    ) -> "_Layout":
-        """``latents``, ``names``: blocks of each window's latents, and its phase; ``channels``:
-        those with samples, of so many.
-        """
-        index, blocks, measured = (
-            {key: i for i, key in enumerate(keys)},
-            len(LATENT_BLOCKS),
-            np.array(channels, dtype=int),
-        )
+        """Number the parameters."""
+        samples = sum(gram.count for gram in grams)
+        measured, count = np.flatnonzero(samples > 0), len(samples)
+        names = [gram.phase for gram in grams]
+        keys = tuple(sorted(noise.latent_sd))
+        index, blocks = {key: i for i, key in enumerate(keys)}, len(LATENT_BLOCKS)
         present = [
-            [b for b in range(blocks) if (b, name) in index and np.any(levels_of == b)]
-            for levels_of, name in zip(latents, names)
+            [b for b in np.unique(gram.latent_block).tolist() if (b, gram.phase) in index]
+            for gram in grams
         ]
         pairs = np.array(
             [(w, b) for w, levels_of in enumerate(present) for b in levels_of], dtype=int
@@ -269,10 +251,10 @@ def maximised(
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 
-    def look(x: np.ndarray, first: bool = False) -> tuple[float, np.ndarray, np.ndarray]:
-        return _likelihood(stack, layout.unpack(x, noise), layout, first)
+    def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        return _likelihood(stack, layout.unpack(x, noise), layout)
 
-    value, slope, curvature = look(x, first=True)
+    value, slope, curvature = look(x)
     for _ in range(ITERATIONS):
         step, promised = _scoring_step(layout, x, slope, curvature, low, high)
         if promised < tolerance:  # it is taken without another look
@@ -333,7 +315,7 @@ def _logarithms(step: np.ndarray) -> np.ndarray:
 
 
 def _likelihood(
-    stack: Stack, noise: Noise, layout: _Layout, first: bool = False
+    stack: Stack, noise: Noise, layout: _Layout
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
     expected curvature.
@@ -344,7 +326,7 @@ def _likelihood(
     inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
     slope[place] = TAIL * (inverse - 1.0)
     curvature[place, place] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
-    values, slopes, curvatures = stack.look(noise, first)
+    values, slopes, curvatures = stack.look(noise)
     (place, target), (places, pair) = layout.slopes, layout.curvatures
     slope += np.bincount(target, slopes.ravel()[place], size)
     curvature += np.bincount(pair, curvatures.ravel()[places], size * size).reshape(size, size)

@@ -6,8 +6,7 @@ size: on a GPU in one batch, on a CPU in batches that fit its cache."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from threading import Lock
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -33,24 +32,7 @@ T = TypeVar("T")
 ROUNDING = 1e-10
 
 BATCH = 8  # windows of a batch on the CPU
-# noise levels that are kept: a round's, and those that its candidates come to while sizes and
-# levels are estimated in turn
-BEGUN = 4
 BLOCKS = len(LATENT_BLOCKS)
-
-
-class Same(tuple):
-    """Arrays that are the same only if they are the very ones."""
-
-    def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, Same)
-            and len(self) == len(other)
-            and all(a is b for a, b in zip(self, other))
-        )
-
-    def __hash__(self) -> int:
-        return hash(tuple(map(id, self)))
 
 
 class _HiddenColumns:
@@ -64,16 +46,6 @@ class _HiddenColumns:
         """
         self._inner, self._sizes, self._device = inner, sizes, device
         self._channels, self._effects = len(inner[0]), inner[0].shape[1] - sizes[0]
-        self._begun, self._lock = {}, Lock()
-
-    def begun(self, noise: tuple, shaped: Callable[[], T]) -> T:
-        """Return the start of several searches at the same noise levels, calculated by the first of
-        them.
-        """
-        with self._lock:
-            start = self._begun.pop(noise, None) or shaped()
-            self._begun = dict([*self._begun.items(), (noise, start)][-BEGUN:])
-            return start
 
     @cached_property
     def hidden(self) -> torch.Tensor:
@@ -104,12 +76,6 @@ class _HiddenColumns:
     ) -> torch.Tensor:
         parts = [[part(inner, w)] for w, inner in enumerate(self._inner)]
         return side_by_side(parts, (self._channels, height, width), self._device)
-
-
-_ON_GPU, _ON_CPU = (lru_cache(maxsize=most)(_HiddenColumns) for most in (2, 32))
-"""Columns that are laid side by side already: residuals and noise levels change far more often than
-derivatives do.
-"""
 
 
 @dataclass(frozen=True)
@@ -211,10 +177,7 @@ class Stack:
             torch.from_numpy(a).to(self.device)
             for a in (cross, square, counts, log_sigma, member, initial)
         ]
-        inner = [gram.inner for gram in grams]
-        columns = (_ON_CPU if self.device == "cpu" else _ON_GPU)(
-            Same(inner), tuple(sizes), self.device
-        )
+        columns = _HiddenColumns([gram.inner for gram in grams], sizes, self.device)
         phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
         return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
 
@@ -249,15 +212,14 @@ class Stack:
         }
         return [by_window[w][:size] for w, size in enumerate(self._sizes)]
 
-    def look(self, noise: Noise, first: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
         levels.
 
-        ``first``: whether others may look at these levels as well, with other residuals. Raises
-        DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B blocks'
-        deviations and the C channels' scales; curvatures (W, B + C, B + C). What the scales share
-        with the fitted columns is given to the channels by their part in them."""
-        parts = self._of_batches(lambda batch: _looked(batch, noise, first))
+        Raises DiagnoseError: as :meth:`values`. Returns values (W,); gradients (W, B + C) by the B
+        blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the
+        scales share with the fitted columns is given to the channels by their part in them."""
+        parts = self._of_batches(lambda batch: _looked(batch, noise))
         return tuple(self._in_order([part[i] for part in parts]) for i in range(3))
 
     def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
@@ -376,19 +338,10 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     return variance, spread, curvature
 
 
-def _looked(
-    batch: _Batch, noise: Noise, first: bool
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Value, gradient and curvature by [blocks, scales]."""
-
-    def shaped() -> tuple[_Shape, tuple[torch.Tensor, ...]]:
-        start = _shape(batch, noise)
-        return start, _curved(start, batch)
-
-    levels = noise.scale.tobytes(), _levels(batch, noise).tobytes()
-    shape, (variance, spread, curvature) = (
-        batch.columns.begun(levels, shaped) if first else shaped()
-    )
+    shape = _shape(batch, noise)
+    variance, spread, curvature = _curved(shape, batch)
     solved = _solved(shape, batch)
     by_block = (batch.member.mT @ (variance + solved.mean**2 - 1.0)[:, :, None])[..., 0]
     moved = shape.level * solved.mean

@@ -18,7 +18,7 @@ from scipy.linalg import lapack
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
-from visthrow.diagnose.likelihood.stack import BATCH, Same, statistics
+from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.law_terms import (
@@ -256,53 +256,26 @@ def distinct(gain: np.ndarray, screened: Screen, count: int) -> list[int]:
 def extended(
     problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]
 ) -> tuple[Problem, list[Point]]:
-    """The problem and points of it with more terms as effects, at 0; nothing is simulated again,
-    and the same derivatives are laid once.
-    """
+    """The problem and points of it with more terms as effects, at 0; nothing is simulated again."""
     wide = replace(problem, terms=(*problem.terms, *terms))
 
-    def laid(window: Window, gram: Gram) -> tuple[np.ndarray, ...]:
+    def extended_window(pair: tuple[Window, Gram]) -> tuple[Window, Gram]:
+        window, gram = pair
         transfer = forces(window, terms)
         columns = transfer * wide.priors.floor[-len(terms) :]
         columns = lapack.dtrtrs(gram.factor, columns, lower=1)[0] if gram.latents else columns
+        cross = np.hstack((gram.cross, gram.cross[:, _latents(gram)] @ columns))
         return (
-            np.hstack((window.effects, window.latent @ transfer)),
-            _appended(gram, columns),
-            columns,
+            replace(window, effects=np.hstack((window.effects, window.latent @ transfer))),
+            replace(gram, inner=_appended(gram, columns), cross=cross),
         )
 
-    columns_of: dict[Same, list[tuple[np.ndarray, ...]]] = {}
     widened = []
     for point in points:
-        key = Same(
-            [a for w, gram in zip(point.windows, point.grams) for a in (w.effects, gram.inner)]
-        )
-        if key not in columns_of:
-            columns_of[key] = parallel_map(
-                lambda pair: laid(*pair), zip(point.windows, point.grams)
-            )
-        windows = [
-            replace(w, effects=effects)
-            for w, (effects, _, _) in zip(point.windows, columns_of[key])
-        ]
-        grams = [
-            replace(
-                gram,
-                inner=inner,
-                cross=np.concatenate(
-                    (gram.cross, gram.cross[:, _latents(gram)] @ laid_columns), axis=1
-                ),
-            )
-            for gram, (_, inner, laid_columns) in zip(point.grams, columns_of[key])
-        ]
-        widened.append(
-            regathered(
-                point,
-                theta=np.append(point.theta, np.zeros(len(terms))),
-                windows=windows,
-                grams=grams,
-            )
-        )
+        pairs = parallel_map(extended_window, zip(point.windows, point.grams))
+        windows, grams = map(list, zip(*pairs))
+        theta = np.append(point.theta, np.zeros(len(terms)))
+        widened.append(regathered(point, theta=theta, windows=windows, grams=grams))
     return wide, widened
 
 
