@@ -73,6 +73,23 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
         np.testing.assert_allclose(length, length[0], atol=0.01)
 
 
+def test_no_tick_is_in_the_logs_of_two_throws(run, monkeypatch):
+    played = read(run[0])
+    period = round(1.0 / played.playback.runner.pilot.period)  # ticks a second
+    begin = played.throws[0][0]
+    two = [(begin, begin + period // 2), (begin + period, begin + 3 * period // 2)]
+    played.throws[:] = two
+    ticks = []
+    monkeypatch.setattr(
+        flightlogs, "log_of", lambda _, first, last, number: ticks.append((first, last))
+    )
+    throws(played)
+    (first, last), (following, _) = ticks
+    assert first < begin
+    assert last < two[1][0]
+    assert following == last + 1
+
+
 def test_commands_before_the_autopilot_follows_are_no_valid_ones(run, tmp_path):
     """As Betaflight has it while it is not armed: frames go out, motors stand still, and have to
     spin up.

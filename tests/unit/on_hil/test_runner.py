@@ -559,6 +559,21 @@ def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
     assert all(track.gate.refused["swapped"] > 10 for track in pilot.tracks.values())
 
 
+def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
+    gap = 0.13  # after it a jump of 0.4 m would pass
+
+    def spoil(time, poses):
+        if time <= START:
+            return poses
+        vehicle, payload = poses
+        x, y, z = payload.pos
+        low = dataclasses.replace(payload, pos=(x, y, z - 0.4))
+        return [vehicle] if time <= START + gap else [vehicle, low]
+
+    pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
+    assert pilot.tracks["payload"].gate.refused["cable"] > 10
+
+
 @pytest.mark.parametrize(
     ("status", "reason"),
     [

@@ -46,8 +46,6 @@ NARROW = 1e-3
 name in that of one of any size.
 """
 
-UNBOUNDED = 1e12  # bounds of an effect are finite; no coefficient of a term comes near
-
 # terms that become effects to be weighed: as many as other sets that are simulated in their place
 WEIGHED = 6
 
@@ -366,7 +364,7 @@ def as_effect(term: Term, prior: float, price: float) -> TermEffect:
         term.formula,
         term.unit,
         term.block,
-        (-UNBOUNDED, UNBOUNDED),
+        (-np.inf, np.inf),
         prior,
         NARROW * prior,
         (),
