@@ -10,6 +10,7 @@ import numpy as np
 
 from sim.hybrid import HybridSim
 from sim.params import (
+    GRAVITY,
     BodyParams,
     PlantParams,
     QueueParams,
@@ -58,8 +59,15 @@ def scene_plant(
 ) -> PlantParams:
     """Plant of a bare scene; flown with ``direct=True`` only body, rope and numerics count."""
     plant = paper_plant()
+    controller = plant.vehicle.controller
+    strong = dataclasses.replace(
+        controller, max_thrust=max(controller.max_thrust, GRAVITY * scene.mass)
+    )
     vehicle = dataclasses.replace(
-        plant.vehicle, body=BodyParams(scene.mass, scene.inertia), queue=QueueParams(delay=0.0)
+        plant.vehicle,
+        body=BodyParams(scene.mass, scene.inertia),
+        controller=strong,
+        queue=QueueParams(delay=0.0),
     )
     rope = RopeParams(
         segments=scene.segments,

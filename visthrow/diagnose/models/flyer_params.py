@@ -53,7 +53,7 @@ class FlyerParams(Bounded):
         float, float, float
     ]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
     motor_time_constant: NotNegative  # [s]
-    command_delay: NotNegative  # [s]
+    command_delay: float  # below 0 where the log stamps its inputs late [s]
     reference_voltage: Positive  # at which the map holds [V]
     voltage_coefficient: float  # thrust changes by this share a volt [1/V]
     drag_xy: NotNegative  # rotor drag [kg/s]
