@@ -195,20 +195,20 @@ def calibrate_from_boards(
         views = [view for i in used if (view := boards[i]) is not None]
         try:
             lens = _solved(views, width, height, fov_deg)
-        except cv2.error as error:
+            estimates = {
+                i: _residual(Fisheye(lens), view, board_pose(Fisheye(lens), view))
+                for i, view in zip(used, views)
+            }
+        except (cv2.error, ValueError) as error:
             centre = np.array([width - 1.0, height - 1.0]) / 2.0
             reach = [float(np.linalg.norm(v.pixels - centre, axis=1).max()) for v in views]
             worst = int(np.argmax(reach))
             reason = str(error).strip().splitlines()[-1]
             left_out[used[worst]] = (
                 f"reaches {reach[worst]:.0f} px from the image's centre, and OpenCV's model, which"
-                f" ends 90 deg off the axis, cannot be started with it ({reason})"
+                f" ends 90 deg off the axis, cannot be fitted with it ({reason})"
             )
             continue
-        estimates = {
-            i: _residual(Fisheye(lens), view, board_pose(Fisheye(lens), view))
-            for i, view in zip(used, views)
-        }
         sizes = {i: float(np.sqrt(2.0 * np.mean(estimates[i] ** 2))) for i in used}
         limit = WRONG_BOARD * float(np.median(list(sizes.values())))
         wrong = max(sizes, key=sizes.__getitem__)
