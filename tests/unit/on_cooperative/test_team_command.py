@@ -30,6 +30,7 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
     assert off == pytest.approx(track.landing_error, abs=1e-3)
     landing_height = experiment.release.landing_height
     assert track.flight_w[-1, 2] == pytest.approx(landing_height, abs=1e-3)
+    assert np.diff(np.append(track.time, track.flight_time)).min() > 0.0
     centres = track.frames_w.mean(axis=(2, 3))
     np.testing.assert_allclose(centres, track.pos_w, atol=1e-6)
 

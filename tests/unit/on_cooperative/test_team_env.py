@@ -1,7 +1,9 @@
 """A team's environment: one goal a world, releases that all agree on, ends that all share."""
 
 import math
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
@@ -10,8 +12,9 @@ from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.cooperative.team import TeamExperiment, as_flown, members
 from visthrow.cooperative.team_env import TeamEnv
-from visthrow.cooperative.team_training import TeamTraining
+from visthrow.cooperative.team_training import TeamTraining, _summary
 from visthrow.onboard.observations import rotation_from_quat
+from visthrow.training.ppo.ppo_training import PPOTraining
 
 
 def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
@@ -206,18 +209,85 @@ def test_the_load_clears_the_vehicle_that_it_flies_past():
     assert clearance == pytest.approx([passing, 0.8], abs=0.01)
 
 
-@pytest.mark.parametrize(("cost", "reach"), [("contact_cost", 0.33), ("margin_cost", 0.26)])
-def test_what_comes_too_near_costs(cost, reach):
+@pytest.mark.parametrize(
+    ("coefficient", "conditions", "asked"),
+    [
+        ("team.contact_cost", ["team.rotor_reach=0.33"], -1.0),
+        ("team.margin_cost", ["team.rotor_reach=0.26"], -1.0),
+        ("task.reward.termination", ["team.rotor_reach=0.33"], -1.0),
+        ("task.reward.smoothness", ["task.reward.rate_command=[1.0, 2.0, 3.0]"], -1.0),
+        ("task.reward.landing", ["task.reward.landing_decay=2.0"], 1.0),
+        ("task.reward.proximity", ["release.clearance_margin=5.0"], 1.0),
+    ],
+)
+def test_a_step_is_paid_as_worked_by_hand(coefficient, conditions, asked):
     rewards = []
-    for value in (0.0, 50.0):
+    for value in (0.0, 10.0):
         torch.manual_seed(3)
-        changes = experiment("pair", f"team.{cost}={value}", f"team.rotor_reach={reach}")
+        changes = experiment("pair", f"{coefficient}={value}", *conditions)
         env = TeamEnv(as_flown(changes, "none"), seed=3, count=4)
-        rewards.append(env.step(hover(env, -torch.ones(4)))[1])
-    missing = env.cfg.team.margin - env.last["gap"]
-    assert (missing > 0.01).all()
-    assert torch.equal(env.last["contact"], missing > env.cfg.team.margin)
-    expected = env.last["contact"].float() if cost == "contact_cost" else missing
-    costs = (rewards[0] - rewards[1]) / (50.0 * env.cfg.task.reward.scale)
-    torch.testing.assert_close(costs, env._rows(expected), atol=1e-4, rtol=0.0)
-    assert expected.min() > 0.01
+        actions = hover(env, torch.full((4,), asked))
+        actions[:, 1:4] = torch.tensor([0.1, -0.2, 0.3])
+        for _ in range(9):
+            _, reward, done, _ = env.step(actions)
+            if done.any():
+                break
+        rewards.append(reward)
+    last, contact = env.last, env.last["contact"].float()
+    missing = env.cfg.team.margin - last["gap"]
+    assert torch.equal(last["contact"], (missing > env.cfg.team.margin) & ~last["released"])
+    expected = {
+        "contact_cost": -contact,
+        "margin_cost": -missing.clamp(max=env.cfg.team.margin),
+        "termination": -contact,
+        "smoothness": torch.full((2,), -(0.01 + 2.0 * 0.04 + 3.0 * 0.09)),
+        "landing": (-2.0 * last["landing_error"]).exp(),
+        "proximity": last["clearance"] - 5.0,
+    }[coefficient.split(".")[-1]]
+    paid = (rewards[1] - rewards[0]) / (10.0 * env.cfg.task.reward.scale)
+    torch.testing.assert_close(paid, env._rows(expected), atol=1e-4, rtol=1e-4)
+    assert expected.abs().min() > 0.01
+
+
+def test_cables_start_from_mounts_that_move_as_the_load_does():
+    torch.manual_seed(3)
+    env = TeamEnv(experiment("pair"), seed=3, count=16)
+    env._mount.copy_(torch.tensor([0.1, -0.05, -0.2]))
+    state = env.views.state
+    state["rate_b"] += torch.randn_like(state["rate_b"])
+    env._form(torch.ones(env.worlds, dtype=torch.bool))
+    turn = rotation_from_quat(state["quat_wb"])
+    length = env._segment[:, None] * env.cfg.rope.segments
+    ends = state["pos_w"] + turn @ env._mount + length * state["cable_dir_w"][0]
+    rate_w = (turn @ state["rate_b"][..., None])[..., 0]
+    velocities = state["vel_w"] + torch.linalg.cross(rate_w, turn @ env._mount)
+    for values in map(env._worlds, (ends, velocities)):
+        torch.testing.assert_close(values[:, 0], values[:, 1], atol=1e-5, rtol=0.0)
+        assert (values[0, 0] - values[1, 0]).norm() > 0.01
+
+
+def test_releases_are_free_ever_earlier_as_training_goes_on(monkeypatch):
+    monkeypatch.setattr(PPOTraining, "collect", lambda self, done: None)
+    training = object.__new__(TeamTraining)
+    training.experiment = experiment("pair", "team.free=[0.1, 0.3]", "team.first_release=20")
+    training.env = SimpleNamespace(earliest=torch.tensor(-1))
+    earliest = []
+    for done in (0.0, 0.1, 0.15, 0.25, 0.3, 1.0):
+        training.collect(done)
+        earliest.append(int(training.env.earliest))
+    assert earliest == [20, 20, 15, 5, 0, 0]
+
+
+def test_a_bias_points_from_the_target_to_where_loads_land():
+    values = {
+        "released": np.array([True, True, True, False]),
+        "contact": np.array([False, False, True, False]),
+        "clearance": np.full(4, 1.0),
+        "landing_error": np.full(4, 0.2),
+        "landing_w": np.array([[2.1, -0.1, 0.0], [2.3, -0.3, 0.0], [9.0, 9.0, 0.0], [0.0] * 3]),
+        "duration": np.full(4, 0.8),
+        "apart": np.full(4, 0.01),
+    }
+    figures = _summary(values, 2.0, 0.2)
+    assert figures["bias"] == pytest.approx([0.2, -0.2])
+    assert (figures["landed"], figures["contact"]) == (0.75, 0.25)
