@@ -425,13 +425,19 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
         read(path, camera="cam7")
 
 
+T265 = (
+    "height: 800\nwidth: 848\ndistortion_model: plumb_bob\n"
+    "D: [-0.0055, 0.0431, -0.0409, 0.0075, 0.0]\n"
+    "K: [286.1, 0.0, 419.5, 0.0, 286.2, 405.8, 0, 0, 1]\n"
+)
+"""Four numbers of Kannala and Brandt under another label."""
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
         (
-            "height: 800\nwidth: 848\ndistortion_model: plumb_bob\n"
-            "D: [-0.0055, 0.0431, -0.0409, 0.0075, 0.0]\nK: [286.1, 0.0, 419.5, 0.0, 286.2, 405.8,"
-            " 0, 0, 1]\n",
+            T265,
             "taken as Kannala-Brandt",
         ),
         (
@@ -462,6 +468,12 @@ def test_numbers_that_contradict_their_label_are_named(text, said, tmp_path):
     _, lens, report = read(path)
     assert said in " ".join(report.remarks)
     assert lens.fov_deg > 80.0
+
+
+def test_a_fifth_coefficient_confirms_the_label(tmp_path):
+    path = tmp_path / "calibration"
+    path.write_text(T265.replace("0.0075, 0.0]", "0.0075, 0.01]"))
+    assert read(path)[2].model == "pinhole-radtan"
 
 
 @pytest.mark.parametrize(

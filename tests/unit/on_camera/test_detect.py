@@ -145,6 +145,18 @@ def test_known_things_narrow_the_search(scene):
     )
 
 
+def test_a_rounder_ball_scores_higher():
+    y, x = np.mgrid[:400, :400] - 199.5
+    scores = []
+    for stretch in (1.0, 1.03):
+        distance = np.hypot(x / stretch, y * stretch)
+        level = 200.0 * np.clip(30.5 - distance, 0.0, 1.0).astype(np.float32)
+        scores.append(DETECTOR._cone(level, np.array([199.5, 199.5]), 30.0).score)
+    # the ellipse is off its circle by 3 % of its radius at most, by 0.03 / sqrt 2 in the mean
+    assert scores[0] > 0.98
+    assert 0.01 < scores[0] - scores[1] < 0.03
+
+
 def test_wrong_pictures():
     with pytest.raises(ValueError, match=r"expected \(400, 400, 3\) and uint8"):
         DETECTOR.detect(np.zeros((400, 300, 3), np.uint8))
