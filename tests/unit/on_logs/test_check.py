@@ -15,7 +15,7 @@ from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
 from visthrow.logs.axes import is_mirror
-from visthrow.logs.check import thrust_checks
+from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
@@ -568,3 +568,22 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
         (["a.npz"], "cf_payload"),
     ):
         assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)
+
+
+@pytest.mark.parametrize(("count", "judged"), [(20, False), (60, True)])
+def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
+    time = np.arange(0.0, 2.0, 0.02)
+    upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
+    log = log_of({"time": time, "quat_wb": upright})
+    force = Channel(time[:count], np.tile([0.0, 0.0, 5.0], (count, 1)), *UNITS["acc_b"])
+    rows = physics.look(FlightLog({**log.channels, "acc_b": force}))
+    assert any("mean force" in row.text for row in rows) == judged
+
+
+def test_delays_of_pieces_that_noise_hides_are_no_drift():
+    """A slow motion goes together with itself, but each piece tells its delay to 50 ms at best."""
+    rng, time = np.random.default_rng(0), np.arange(0.0, 40.0, 0.01)
+    pos = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
+    noisy = [pos + rng.normal(0.0, 0.3, pos.shape) * [1.0, 1.0, 0.0] for _ in range(2)]
+    assert physics._drift(time, pos, time, pos, "")
+    assert physics._drift(time, noisy[0], time, noisy[1], "") == []
