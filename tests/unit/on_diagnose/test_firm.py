@@ -9,7 +9,7 @@ import pytest
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.reporting.diagnosis_report import instead, landing_sentence
-from visthrow.diagnose.select import held_out, result, search
+from visthrow.diagnose.select import held_out, result, scatter, search, verdicts
 
 EFFECTS = catalogue(12)
 
@@ -178,3 +178,20 @@ def test_two_causes_that_may_be_two_others_are_told():
         instead(SimpleNamespace(theta={"lag": 1.0}, sets=sets)) == []
     )  # a law took the place of one
     assert instead(SimpleNamespace(theta={}, sets=())) == []
+
+
+def test_several_forms_at_once_are_another_form(monkeypatch):
+    """Two effects that differ from flight to flight at once: neither is the cause."""
+    form = scatter.Scatter("", "", "", "rope", "N", (), True, 1.0, 0.5, 1.5, 0.1, 20.0, 8)
+    forms = tuple(replace(form, name=f"effect_{i:02d}_by_flight") for i in (1, 4))
+    overall = []
+    for count in (1, 2):
+
+        def conclude(selector, count=count):
+            selector.scatter = lambda active, **_: forms[:count]
+            return verdicts.conclude(selector)
+
+        monkeypatch.setattr(search, "conclude", conclude)
+        model = SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
+        overall.append(search.explain(model, laws=False).overall)
+    assert overall == [result.KNOWN, result.UNKNOWN]

@@ -19,6 +19,7 @@ from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
+from visthrow.diagnose.throw import landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -306,3 +307,9 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
     assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
     assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
     assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
+
+
+def test_a_path_comes_down_between_two_points():
+    path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
+    np.testing.assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
+    assert np.isnan(landing._crossing(path, 0.7)).all()

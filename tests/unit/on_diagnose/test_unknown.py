@@ -3,12 +3,14 @@ is asked for.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
+from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
@@ -289,3 +291,19 @@ def test_terms_are_screened_beside_what_varies(days):
         np.testing.assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
         cross = wide.information[-1, :-1] / own.floor
         np.testing.assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())
+
+
+def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
+    """A term and a name of known information, against the maxima of their likelihoods."""
+    information, score = np.array([[4.0, 2.0], [2.0, 9.0]]), np.array([2.0, 6.0])
+    term = terms.as_effect(laws.Term("payload force", (), "vel"), 100.0, 0.0)
+    effects = (replace(catalogue(1)[0], prior_sd=1.0, floor=1.0), term)
+    priors = Priors.of(effects, ("pos_w", "payload_pos_w"))
+    point = SimpleNamespace(information=information, score=score)
+    both, name = 0.5 * score @ np.linalg.solve(information, score), 0.5 * score[0] ** 2 / 4.0
+    nats = terms.unexplained_nats(point, priors, [0, 1], 1, 0)
+    assert nats == pytest.approx(both - name, rel=1e-3)
+    (law,) = terms.laws(SimpleNamespace(priors=priors, effects=effects), point, [0, 1], 5.0)
+    covariance = np.linalg.inv(information + np.diag(priors.slab**-2.0))
+    assert law.sd == pytest.approx(term.floor * covariance[1, 1] ** 0.5)
+    assert law.covariance == pytest.approx((law.sd**2,))
