@@ -5,6 +5,7 @@ flight; what is refused.
 from types import SimpleNamespace
 from unittest.mock import create_autospec
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -16,6 +17,7 @@ from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.params import RopeParams
 from visthrow import cli, config
+from visthrow.cli.fly import _rendered_eyes
 from visthrow.detector_training.eyes import HANGING, RenderedEyes
 from visthrow.detector_training.scenes.scene import Nuisances, Truth
 from visthrow.throws.flight import Flight, Policies, hover, throw
@@ -52,6 +54,21 @@ def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):
     assert "no checkpoint to resume from" in capsys.readouterr().err
 
 
+def hanging():
+    """A vehicle whose payload and goal are in view, and the goal."""
+    zero = np.zeros((1, 3))
+    now = SimpleNamespace(
+        pos_w=np.array([[0.0, 0.0, 1.3]]),
+        quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]),
+        vel_w=zero,
+        rate_b=zero,
+        payload_pos_w=np.array([[0.05, -0.03, 0.93]]),
+        payload_vel_w=zero,
+        time=0.0,
+    )
+    return now, np.array([[1.0, 0.2, 0.0]])
+
+
 @pytest.mark.parametrize("by", sorted(NEAR))
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
@@ -66,17 +83,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
         nuisances=Nuisances(*(0.0,) * 8),
         keep=True,
     )
-    zero = np.zeros((1, 3))
-    now = SimpleNamespace(
-        pos_w=np.array([[0.0, 0.0, 1.3]]),
-        quat_wb=np.array([[0.0, 0.1, 0.0, 0.995]]),
-        vel_w=zero,
-        rate_b=zero,
-        payload_pos_w=np.array([[0.05, -0.03, 0.93]]),
-        payload_vel_w=zero,
-        time=0.0,
-    )
-    goal = np.array([[1.0, 0.2, 0.0]])
+    now, goal = hanging()
     points, valid = eyes.look(now, now, goal, np.array([True]))
     pilot = KeypointCamera(camera, dtype=torch.float64)
     quat = torch.tensor(now.quat_wb / np.linalg.norm(now.quat_wb))
@@ -94,6 +101,16 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
     with pytest.raises(ValueError, match="expected one of learnt, contours"):
         RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, method="magic")
+
+
+def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):
+    loaded = load_policy("vision")
+    eyes, (now, goal) = _rendered_eyes(loaded, "contours", 3), hanging()
+    eyes.look(now, now, goal, np.array([True]))
+    sheet = cv2.imread(str(eyes.sheet(tmp_path / "pixels.png")))
+    lens = loaded.experiment.camera.fisheye
+    assert sheet.shape == (2 * lens.height, 3 * lens.width, 3)
+    assert len(np.unique(sheet)) > 100
 
 
 class Blind:

@@ -127,6 +127,15 @@ def test_the_targets_are_as_old_as_the_poses_that_the_teacher_learnt_from(monkey
     assert max(latency) > 0.0
 
 
+def test_a_throw_that_ended_teaches_no_more():
+    trainer, _ = trained(0, 1.0, "distillation.horizon=30", "task.bounds.time_limit=0.4")
+    trainer.algorithm.collect(0.0)
+    alive = trainer.algorithm._alive
+    assert alive[0].all()
+    assert (alive.diff(dim=0) <= 0.0).all()
+    assert not alive[21:].any()
+
+
 def test_the_exported_policy_remembers_as_the_network_does(whole):
     trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1)
     trainer.load(whole / CHECKPOINT)
