@@ -145,8 +145,8 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
 
 @pytest.mark.slow
 def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
-    """The same tasks as jobs of submitit's local executor, in pieces so short that each holds one
-    iteration.
+    """The same tasks as jobs of submitit's local executor, in pieces that end before the training
+    does.
     """
     pytest.importorskip("submitit")
     from visthrow.paper.sweep import pool
@@ -154,13 +154,13 @@ def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
 
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setattr(pool, "BUSY_PAUSE", 0.1)
-    changes = ("runs.tiny.seeds=[1]", 'runs.tiny.changes=["ppo.iterations=3"]')
+    changes = ("runs.tiny.seeds=[1]", 'runs.tiny.changes=["ppo.iterations=16"]')
     work, out, said = load_list(path, changes), tmp_path / "jobs", []
     cluster = Cluster(path, out, "local", 1, 1, minutes=0.001, changes=changes)
     outcome = pool.ProcessPool(work, out, cluster, said.append).run()
     assert outcome == pool.Outcome()
     assert status(work, out)[1]
     pieces = list((work.sources[0].folder(out) / "pieces").iterdir())
-    assert len(pieces) == 3
-    assert rows(work.sources[0], out) == 3
-    assert sum("begins" in line for line in said) == 3
+    assert len(pieces) > 1
+    assert rows(work.sources[0], out) == 16
+    assert sum("begins" in line for line in said) >= len(pieces)
