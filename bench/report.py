@@ -43,9 +43,8 @@ class Report:
     bench: str  # which module of this folder made it
     title: str
     tables: tuple[Table, ...]
-    notes: tuple[
-        str, ...
-    ]  # sentences below the tables: how it was measured, what a number does not say
+    # sentences below the tables: how it was measured, what a number does not say
+    notes: tuple[str, ...]
     figures: dict[str, Any] = field(
         default_factory=dict
     )  # the numbers behind the tables, SI units, for programs

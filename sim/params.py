@@ -36,9 +36,8 @@ class BodyParams(BoundedFields):
     """
 
     mass: Mass  # [kg]
-    inertia: tuple[
-        Positive, Positive, Positive
-    ]  # principal moments about the centre of mass [kg m^2]
+    # principal moments about the centre of mass [kg m^2]
+    inertia: tuple[Positive, Positive, Positive]
     com: tuple[float, float, float] = (0.0, 0.0, 0.0)  # see VehicleParams [m]
 
 
@@ -241,9 +240,8 @@ class VehicleParams(BoundedFields):
     battery: BatteryParams
     thrust: ThrustParams
     aero: AeroParams
-    collision_radius: (
-        NotNegative  # sphere about the centre of mass that the payload must not enter [m]
-    )
+    # sphere about the centre of mass that the payload must not enter [m]
+    collision_radius: NotNegative
 
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
@@ -429,9 +427,8 @@ class SimParams(BoundedFields):
     control_period: Duration  # of the policy [s]
     substep: Duration  # largest integration step [s]
     gamma: Positive  # of the ROS2 W-method [-]
-    max_turn: (
-        Positive  # a segment that turns more in one substep falls back to the first stage [rad]
-    )
+    # a segment that turns more in one substep falls back to the first stage [rad]
+    max_turn: Positive
     precision: Literal["float32", "float64"] = "float32"
     # engine of the bodies: the fused kernel, or one of sim.solvers.SOLVERS
     solver: Literal["chain", "exchanged_chain", "physx", "mujoco_warp"] = "chain"
@@ -528,9 +525,8 @@ class RandomizationParams(BoundedFields):
     tether_variants: int  # number of cable lengths, one for each environment for good
     tether_spread: NotNegative  # the lengths span +- this fraction
     battery_used: NotNegative  # fraction of charge used is drawn from 0 to this
-    goal_radius: (
-        float  # goals are uniform on a ground disk of this radius about the spawn point [m]
-    )
+    # goals are uniform on a ground disk of this radius about the spawn point [m]
+    goal_radius: float
     payload_variants: int = (
         1  # number of payload masses, and of drags, in every combination with the cable lengths
     )

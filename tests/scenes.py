@@ -43,18 +43,15 @@ class Scene:
     mount: tuple[float, float, float]  # rope attachment, body frame [m]
     segments: int  # L
     segment_length: float  # [m]
-    segment_mass: (
-        float  # of one segment, centre of mass in its middle, transverse inertia m l^2 / 12 [kg]
-    )
+    # of one segment, centre of mass in its middle, transverse inertia m l^2 / 12 [kg]
+    segment_mass: float
     ball_mass: float  # [kg]
     ball_inertia: float  # transverse, about the ball's centre [kg m^2]
     ball_offset: float  # ball's centre past the end of the last segment [m]
-    direction: tuple[
-        float, float, float
-    ]  # of the whole rope from the mount outwards, world frame, any length
-    cable_rate_w: tuple[
-        float, float, float
-    ]  # angular velocity of the whole rope, world frame [rad/s]; axial part ignored
+    # of the whole rope from the mount outwards, world frame, any length
+    direction: tuple[float, float, float]
+    # angular velocity of the whole rope, world frame [rad/s]; axial part ignored
+    cable_rate_w: tuple[float, float, float]
     joint_damping: float  # [N m s]
     duration: float  # [s]
     schedule: tuple[Wrench, ...]

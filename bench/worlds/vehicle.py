@@ -72,9 +72,8 @@ class Numbers:
     slew_thrust: REAL  # thrust grows with the collective's change [s]: likewise
     yaw_swirl: REAL  # side force e_z x v [kg/s]: likewise
     power_drag: REAL  # drag along -|v|^1/2 v [kg/s (s/m)^1/2]: outside the grammar of laws as well
-    sink_push: (
-        REAL  # force along body z wherever the vehicle sinks faster than SINKING [N]: likewise
-    )
+    # force along body z wherever the vehicle sinks faster than SINKING [N]: likewise
+    sink_push: REAL
     mount: V3  # from the frame's origin
     length: REAL
     rope_mass: REAL

@@ -83,9 +83,8 @@ class BallSeen:
 class GoalSeen:
     """The goal square by its corners."""
 
-    rays_c: (
-        np.ndarray
-    )  # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
+    # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
+    rays_c: np.ndarray
     score: float
 
 

@@ -33,9 +33,8 @@ class Detection:
 
     stamp: float  # of the exposure, on the runner's clock [s]
     corners: Corners | None  # unit rays to the corners of the goal square, in turn
-    ball: (
-        tuple[float, float, float, float] | None
-    )  # unit ray to the ball's centre, and half-angle [rad]
+    # unit ray to the ball's centre, and half-angle [rad]
+    ball: tuple[float, float, float, float] | None
 
     def values(self) -> list:
         """Return it as JSON has it."""

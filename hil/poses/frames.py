@@ -37,9 +37,8 @@ class FrameParams(Bounded):
     body_axes: str
     quaternion: Literal["xyzw", "wxyz"]  # order of the source's quaternions
     yaw_offset_deg: float  # turn about our world z after the exchange of axes
-    marker_offset_b: tuple[
-        float, float, float
-    ]  # of the tracked point from the centre of mass [m], our body frame
+    # of the tracked point from the centre of mass [m], our body frame
+    marker_offset_b: tuple[float, float, float]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -38,9 +38,8 @@ class CarryMove:
 
     text: str  # for the operator
     turn: bool  # of the attitude, else of the place
-    axis: (
-        int | None
-    )  # of our axes along or about which it goes; None for the way back, which is not judged
+    # of our axes along or about which it goes; None for the way back, which is not judged
+    axis: int | None
 
 
 MOVES = (
@@ -90,9 +89,8 @@ class CarryResult:
 
     lines: tuple[Line, ...]
     fitting: FrameParams  # under which the moves fit best
-    mirrored: (
-        bool  # a left-handed source would fit better: left and right exchanged, or the axes are
-    )
+    # a left-handed source would fit better: left and right exchanged, or the axes are
+    mirrored: bool
     passed: bool
 
 

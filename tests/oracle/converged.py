@@ -23,9 +23,8 @@ class OracleRun:
     rate_b: np.ndarray  # [rad/s], shape (T, 3)
     ball_pos_w: np.ndarray  # [m], shape (T, 3)
     ball_vel_w: np.ndarray  # [m/s], shape (T, 3)
-    cable_points_w: (
-        np.ndarray
-    )  # mount, every joint and the end of the last segment [m], shape (T, L+1, 3)
+    # mount, every joint and the end of the last segment [m], shape (T, L+1, 3)
+    cable_points_w: np.ndarray
     cable_dir_w: np.ndarray  # shape (T, L, 3)
     cable_vel_w: np.ndarray  # time derivative of the directions [1/s], shape (T, L, 3)
     energy: np.ndarray  # kinetic and potential [J], shape (T, 2)

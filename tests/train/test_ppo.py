@@ -240,7 +240,7 @@ def reached(seed: int, iterations: int = 24) -> tuple[float, list[float]]:
     the divergence.
     """
     torch.manual_seed(seed)
-    changes = ("environments=64", "steps=8", "hidden=[32,32]", "settled=0.5")
+    changes = ("environments=64", "steps=8", "hidden=[32,32]")
     words = [f"ppo.{change}" for change in changes]
     experiment = config.load(Experiment, config.find("train", "state"), words)
     training = PPOTraining(experiment, "cpu", seed, Ranks("cpu"), build=Reach)
@@ -255,12 +255,12 @@ def reached(seed: int, iterations: int = 24) -> tuple[float, list[float]]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_every_seed_learns_and_its_steps_settle(seed):
+def test_every_seed_learns_with_ever_smaller_steps(seed):
     distance, targets = reached(seed)
     assert distance < REACHED
     assert targets[0] == pytest.approx(0.015)
-    assert targets[:12] == sorted(set(targets[:12]), reverse=True)
-    assert targets[12:] == pytest.approx([0.003] * 12)
+    assert targets == sorted(set(targets), reverse=True)
+    assert targets[-1] == pytest.approx(0.015 - 0.012 * 23 / 24)
 
 
 @pytest.mark.gpu

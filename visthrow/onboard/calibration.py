@@ -122,9 +122,8 @@ class Hovered:
 class Calibration:
     """The estimates from a hover, each with its standard deviation."""
 
-    turn_b: tuple[
-        float, float, float
-    ]  # of the camera from its nominal pose: roll, pitch, yaw [rad]
+    # of the camera from its nominal pose: roll, pitch, yaw [rad]
+    turn_b: tuple[float, float, float]
     turn_sigma: tuple[float, float, float]  # [rad]
     latency: float  # of the keypoints beyond the poses' and beyond what is stated [s]
     latency_sigma: float  # [s]

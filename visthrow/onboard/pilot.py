@@ -54,9 +54,8 @@ class PilotOutput:
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: np.ndarray  # whether the latch is to trip, shape (E,), bool
     observation: np.ndarray  # shape (E, D)
-    keypoints: (
-        np.ndarray | None
-    )  # normalised image coordinates, shape (E, 8, 2); None without a camera
+    # normalised image coordinates, shape (E, 8, 2); None without a camera
+    keypoints: np.ndarray | None
     valid: np.ndarray | None  # which of them are seen, shape (E, 8), bool
 
 

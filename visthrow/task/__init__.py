@@ -49,9 +49,8 @@ class ObservationParams(Bounded):
     layout: Literal["state", "vision"]
     history: int  # earlier payload measurements beside the current one
     validity: bool  # vision: whether the actor is told which keypoints are valid
-    latency: tuple[
-        float, float
-    ]  # age of all that is measured, drawn per episode from this range [s]
+    # age of all that is measured, drawn per episode from this range [s]
+    latency: tuple[float, float]
     latency_jitter: NotNegative = (
         0.0  # of that age, uniform up to this to either side, drawn per step [s]
     )
@@ -211,14 +210,13 @@ class PPOParams(Bounded):
     learning_rate: Positive
     schedule: Literal["adaptive", "fixed"]
     desired_kl: Positive  # at the first iteration
-    final_kl: Positive  # once settled; linear between
+    final_kl: Positive  # at the last one; linear between
     discount: Share
     gae_lambda: Share
     clip: Positive
     entropy: NotNegative
     value_coefficient: NotNegative
     max_grad_norm: Positive
-    settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
     products: Literal["float32", "bfloat16"] = (
         "float32"  # of the hidden layers; weights are float32 either way
     )

@@ -32,9 +32,8 @@ class Throws:
     error: np.ndarray  # [m], shape (N,)
     duration: np.ndarray  # [s], shape (N,)
     clearance: np.ndarray  # [m], shape (N,)
-    smoothness: (
-        np.ndarray
-    )  # root mean square change of the normalised commands from step to step, shape (N,)
+    # root mean square change of the normalised commands from step to step, shape (N,)
+    smoothness: np.ndarray
     goal_w: np.ndarray | None = (
         None  # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
     )

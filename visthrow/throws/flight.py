@@ -182,9 +182,8 @@ class FlightObserver:
 class Phase:
     """Part of a flight."""
 
-    throws: (
-        bool  # whether the pilots fly, or the hover controller, which begins with empty integrals
-    )
+    # whether the pilots fly, or the hover controller, which begins with empty integrals
+    throws: bool
     over: Callable[["Flight"], bool]  # asked after each period
 
 

@@ -54,9 +54,8 @@ class Trade:
     """Durations and errors on one plant."""
 
     title: str
-    fronts: tuple[
-        tuple[int, str, np.ndarray], ...
-    ]  # series, label, points (N, 2): duration [s], error [m]
+    # series, label, points (N, 2): duration [s], error [m]
+    fronts: tuple[tuple[int, str, np.ndarray], ...]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
     crosses: tuple[tuple[str, np.ndarray], ...] = ()  # the paper's
 

@@ -52,9 +52,8 @@ class CrazyflieParams(Bounded):
     device: str
     remote: bool  # whether a network device may leave this machine
     thrust: HoverThrustParams
-    release_parameter: (
-        str  # of eight bits that opens the mechanism at 1: group.name of an app or a deck
-    )
+    # of eight bits that opens the mechanism at 1: group.name of an app or a deck
+    release_parameter: str
     mechanism_lag: NotNegative  # from the parameter's change to separation [s]
     release_timeout: Positive  # without an answer the release has failed [s]
     silence: Positive  # after which it counts as lost [s]

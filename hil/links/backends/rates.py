@@ -34,9 +34,8 @@ class RatesParams(Bounded):
     # betaflight: RC rate in hundredths; actual: rate around the middle in 10 deg/s. At 0 the curve
     # would be flat there.
     rc_rates: tuple[Steep, Steep, Steep]
-    rates: tuple[
-        Byte, Byte, Byte
-    ]  # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
+    # betaflight: super rate in hundredths; actual: rate at the end in 10 deg/s
+    rates: tuple[Byte, Byte, Byte]
     expo: tuple[Percent, Percent, Percent]  # in hundredths
 
     def rate(self, axis: int, stick: float) -> float:

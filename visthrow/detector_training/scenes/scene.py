@@ -374,9 +374,8 @@ class Truth:
     """
 
     ball_c: Tensor  # centre [m], shape (E, 3), camera frame
-    corners_c: (
-        Tensor  # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
-    )
+    # of the square [m], shape (E, 4, 3), in the order of `camera.keypoints.goal_square`
+    corners_c: Tensor
     rot_wc: Tensor  # camera to world, shape (E, 3, 3)
     ball_seen: Tensor  # whole in the field of view, shape (E,), bool
     goal_seen: Tensor  # likewise

@@ -61,9 +61,8 @@ class Gram:
     square: np.ndarray  # r' r / sigma^2, shape (C,)
     nuisances: int
     latent_block: np.ndarray  # shape (L,)
-    factor: (
-        np.ndarray
-    )  # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
+    factor: np.ndarray
     shown: Mapping[
         int, float
     ]  # latent block -> median inner product of its columns with themselves
@@ -88,9 +87,8 @@ class Noise:
     scale: np.ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
-    share: (
-        np.ndarray
-    )  # latent deviation of each window and block in its phase's, shape (windows, 3)
+    # latent deviation of each window and block in its phase's, shape (windows, 3)
+    share: np.ndarray
 
     def deviation(self, gram: Gram, window: int) -> np.ndarray:
         """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""

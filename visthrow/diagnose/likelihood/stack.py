@@ -356,9 +356,8 @@ class _Integrated:
 
     left: list[np.ndarray]  # which of the J columns are a window's own
     at: _Shape
-    half: (
-        torch.Tensor
-    )  # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
+    # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
+    half: torch.Tensor
     information: list[np.ndarray]  # of each window
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:

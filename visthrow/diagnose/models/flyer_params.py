@@ -30,9 +30,8 @@ class TorqueParams(Bounded):
     arm_x: Positive  # of each rotor from the centre of mass, along x and along y [m]
     arm_y: Positive
     torque_ratio: NotNegative  # drag torque over thrust [m]
-    spin: tuple[
-        float, float, float, float
-    ]  # +1 turns clockwise seen from above; order of the rotors as everywhere
+    # +1 turns clockwise seen from above; order of the rotors as everywhere
+    spin: tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -49,9 +48,8 @@ class FlyerParams(Bounded):
     attitude: str  # channel of the measured attitude
     mass: Positive  # of the vehicle alone [kg]
     gravity: Positive  # [m/s^2]
-    thrust_map: tuple[
-        float, float, float
-    ]  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
+    # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
+    thrust_map: tuple[float, float, float]
     motor_time_constant: NotNegative  # [s]
     command_delay: float  # below 0 where the log stamps its inputs late [s]
     reference_voltage: Positive  # at which the map holds [V]

@@ -33,9 +33,8 @@ class GimbalParams(Bounded):
 
     base_b: tuple[float, float, float]  # the gimbal's centre in the body frame [m]
     camera_offset: float  # of the camera along the gimbal's x axis [m]
-    camera_axes_deg: tuple[
-        float, float, float
-    ]  # gimbal to camera: turns about fixed x, y, z in this order [deg]
+    # gimbal to camera: turns about fixed x, y, z in this order [deg]
+    camera_axes_deg: tuple[float, float, float]
     marker_z: float  # the marker over the payload's tracked centre, along the vertical [m]
     sigma_across: Positive  # of the marker's direction times distance [m]
     sigma_along: Positive  # of its distance [m]

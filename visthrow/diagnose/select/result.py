@@ -124,9 +124,8 @@ class ChannelGain:
     gain: float  # 1 - after / before
     low: float  # 95 % interval of the gain, by bootstrap over flights
     high: float
-    horizons: tuple[
-        tuple[float, float, float, float], ...
-    ]  # horizon [s], before, after, floor, in sigmas
+    # horizon [s], before, after, floor, in sigmas
+    horizons: tuple[tuple[float, float, float, float], ...]
 
 
 @dataclass(frozen=True)

@@ -40,9 +40,8 @@ class PredictedLandings:
 
     flights: np.ndarray  # their numbers, shape (F,)
     measured: np.ndarray  # shape (F, 3)
-    predicted: (
-        np.ndarray
-    )  # open loop from before the throw, shape (F, 3); NaN where it never comes down
+    # open loop from before the throw, shape (F, 3); NaN where it never comes down
+    predicted: np.ndarray
     released: np.ndarray  # from a state fitted up to the separation, shape (F, 3)
 
     @property

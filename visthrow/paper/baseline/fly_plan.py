@@ -51,13 +51,11 @@ rate, and attitude.
 class Flown(Throws):
     """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
 
-    position_error: (
-        np.ndarray
-    )  # of the payload at separation against the planned release [m], shape (N,)
+    # of the payload at separation against the planned release [m], shape (N,)
+    position_error: np.ndarray
     velocity_error: np.ndarray  # the same [m/s], shape (N,)
-    tracking: (
-        np.ndarray
-    )  # root mean square distance of the payload from the path until the release [m], shape (N,)
+    # root mean square distance of the payload from the path until the release [m], shape (N,)
+    tracking: np.ndarray
     step_times: np.ndarray  # of all steps of the controller [s], shape (K,)
 
 

@@ -22,9 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = (
         "examples:\n  visthrow report                                the page, from the committed"
-        " records\n  visthrow report --results runs/sweep/throws    with throws of your own sweep"
-        " besides\n\nThrows of few minutes are made by 'visthrow sweep run quick', those of the"
-        " page by 'visthrow sweep run paper' and\n'gap'.\n"
+        " records\n  visthrow report --results runs/sweep/throws    add the throws of your sweep\n"
+        "\n'visthrow sweep run quick' makes a few throws within minutes; 'visthrow sweep run paper'"
+        " and 'gap' make those\nof the page.\n"
     )
     parser.add_argument(
         "--results",
@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read and write."""
+    """Read the records and write the page."""
     from visthrow.common.storage import writable
     from visthrow.paper import RECORDS
     from visthrow.paper.report import result_set
