@@ -20,6 +20,7 @@ from visthrow.diagnose.inputs.proposal import propose
 from visthrow.diagnose.throw.command_mistakes import commanded
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs import read, table_of
+from visthrow.logs.check import relations
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
@@ -134,6 +135,22 @@ def test_a_marker_in_millimetres_is_no_velocity_of_another():
         path = np.column_stack([np.cos(turn), np.sin(turn), 1.0 + 0.0 * turn])
         table |= {f"{body}.{axis} [mm]": 500.0 * c for axis, c in zip("XYZ", path.T)}
     assert [c.name for c in propose(table, "a.csv").mapping.channels] == ["pos_w"]
+
+
+def test_markers_are_compared_in_a_time_that_grows_with_their_number(monkeypatch):
+    """Thirty markers whose names tell no unit; one velocity among them is no position."""
+    time = np.arange(0.0, 8.0, 0.01)
+    path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 1.0 + 0.2 * np.sin(time)])
+    columns = {"time": time} | named("v", np.gradient(path, time, axis=0))
+    for i in range(30):
+        columns |= named(f"m{i}", path + [0.01 * i, 0.02 * i, 0.0])
+    compared = []
+    relate = relations.relate
+    monkeypatch.setattr(relations, "relate", lambda *a, **k: compared.append(0) or relate(*a, **k))
+    asked = " ".join(propose(columns, "capture").questions)
+    assert "m29_x, m29_y, m29_z a position?" in asked
+    assert "are v_x, v_y, v_z a position?" not in asked
+    assert len(compared) < 100
 
 
 def test_the_imu_of_euroc_is_proposed(tmp_path):

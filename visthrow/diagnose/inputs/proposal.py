@@ -61,6 +61,9 @@ _HINTS = (
 UPS = ("", "x,-z,y")
 """Axes of a world whose z is up, and of one whose y is, as Motive's."""
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
+_REACH, _LATEST = 0.2, 0.15  # delays between them that are tried, and that count [s]
+_SPAN, _COARSE = 0.1, 0.02  # over which a path is differentiated; of the grid of many pairs [s]
+_COMPARED = 1000  # rows on which the distance of two paths is judged
 _TURN = 7.0  # above a full turn in radians: degrees
 
 
@@ -192,6 +195,12 @@ def _moves(values: np.ndarray) -> bool:
     """Whether rows of numbers, shape (T, columns), differ."""
     whole = values[np.all(np.isfinite(values), axis=1)]
     return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
+
+
+def _normalised(values: np.ndarray) -> np.ndarray:
+    """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
+    centred = (values - np.mean(values, axis=0)).ravel()
+    return centred / max(float(np.linalg.norm(centred)), 1e-300)
 
 
 def _rises(cells: np.ndarray) -> bool:
@@ -516,11 +525,8 @@ class _Chooser:
                 f"are {', '.join(g.columns)} a position? Their names do not say" for g in groups
             ]
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
-        groups = [
-            g
-            for g in groups
-            if all(rival is g or self._relation(rival, g, _FIRMLY) is None for rival in moving)
-        ]  # no derivatives
+        derived = self._derivatives(moving, groups)
+        groups = [group for group, is_rate in zip(groups, derived) if not is_rate]
         for group in [g for g in groups if "cam" in g.stem.lower()]:
             unit = self._length_unit(group)
             if unit and "marker_pos_c" not in self.made:
@@ -674,11 +680,12 @@ class _Chooser:
     def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
         """The path below another one that keeps its distance from it."""
         candidates = []
+        rows = slice(None, None, max(1, len(self.time) // _COMPARED))
         for upper, a in paths:
             for lower, b in paths:
                 if upper is lower:
                     continue
-                gap = lower.values * UNITS[b][1] - upper.values * UNITS[a][1]
+                gap = lower.values[rows] * UNITS[b][1] - upper.values[rows] * UNITS[a][1]
                 length = np.linalg.norm(gap, axis=1)
                 middle, spread = np.nanmedian(length), np.nanstd(length)
                 if (
@@ -705,17 +712,54 @@ class _Chooser:
         time, columns = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
         if len(time) < 100:
             return None
-        stamps, derived = relations.derivative(time, columns[:, : path.values.shape[1]], 0.1)
+        stamps, derived = relations.derivative(time, columns[:, : path.values.shape[1]], _SPAN)
         relation = relations.relate(
-            stamps, derived, time, columns[:, path.values.shape[1] :], reach=0.2
+            stamps, derived, time, columns[:, path.values.shape[1] :], reach=_REACH
         )
         return (
             relation
             if relation is not None
             and relation.correlation > threshold
-            and abs(relation.delay) < 0.15
+            and abs(relation.delay) < _LATEST
             else None
         )
+
+    def _derivatives(self, paths: list[Group], rates: list[Group]) -> list[bool]:
+        """Tell which groups are the derivative of another path.
+
+        Captures of many markers have thousands of pairs: all are correlated on one coarse grid, by
+        one matrix product a delay.
+        """
+        grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
+        steps = round(_REACH / _COARSE)
+        count = len(grid) - 2 * steps
+        if not rates or count < 25:
+            return [False] * len(rates)
+        slopes = [self._on_grid(path, grid, slope=True)[steps : steps + count] for path in paths]
+        slopes = np.array([_normalised(slope) for slope in slopes])
+        values = [self._on_grid(rate, grid) for rate in rates]
+        scores = []
+        for start in range(2 * steps + 1):
+            moved = [_normalised(path[start : start + count]) for path in values]
+            scores.append(slopes @ np.array(moved).T)
+        late = np.abs(np.argmax(scores, axis=0) - steps) * _COARSE
+        firm = (np.max(scores, axis=0) > _FIRMLY) & (late < _LATEST)
+        return [
+            rate.unit not in unit_evidence.LENGTHS  # a length is no velocity
+            and any(hit and path is not rate for hit, path in zip(column, paths))
+            for rate, column in zip(rates, firm.T)
+        ]
+
+    def _on_grid(self, group: Group, grid: np.ndarray, slope: bool = False) -> np.ndarray:
+        """Return a group's values, or their slope, at times of a grid; zeros where too few are
+        known.
+        """
+        time, values = unit_evidence.rising(self.time, group.values)
+        if len(time) >= 100 and slope:
+            time, values = relations.derivative(time, values, _SPAN)
+        if len(time) < 100:
+            return np.zeros((len(grid), group.values.shape[1]))
+        return relations.on_grid(time, values, grid)
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
