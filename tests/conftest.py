@@ -1,13 +1,13 @@
 """One thread a product for all tests: see :mod:`visthrow.diagnose.likelihood.threads`."""
 
-import pytest
+from pytest import fixture
 
 from visthrow.diagnose.likelihood.threads import single
 
 single()
 
 
-@pytest.fixture
+@fixture
 def one_thread():
     """One thread for torch: small work; the same bits need the same number of threads."""
     import torch

@@ -2,9 +2,10 @@
 throws, 200 Hz.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
+from numpy.random import default_rng
 
 from bench.worlds.pilot import FreeFlight, Throw, Tracker
 from sim.effects.effect import apply
@@ -49,14 +50,14 @@ def fly(
         lost: share of the commands that never arrive, where the last one stays; the log holds what
             was sent.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     references = [FreeFlight(rng) for _ in range(free)]
     references += [
         Throw(rng, speed, rng.uniform(-np.pi, np.pi)) for speed in np.linspace(6.0, 10.0, throws)
     ]
     plant = setting.plant
-    steps = dataclasses.replace(plant.sim, control_period=TICK, substep=FINE, precision="float64")
-    sim = HybridSim(dataclasses.replace(plant, sim=steps), len(references), extensions=EVERYTHING)
+    steps = replace(plant.sim, control_period=TICK, substep=FINE, precision="float64")
+    sim = HybridSim(replace(plant, sim=steps), len(references), extensions=EVERYTHING)
     known = paper_plant()
     pilot = Tracker(
         references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng
@@ -66,7 +67,7 @@ def fly(
         name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")
     }
     separated = np.full(len(references), np.inf)
-    left, link, arrived = [None] * len(references), np.random.default_rng([seed, 1]), None
+    left, link, arrived = [None] * len(references), default_rng([seed, 1]), None
     ticks = round(max(seconds, 2.6) / TICK)
     for k in range(ticks):
         t = k * TICK

@@ -2,7 +2,7 @@
 knows.
 """
 
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 from sim.kernels.structs import EXTENSIONS
@@ -35,14 +35,11 @@ def plain_vehicle(vehicle: VehicleParams, **kinds: str) -> VehicleParams:
     otherwise.
     """
     chosen = {"aero": "none", "battery": "ideal", **kinds}
-    parts = {
-        name: dataclasses.replace(getattr(vehicle, name), kind=kind)
-        for name, kind in chosen.items()
-    }
-    return dataclasses.replace(vehicle, **parts)
+    parts = {name: replace(getattr(vehicle, name), kind=kind) for name, kind in chosen.items()}
+    return replace(vehicle, **parts)
 
 
 def plain_plant() -> PlantParams:
     """Return the paper's plant without aerodynamics and with an ideal battery."""
     plant = paper_plant()
-    return dataclasses.replace(plant, vehicle=plain_vehicle(plant.vehicle))
+    return replace(plant, vehicle=plain_vehicle(plant.vehicle))

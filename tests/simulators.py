@@ -2,8 +2,7 @@
 plain NumPy.
 """
 
-import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ def numerics(
     substep: float = 0.002, precision: str = "float32", control_period: float = 0.02
 ) -> SimParams:
     """The paper's numerics with another substep, precision or period."""
-    return dataclasses.replace(
+    return replace(
         paper_plant().sim, substep=substep, precision=precision, control_period=control_period
     )
 
@@ -50,7 +49,7 @@ def bare_quadrotor(
 ) -> HybridSim:
     """Return quadrotors without a rope."""
     sim = numerics(step, precision, control_period)
-    plant = dataclasses.replace(paper_plant(), vehicle=vehicle, sim=sim)
+    plant = replace(paper_plant(), vehicle=vehicle, sim=sim)
     return HybridSim(plant, count, without_rope=integrator, **options)
 
 
@@ -60,10 +59,8 @@ def scene_plant(
     """Plant of a bare scene; flown with ``direct=True`` only body, rope and numerics count."""
     plant = paper_plant()
     controller = plant.vehicle.controller
-    strong = dataclasses.replace(
-        controller, max_thrust=max(controller.max_thrust, GRAVITY * scene.mass)
-    )
-    vehicle = dataclasses.replace(
+    strong = replace(controller, max_thrust=max(controller.max_thrust, GRAVITY * scene.mass))
+    vehicle = replace(
         plant.vehicle,
         body=BodyParams(scene.mass, scene.inertia),
         controller=strong,
@@ -93,7 +90,7 @@ def scene_sim(
 ) -> HybridSim:
     """Simulator of one vehicle at the start of a scene."""
     plant = scene_plant(scene, substep, precision, control_period)
-    plant = dataclasses.replace(plant, sim=dataclasses.replace(plant.sim, solver=solver))
+    plant = replace(plant, sim=replace(plant.sim, solver=solver))
     sim = HybridSim(plant, 1, direct=True, **options)
     sim.place(
         np.array([scene.pos_w]),

@@ -8,6 +8,7 @@ force shapes on either mass or shifts of a measured position, so the linearisati
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.random import default_rng
 
 from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
 
@@ -84,8 +85,8 @@ class SyntheticModel(Model):
     calls: int = 0
 
     def __post_init__(self) -> None:
-        self._rng = np.random.default_rng(self.seed)
-        self._draw = np.random.default_rng([self.seed, self.fresh])
+        self._rng = default_rng(self.seed)
+        self._draw = default_rng([self.seed, self.fresh])
         self._at = {e.name: j for j, e in enumerate(self.effects)}
         self._time = np.arange(0.0, LENGTH, 1.0 / self.rate)
         self._knots = np.linspace(0.0, LENGTH, KNOTS)

@@ -5,8 +5,9 @@ made up for.
 import pickle
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, mark, raises
+from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
 from camera.mount import rotation_from_vector
@@ -49,7 +50,7 @@ def test_a_hover_finds_each_camera_and_the_throw_sees_as_the_nominal_one(monkeyp
         for one, is_turned, is_scaled in zip(found, turn, scale, strict=True):
             np.testing.assert_allclose(one.turn_b, is_turned, atol=4.0 * max(one.turn_sigma))
             assert max(one.turn_sigma) < np.radians(0.2)
-            assert one.scale == pytest.approx(is_scaled, abs=4.0 * one.scale_sigma)
+            assert one.scale == approx(is_scaled, abs=4.0 * one.scale_sigma)
             assert one.scale_sigma < 0.005
         assert (env.episode_length_buf == 0).all()
         assert env.views.state["vel_w"].norm(dim=-1).max() < 0.3, "it hovers again"
@@ -68,18 +69,14 @@ def test_corrected_keypoints_are_those_of_the_nominal_camera():
     )
     got, left = corrected_keypoints(camera, seen * (1.0 + scale[:, None, None]), valid, turn, scale)
     assert left.all()
-    torch.testing.assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
-    torch.testing.assert_close(
-        got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3
-    )  # a box is upright in each image
-    torch.testing.assert_close(got[:, 4:].mean(1), nominal[:, 4:].mean(1), rtol=0, atol=1e-3)
+    assert_close(got[:, :4], nominal[:, :4], rtol=0, atol=1e-4)
+    assert_close(got[:, 4:], nominal[:, 4:], rtol=0, atol=5e-3)  # a box is upright in each image
+    assert_close(got[:, 4:].mean(1), nominal[:, 4:].mean(1), rtol=0, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "change", ['task.observation.layout="state"', "task.target.speed=[0.1,0.2]"]
-)
+@mark.parametrize("change", ['task.observation.layout="state"', "task.target.speed=[0.1,0.2]"])
 def test_what_cannot_be_calibrated_is_refused(change):
-    with pytest.raises(ConfigError, match="calibration in the hover"):
+    with raises(ConfigError, match="calibration in the hover"):
         calibrated_start(experiment(change))
 
 

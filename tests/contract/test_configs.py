@@ -6,7 +6,7 @@ import types
 import typing
 from pathlib import Path
 
-import pytest
+from pytest import mark, raises
 
 from camera.params import CameraParams
 from sim.params import PlantParams, SensingParams
@@ -28,7 +28,7 @@ def named(path: Path) -> str:
     return str(path.relative_to(config.configs_root()))
 
 
-@pytest.mark.parametrize("path", FILES, ids=named)
+@mark.parametrize("path", FILES, ids=named)
 def test_fills_its_schema(path):
     schema = kinds.schema_of(path.parent.name, path.stem)
     loaded = config.load(schema, path)
@@ -56,9 +56,7 @@ def uncommented(text: str) -> list[str]:
     return wrong
 
 
-@pytest.mark.parametrize(
-    "path", [path for path in FILES if path.parent.name in COMMENTED], ids=named
-)
+@mark.parametrize("path", [path for path in FILES if path.parent.name in COMMENTED], ids=named)
 def test_every_number_says_where_it_comes_from(path):
     text = path.read_text(encoding="utf-8")
     assert not uncommented(TEXT.sub("", text) if path.parent.name == "effects" else text)
@@ -98,11 +96,9 @@ def test_the_catalogue_reads_every_file_of_effects_and_every_number_of_a_change_
 
 def test_an_effect_that_changes_nothing_or_names_no_condition_is_refused():
     text = config.find("effects", "numerics").read_text(encoding="utf-8")
-    with pytest.raises(config.ConfigError, match="neither; expected one"):
+    with raises(config.ConfigError, match="neither; expected one"):
         config.loads(kinds.schema_of("effects"), re.sub(r"(?m)^changes = .*$", "", text))
-    with pytest.raises(
-        config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"
-    ):
+    with raises(config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"):
         config.loads(kinds.schema_of("effects"), text + 'needs = "never"\n')
 
 
@@ -119,7 +115,7 @@ def test_a_changed_digit_in_a_key_is_caught():
     path = config.find("vehicle", "paper")
     text = path.read_text(encoding="utf-8").replace("collision_radius", "collision_radios")
     assert "collision_radios" in tomllib.loads(text)
-    with pytest.raises(
+    with raises(
         config.ConfigError, match="collision_radios: unknown key; did you mean 'collision_radius'"
     ):
         config.loads(kinds.schema_of("vehicle"), text)

@@ -2,12 +2,13 @@
 reward by hand.
 """
 
-import dataclasses
 import math
+from dataclasses import replace
 
-import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark, raises
+from torch.testing import assert_close
 
 from sim.kernels.state import COLLISION, NONFINITE
 from visthrow import config
@@ -25,19 +26,15 @@ def experiment(kind="state", noise=True):
     e = config.load(Experiment, config.find("train", kind))
     if noise:
         return e
-    quiet = dataclasses.replace(
+    quiet = replace(
         e.task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
     )
-    seen = dataclasses.replace(e.task.observation, latency=(0.0, 0.0))
-    lens = dataclasses.replace(
-        e.camera, noise=dataclasses.replace(e.camera.noise, step_std=0.0, bias_std=0.0)
-    )
-    return dataclasses.replace(
-        e, camera=lens, task=dataclasses.replace(e.task, noise=quiet, observation=seen)
-    )
+    seen = replace(e.task.observation, latency=(0.0, 0.0))
+    lens = replace(e.camera, noise=replace(e.camera.noise, step_std=0.0, bias_std=0.0))
+    return replace(e, camera=lens, task=replace(e.task, noise=quiet, observation=seen))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def env():
     torch.manual_seed(0)
     return ThrowEnv(experiment(noise=False), count=16)
@@ -47,9 +44,9 @@ def test_layouts_have_the_papers_sizes():
     params = experiment("vision_ideal").task.observation
     assert observations.layout_of(experiment().task.observation).dimension == 35
     assert observations.layout_of(params).dimension == 69
-    assert observations.layout_of(dataclasses.replace(params, validity=False)).dimension == 61
-    with pytest.raises(ValueError, match="expected 'state' or 'vision'"):
-        observations.layout_of(dataclasses.replace(params, layout="lidar"))
+    assert observations.layout_of(replace(params, validity=False)).dimension == 61
+    with raises(ValueError, match="expected 'state' or 'vision'"):
+        observations.layout_of(replace(params, layout="lidar"))
 
 
 def test_groups_shapes_and_fresh_tensors(env):
@@ -61,7 +58,7 @@ def test_groups_shapes_and_fresh_tensors(env):
     assert second["critic"].shape == (16, 42)
     assert reward.shape == done.shape == (16,)
     assert first["actor"].data_ptr() != second["actor"].data_ptr()
-    torch.testing.assert_close(first["actor"], kept, rtol=0, atol=0)
+    assert_close(first["actor"], kept, rtol=0, atol=0)
     assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
 
 
@@ -81,12 +78,12 @@ def test_actor_does_not_see_what_only_the_critic_may(env):
     now = (
         observations.VEHICLE + 5 + 2
     )  # the payload's history moved on by one entry of the same value
-    torch.testing.assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
-    torch.testing.assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
+    assert_close(after["actor"][:, :now], before["actor"][:, :now], rtol=0, atol=0)
+    assert_close(after["actor"][:, -1], before["actor"][:, -1], rtol=0, atol=0)
     assert (after["critic"] - before["critic"]).abs().amax(0).count_nonzero() >= 6
 
 
-@pytest.mark.parametrize("name", ["paper", "paper_vision"])
+@mark.parametrize("name", ["paper", "paper_vision"])
 def test_the_papers_recipe_and_nothing_else(name):
     """Sec.
 
@@ -98,9 +95,7 @@ def test_the_papers_recipe_and_nothing_else(name):
     seen, reward, _, _ = env.step(torch.zeros(32, 5))
     assert seen["actor"].shape == (32, 61 if "vision" in name else 35)
     assert seen["critic"].shape == (32, 38)
-    np.testing.assert_array_equal(
-        seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy()
-    )
+    assert_array_equal(seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy())
     assert not env.delay.age.any()
     assert env.views.state["charge_used"].max() < 1e-3, (
         "share of a full battery that one step may draw"
@@ -109,9 +104,7 @@ def test_the_papers_recipe_and_nothing_else(name):
     assert ((rest > 0.0) & (rest < 1.0)).all(), (
         "a second costs 2 as in Table II; what is left are speeds and commands"
     )
-    assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == pytest.approx(
-        2e8, rel=1e-3
-    )
+    assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == approx(2e8, rel=1e-3)
 
 
 def test_the_critic_sees_what_is_named():
@@ -127,13 +120,13 @@ def test_the_critic_sees_what_is_named():
         "pose_age": 1,
     }
     for chosen in [(), ("exact",), ("mass",), ("exact", "mount"), tuple(named), ("exact", *named)]:
-        own = dataclasses.replace(e, ppo=dataclasses.replace(e.ppo, privileged=chosen))
+        own = replace(e, ppo=replace(e.ppo, privileged=chosen))
         seen = ThrowEnv(own, count=4).get_observations()
         known = sum(named.get(name, 0) for name in chosen)
         assert seen["critic"].shape == (4, 35 + known)  # exact: the same parts without their noise
         assert torch.equal(seen["critic"][:, :35], seen["actor"]) == ("exact" not in chosen)
-    with pytest.raises(ConfigError, match=r"ppo\.privileged has 'velocity'; .*payload_velocity"):
-        dataclasses.replace(e.ppo, privileged=("velocity",))
+    with raises(ConfigError, match=r"ppo\.privileged has 'velocity'; .*payload_velocity"):
+        replace(e.ppo, privileged=("velocity",))
 
 
 def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():
@@ -146,7 +139,7 @@ def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():
         assert bool(done.all()) == (step == 6)
     last, p = env.last, env.cfg.task.reward
     duration = 5 * PERIOD + 0.01  # separation lies 10 ms into the sixth period
-    np.testing.assert_allclose(
+    assert_allclose(
         (last["duration"] - env.views.out["time_to_impact"]).numpy(), duration, atol=1e-5
     )
     landing = 500.0 * torch.exp(-2.5 * last["landing_error"])
@@ -155,30 +148,26 @@ def test_release_ends_an_episode_after_the_lag_and_is_paid_by_hand():
     expected = (
         landing + flight + near - 2.0 * PERIOD
     )  # Eq. 2: nothing of speeds and commands at the release step
-    np.testing.assert_allclose((reward / p.scale).numpy(), expected.numpy(), rtol=1e-5)
+    assert_allclose((reward / p.scale).numpy(), expected.numpy(), rtol=1e-5)
 
 
 def test_reward_terms_by_hand():
     p = experiment().task.reward
     one = torch.ones(1, 3)
     # 1e-3 * 3 + 1e-3 * 3 + 3e-3 * |2 - 1|^2 * 3, all negative
-    assert rewards.kinetic(p, one, one, 2 * one).item() == pytest.approx(
-        -(3e-3 + 3e-3 + 9e-3), rel=1e-6
-    )
+    assert rewards.kinetic(p, one, one, 2 * one).item() == approx(-(3e-3 + 3e-3 + 9e-3), rel=1e-6)
     # 0.5 * 0.05 * (1 + 0.25 + 0)
     command = torch.tensor([[0.7, 1.0, -0.5, 0.0, 0.0]])
-    assert rewards.command(p, command, torch.tensor(p.rate_command)).item() == pytest.approx(
+    assert rewards.command(p, command, torch.tensor(p.rate_command)).item() == approx(
         -0.03125, rel=1e-6
     )
     # 0.5 * (0.15 (0.2 * 0.1 + 0.01) + 0.025 (0.2 * 0.4 + 0.16))
     a, b = torch.tensor([[0.1, 0.4, 0, 0, 0.0]]), torch.zeros(1, 5)
-    assert rewards.change(p, a, b, torch.tensor(p.command_change)).item() == pytest.approx(
+    assert rewards.change(p, a, b, torch.tensor(p.command_change)).item() == approx(
         -0.00525, rel=1e-5
     )
-    assert rewards.landing(p, torch.tensor([0.4])).item() == pytest.approx(
-        500 * math.exp(-1.0), rel=1e-6
-    )
-    assert rewards.proximity(p, torch.tensor([0.15]), 0.25).item() == pytest.approx(-10.0, rel=1e-5)
+    assert rewards.landing(p, torch.tensor([0.4])).item() == approx(500 * math.exp(-1.0), rel=1e-6)
+    assert rewards.proximity(p, torch.tensor([0.15]), 0.25).item() == approx(-10.0, rel=1e-5)
     assert rewards.proximity(p, torch.tensor([0.35]), 0.25).item() == 0.0
 
 
@@ -198,7 +187,7 @@ ENDS = [  # what is changed, to a value just inside and just outside; whether it
 ]
 
 
-@pytest.mark.parametrize(("name", "inside", "outside", "always"), ENDS)
+@mark.parametrize(("name", "inside", "outside", "always"), ENDS)
 def test_an_end_of_an_episode_just_inside_and_just_outside(name, inside, outside, always):
     bounds = experiment().task.bounds
     for value, ends in ((inside, False), (outside, True)):
@@ -226,35 +215,27 @@ def test_commands_and_their_inverse():
     rate = torch.tensor([10.0, 10.0, 4.0])
     action = torch.rand(100, 4) * 2 - 1
     command = actions.command_from_action(action, 14.0, rate)
-    torch.testing.assert_close(
-        actions.action_from_command(command, 14.0, rate), action, rtol=1e-5, atol=1e-5
-    )
+    assert_close(actions.action_from_command(command, 14.0, rate), action, rtol=1e-5, atol=1e-5)
     edge = actions.command_from_action(torch.tensor([[9.0, 9, -9, 9], [-9.0, 0, 0, 0]]), 14.0, rate)
     assert edge.tolist() == [[14.0, 10.0, -10.0, 4.0], [0.0, 0.0, 0.0, 0.0]]
     hover = torch.tensor([actions.hover_action(2.7, 14.0)])
-    assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == pytest.approx(
-        2.7, rel=1e-5
-    )
+    assert actions.command_from_action(hover, 14.0, rate)[0, 0].item() == approx(2.7, rel=1e-5)
     assert not actions.release_asked(hover, 0.95).item()
 
 
 def test_measurements_are_as_old_as_the_latency():
     """With half a period of latency the actor sees the mean of the last two steps."""
     e = experiment(noise=False)
-    late = dataclasses.replace(e.task.observation, latency=(PERIOD / 2, PERIOD / 2))
-    env = ThrowEnv(
-        dataclasses.replace(e, task=dataclasses.replace(e.task, observation=late)), count=8
-    )
+    late = replace(e.task.observation, latency=(PERIOD / 2, PERIOD / 2))
+    env = ThrowEnv(replace(e, task=replace(e.task, observation=late)), count=8)
     env.step(torch.zeros(8, 5))
     before = env.views.state["pos_w"].clone()
     obs, _, done, _ = env.step(torch.zeros(8, 5))
     assert not done.any()
-    torch.testing.assert_close(
-        obs["actor"][:, :3], (before + env.views.state["pos_w"]) / 2, rtol=0, atol=1e-6
-    )
+    assert_close(obs["actor"][:, :3], (before + env.views.state["pos_w"]) / 2, rtol=0, atol=1e-6)
 
 
-@pytest.mark.parametrize("kind", ["state", "vision"])
+@mark.parametrize("kind", ["state", "vision"])
 def test_same_seed_same_bits(kind):
     def run():
         torch.manual_seed(3)
@@ -265,4 +246,4 @@ def test_same_seed_same_bits(kind):
 
     first, second = run(), run()
     for a, b in zip(first, second, strict=True):
-        np.testing.assert_array_equal(a.numpy(), b.numpy())
+        assert_array_equal(a.numpy(), b.numpy())

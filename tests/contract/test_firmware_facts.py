@@ -9,7 +9,7 @@ import ast
 import re
 from pathlib import Path
 
-import pytest
+from pytest import mark
 
 from hil.links.backends.ardupilot import MOST_SILENCE
 from hil.links.backends.px4 import MOST_LOSS
@@ -106,13 +106,13 @@ def offences(text: str, choices: set[str]) -> list[str]:
     return found
 
 
-@pytest.mark.parametrize("path", PATHS)
+@mark.parametrize("path", PATHS)
 def test_no_constant_of_a_firmware_without_a_source(path):
     choices = set(CHOICES.get(path, "").split())
     assert offences((ROOT / path).read_text(encoding="utf-8"), choices) == []
 
 
-@pytest.mark.parametrize("path", CHOICES)
+@mark.parametrize("path", CHOICES)
 def test_each_choice_is_still_there(path):
     tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
     bound = {
@@ -146,7 +146,7 @@ SAYINGS = [
 """Page, words with a number, and the row that has the number."""
 
 
-@pytest.mark.parametrize(("page", "words", "name"), SAYINGS)
+@mark.parametrize(("page", "words", "name"), SAYINGS)
 def test_a_page_gives_the_number_of_the_table(page, words, name):
     text = (ROOT / f"docs/pilots/{page}.md").read_text(encoding="utf-8")
     assert float(re.search(words, text)[1]) == FACTS[name].value
@@ -174,7 +174,7 @@ NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
 OURS = {MOST_SILENCE, MOST_LOSS}  # limits that the audit sets
 
 
-@pytest.mark.parametrize("firmware", ["ardupilot", "px4"])
+@mark.parametrize("firmware", ["ardupilot", "px4"])
 def test_numbers_of_parameters_on_a_page_stand_in_the_table(firmware):
     text = (ROOT / f"docs/pilots/{firmware}.md").read_text(encoding="utf-8")
     assert [line for line in text.splitlines() if unfounded(line, firmware)] == []

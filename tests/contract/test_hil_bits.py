@@ -2,13 +2,16 @@
 and replays are exact.
 """
 
-import dataclasses
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_array_equal
+from pytest import mark, param, skip
 
 from hil.control.recording.playback import replay
 from hil.control.recording.record import RunRecorder, lines, read_poses
@@ -36,7 +39,7 @@ def stream(streams: int, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
     """Random flights, float32, shape (streams, steps, ...): tilts up to upside down, a payload that
     swings all about.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     time = TICK * np.arange(steps)[:, None]
 
     def wave(size: float) -> np.ndarray:
@@ -47,16 +50,16 @@ def stream(streams: int, steps: int, seed: int = 0) -> dict[str, np.ndarray]:
         return size * rng.random((streams, 1, 3)) * np.sin(phase + pace * time)
 
     turn = wave(2.5)
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    angle = norm(turn, axis=-1, keepdims=True)
     quat = np.concatenate([turn * np.sinc(angle / (2 * np.pi)) / 2, np.cos(angle / 2)], axis=-1)
     pos = wave(1.5) + [0.0, 0.0, 1.4]
     swing = wave(1.0) + [0.0, 0.0, -0.8]
     made = {
         "pos_w": pos,
-        "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        "quat_wb": quat / norm(quat, axis=-1, keepdims=True),
         "vel_w": wave(5.0),
         "rate_b": wave(9.0),
-        "payload": pos + 0.383 * swing / np.linalg.norm(swing, axis=-1, keepdims=True),
+        "payload": pos + 0.383 * swing / norm(swing, axis=-1, keepdims=True),
         "goal_w": wave(2.0) * [1, 1, 0],
     }
     return {name: values.astype(np.float32) for name, values in made.items()}
@@ -91,7 +94,7 @@ def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarra
     for n in range(streams * steps):
         goal_w = tuple(flown["goal_w"].reshape(-1, 3)[n - n % steps].astype(float).tolist())
         if n % steps == 0:
-            runner.parts.params = dataclasses.replace(runner.parts.params, goal_w=goal_w)
+            runner.parts.params = replace(runner.parts.params, goal_w=goal_w)
             runner.pilot.start()
         decision = runner.tick(TICK * n, poses[n], Status(True), OperatorInput())
         observations.append(decision.observation)
@@ -108,7 +111,7 @@ def shown_by_the_environment(flown, actions: np.ndarray, policy: str, device: st
     streams, steps = flown["pos_w"].shape[:2]
     experiment = quiet(policy)
     camera = by_own_rule(Policy.load(find_policy(policy)), experiment.camera)
-    env = ThrowEnv(dataclasses.replace(experiment, camera=camera), device, count=streams)
+    env = ThrowEnv(replace(experiment, camera=camera), device, count=streams)
     states, out = env.views.state, []
     env.views.goal_w.copy_(torch.from_numpy(flown["goal_w"][:, 0]))
     states["attached"].fill_(1)
@@ -133,11 +136,11 @@ def both(
     return seen, shown_by_the_environment(flown, actions, policy, device)
 
 
-@pytest.mark.parametrize("policy", ["vision", "vision_located"])
+@mark.parametrize("policy", ["vision", "vision_located"])
 def test_poses_of_a_vision_policy(policy, tmp_path):
     seen, shown = both(policy, 40, 60, tmp_path / "a")
     assert seen.shape[:2] == (40, 60)
-    np.testing.assert_array_equal(seen, shown)
+    assert_array_equal(seen, shown)
     layout = layout_of(SimpleNamespace(**Policy.load(find_policy(policy)).contract["observation"]))
     valid = seen[..., layout.columns("validity")]
     assert 0.1 < valid.mean() < 0.95, "points inside and outside of the field of view"
@@ -145,14 +148,14 @@ def test_poses_of_a_vision_policy(policy, tmp_path):
 
 def test_poses_of_the_state_policy(tmp_path):
     seen, shown = both("state", 10, 20, tmp_path / "a")
-    np.testing.assert_array_equal(seen, shown)
+    assert_array_equal(seen, shown)
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("policy", ["state", "vision"])
+@mark.gpu
+@mark.parametrize("policy", ["state", "vision"])
 def test_ten_thousand_poses_against_cuda(policy, tmp_path):
     if not torch.cuda.is_available():
-        pytest.skip("no CUDA device")
+        skip("no CUDA device")
     seen, shown = both(policy, 100, 100, tmp_path / "a", "cuda:0")
     np.testing.assert_allclose(seen, shown, atol=CUDA, rtol=CUDA)
 
@@ -165,9 +168,9 @@ def patchy(rng: np.random.Generator):
         out = late + [p for p in poses if rng.random() > 0.05]
         late.clear()
         if rng.random() < 0.1 and out:
-            late.append(dataclasses.replace(out.pop(), arrival=time + TICK))
+            late.append(replace(out.pop(), arrival=time + TICK))
         if rng.random() < 0.02 and out:
-            out.append(dataclasses.replace(out[-1], pos=(math.nan, 0.0, 0.0)))
+            out.append(replace(out[-1], pos=(math.nan, 0.0, 0.0)))
         if rng.random() < 0.02 and out:
             out.append(out[-1])
         return [] if 0.5 < time % 1.5 < 0.56 else out
@@ -176,7 +179,7 @@ def patchy(rng: np.random.Generator):
 
 
 RUNS = {
-    "drop-outs": {"poses": patchy(np.random.default_rng(1)), "seconds": 3.0},
+    "drop-outs": {"poses": patchy(default_rng(1)), "seconds": 3.0},
     "operator's abort": {
         "words": lambda t, s: OperatorInput(arm=s == "ready", abort=t > 1.0),
         "seconds": 2.0,
@@ -196,8 +199,8 @@ QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", 
 SHORT = ("drop-outs", "mocap gone", "late ticks")
 
 
-@pytest.mark.parametrize(
-    "name", [name if name in SHORT else pytest.param(name, marks=pytest.mark.slow) for name in RUNS]
+@mark.parametrize(
+    "name", [name if name in SHORT else param(name, marks=mark.slow) for name in RUNS]
 )
 def test_any_run_replays_bit_for_bit(name, tmp_path):
     folder = tmp_path / "run"

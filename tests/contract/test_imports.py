@@ -9,7 +9,7 @@ import sys
 from functools import cache
 from pathlib import Path
 
-import pytest
+from pytest import mark
 
 from sim.solvers import SOLVERS
 
@@ -68,7 +68,7 @@ def allowed(name: str, may_use: set[str]) -> bool:
     return any(name == known or name.startswith(known + ".") for known in may_use)
 
 
-@pytest.mark.parametrize("package", PACKAGES)
+@mark.parametrize("package", PACKAGES)
 def test_packages_import_one_way(package):
     wrong = [
         f"{path.relative_to(ROOT)} imports {name}"
@@ -100,7 +100,7 @@ def test_onboard_modules_import_only_onboard_modules():
     assert not wrong
 
 
-@pytest.mark.parametrize("room", OPTIONAL_ROOMS)
+@mark.parametrize("room", OPTIONAL_ROOMS)
 def test_nothing_imports_an_optional_room_from_outside(room):
     inside = ROOT / room.replace(".", "/")
     wrong = [

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
+from pytest import mark
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
@@ -106,7 +106,7 @@ def product() -> dict[str, float]:
     return counts({str(path): path.read_text(encoding="utf-8") for path in paths})
 
 
-@pytest.mark.parametrize("name", CEILINGS)
+@mark.parametrize("name", CEILINGS)
 def test_a_count_stays_under_its_ceiling(name):
     assert product()[name] <= CEILINGS[name]
 
@@ -122,7 +122,7 @@ SPOILT = {
 }
 
 
-@pytest.mark.parametrize("name", CEILINGS)
+@mark.parametrize("name", CEILINGS)
 def test_each_count_sees_a_spoilt_line(name):
     plain = {"a/first.py": 'class First:\n    """A thing."""\n'}
     again = {"b/first.py" if name == "file names twice" else "b/second.py": SPOILT[name]}

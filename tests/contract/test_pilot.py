@@ -2,11 +2,12 @@
 one.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_array_equal
+from pytest import mark, raises
 
 from camera.keypoints import KeypointCamera
 from visthrow import config
@@ -23,16 +24,16 @@ STEPS = 200
 def quiet(name: str) -> Experiment:
     """An experiment without any noise or latency."""
     experiment = config.load(Experiment, config.find("train", name))
-    noise = dataclasses.replace(
+    noise = replace(
         experiment.task.noise,
         observation_step=0.0,
         observation_bias=0.0,
         command_step=0.0,
         command_bias=0.0,
     )
-    camera = dataclasses.replace(
+    camera = replace(
         experiment.camera,
-        noise=dataclasses.replace(
+        noise=replace(
             experiment.camera.noise,
             step_std=0.0,
             bias_std=0.0,
@@ -42,15 +43,11 @@ def quiet(name: str) -> Experiment:
             held_probability=0.0,
             scale_std=0.0,
         ),
-        mount=dataclasses.replace(
-            experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0
-        ),
+        mount=replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
     )
-    observation = dataclasses.replace(
-        experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0
-    )
-    task = dataclasses.replace(experiment.task, noise=noise, observation=observation)
-    return dataclasses.replace(experiment, task=task, camera=camera)
+    observation = replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
+    task = replace(experiment.task, noise=noise, observation=observation)
+    return replace(experiment, task=task, camera=camera)
 
 
 def random_policy(experiment: Experiment, seed: int = 0) -> Policy:
@@ -65,7 +62,7 @@ def random_policy(experiment: Experiment, seed: int = 0) -> Policy:
     return Policy(weights, (torch.randn(16), bias), "tanh", contract)
 
 
-@pytest.mark.parametrize("name", ["state", "vision", "vision_ideal"])
+@mark.parametrize("name", ["state", "vision", "vision_ideal"])
 def test_observation_equals_the_environments(name):
     experiment, count = quiet(name), 3
     policy = random_policy(experiment)
@@ -85,7 +82,7 @@ def test_observation_equals_the_environments(name):
             views = (state[key][one] for key in ("pos_w", "quat_wb", "vel_w", "rate_b"))
             outs.append(pilot.act(*views, payload[one], goal[one], state["attached"][one]))
         seen = np.concatenate([out.observation for out in outs])
-        np.testing.assert_array_equal(seen, shown.numpy())
+        assert_array_equal(seen, shown.numpy())
         action = torch.from_numpy(np.concatenate([out.action for out in outs]))
         observations, _, done, _ = env.step(action)
         shown = observations["actor"].clone()
@@ -109,7 +106,7 @@ def test_command_equals_the_environments():
         env.views.goal_w.numpy().copy(),
     )
     env.step(policy.act(env.get_observations()["actor"]))
-    np.testing.assert_array_equal(out.command, env.views.command.numpy())
+    assert_array_equal(out.command, env.views.command.numpy())
     assert out.release[0] == bool(env.views.release[0])
 
 
@@ -130,16 +127,16 @@ def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
     older.save(path)
     assert Pilot(Policy.load(path), camera).camera.edge_reads
     assert load_policy(path, "vision_ideal").experiment.camera.noise.invalid_reads == "edge"
-    with pytest.raises(MismatchError, match="invalid_reads: trained with 'edge', here 'zero'"):
+    with raises(MismatchError, match="invalid_reads: trained with 'edge', here 'zero'"):
         load_policy(path, "vision_ideal", ["camera.noise.invalid_reads=zero"])
 
 
 def test_another_camera_is_refused():
     experiment = quiet("vision")
-    other = dataclasses.replace(experiment.camera, goal_side=0.3)
-    with pytest.raises(MismatchError, match=r"goal_side: trained with 0\.25, here 0\.3"):
+    other = replace(experiment.camera, goal_side=0.3)
+    with raises(MismatchError, match=r"goal_side: trained with 0\.25, here 0\.3"):
         Pilot(random_policy(experiment), other)
-    with pytest.raises(PolicyError, match="needs a camera"):
+    with raises(PolicyError, match="needs a camera"):
         Pilot(random_policy(experiment))
 
 
@@ -147,12 +144,12 @@ def test_wrong_shapes_and_contracts_are_refused():
     experiment = quiet("state")
     policy = random_policy(experiment)
     still = np.zeros((1, 3))
-    with pytest.raises(ValueError, match=r"pos_w has shape \(2, 3\); expected \(1, 3\)"):
+    with raises(ValueError, match=r"pos_w has shape \(2, 3\); expected \(1, 3\)"):
         Pilot(policy).act(np.zeros((2, 3)), np.array([[0, 0, 0, 1.0]]), still, still, still, still)
     contract = {key: value for key, value in policy.contract.items() if key != "release"}
-    with pytest.raises(PolicyError, match="release"):
-        Pilot(dataclasses.replace(policy, contract=contract))
-    with pytest.raises(PolicyError, match="no camera"):
+    with raises(PolicyError, match="release"):
+        Pilot(replace(policy, contract=contract))
+    with raises(PolicyError, match="no camera"):
         Pilot(policy).see(still, np.array([[0, 0, 0, 1.0]]), still, still)
 
 
@@ -168,7 +165,7 @@ def test_keypoints_beside_a_state_policy_leave_its_observation_alone():
     )
     with_camera = Pilot(policy, experiment.camera).act(*views, [2.0, 0.0, 0.0])
     without = Pilot(policy).act(*views, [2.0, 0.0, 0.0])
-    np.testing.assert_array_equal(with_camera.observation, without.observation)
+    assert_array_equal(with_camera.observation, without.observation)
     assert without.keypoints is None
     assert with_camera.keypoints.shape == (1, 8, 2)
     assert isinstance(Pilot(policy, experiment.camera).camera, KeypointCamera)

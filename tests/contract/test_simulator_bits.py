@@ -2,11 +2,13 @@
 parameter.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import warp as wp
+from numpy.linalg import norm
+from numpy.testing import assert_array_equal
+from pytest import mark
 
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE, OUTPUT_FIELDS, STATE_FIELDS
@@ -33,22 +35,19 @@ def everything(sim: HybridSim) -> dict[str, np.ndarray]:
 
 def assert_same(a: dict, b: dict, rows=slice(None), other=slice(None)) -> None:
     for name, value in a.items():
-        np.testing.assert_array_equal(value[rows], b[name][other], err_msg=name)
+        assert_array_equal(value[rows], b[name][other], err_msg=name)
 
 
 def vehicles(count: int) -> list:
     """Vehicles of different masses."""
     vehicle = paper_plant().vehicle
     masses = vehicle.body.mass * (1.0 + 0.02 * np.arange(count))
-    return [
-        dataclasses.replace(vehicle, body=BodyParams(float(m), vehicle.body.inertia))
-        for m in masses
-    ]
+    return [replace(vehicle, body=BodyParams(float(m), vehicle.body.inertia)) for m in masses]
 
 
 def ropes(count: int) -> list:
     rope = paper_plant().rope
-    return [dataclasses.replace(rope, length=rope.length * (1.0 + 0.01 * k)) for k in range(count)]
+    return [replace(rope, length=rope.length * (1.0 + 0.01 * k)) for k in range(count)]
 
 
 def poses(seed: int, count: int) -> dict[str, np.ndarray]:
@@ -56,12 +55,12 @@ def poses(seed: int, count: int) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(seed)
     segments = paper_plant().rope.segments
     directions = np.array([0.0, 0.0, -1.0]) + 0.4 * rng.normal(size=(count, segments, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    directions /= norm(directions, axis=-1, keepdims=True)
     swing = np.cross(rng.normal(size=(count, segments, 3)), directions)
     quat = np.array([0.0, 0.0, 0.0, 1.0]) + 0.2 * rng.normal(size=(count, 4))
     return {
         "pos_w": rng.normal(size=(count, 3)),
-        "quat_wb": quat / np.linalg.norm(quat, axis=-1, keepdims=True),
+        "quat_wb": quat / norm(quat, axis=-1, keepdims=True),
         "vel_w": rng.normal(size=(count, 3)),
         "rate_b": rng.normal(size=(count, 3)),
         "cable_dir_w": directions,
@@ -132,7 +131,7 @@ def test_a_graph_equals_launches():
         eager.randomize(spreads, mask)
         wp.capture_launch(capture.graph)
         assert_same(everything(eager), everything(graphed))
-    np.testing.assert_array_equal(eager.goal_w.numpy(), graphed.goal_w.numpy())
+    assert_array_equal(eager.goal_w.numpy(), graphed.goal_w.numpy())
 
 
 def test_a_masked_reset_leaves_the_rest():
@@ -144,7 +143,7 @@ def test_a_masked_reset_leaves_the_rest():
     sim.randomize(start_spreads(), wp.array(mask, device="cpu"))
     kept, fresh = mask == 0, mask == 1
     assert_same(everything(sim), before, kept, kept)
-    np.testing.assert_array_equal(sim.goal_w.numpy()[kept], goals[kept])
+    assert_array_equal(sim.goal_w.numpy()[kept], goals[kept])
     assert np.all(np.any(sim.get("pos_w")[fresh] != before["pos_w"][fresh], axis=-1))
     assert np.all(sim.get("attached")[fresh] == 1)
     assert np.all(sim.get("release_timer")[fresh] < 0.0)
@@ -196,7 +195,7 @@ def test_the_queue_holds_hover_after_a_reset():
     )
 
 
-@pytest.mark.parametrize("seed", [0, 11])
+@mark.parametrize("seed", [0, 11])
 def test_one_seed_one_flight(seed):
     first, second, other = (HybridSim(paper_plant(), COUNT, seed=s) for s in (seed, seed, seed + 1))
     commands = random_commands(7, STEPS, COUNT)
@@ -216,7 +215,7 @@ def test_draws_do_not_depend_on_the_batch():
     assert_same(everything(small), everything(large), slice(None), slice(0, 2))
 
 
-@pytest.mark.parametrize("place", range(4))
+@mark.parametrize("place", range(4))
 def test_a_bad_command_raises_a_bit_and_does_not_spread(place):
     """Not a number in one environment: its bit is set, its last command is held, the others never
     notice.
@@ -246,12 +245,12 @@ def test_a_bad_state_raises_a_bit_and_is_put_back():
         sick.step()
         well.step()
         assert sick.get("status").tolist() == [0, NONFINITE, 0]
-    np.testing.assert_array_equal(sick.get("pos_w")[1], before[1])
+    assert_array_equal(sick.get("pos_w")[1], before[1])
     assert_same(everything(sick), everything(well), slice(0, None, 2), slice(0, None, 2))
 
 
-@pytest.mark.parametrize("kind", ["hybrid", "alone"])
-@pytest.mark.parametrize(
+@mark.parametrize("kind", ["hybrid", "alone"])
+@mark.parametrize(
     "name", ["setpoint", "gyro", "integral", "motor_speed", "voltage", "charge_used", "rate_b"]
 )
 def test_no_part_of_the_state_may_be_bad(kind, name):
@@ -292,10 +291,10 @@ def test_quadrotors_alone_batch_and_reset():
         "queue",
     )
     for name in names:
-        np.testing.assert_array_equal(batch.get(name), graphed.get(name), err_msg=name)
+        assert_array_equal(batch.get(name), graphed.get(name), err_msg=name)
     alone = quad(1)
     for command in commands[:, 3:4]:
         alone.set_command(command)
         alone.step()
     for name in names:
-        np.testing.assert_array_equal(alone.get(name)[0], batch.get(name)[3], err_msg=name)
+        assert_array_equal(alone.get(name)[0], batch.get(name)[3], err_msg=name)

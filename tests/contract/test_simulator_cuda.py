@@ -2,11 +2,12 @@
 agrees.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import warp as wp
+from numpy.testing import assert_allclose
+from pytest import mark
 
 from sim.hybrid import HybridSim
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
@@ -16,8 +17,8 @@ from visthrow import config
 from visthrow.task import TaskParams
 
 pytestmark = [
-    pytest.mark.gpu,
-    pytest.mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"),
+    mark.gpu,
+    mark.skipif(not wp.is_cuda_available(), reason="needs a CUDA device"),
 ]
 DEVICE = "cuda:0"
 COUNT, STEPS = 200, 15
@@ -73,10 +74,10 @@ def test_members_alone_equal_their_batch():
 
 
 def test_cuda_agrees_with_the_cpu():
-    plant = dataclasses.replace(paper_plant(), sim=numerics(precision="float64"))
+    plant = replace(paper_plant(), sim=numerics(precision="float64"))
     there, here = (driven(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
     for name in ("pos_w", "payload_pos_w", "landing_w"):
-        np.testing.assert_allclose(there[name], here[name], atol=SAME, err_msg=name)
+        assert_allclose(there[name], here[name], atol=SAME, err_msg=name)
 
 
 def test_quadrotor_alone():
@@ -88,4 +89,4 @@ def test_quadrotor_alone():
         for sim in sims:
             sim.set_command(command)
             sim.step()
-    np.testing.assert_allclose(sims[0].get("pos_w"), sims[1].get("pos_w"), atol=SAME)
+    assert_allclose(sims[0].get("pos_w"), sims[1].get("pos_w"), atol=SAME)

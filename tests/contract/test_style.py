@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from functools import cache
 from pathlib import Path
 
-import pytest
+from pytest import fixture, mark
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
@@ -210,7 +210,7 @@ def test_every_part_of_the_product_is_in_a_room():
     assert set(PACKAGES) <= set(ORDER)
 
 
-@pytest.fixture
+@fixture
 def house(tmp_path):
     """Write a small product of two rooms and return what writes a module of it."""
 
@@ -227,7 +227,7 @@ def house(tmp_path):
     return write
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text",
     [
         "import p.high.b\n",

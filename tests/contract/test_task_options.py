@@ -2,11 +2,13 @@
 departures from a contract.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, raises
 
 from sim.hybrid import rope_variants, tether_lengths
 from visthrow import cli, config
@@ -37,15 +39,13 @@ def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():
     for step in range(1, 7):  # 0.11 s of lag end within the sixth period
         _, _, done, _ = env.step(ask)
         if step < 6:
-            np.testing.assert_allclose(
-                env.views.goal_w, start + step * PERIOD * velocity, atol=1e-6
-            )
+            assert_allclose(env.views.goal_w, start + step * PERIOD * velocity, atol=1e-6)
     assert bool(done.all())
     landed_at = env.last["duration"]  # from the throw's start to the landing
     goal = start + landed_at[:, None] * velocity
-    np.testing.assert_allclose(env.last["goal_w"], goal, atol=1e-5)
+    assert_allclose(env.last["goal_w"], goal, atol=1e-5)
     miss = (env.last["landing_w"] - goal)[:, :2].norm(dim=1)
-    np.testing.assert_allclose(env.last["landing_error"], miss, atol=1e-5)
+    assert_allclose(env.last["landing_error"], miss, atol=1e-5)
 
 
 def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
@@ -67,12 +67,12 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
         alive &= done == 0
     assert alive.sum() > 20
     actor, velocity = obs["actor"][alive], env.goals.velocity[alive]
-    np.testing.assert_allclose(
+    assert_allclose(
         actor[:, -2:], velocity[:, :2], rtol=0.05, atol=0.01
     )  # the prior still pulls a little
     goal_seen = actor[:, 20:22] + actor[:, 22:24] + actor[:, :2]
     expected = (env.views.goal_w[alive] - 0.01 * velocity)[:, :2]
-    np.testing.assert_allclose(goal_seen, expected, atol=1e-5)
+    assert_allclose(goal_seen, expected, atol=1e-5)
     assert (obs["critic"][alive][:, -2:] == velocity[:, :2]).all()
 
 
@@ -81,11 +81,9 @@ def test_throws_at_moving_goals_keep_where_the_goal_was():
     throws = protocol.throw(loaded.experiment, loaded.policy.act, 1.5, 8, "cpu", 0)
     good = throws.success
     assert good.all()
-    moved = np.linalg.norm(throws.goal_w - [1.5, 0.0], axis=1)
-    np.testing.assert_allclose(moved, 0.5 * throws.duration, rtol=1e-4)
-    np.testing.assert_allclose(
-        np.linalg.norm(throws.landing_w - throws.goal_w, axis=1), throws.error, atol=1e-5
-    )
+    moved = norm(throws.goal_w - [1.5, 0.0], axis=1)
+    assert_allclose(moved, 0.5 * throws.duration, rtol=1e-4)
+    assert_allclose(norm(throws.landing_w - throws.goal_w, axis=1), throws.error, atol=1e-5)
     assert throws.summary()["error_mean"] > 0.2, (
         "a policy for goals that stand still throws to where it saw them"
     )
@@ -98,9 +96,9 @@ def test_payloads_vary_in_every_combination():
     seen = {(round(r.length, 6), round(r.payload_mass, 6), round(r.payload_drag, 9)) for r in ropes}
     assert len(seen) == len(ropes)
     masses = np.array([r.payload_mass for r in ropes]) / params.rope.payload_mass
-    assert (masses.min(), masses.max()) == pytest.approx((0.8, 1.2))
+    assert (masses.min(), masses.max()) == approx((0.8, 1.2))
     gyration = [r.payload_inertia / r.payload_mass for r in ropes]
-    np.testing.assert_allclose(gyration, params.rope.payload_inertia / params.rope.payload_mass)
+    assert_allclose(gyration, params.rope.payload_inertia / params.rope.payload_mass)
     assert [r.length for r in ropes[:6]] == [
         r.length for r in tether_lengths(params.rope, params.task.start)
     ]
@@ -115,19 +113,17 @@ def test_what_varies_in_training_varies_in_its_throws():
     start = protocol.hover_start(experiment("state_payload")).task.start
     assert (start.payload_variants, start.payload_spread, start.tether_spread) == (5, 0.2, 0.1)
     assert start.position == (0.03, 0.03, 0.03)
-    with pytest.raises(ValueError, match="expected 1 or more, and 0 to below 1"):
-        rope_variants(experiment("state").rope, dataclasses.replace(start, payload_spread=1.0))
+    with raises(ValueError, match="expected 1 or more, and 0 to below 1"):
+        rope_variants(experiment("state").rope, replace(start, payload_spread=1.0))
 
 
 def test_departures_are_refused_unless_allowed_and_then_named():
     change = ["vehicle.motor.time_constant=0.05", "rope.length=0.4"]
-    with pytest.raises(MismatchError, match=r"rope\.length"):
+    with raises(MismatchError, match=r"rope\.length"):
         load_policy("state", "state", change, allow=["vehicle"])
-    with pytest.raises(MismatchError, match=r"vehicle\.motor\.time_constant"):
+    with raises(MismatchError, match=r"vehicle\.motor\.time_constant"):
         load_policy("state", "state", change, allow=["rope.length", "vehicle.motor.kind"])
-    with pytest.raises(
-        ConfigError, match=r"allow 'vehicle\.mot': .* did you mean 'vehicle\.motor'"
-    ):
+    with raises(ConfigError, match=r"allow 'vehicle\.mot': .* did you mean 'vehicle\.motor'"):
         load_policy("state", allow=["vehicle.mot"])
     loaded = load_policy("state", "state", change, allow=["rope.length", "vehicle.motor"])
     assert loaded.departures == {"rope.length": 0.4, "vehicle.motor.time_constant": 0.05}
@@ -165,7 +161,7 @@ def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
     assert "goal_velocity" not in plain["observation"]
     assert moving["observation"]["goal_velocity"] is True
     assert "payload_drag" not in plain["rope"]
-    assert contract_of(experiment("state_drag"))["rope"]["payload_drag"] == pytest.approx(1.04e-3)
+    assert contract_of(experiment("state_drag"))["rope"]["payload_drag"] == approx(1.04e-3)
 
 
 def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():
@@ -176,13 +172,11 @@ def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realisti
         > 0.0
     )
     assert ReferenceAdapter(experiment("state"), realistic=False)._plant.extras.payload_drag == 0.0
-    assert ReferenceAdapter(params, realistic=True)._plant.extras.payload_drag == pytest.approx(
-        1.044e-3
-    )
+    assert ReferenceAdapter(params, realistic=True)._plant.extras.payload_drag == approx(1.044e-3)
 
 
 def test_speeds_that_make_no_range_are_refused():
-    with pytest.raises(ValueError, match="ascending range"):
+    with raises(ValueError, match="ascending range"):
         TargetParams((0.5, 0.2))
 
 
@@ -202,5 +196,5 @@ def test_a_policy_is_flown_without_what_only_its_training_had():
         named.experiment.camera.noise.drop_probability,
         named.experiment.camera.noise.scale_std,
     ) == (0.3, 0.0)
-    with pytest.raises(MismatchError, match="latency"):
+    with raises(MismatchError, match="latency"):
         load_policy("vision", overrides=["task.observation.latency=[0.06,0.06]"])

@@ -4,7 +4,7 @@ import re
 import subprocess
 from pathlib import Path
 
-import pytest
+from pytest import mark
 
 ROOT = Path(__file__).resolve().parents[2]
 BINARY = {
@@ -66,7 +66,7 @@ def test_no_machine_paths():
     assert not wrong
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("line", "caught"),
     [
         ("/home/me/x", True),

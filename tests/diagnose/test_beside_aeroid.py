@@ -2,15 +2,15 @@
 nobody gave.
 """
 
-import pytest
+from pytest import importorskip, mark
 
 from bench.diagnose import beside_aeroid as beside
 
-pytestmark = pytest.mark.slow
+pytestmark = mark.slow
 
 
 def test_it_is_as_near_and_names_what_it_was_not_told():
-    pytest.importorskip("aeroid")
+    importorskip("aeroid")
     lines = [beside.compared(250000001 + i, colour) for i in range(2) for colour in beside.COLOURS]
     found = [line["fit"][name] for line in lines for name in beside.NAMES]
     assert all(

@@ -7,7 +7,8 @@ import os
 from itertools import pairwise
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, mark
 
 from bench.diagnose import altered, cases
 from bench.diagnose.bad import BAD
@@ -23,7 +24,7 @@ from visthrow.logs.flightlog import FlightLog
 SMALL = dict(free=1, free_seconds=1.0, throws=2)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def logs() -> list[FlightLog]:
     return cases.logs_of(Recipe(11, "rod", {"com_y": 1e-3}, **SMALL))
 
@@ -50,15 +51,11 @@ def test_a_mirror_undoes_itself_and_turns_rotations_around(logs):
     once = altered.mirrored(logs[1])
     twice = altered.mirrored(once)
     for name, channel in logs[1].channels.items():
-        np.testing.assert_allclose(twice[name].values, channel.values)
+        assert_allclose(twice[name].values, channel.values)
     rate = lambda log: np.gradient(2.0 * log["quat_wb"].values[:, :3], log["quat_wb"].time, axis=0)  # noqa: E731
     level = np.abs(logs[1]["quat_wb"].values[:, 3]) > 0.99
-    np.testing.assert_allclose(
-        rate(once)[level], (rate(logs[1]) * [-1.0, 1.0, -1.0])[level], atol=1e-9
-    )
-    np.testing.assert_allclose(
-        once["command"].values, logs[1]["command"].values * [1.0, -1.0, 1.0, -1.0]
-    )
+    assert_allclose(rate(once)[level], (rate(logs[1]) * [-1.0, 1.0, -1.0])[level], atol=1e-9)
+    assert_allclose(once["command"].values, logs[1]["command"].values * [1.0, -1.0, 1.0, -1.0])
     assert altered.mirrored_theta({"com_y": 1.0, "motor_1": 2.0, "com_x": 3.0}) == {
         "com_y": -1.0,
         "motor_2": 2.0,
@@ -69,20 +66,20 @@ def test_a_mirror_undoes_itself_and_turns_rotations_around(logs):
 def test_a_turned_hall_keeps_distances_and_heights(logs):
     turned = altered.turned(logs[1], 0.5 * np.pi, (2.0, -1.0, 0.0))
     p, q = (log["pos_w"].values - log["payload_pos_w"].values for log in (logs[1], turned))
-    np.testing.assert_allclose(
+    assert_allclose(
         q, p @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), atol=1e-12
     )
     back = altered.turned(turned, -0.5 * np.pi, (1.0, 2.0, 0.0))
-    np.testing.assert_allclose(back["pos_w"].values, logs[1]["pos_w"].values, atol=1e-12)
+    assert_allclose(back["pos_w"].values, logs[1]["pos_w"].values, atol=1e-12)
     alike = np.abs(np.sum(back["quat_wb"].values * logs[1]["quat_wb"].values, axis=1))
-    np.testing.assert_allclose(alike, np.sum(logs[1]["quat_wb"].values ** 2, axis=1), atol=1e-12)
+    assert_allclose(alike, np.sum(logs[1]["quat_wb"].values ** 2, axis=1), atol=1e-12)
 
 
 def test_scrambled_logs_keep_their_poses_and_exchange_their_commands(logs):
     mixed = altered.scrambled(logs)
-    np.testing.assert_array_equal(mixed[1]["pos_w"].values, logs[1]["pos_w"].values)
-    np.testing.assert_array_equal(mixed[1]["command"].values, logs[2]["command"].values)
-    np.testing.assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
+    assert_array_equal(mixed[1]["pos_w"].values, logs[1]["pos_w"].values)
+    assert_array_equal(mixed[1]["command"].values, logs[2]["command"].values)
+    assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
 
 
 def test_the_tool_is_asked_apart(tmp_path):
@@ -106,7 +103,7 @@ def test_a_proposed_manoeuvre_is_flown_on_the_plant():
             [np.interp(record["time"] - begin, reference.time, c) for c in reference.pos_w.T]
         )
         assert np.abs(record["pos"] - want).max() < 0.15, name
-        assert record["time"][-1] - record["time"][0] == pytest.approx(manoeuvre.seconds, abs=0.05)
+        assert record["time"][-1] - record["time"][0] == approx(manoeuvre.seconds, abs=0.05)
         assert np.isfinite(record["ball"]).all() == manoeuvre.payload
     loaded, bare = (
         cases.flight_log(r)
@@ -177,22 +174,22 @@ def told(line: dict) -> str:
     )
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(cases.KINDS))
+@mark.slow
+@mark.parametrize("kind", list(cases.KINDS))
 def test_symmetries_hold(kind):
     (line,) = run_cases([kind])
     assert line["passed"], told(line)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(PAIRS))
+@mark.slow
+@mark.parametrize("kind", list(PAIRS))
 def test_pairs_are_a_class_and_the_plan_separates_them(kind):
     (line,) = run_cases([kind])
     assert line["passed"], f"{told(line)}; done: {line.get('done')}"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", list(BAD))
+@mark.slow
+@mark.parametrize("kind", list(BAD))
 def test_bad_logs_get_no_name(kind):
     (line,) = run_cases([kind])
     assert line["passed"], told(line)

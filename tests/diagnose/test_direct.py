@@ -2,12 +2,12 @@
 a detector's marks.
 """
 
-import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, fixture, mark
 
 from bench.diagnose.sealed import flight_log
 from bench.worlds.camera import CENTRE, FOCAL, HALF_VIEW, marks
@@ -34,7 +34,7 @@ class Eyes:
     """What the diagnosis takes from the keypoints of a world whose camera has an effect."""
 
     def __init__(self, flown, effects: dict):
-        records = recorded(dataclasses.replace(RECIPE, effects=effects), flown)
+        records = recorded(replace(RECIPE, effects=effects), flown)
         self.logs = [flight_log(record) for record in records]
         experiment = config.load(Experiment, config.find("train", "state"), ["rope.segments=1"])
         self.setting = Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera)
@@ -67,7 +67,7 @@ class Eyes:
         return np.concatenate([change / sigma for change, sigma in pairs]) / step
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown():
     """Flights; no effect of a camera changes them."""
     return fly_recipe(RECIPE)
@@ -100,7 +100,7 @@ def test_the_worlds_camera_sees_what_the_packages_sees():
     assert 1e-6 < np.abs(pixels[:, 4:] - found[:, 4:])[seen[:, 4:]].max() < BOX
 
 
-@pytest.mark.parametrize("name", ["camera_tilt_x", "camera_latency", "camera_focal"])
+@mark.parametrize("name", ["camera_tilt_x", "camera_latency", "camera_focal"])
 def test_an_effect_of_the_camera_is_measured_by_keypoints_alone(flown, name):
     """With a track that jumps at the ends of its pieces the latency was a tenth of what
     was hidden.
@@ -109,5 +109,5 @@ def test_an_effect_of_the_camera_is_measured_by_keypoints_alone(flown, name):
     assert CAMERA_FLOORS[name] == catalogue()[name].floor
     eyes = Eyes(flown, {name: truth})
     column, off = eyes.column(name), eyes.off()
-    assert column @ off / (column @ column) == pytest.approx(truth, rel=0.15)
+    assert column @ off / (column @ column) == approx(truth, rel=0.15)
     assert np.var(off - column * truth) < 1.2

@@ -6,8 +6,8 @@ import os
 from collections import Counter
 from dataclasses import replace
 
-import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import fixture, mark, raises
 
 from bench.diagnose import finding
 from visthrow.config.effects import catalogue
@@ -33,15 +33,15 @@ def other_than(name: str) -> str:
     return next(other for other in finding.SINGLE if other != name)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def suite():
     """Kinds of worlds and the first seed, drawn by the system and printed."""
     seed = int.from_bytes(os.urandom(4), "little")
     print(f"seed {seed}")
-    return finding.draw_few(np.random.default_rng(seed)), seed
+    return finding.draw_few(default_rng(seed)), seed
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def real():
     """The tool itself, which is asked once about the same logs."""
     return finding.once(finding.explain)
@@ -51,15 +51,15 @@ def test_what_is_hidden_is_found(suite, real):
     finding.require(real, *suite)
 
 
-@pytest.mark.parametrize("name", list(SPOILT))
+@mark.parametrize("name", list(SPOILT))
 def test_a_spoilt_tool_is_caught(name, suite, real):
     kinds, seed = suite
-    with pytest.raises(AssertionError, match="seed"):
+    with raises(AssertionError, match="seed"):
         finding.require(SPOILT[name](kinds, real), kinds, seed)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@mark.slow
+@mark.parametrize("seed", [1, 2, 3])
 def test_what_is_hidden_is_found_in_more_worlds(seed):
     """Further suites, and a plant of MuJoCo, whose flights take longer."""
     chain = [
@@ -67,17 +67,15 @@ def test_what_is_hidden_is_found_in_more_worlds(seed):
         finding.Kind(("com_x",), "chain"),
         finding.Kind(("cmd_delay",), "chain"),
     ]
-    finding.require(
-        finding.explain, [*finding.kinds(np.random.default_rng(seed)), *chain], 1_000_000 * seed
-    )
+    finding.require(finding.explain, [*finding.kinds(default_rng(seed)), *chain], 1_000_000 * seed)
 
 
-@pytest.mark.slow
+@mark.slow
 def test_effects_exchanged_in_the_catalogue_are_noticed(monkeypatch):
     """Worlds of another hand notice; worlds of the simulator's own equations would not."""
     known = catalogue()
     one, other = known["com_x"], known["com_y"]
     monkeypatch.setitem(known, "com_x", replace(one, changes=other.changes))
     monkeypatch.setitem(known, "com_y", replace(other, changes=one.changes))
-    with pytest.raises(AssertionError, match="seed"):
+    with raises(AssertionError, match="seed"):
         finding.require(finding.explain, [finding.Kind(("com_x",), "rod")], 4)

@@ -3,7 +3,7 @@ answers are judged as they should be.
 """
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from bench.diagnose import foreign
 from visthrow.diagnose.models.flyer import FlyerModel
@@ -20,7 +20,7 @@ def off(world: dict, name: str) -> float:
     return float(np.std(np.concatenate(FlyerModel([log], foreign.known(name)).residuals({}))))
 
 
-@pytest.mark.parametrize("vehicle", [0, 1])
+@mark.parametrize("vehicle", [0, 1])
 def test_a_world_without_a_hidden_effect_is_what_its_owner_expects(vehicle):
     name, hidden, world = foreign.drawn(6 * vehicle)
     assert (name, hidden) == (("crazyflie", "five_inch")[vehicle], "")
@@ -48,7 +48,7 @@ def test_worlds_differ_and_every_effect_is_hidden_by_some_seed():
         )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("hidden", "groups", "overall", "judged"),
     [
         ("", [], "NO EFFECT", "right"),

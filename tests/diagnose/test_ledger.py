@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from bench.diagnose import ledger, sealed
 from visthrow.paper import measurements
@@ -51,7 +51,7 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize(("begins", "kind"), KINDS.items())
+@mark.parametrize(("begins", "kind"), KINDS.items())
 def test_the_record_says_what_the_shipped_ledger_says(begins, kind):
     """Worlds, found, names up to class, exact, more names than causes: cell by cell; none is left
     out of any row.

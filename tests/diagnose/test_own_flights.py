@@ -3,7 +3,7 @@ nothing is.
 """
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from visthrow.diagnose.select import search
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -16,7 +16,7 @@ LATE = (8e-3, 12e-3)
 """Age of what the pilot of these flights is told [s]."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown():
     """Policy and flights, as ``visthrow fly --seed 1`` saves them."""
     loaded = load_policy("vision", None, [])
@@ -37,7 +37,7 @@ def test_flights_of_fly_hide_nothing(flown):
     assert (diagnosis.overall, dict(diagnosis.theta), diagnosis.events) == ("NO EFFECT", {}, ())
 
 
-@pytest.mark.parametrize("name", MEASURED)
+@mark.parametrize("name", MEASURED)
 def test_measured_channels_were_true_when_they_are_stamped(flown, name):
     """Their error is the noise alone: it has no part along the motion, where 10 ms of age would be
     10 ms of it.

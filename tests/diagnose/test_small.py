@@ -7,7 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import approx, mark, param, raises
 from scipy.spatial.transform import Rotation
 
 from bench.diagnose import foreign, small
@@ -71,7 +72,7 @@ ACTING = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "law"), ACTING)
+@mark.parametrize(("kind", "law"), ACTING)
 def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
     """Two ways to the same: forces at the knots through the latents' derivatives, and the law in
     every step.
@@ -95,25 +96,22 @@ def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
         column.append(told[:, 0])
         change.append(told[:, 1])
     column, change = np.concatenate(column), np.concatenate(change)
-    assert np.linalg.norm(column) > 0.1
+    assert norm(column) > 0.1
     slope = column @ change / (column @ column)
-    assert slope == pytest.approx(1.0, abs=0.1)
-    assert np.linalg.norm(change - slope * column) < 0.25 * np.linalg.norm(column)
+    assert slope == approx(1.0, abs=0.1)
+    assert norm(change - slope * column) < 0.25 * norm(column)
 
 
-@pytest.mark.parametrize("kind", list(small.WORLDS))
+@mark.parametrize("kind", list(small.WORLDS))
 def test_nothing_hidden_is_no_effect(kind):
     diagnosis = search.explain(small.model_of(kind, small.logs_of(kind, "", 1)))
     assert diagnosis.overall == "NO EFFECT"
     assert not diagnosis.laws
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "law"),
-    [
-        pytest.param(*case, marks=pytest.mark.slow)
-        for case in (("trim", "ground"), ("pendulum", "brake"))
-    ],
+    [param(*case, marks=mark.slow) for case in (("trim", "ground"), ("pendulum", "brake"))],
 )
 def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_path, capsys):
     plain, extended, out = tmp_path / "plain.toml", tmp_path / "extended.toml", tmp_path / "out"
@@ -194,13 +192,13 @@ def test_what_cannot_act_is_refused():
         LawParams("vehicle torque", (), "rate", 1e-6),
         LawParams("payload force", ("tension",), "payload_vel", 0.1),
     )
-    with pytest.raises(LogError, match="M = c ω cannot act here: this model has no vehicle torque"):
+    with raises(LogError, match="M = c ω cannot act here: this model has no vehicle torque"):
         FlyerModel([fly(4.0)], FLYER).extend({}, [torque])
-    with pytest.raises(LogError, match="this model has no tension"):
+    with raises(LogError, match="this model has no tension"):
         MODELS["ball"]().extend({}, [pull])
-    with pytest.raises(ConfigError, match="no 'tensoin'; did you mean 'tension'"):
+    with raises(ConfigError, match="no 'tensoin'; did you mean 'tension'"):
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("tensoin",)),))
-    with pytest.raises(ConfigError, match="3 factors; expected at most 2"):
+    with raises(ConfigError, match="3 factors; expected at most 2"):
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("payload_speed",) * 3),))
 
 
@@ -222,7 +220,7 @@ def test_an_unknown_of_a_model_without_laws_says_so(capsys, tmp_path, monkeypatc
     assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
 
 
-@pytest.mark.parametrize("kind", ["gimbal", "stand"])
+@mark.parametrize("kind", ["gimbal", "stand"])
 def test_models_without_laws_say_why(kind, tmp_path, capsys):
     law = {
         "formula": "F = c z",

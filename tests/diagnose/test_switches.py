@@ -3,7 +3,7 @@ fit and a transient.
 """
 
 import numpy as np
-import pytest
+from pytest import approx, mark, param
 
 from bench.diagnose.sealed import flight_log, model_of
 from bench.worlds.world import Recipe, fly_recipe, recorded
@@ -17,10 +17,10 @@ noise, gusts, initial states.
 """
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("lacks", "name"),
     [
-        pytest.param("vehicle.motor.kind='instant'", "motor_lag", marks=pytest.mark.slow),
+        param("vehicle.motor.kind='instant'", "motor_lag", marks=mark.slow),
         ("vehicle.controller.kind='geometric'", "controller_kind"),
     ],
 )
@@ -42,5 +42,5 @@ def test_a_missing_block_is_worth_its_whole_size(lacks, name):
         without = np.linalg.lstsq(free[:, :-1], w.residual / w.sigma, rcond=None)[0]
         misfit += float(np.sum((w.residual / w.sigma - free[:, :-1] @ without) ** 2))
         left += float(np.sum((w.residual / w.sigma - free @ size) ** 2))
-        assert size[-1] == pytest.approx(1.0, abs=0.1)
+        assert size[-1] == approx(1.0, abs=0.1)
     assert left < LEFT * misfit

@@ -3,11 +3,12 @@ move as the simulator does.
 """
 
 import ast
-import dataclasses
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import mark, param
 
 from bench.worlds.fly import fly
 from bench.worlds.numbers import nominal
@@ -54,9 +55,7 @@ def test_the_check_of_imports_finds_one():
     assert imported("def f():\n    from sim.hybrid import HybridSim\n") & PACKAGES
 
 
-@pytest.mark.parametrize(
-    "plant", ["rod", *(pytest.param(name, marks=pytest.mark.slow) for name in ("string", "chain"))]
-)
+@mark.parametrize("plant", ["rod", *(param(name, marks=mark.slow) for name in ("string", "chain"))])
 def test_a_world_without_effect_moves_as_the_simulator(plant):
     rng = np.random.default_rng(0)
     throws = [Throw(rng, speed, heading) for speed, heading in ((7.0, 0.4), (11.0, -2.0))]
@@ -67,11 +66,9 @@ def test_a_world_without_effect_moves_as_the_simulator(plant):
 
     params = paper_plant()
     segments = {"rod": 1, "string": 24, "chain": 15}[plant]
-    rope = dataclasses.replace(
-        params.rope, segments=segments, payload_inertia=max(world.ball_inertia, 1e-9)
-    )
-    numerics = dataclasses.replace(params.sim, substep=2.5e-4, precision="float64")
-    sim = HybridSim(dataclasses.replace(params, rope=rope, sim=numerics), 2)
+    rope = replace(params.rope, segments=segments, payload_inertia=max(world.ball_inertia, 1e-9))
+    numerics = replace(params.sim, substep=2.5e-4, precision="float64")
+    sim = HybridSim(replace(params, rope=rope, sim=numerics), 2)
     sim.place(np.array([throw.at(0.0)[0] for throw in throws]), battery_used=0.1)
     worst = 0.0
     for k in range(flown.commands.shape[1]):
@@ -80,8 +77,8 @@ def test_a_world_without_effect_moves_as_the_simulator(plant):
         hangs = sim.get("attached") != 0
         now = (k + 1) * 20
         both = np.maximum(
-            np.linalg.norm(sim.get("pos_w") - flown.pos[:, now], axis=1),
-            np.linalg.norm(sim.get("payload_pos_w") - flown.ball[:, now], axis=1),
+            norm(sim.get("pos_w") - flown.pos[:, now], axis=1),
+            norm(sim.get("payload_pos_w") - flown.ball[:, now], axis=1),
         )
         worst = max([worst, *both[hangs]])
     assert 0.0 < worst < AGREEMENT[plant]
@@ -121,6 +118,6 @@ def test_a_world_follows_from_its_seed_and_its_digest_from_its_truth():
     once, again = (recorded(recipe, fly_recipe(recipe)) for _ in range(2))
     for a, b in zip(once, again):
         np.testing.assert_array_equal(a["pos"], b["pos"])
-    other = dataclasses.replace(recipe, effects={k: -v for k, v in recipe.effects.items()})
+    other = replace(recipe, effects={k: -v for k, v in recipe.effects.items()})
     assert recipe.digest() != other.digest()
-    assert recipe.digest() == dataclasses.replace(recipe).digest()
+    assert recipe.digest() == replace(recipe).digest()

@@ -4,8 +4,8 @@ never sent.
 
 import math
 
-import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 
 from hil.errors import RunError
 from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
@@ -60,11 +60,11 @@ def test_units_and_axes_of_the_command():
     turn(backend, link, fake)
     assert backend.send((7.0, 1.0, 2.0, 3.0), 0.1)
     turn(backend, link, fake)
-    np.testing.assert_allclose(fake.plant.commands[-1], (7.0, 1.0, 2.0, 3.0), rtol=1e-6)
+    assert_allclose(fake.plant.commands[-1], (7.0, 1.0, 2.0, 3.0), rtol=1e-6)
     assert fake.followed == 1
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "change", [{"type_mask": 132}, {"type_mask": 192}, {"type_mask": 0}, {"target_system": 2}, {}]
 )
 def test_the_fake_ignores_what_the_real_one_ignores(change):
@@ -84,13 +84,13 @@ def test_silence_levels_the_fake():
     link.send(attitude_target(0.0, (1, 1), 0.9, (1.0, 0.0, 0.0)))
     for _ in range(590):
         fake.step()
-    assert fake.plant.commands[-1][1] == pytest.approx(1.0)
+    assert fake.plant.commands[-1][1] == approx(1.0)
     for _ in range(20):
         fake.step()
-    np.testing.assert_allclose(fake.plant.commands[-1], (0.272 * 9.81, 0.0, 0.0, 0.0))
+    assert_allclose(fake.plant.commands[-1], (0.272 * 9.81, 0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("answer", "state", "sends"),
     [
         ("accepted", "accepted", 1),
@@ -113,7 +113,7 @@ def test_release_and_its_answers(answer, state, sends):
         assert backend.status(fake.plant.time).release == "pending"
     turn(backend, link, fake, 200)
     assert backend.status(fake.plant.time).release == state
-    assert fake.witness.releases == pytest.approx(sends, abs=1 if sends > 1 else 0)
+    assert fake.witness.releases == approx(sends, abs=1 if sends > 1 else 0)
     assert backend.due() is None
 
 
@@ -158,7 +158,7 @@ def test_a_throw_with_a_plain_plant_releases_in_time():
     assert abs(plant.released - latch) <= 5e-3, "latch to separation is the trained lag within 5 ms"
     assert summary["missed"] == 0
     down = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
-    assert summary["landings"][0]["time"] == pytest.approx(plant.released + 0.11 + down, abs=6e-3)
+    assert summary["landings"][0]["time"] == approx(plant.released + 0.11 + down, abs=6e-3)
 
 
 def test_plants_that_are_none():
@@ -170,5 +170,5 @@ def test_plants_that_are_none():
         "os:system",
         "math:pi",
     ):
-        with pytest.raises(RunError, match="expected module:function"):
+        with raises(RunError, match="expected module:function"):
             load_plant(target, "state", 0)

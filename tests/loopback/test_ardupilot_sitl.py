@@ -10,7 +10,8 @@ import struct
 import threading
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark
 
 from hil.links.clock import ManualClock
 from hil.links.device import Device, UdpPort
@@ -52,7 +53,7 @@ def servos(*motors, hook=1900):
     return (*motors, 1000, 1000, 1000, 1000, hook, *[1000] * 7)
 
 
-@pytest.fixture
+@fixture
 def bridge(monkeypatch):
     monkeypatch.setattr(ardupilot, "SERVOS", 0)  # any port that is free
     monkeypatch.setattr(ardupilot, "PATIENCE", PATIENCE)
@@ -84,13 +85,13 @@ def test_each_frame_is_flown_once_and_answered_with_the_state_after_it(bridge):
     assert [round(state["timestamp"], 6) for state in states] == [0.002, 0.004, 0.004, 0.006]
     assert (bridge.frames, bridge.repeated, bridge.restarts) == (3, 1, 0)
     assert bridge.plant.held
-    np.testing.assert_allclose(
+    assert_allclose(
         states[-1]["position"], [1.0, -1.0, -1.0] * bridge.plant.state["pos_w"], atol=1e-6
     )
-    np.testing.assert_allclose(states[-1]["imu"]["accel_body"], [0.0, 0.0, -9.81], atol=0.1)
+    assert_allclose(states[-1]["imu"]["accel_body"], [0.0, 0.0, -9.81], atol=0.1)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "axis"),
     [((-30, 0, 0, -30), 0), ((0, -30, 0, -30), 1), ((60, 60, -30, -30), 2)],
     ids=[
@@ -114,7 +115,7 @@ def test_the_mechanisms_output_lets_the_ball_go(bridge):
     fly(bridge, [(101 + n, servos(*[HOVER + 20] * 4, hook=1100)) for n in range(60)])
     report = bridge.report()
     assert report["releases"] == 1
-    assert report["separation_time"] == pytest.approx(report["release_time"] + 0.06, abs=0.005)
+    assert report["separation_time"] == approx(report["release_time"] + 0.06, abs=0.005)
 
 
 def test_time_goes_on_without_waiting_before_the_first_frame(bridge):
@@ -155,7 +156,7 @@ def test_a_late_start_of_a_firmware_leaves_no_debt(monkeypatch):
     fake.plant = fake
     report = serve(fake, clock, 3.0)
     assert report["late_periods"] <= 501
-    assert report["speed"] == pytest.approx(1.0)
+    assert report["speed"] == approx(1.0)
 
 
 def test_strange_packets_are_none():

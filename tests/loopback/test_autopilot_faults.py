@@ -4,13 +4,13 @@ the vehicle did without it.
 In every one the fake watches that no command arrives that is not finite or within limits, and that
 the release comes once at most, from an armed vehicle inside its fence."""
 
-import dataclasses
 import errno
 import math
 import time
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, mark, param
 
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput
@@ -91,7 +91,7 @@ def reason(told, state: str) -> str:
 GONE = "the autopilot is silent, disarmed or in another mode"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_silent(kind):
     """Abort after the heartbeat's time-out, counted from the last sign of life."""
     limit = 0.5 if kind == "betaflight" else 1.5
@@ -101,7 +101,7 @@ def test_silent(kind):
     assert START + limit - BEAT[kind] - TICK <= when(told, "abort") <= START + limit + 2 * TICK
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_the_pilot_takes_over(kind):
     """Abort at the next sign of life; from then on not one command is sent, no mode is
     asked for.
@@ -120,14 +120,14 @@ def test_the_pilot_takes_over(kind):
     assert fake.taken
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_disarmed_and_not_ours_to_arm(kind):
     fake, _, told = run(kind, 4.0, armed=False, overrides=("states.idle=1.5",))
     assert reason(told, "abort") == "autopilot not ready (disarmed), for 1.5 s"
     assert fake.witness.commands == 0
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "override"), [("ardupilot", "ardupilot.arm=true"), ("px4", "px4.arm=true")]
 )
 def test_refuses_arming(kind, override):
@@ -145,7 +145,7 @@ def test_refuses_arming(kind, override):
     assert fake.witness.releases == 0
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@mark.parametrize("kind", ["ardupilot", "px4"])
 def test_arms_where_it_was_told_to(kind):
     fake, _, told = run(kind, 4.0, armed=False, overrides=(f"{kind}.arm=true",))
     assert "throw" in [state for state, _, _ in told]
@@ -182,7 +182,7 @@ once.
 """
 
 
-@pytest.mark.parametrize(("kind", "answer"), RELEASES)
+@mark.parametrize(("kind", "answer"), RELEASES)
 def test_a_release_that_does_not_happen(kind, answer):
     """ACK without movement, IN_PROGRESS for ever, silence, refusal: the run is aborted, and it is
     never sent again. The vehicle is quiet again long before, which does not count while the answer
@@ -212,7 +212,7 @@ def test_a_release_that_does_not_happen(kind, answer):
     assert last[-1] <= latch + 0.11 + 2 * TICK, "none is sent after the time of separation"
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_a_policy_at_its_limits_stays_within_them(kind):
     """All of thrust and rates: as much arrives and no more; on a vehicle that obeyed, the fence
     would end it.
@@ -221,7 +221,7 @@ def test_a_policy_at_its_limits_stays_within_them(kind):
     np.testing.assert_allclose(fake.witness.worst, (14.0, 10.0, 10.0, 4.0), rtol=3e-3)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "length", "event"),
     [
         ("ardupilot", 0.15, None),
@@ -243,7 +243,7 @@ def test_a_tick_overrun(kind, length, event):
 
     late = []
     fake, summary, told = run(kind, START + 1.2, watch=dawdle)
-    assert summary["missed"] == pytest.approx(length / TICK, abs=2)
+    assert summary["missed"] == approx(length / TICK, abs=2)
     events = [text for _, text in fake.events]
     if event is None:
         assert told[-1][0] == "throw"
@@ -267,7 +267,7 @@ KILLED = {
 """What the vehicle does by itself, and how long after the last set-point [s]."""
 
 
-@pytest.mark.parametrize("way", KILLED)
+@mark.parametrize("way", KILLED)
 def test_the_runner_is_killed_in_mid_throw(way):
     """It falls silent between two ticks and never comes back; the fake flies on and shows what its
     failsafes do.
@@ -285,14 +285,14 @@ def test_the_runner_is_killed_in_mid_throw(way):
     after = [(time - last, text) for time, text in fake.events[before:]]
     assert [text for _, text in after] == [text for _, text in KILLED[way]]
     for (found, _), (wanted, _) in zip(after, KILLED[way]):
-        assert found == pytest.approx(wanted, abs=0.02)
+        assert found == approx(wanted, abs=0.02)
     command = fake.plant.commands[-1]
-    assert command[0] == pytest.approx(0.0 if all_channels else 2.668, rel=0.02)
+    assert command[0] == approx(0.0 if all_channels else 2.668, rel=0.02)
     assert fake.witness.breaches == []
     assert fake.witness.releases == 0
 
 
-@pytest.mark.parametrize("full_at", [0.0, START])
+@mark.parametrize("full_at", [0.0, START])
 def test_the_disk_is_full(tmp_path, full_at):
     """Before the throw: none is armed.
 
@@ -331,16 +331,16 @@ def test_the_disk_is_full(tmp_path, full_at):
     assert fake.witness.releases == 0
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "value"),
     [(kind, math.nan) for kind in KINDS]
-    + [pytest.param(kind, math.inf, marks=pytest.mark.slow) for kind in KINDS],
+    + [param(kind, math.inf, marks=mark.slow) for kind in KINDS],
 )
 def test_a_policy_that_puts_out_no_numbers(kind, value):
     def spoil(now, runner, fake):
         if now >= START and not spoiled:
             act = runner.pilot.act
-            runner.pilot.act = lambda *args: dataclasses.replace(
+            runner.pilot.act = lambda *args: replace(
                 act(*args), command=np.full((1, 4), value, np.float32), release=np.array([True])
             )
             spoiled.append(now)
@@ -352,7 +352,7 @@ def test_a_policy_that_puts_out_no_numbers(kind, value):
     assert (fake.witness.releases, summary["guard"]["refused"]) == (0, 1)
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_fence_ends_a_policy_at_its_limits():
     from visthrow.throws.wire_plant import make
 
@@ -368,7 +368,7 @@ def test_the_fence_ends_a_policy_at_its_limits():
     assert fake.witness.releases == 0
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_ctrl_c_in_mid_throw(kind):
     """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is
     brought down by the runner.

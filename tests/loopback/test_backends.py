@@ -3,7 +3,8 @@ and whose hands it is in.
 """
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from hil.check import AutopilotCheck
 from hil.control.loop import Loop
@@ -72,7 +73,7 @@ class Desk:
         raise AssertionError(self.status)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_units_and_axes_of_commands(kind):
     """A quarter of a turn a second about each axis alone, and a thrust, arrive as they
     were meant.
@@ -85,7 +86,7 @@ def test_units_and_axes_of_commands(kind):
         (13.0, -9.0, 8.0, 2.0),
     ):
         desk.turn(0.06, command)
-        np.testing.assert_allclose(desk.fake.plant.commands[-1], command, atol=0.012, rtol=2e-3)
+        assert_allclose(desk.fake.plant.commands[-1], command, atol=0.012, rtol=2e-3)
     assert desk.fake.witness.breaches == []
 
 
@@ -116,7 +117,7 @@ def test_a_vehicle_that_the_runner_is_to_arm_is_not_taken_before_its_checks_pass
         assert desk.status.connected == connected, desk.status.note
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_hands(kind):
     """Pilot, runner, the autopilot's own hold and landing; then the pilot again, who is
     not fought.
@@ -144,7 +145,7 @@ def test_hands(kind):
     assert desk.fake.mode == mode, "an abort does not take it out of the pilot's hands"
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@mark.parametrize("kind", ["ardupilot", "px4"])
 def test_an_abort_lands(kind):
     desk = Desk(kind).follow()
     for _ in range(20):
@@ -154,7 +155,7 @@ def test_an_abort_lands(kind):
     assert desk.fake.mode == (9 if kind == "ardupilot" else PX4_LAND)
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@mark.parametrize("kind", ["ardupilot", "px4"])
 def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
     """The heartbeat shows the hold when landing is wanted already: that is no pilot."""
     desk = Desk(kind).follow()
@@ -228,8 +229,8 @@ def test_what_silence_does_under_the_override_follows_betaflights_version():
         desk.turn(0.3, command)
         desk.turn(2.0)
         thrust, roll = desk.fake.plant.commands[-1][:2]
-        assert (roll == pytest.approx(1.0, abs=0.02)) == held
-        assert (thrust == pytest.approx(3.0, rel=0.01)) == held
+        assert (roll == approx(1.0, abs=0.02)) == held
+        assert (thrust == approx(3.0, rel=0.01)) == held
 
 
 def test_betaflight_that_is_handed_back_is_level_with_the_pilots_throttle():
@@ -244,7 +245,7 @@ def test_betaflight_that_is_handed_back_is_level_with_the_pilots_throttle():
             desk.turn(0.02)
             desk.backend.surrender(desk.now)
         assert (desk.fake.witness.commands > came + 5) == frames
-        np.testing.assert_allclose(desk.fake.plant.commands[-1], HOVER, rtol=0.01, atol=0.05)
+        assert_allclose(desk.fake.plant.commands[-1], HOVER, rtol=0.01, atol=0.05)
 
 
 def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_the_end():
@@ -257,7 +258,7 @@ def test_betaflight_with_all_channels_arms_with_the_throttle_low_and_disarms_in_
     desk.follow()
     assert desk.fake.armed
     desk.turn(0.1, HOVER)
-    np.testing.assert_allclose(desk.fake.plant.commands[-1][0], HOVER[0], rtol=2e-3)
+    assert_allclose(desk.fake.plant.commands[-1][0], HOVER[0], rtol=2e-3)
     desk.backend.finish(desk.now)
     desk.turn(0.05)
     assert not desk.fake.armed
@@ -296,7 +297,7 @@ TRAPS = {
 }
 
 
-@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in TRAPS[kind]])
+@mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in TRAPS[kind]])
 def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
     tables = []
     desk = Desk(kind, parameters={name: TRAPS[kind][name]}, tell=tables.append)
@@ -311,7 +312,7 @@ def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
     assert desk.fake.parameters[name] == TRAPS[kind][name], "nothing is written unasked"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "names"),
     [
         ("ardupilot", set(TRAPS["ardupilot"]) - {"GRIP_TYPE", "GRIP_RELEASE"}),
@@ -328,9 +329,7 @@ def test_write_parameters_mends_them(kind, names):
     assert set(desk.backend.audit.written) == names
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [("ardupilot", "EK3_SRC1_POSXY"), ("px4", "EKF2_EV_CTRL")]
-)
+@mark.parametrize(("kind", "name"), [("ardupilot", "EK3_SRC1_POSXY"), ("px4", "EKF2_EV_CTRL")])
 def test_an_autopilot_without_external_poses_needs_no_source_of_them(kind, name):
     """Software knows its place by its own simulated GPS."""
     desk = Desk(kind, f"{kind}.poses=false", parameters={name: 0.0})
@@ -356,12 +355,10 @@ def test_parameters_of_the_config_are_audited_and_written():
     desk = Desk("px4", *wanted, parameters=found, write=True)
     desk.turn(3.0)
     assert desk.status.fault is None
-    assert desk.fake.parameters["SIH_MASS"] == pytest.approx(0.272)
+    assert desk.fake.parameters["SIH_MASS"] == approx(0.272)
 
 
-@pytest.mark.parametrize(
-    ("kind", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")]
-)
+@mark.parametrize(("kind", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")])
 def test_a_second_of_the_last_rates_is_too_long(kind, name):
     desk = Desk(kind, parameters={name: 1.0})
     desk.turn(0.5)
@@ -390,9 +387,7 @@ def test_without_the_audit_the_traps_are_what_they_are():
     """
     desk = Desk("ardupilot", "ardupilot.audit=false", parameters={"GUID_OPTIONS": 0.0}).follow()
     desk.turn(0.1, (7.0, 0.0, 0.0, 0.0))
-    assert desk.fake.plant.commands[-1][0] == pytest.approx(2.668, rel=1e-3), (
-        "half thrust: no climb"
-    )
+    assert desk.fake.plant.commands[-1][0] == approx(2.668, rel=1e-3), "half thrust: no climb"
     desk = Desk("ardupilot", "ardupilot.audit=false", 'ardupilot.release="servo"').follow()
     desk.backend.release(desk.now)
     desk.turn(0.7, HOVER)
@@ -407,7 +402,7 @@ ACTUATOR = (
 )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "overrides", "parameters"),
     [
         ("ardupilot", (), {}),
@@ -426,7 +421,7 @@ def test_every_way_to_release(kind, overrides, parameters):
     while desk.status.release == "idle" or desk.fake.release_time is None:
         desk.turn(0.02, HOVER)
         assert desk.now < when + 0.2
-    assert desk.fake.release_time == pytest.approx(when, abs=0.025)
+    assert desk.fake.release_time == approx(when, abs=0.025)
     desk.turn(1.5, HOVER)
     assert desk.status.release == "accepted"
     assert (desk.fake.witness.releases, desk.fake.witness.breaches) == (1, [])
@@ -451,7 +446,7 @@ def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
         assert (desk.fake.witness.releases, desk.status.release) == (0, "idle")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "mechanism"),
     [*((kind, 0.06) for kind in KINDS), ("ardupilot", 0.002), ("betaflight", 0.11)],
 )
@@ -469,7 +464,7 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     assert (summary["latches"], fake.witness.breaches) == (1, [])
 
 
-@pytest.mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in KINDS), ("px4", False)])
+@mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in KINDS), ("px4", False)])
 def test_a_complete_throw(kind, prompt):
     """Also where a change of mode is seen in a heartbeat up to a second later."""
     plant = LevelPlant()
@@ -525,7 +520,7 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
     assert [text for _, text in fake.events] == ["mode 17", "mode 4", "mode 17", "mode 9"]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "factor", "good"), [*((kind, 1.0, True) for kind in KINDS), ("px4", 1.15, False)]
 )
 def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
@@ -542,13 +537,13 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
         check.tick(desk.now, desk.runner)
     found, text = check.results(desk.now, desk.runner.mass)[-1]
     assert found == good, text
-    assert check.meter.share == pytest.approx(hover, rel=0.01)
+    assert check.meter.share == approx(hover, rel=0.01)
 
 
 def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():
     """MSP_SERVO does not show them; a good release is none that moved nothing."""
     desk = Desk("betaflight", parameters={"channel_forwarding": 1}).follow()
-    assert desk.backend.voltage == pytest.approx(11.1), "sent in hundredths of a volt"
+    assert desk.backend.voltage == approx(11.1), "sent in hundredths of a volt"
     desk.backend.release(desk.now)
     desk.turn(1.0, HOVER)
     assert (desk.status.release, desk.fake.witness.releases) == ("accepted", 1)
@@ -602,7 +597,7 @@ def test_px4s_gripper_opens_at_the_minimum_of_its_output():
     assert wrong.backend.audit.problems == ["PWM_AUX_MIN1 is 1000; expected 2000 (servo_open_us)"]
 
 
-@pytest.mark.parametrize(("kind", "closed"), [("ardupilot", 1900), ("px4", 2000)])
+@mark.parametrize(("kind", "closed"), [("ardupilot", 1900), ("px4", 2000)])
 def test_a_mechanism_that_is_open_is_not_taken(kind, closed):
     """One that was left open after the last throw, or whose ends are exchanged: nothing hangs."""
     desk = Desk(kind, f"{kind}.servo_open_us={closed}", f"{kind}.audit=false")
@@ -611,7 +606,7 @@ def test_a_mechanism_that_is_open_is_not_taken(kind, closed):
     assert desk.status.note.startswith("the mechanism's output is at its open end: close it")
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@mark.parametrize("kind", ["ardupilot", "px4"])
 def test_a_mode_is_seen_soon_though_the_heartbeat_is_slow(kind):
     """PX4's comes once a second and says nothing of a change; it is asked for more often."""
     desk = Desk(kind, prompt=False).follow()

@@ -9,7 +9,7 @@ import struct
 import sys
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from bench.crazyflie import fly
 from bench.processes import free_port
@@ -50,7 +50,7 @@ def test_a_whole_throw():
     assert np.linalg.norm(place - fake.plant.state["pos_w"]) < 0.1
 
 
-@pytest.mark.parametrize("axis", range(3))
+@mark.parametrize("axis", range(3))
 def test_the_vehicle_turns_as_it_was_commanded(axis):
     """Roll right, nose down and yaw left are positive with us."""
     one = desk().follow()
@@ -58,9 +58,9 @@ def test_the_vehicle_turns_as_it_was_commanded(axis):
     rates[axis] = 1.0
     one.turn(0.06, (HOVER[0], *rates))
     thrust, *turns = one.fake.plant.commands[-1]
-    assert thrust == pytest.approx(HOVER[0], rel=1e-3)
-    assert turns[axis] == pytest.approx(1.3 if axis == 2 else 1.0, abs=0.3)
-    assert [turn for i, turn in enumerate(turns) if i != axis] == pytest.approx([0.0, 0.0])
+    assert thrust == approx(HOVER[0], rel=1e-3)
+    assert turns[axis] == approx(1.3 if axis == 2 else 1.0, abs=0.3)
+    assert [turn for i, turn in enumerate(turns) if i != axis] == approx([0.0, 0.0])
 
 
 def test_legacy_set_points_mean_what_the_firmware_makes_of_them():
@@ -94,7 +94,7 @@ def test_modes_that_others_have_set_are_set_again():
             assert fake.parameters[name] == value
 
 
-@pytest.mark.parametrize("name", ["stabilizer.controller", "flightmode.posSet", "hook.open"])
+@mark.parametrize("name", ["stabilizer.controller", "flightmode.posSet", "hook.open"])
 def test_nothing_flies_while_a_setting_is_missing(name):
     tables = []
     one = desk(tell=tables.append)
@@ -129,8 +129,8 @@ def test_silence_levels_it_and_then_stops_the_motors():
     while one.fake.supervisor != LOCKED:
         one.fake.step()
     told = {text: time - begun for time, text in one.fake.events}
-    assert told[LEVEL] == pytest.approx(FACTS["levels_after"], abs=0.06)
-    assert told[LOCKED] == pytest.approx(FACTS["stops_after"], abs=0.06)
+    assert told[LEVEL] == approx(FACTS["levels_after"], abs=0.06)
+    assert told[LOCKED] == approx(FACTS["stops_after"], abs=0.06)
     one.fake.step()
     assert one.fake.plant.commands[-1] == (0.0, 0.0, 0.0, 0.0)
     one.turn(0.3, HOVER)
@@ -157,7 +157,7 @@ def test_a_vehicle_that_is_handed_back_holds_its_place():
             one.turn(0.02)
             one.backend.surrender(one.now)
         assert one.fake.supervisor == FLYING, "set-points of a place keep its watchdog quiet"
-        assert one.fake.held.place_w == pytest.approx((*place[:2], z), abs=0.02)
+        assert one.fake.held.place_w == approx((*place[:2], z), abs=0.02)
 
 
 class _Track:
@@ -172,7 +172,7 @@ class _Track:
         return (Pose(0.0, 0.0, "vehicle", tuple(self.place), (0.0, 0.0, 0.0, 1.0)),)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("answer", "state", "note"),
     [
         ("accepted", ACCEPTED, ""),
@@ -205,10 +205,10 @@ def test_packets_and_devices(monkeypatch):
     packed = struct.pack("<B3fHB", 11, 1.0, -2.0, 3.0, 7, 1)
     assert crtp.manual(7, (1.0, 2.0, 3.0)) == b"\x70" + packed
     assert crtp.set_parameter("a.b", 1) == b"\x23\x00a\0b\0\x08\x01"
-    with pytest.raises(LinkError, match="is refused"):
+    with raises(LinkError, match="is refused"):
         crtp.open_crtp("/bin/sh", False)
     monkeypatch.setitem(sys.modules, "cflib.crtp", None)
-    with pytest.raises(LinkError, match="crazyflie"):
+    with raises(LinkError, match="crazyflie"):
         crtp.open_crtp("radio://0/80/2M", False)
     assert Crazyflie.holds is False
 

@@ -6,7 +6,7 @@ the same with processes.
 import os
 import signal
 
-import pytest
+from pytest import mark
 
 from hil.control.loop import Loop
 from hil.operator_terminal import ENDING, Terminal
@@ -104,7 +104,7 @@ RUNS += [(way, "throw", KINDS[i % 3]) for i, way in enumerate(REASONS) if way !=
 """Each autopilot in each state, and each way once: what ends a run knows no autopilot."""
 
 
-@pytest.mark.parametrize(("way", "state", "kind"), RUNS)
+@mark.parametrize(("way", "state", "kind"), RUNS)
 def test_it_ends_by_landing(way, state, kind, monkeypatch):
     run = Told(way, state, with_fake(kind, state), monkeypatch)
     assert (run.summary["aborted"], run.summary["reason"], run.summary["state"]) == (

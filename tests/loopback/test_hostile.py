@@ -10,7 +10,8 @@ import sys
 import time
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import mark
 
 from bench.processes import free_port
 from hil.links.backends.base import FAILED
@@ -29,7 +30,7 @@ def flood(count: int, kind: str, seed: int) -> None:
     runner, source, clock, fake = peers(
         LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0))
     )
-    rng, inbox, commands = np.random.default_rng(seed), source._link.port.inbox, []
+    rng, inbox, commands = default_rng(seed), source._link.port.inbox, []
     fake.link.listen(
         lambda message, arrival: commands.append(
             (message.get_type(), getattr(message, "command", None))
@@ -57,7 +58,7 @@ def flood(count: int, kind: str, seed: int) -> None:
     assert runner.backend.status(now).release != FAILED
 
 
-@pytest.mark.parametrize("kind", ["ardupilot", "px4"])
+@mark.parametrize("kind", ["ardupilot", "px4"])
 def test_messages_of_every_kind_command_nothing(kind):
     flood(5_000, kind, 0)
 
@@ -137,7 +138,7 @@ def flown(seed: int, count: int, kind: str, signed: bool):
         overrides=quick,
         **kwargs,
     )
-    rng, port, captured = np.random.default_rng(seed), source.links[0].port, []
+    rng, port, captured = default_rng(seed), source.links[0].port, []
     make, left, decisions, poll, tick = (
         forger(rng, signed, captured),
         [count],
@@ -195,7 +196,7 @@ def unmoved(seed: int, count: int) -> None:
     raise AssertionError(f"{left} of {count} packets were not sent")
 
 
-@pytest.mark.parametrize("seed", [0, 3])
+@mark.parametrize("seed", [0, 3])
 def test_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, 6_000)
 
@@ -206,14 +207,14 @@ on a free core, 3 s are asked for. Wall time says nothing on a busy machine.
 """
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@mark.slow
+@mark.parametrize("seed", SEEDS)
 def test_a_million_messages_command_nothing(seed):
     flood(EACH, ("ardupilot", "px4")[seed % 2], seed)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@mark.slow
+@mark.parametrize("seed", SEEDS)
 def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
     unmoved(seed, EACH)
 
@@ -223,7 +224,7 @@ def test_a_flood_in_mid_throw_neither_commands_nor_releases():
     released twice.
     """
     plant = LevelPlant()
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     strings = [noise(rng) for _ in range(100)] + [
         mutated(rng, [any_message(rng)])[:-1] for _ in range(300)
     ]

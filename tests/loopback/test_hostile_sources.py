@@ -7,7 +7,7 @@ import threading
 import time
 
 import numpy as np
-import pytest
+from pytest import fixture, importorskip, mark
 
 from bench.hostile import READERS, judge
 from hil.poses.sources.capture import LOOK
@@ -31,16 +31,16 @@ def eventually(condition):
         time.sleep(0.002)
 
 
-@pytest.fixture
+@fixture
 def motive():
     server = Motive()
     yield server
     server.close()
 
 
-@pytest.fixture
+@fixture
 def natnet(motive):
-    pytest.importorskip("natnet", reason="extra natnet")
+    importorskip("natnet", reason="extra natnet")
     said = []
     params = MocapParams("natnet", "127.0.0.1", multicast=False, timeout=10.0)
     source = NatNetSource(params, IDS, time.monotonic, tell=said.append)
@@ -84,10 +84,10 @@ def test_bad_datagrams_end_no_thread_of_natnet(motive, natnet):
     second.close()
 
 
-@pytest.mark.parametrize("kind", READERS)
+@mark.parametrize("kind", READERS)
 def test_hostile_items_change_no_throw(kind):
     if kind == "natnet":
-        pytest.importorskip("natnet", reason="extra natnet")
+        importorskip("natnet", reason="extra natnet")
     assert judge(kind, 0, 3000) == 3000
 
 
@@ -95,7 +95,7 @@ def test_what_ends_the_reader_of_motioncapture_ends_no_run(motive, monkeypatch):
     """Its OptiTrack client reads beyond the end of a datagram, and crashes or hangs. Strangers' do
     not get to it; those of the host's address end its process, which is started again.
     """
-    pytest.importorskip("motioncapture", reason="extra motioncapture")
+    importorskip("motioncapture", reason="extra motioncapture")
     monkeypatch.setattr("hil.poses.sources.motion_capture.RESTART_DELAY", 0.5)
     monkeypatch.setattr("hil.poses.sources.motion_capture.QUIET", 3.0)
     params = MocapParams("optitrack", "127.0.0.1", settings={"interface_ip": "127.0.0.1"})
@@ -131,8 +131,8 @@ def test_what_ends_the_reader_of_motioncapture_ends_no_run(motive, monkeypatch):
     source.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("kind", READERS)
+@mark.slow
+@mark.parametrize("seed", SEEDS)
+@mark.parametrize("kind", READERS)
 def test_a_million_hostile_items_change_no_throw(kind, seed):
     judge(kind, seed, EACH)

@@ -3,7 +3,7 @@
 In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the same on every machine.
 """
 
-import pytest
+from pytest import approx, mark
 
 from hil.control.state_machine import OperatorInput
 from tests.hil_flight import simple_policy
@@ -65,20 +65,20 @@ def when(told, state: str, after: float = 0.0) -> float:
     return next(time for name, _, time in told if name == state and time > after)
 
 
-@pytest.mark.parametrize("name", sorted(FAULTS))
+@mark.parametrize("name", sorted(FAULTS))
 def test_a_fault_in_mid_throw(name):
     runner, fake, told = spoiled(name)
     assert when(told, "throw") < START - 0.2, "the throw goes on when the fault begins"
     after = [(state, reason) for state, reason, time in told if time > START]
     if name in ENDS:
         assert after[0] == ("recover", "stale poses")
-        assert when(told, "recover") == pytest.approx(START + HOLD, abs=ROOM)
+        assert when(told, "recover") == approx(START + HOLD, abs=ROOM)
         assert after[1][0] == "abort"
         assert "no new pose of the vehicle" in after[1][1]
-        assert when(told, "abort") == pytest.approx(START + ABORT, abs=ROOM)
+        assert when(told, "abort") == approx(START + ABORT, abs=ROOM)
     elif name == "payload-lost":
         assert after[0] == ("recover", "stale poses")
-        assert when(told, "recover") == pytest.approx(START + HOLD, abs=ROOM)
+        assert when(told, "recover") == approx(START + HOLD, abs=ROOM)
         assert "abort" not in [state for state, _ in after]
     elif name == "rare":
         assert after[0][0] == "recover"
@@ -97,7 +97,7 @@ def test_every_fault_is_accounted_for():
     assert ENDS | FLOWN_THROUGH | {"payload-lost", "rare"} == set(FAULTS)
 
 
-@pytest.mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
+@mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
 def test_a_fault_as_the_policy_asks_for_the_release(name):
     """It asks from the first tick of the throw on; the fault is there from the start of the check:
     nothing is released unless the poses passed all checks, and then once.

@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-import pytest
+from pytest import mark, raises
 
 from hil.control.loop import Loop
 from hil.control.response import AXES
@@ -93,48 +93,48 @@ def require_refused(runner, said, sunk):
         assert sunk < SUNK, said
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_the_policys_vehicle_throws_even_with_a_slow_yaw(kind):
     runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=SLOW))
     assert runner.machine.state is State.THROW, said
     assert sunk < SUNK
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_a_yaw_that_does_not_turn_is_handed_back(kind):
     runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=1e6))
     require_refused(runner, said, sunk)
     assert "handed back: yaw: the vehicle does not turn as commanded" in said
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
+@mark.parametrize("kind", KINDS)
+@mark.parametrize("times", [0.5, 2.0, 4.0])
 def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, times):
     weight = 2.668 * times
     over = [f"{kind}.thrust.weight={weight}", f"{kind}.thrust.hover={min(0.1906 * times, 0.9)}"]
     params = config.load(HilParams, config.find("hil", CONFIGS[kind]), over)
-    with pytest.raises(RunError, match=r"times the weight that the policy was trained with"):
+    with raises(RunError, match=r"times the weight that the policy was trained with"):
         require_reach(params, simple_policy().contract)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("times", [0.5, 2.0, 4.0])
+@mark.parametrize("kind", KINDS)
+@mark.parametrize("times", [0.5, 2.0, 4.0])
 def test_another_weight_than_the_configuration_says(kind, times):
     runner, said, sunk = fly(kind, times)
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("share", [0.8, 1.2])
+@mark.parametrize("kind", KINDS)
+@mark.parametrize("share", [0.8, 1.2])
 def test_another_thrust_line(kind, share):
     runner, said, sunk = fly(kind, spoil=bend(share))
     require_refused(runner, said, sunk)
     assert "times the weight" in said or "thrust: the vehicle" in said
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("axis", range(3))
+@mark.parametrize("kind", KINDS)
+@mark.parametrize("axis", range(3))
 def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
@@ -143,7 +143,7 @@ def test_the_sign_of_a_rate(kind, axis):
     assert runner.parts.response.time <= most + 1e-9
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_a_mechanism_that_opens_the_other_way(kind):
     runner, said, sunk = fly(kind, spoil=reverse)
     require_refused(runner, said, sunk)

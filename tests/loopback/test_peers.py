@@ -6,7 +6,7 @@ import contextlib
 import shutil
 import socket
 
-import pytest
+from pytest import fixture, raises
 
 from bench.processes import free_port
 from hil.links.backends import make_backend
@@ -62,7 +62,7 @@ class Wire:
         return poses
 
 
-@pytest.fixture
+@fixture
 def wire(tmp_path):
     with contextlib.ExitStack() as stack:
 
@@ -96,7 +96,7 @@ def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
         vehicle.pump(lambda: 0.0)
         assert ATTITUDE in heard
         stranger.setblocking(False)
-        with pytest.raises(BlockingIOError):
+        with raises(BlockingIOError):
             stranger.recv(1000)
 
 

@@ -2,7 +2,7 @@
 reason that is true, and a run hovers on those alone that the check passes.
 """
 
-import pytest
+from pytest import mark
 
 from hil.control.loop import Loop
 from hil.control.runner import Runner
@@ -32,7 +32,7 @@ def loaded() -> HilParams:
     return config.load(HilParams, config.find("hil", "dry_run"), SETTINGS)
 
 
-@pytest.mark.parametrize("name", STREAMS)
+@mark.parametrize("name", STREAMS)
 def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     stream, params = STREAMS[name], loaded()
     sent = Sent(params, stream)

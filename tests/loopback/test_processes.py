@@ -16,7 +16,7 @@ import termios
 import time
 
 import numpy as np
-import pytest
+from pytest import fixture, mark
 
 from hil.control.recording.playback import replay
 from tests.fakes import KINDS
@@ -182,7 +182,7 @@ class Pair:
                 process.communicate()
 
 
-@pytest.fixture
+@fixture
 def never(tmp_path):
     """A policy that hovers and never releases, as a file."""
     path = tmp_path / "never.npz"
@@ -217,7 +217,7 @@ def test_sigterm_in_mid_throw(tmp_path, never):
     assert json.loads((tmp_path / "run" / "summary.json").read_text())["aborted"]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_terminal_is_closed_in_mid_throw(tmp_path, never):
     """As by a dropped ssh: the run's terminal is gone, and says so by SIGHUP; it lands, and its
     folder is complete.
@@ -273,8 +273,8 @@ OWN = {
 """What the vehicle does by itself when nobody speaks any more."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+@mark.slow
+@mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
     def fly(folder, speed):
         with Pair(folder, kind, never, overrides=QUICK, both=("--speed", str(speed))) as pair:
@@ -298,7 +298,7 @@ def test_the_runner_is_killed_in_mid_throw(tmp_path, kind, never):
     assert found["actions"] > 5
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
     """The throw is flown to its end, the next one is not armed, the end of the run says so."""
     overrides = (*QUICK[:3], "states.throw=4.0", "states.ready=2.0", "states.land=1.0", "throws=2")
@@ -314,9 +314,9 @@ def test_the_disk_fills_up_in_mid_throw(tmp_path, never):
     assert (report["breaches"], report["releases"]) == ([], 0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("policy", ["state", "vision"])
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+@mark.slow
+@mark.parametrize("policy", ["state", "vision"])
+@mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_a_throw_with_each_kind(tmp_path, kind, policy):
     """In real time where the machine keeps up, with the simulator's vehicle and the shipped
     policies.

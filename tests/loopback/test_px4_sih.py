@@ -4,7 +4,8 @@ import math
 import threading
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, fixture
 
 from bench.processes import free_port
 from hil.links.clock import MonotonicClock
@@ -58,9 +59,9 @@ def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulat
         off[rises + 1] - off[rises]
     )
     period = 2.0 * math.pi * math.sqrt(ball.length / 9.81)
-    assert np.diff(crossings).mean() == pytest.approx(period, rel=0.01)
+    assert np.diff(crossings).mean() == approx(period, rel=0.01)
     early, late = (np.abs(off[(time > t) & (time < t + period)]).max() for t in (0.5, 3.3))
-    assert late / early == pytest.approx(0.25, abs=0.05)
+    assert late / early == approx(0.25, abs=0.05)
     reach = np.linalg.norm(track[-1, 1:] - [0.02, 0.0, 2.0 + ball.mount_b[2]])
     assert reach <= ball.length * (1.0 + 1e-9)
 
@@ -70,7 +71,7 @@ def test_a_release_at_a_steady_speed_falls_by_the_parabola():
     ball, speed = make_ball("vision", 0), np.array([1.0, 0.5, 0.0])
     fly(ball, 8.0, lambda t: np.array([0.0, 0.0, 2.0]) + t * speed, release=7.0)
     landing, height = ball.landing, 2.0 + ball.mount_b[2] - ball.length - ball.ground
-    assert landing["landing_time"] - landing["separation_time"] == pytest.approx(
+    assert landing["landing_time"] - landing["separation_time"] == approx(
         math.sqrt(2.0 * height / 9.81), abs=0.02
     )
     assert not ball.attached
@@ -79,7 +80,7 @@ def test_a_release_at_a_steady_speed_falls_by_the_parabola():
 def test_a_ball_that_hangs_below_a_vehicle_on_the_ground_lies_on_it():
     ball = make_ball("vision", 0)
     fly(ball, 1.0, lambda t: np.array([0.0, 0.0, 0.1]))
-    assert ball.state["payload_pos_w"][2] == pytest.approx(ball.ground)
+    assert ball.state["payload_pos_w"][2] == approx(ball.ground)
     assert ball.attached
 
 
@@ -133,7 +134,7 @@ class OtherSide:
         self.link.pump(lambda: time)
 
 
-@pytest.fixture
+@fixture
 def bridge():
     port, params = free_port(), config.load(HilParams, config.find("hil", "px4")).px4
     own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
@@ -149,10 +150,8 @@ def test_the_bridge_hears_places_and_the_mechanism(bridge):
     for _ in bridge.other.fly(bridge, 400, (1.0, 2.0, -3.0), 0.3, lambda n: [2000, opens][n > 300]):
         pass
     now = bridge.plant.state
-    np.testing.assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=0.01)
-    np.testing.assert_allclose(
-        now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6
-    )
+    assert_allclose(now["pos_w"], [1.0, -2.0, 3.0], atol=0.01)
+    assert_allclose(now["quat_wb"], [0.0, 0.0, -math.sin(0.15), math.cos(0.15)], atol=1e-6)
     assert bridge.other.asked >= {
         mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
         mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW,

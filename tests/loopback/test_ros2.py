@@ -4,13 +4,13 @@ import subprocess
 import sys
 import time
 
-import pytest
+from pytest import importorskip, mark, raises
 
 from hil.errors import SourceError
 from hil.poses.sources.motion_capture import MocapParams, RigidBody
 from hil.poses.sources.ros2 import KINDS, Ros2Source
 
-pytest.importorskip("cyclonedds", reason="extra ros2")
+importorskip("cyclonedds", reason="extra ros2")
 
 DOMAIN = "57"
 
@@ -85,11 +85,11 @@ def test_poses_come_from_another_process():
         assert 0.0 < time.monotonic() - pose.arrival < 20.0
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "name", ["quad", "geometry_msgs/Pose:/quad", "tf2_msgs/TFMessage:/tf", "nav_msgs/Odometry:quad"]
 )
 def test_names_that_are_no_topic_are_refused(name):
-    with pytest.raises(SourceError, match="expected TYPE:TOPIC with a type of"):
+    with raises(SourceError, match="expected TYPE:TOPIC with a type of"):
         Ros2Source(
             MocapParams("ros2", "127.0.0.1", settings={"domain": DOMAIN}),
             (RigidBody("vehicle", name),),
@@ -99,7 +99,7 @@ def test_names_that_are_no_topic_are_refused(name):
 
 def test_a_domain_that_is_none_is_refused():
     quad = (RigidBody("vehicle", f"{KINDS[0]}:/quad"),)
-    with pytest.raises(SourceError, match="expected ROS_DOMAIN_ID, 0 to 232"):
+    with raises(SourceError, match="expected ROS_DOMAIN_ID, 0 to 232"):
         Ros2Source(
             MocapParams("ros2", "127.0.0.1", settings={"domain": "ros"}), quad, time.monotonic
         )

@@ -2,7 +2,7 @@
 
 import socket
 
-import pytest
+from pytest import approx, fixture
 
 from hil.control.loop import Loop
 from hil.control.recording.playback import replay
@@ -46,7 +46,7 @@ class Pair:
             loop.team.close()
 
 
-@pytest.fixture
+@fixture
 def pair():
     pair = Pair()
     yield pair
@@ -64,10 +64,10 @@ def test_both_throw_and_release_in_one_tick(pair, tmp_path):
     releases = [[d.time for d in each if d.release] for each in pair.decisions]
     starts = [next(d.time for d in each if d.state == "throw") for each in pair.decisions]
     asked = [next(d.time for d in each if d.ready == RELEASE) for each in pair.decisions]
-    assert starts[0] == pytest.approx(starts[1])
+    assert starts[0] == approx(starts[1])
     assert len(releases[0]) == len(releases[1]) == 1
-    assert releases[0] == pytest.approx(releases[1])
-    assert releases[0][0] == pytest.approx(max(asked) + 0.02)
+    assert releases[0] == approx(releases[1])
+    assert releases[0][0] == approx(max(asked) + 0.02)
     pair.turn(30)
     assert [fake.witness.releases for fake in pair.fakes] == [1, 1]
     first.recorder.close({})
@@ -106,7 +106,7 @@ def test_lost_words_part_the_releases_by_as_many_ticks(pair):
     first.team.say = lossy
     pair.turn(100, lambda pair: all(loop.throws for loop in pair.loops))
     assert lost
-    assert second.throws[0] - first.throws[0] == pytest.approx(0.06)
+    assert second.throws[0] - first.throws[0] == approx(0.06)
 
 
 def test_a_stranger_is_not_heard(pair):

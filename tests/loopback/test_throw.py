@@ -8,7 +8,8 @@ import subprocess
 import sys
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import approx, mark
 
 from hil.control.loop import Loop
 from hil.control.recording.playback import replay
@@ -47,7 +48,7 @@ throw lands is not the runner's doing.
 """
 
 
-@pytest.mark.parametrize("policy", ["state", "vision"])
+@mark.parametrize("policy", ["state", "vision"])
 def test_throws_in_lock_step(policy):
     loaded, errors = Policy.load(find_policy(policy)), []
     for seed in range(2):
@@ -58,7 +59,7 @@ def test_throws_in_lock_step(policy):
         assert true is not None, summary["reason"]
         errors.append(np.hypot(true[0] - 2.0, true[1]))
         (landing,) = summary["landings"]
-        assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
+        assert norm(np.subtract(landing["landing_w"], true)) < READ_BACK
         assert (summary["cancelled"], fake.witness.releases, summary["guard"]["refused"]) == (
             0,
             1,
@@ -68,7 +69,7 @@ def test_throws_in_lock_step(policy):
     assert np.mean(errors) < LANDING
 
 
-@pytest.mark.parametrize("after", [0.0, 0.0017, 0.0049])
+@mark.parametrize("after", [0.0, 0.0017, 0.0049])
 def test_the_plant_lets_go_at_the_instant_that_it_is_told(after):
     plant = make("state", 0)
     level = np.array([9.81 * plant.mass[0], 0.0, 0.0, 0.0])
@@ -77,7 +78,7 @@ def test_the_plant_lets_go_at_the_instant_that_it_is_told(after):
     tripped = plant.time + after
     for _ in range(30):
         plant.step(level, True, after)
-    assert plant.landing["separation_time"] == pytest.approx(tripped + 0.11, abs=1e-5)
+    assert plant.landing["separation_time"] == approx(tripped + 0.11, abs=1e-5)
 
 
 def free_port() -> int:
@@ -122,7 +123,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     if report["late_periods"] < FEW_LATE and summary["missed"] == 0:
         true, (landing,) = report["landing_w"], summary["landings"]
         assert np.hypot(true[0] - 2.0, true[1]) < ONE_THROW
-        assert np.linalg.norm(np.subtract(landing["landing_w"], true)) < READ_BACK
+        assert norm(np.subtract(landing["landing_w"], true)) < READ_BACK
     found = replay(tmp_path / "run")
     assert found["differences"] == []
     assert found["actions"] > 20 * summary["latches"]

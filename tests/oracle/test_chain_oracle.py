@@ -4,11 +4,12 @@ MuJoCo's joints are universal: they pass the twist of a turning vehicle on and d
 our recursion do not. With the damping of the scenes that is worth 0.03 mm; the tests of the order
 leave the damping out."""
 
-import dataclasses
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import mark
 
 from sim.kernels.state import NONFINITE
 from tests.oracle.converged import OracleRun, converged
@@ -40,13 +41,13 @@ def oracle(scene: Scene) -> OracleRun:
 def errors(flight: Flight, run: OracleRun) -> tuple[float, float, float]:
     """Vehicle [m], ball [m], ball's velocity [m/s]."""
     return (
-        np.linalg.norm(flight.pos_w - run.pos_w[-1]),
-        np.linalg.norm(flight.ball_pos_w - run.ball_pos_w[-1]),
-        np.linalg.norm(flight.ball_vel_w - run.ball_vel_w[-1]),
+        norm(flight.pos_w - run.pos_w[-1]),
+        norm(flight.ball_pos_w - run.ball_pos_w[-1]),
+        norm(flight.ball_vel_w - run.ball_vel_w[-1]),
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("step", "near", "slow", "name", "precision"),
     [
         (2e-3, POSITION, VELOCITY, "hard_throw", "float32"),
@@ -80,7 +81,7 @@ def test_the_violent_whip_converges():
 def coarse_rope(segments: int) -> Scene:
     """The hard throw with a rope of few segments, without damping."""
     scene = load_scene(SCENES / "hard_throw.toml")
-    return dataclasses.replace(
+    return replace(
         scene,
         segments=segments,
         segment_length=0.33 / segments,
@@ -89,7 +90,7 @@ def coarse_rope(segments: int) -> Scene:
     )
 
 
-@pytest.mark.parametrize("segments", RESOLVED)
+@mark.parametrize("segments", RESOLVED)
 def test_order_of_the_step(segments):
     """Against MuJoCo, and by three steps of our own, which needs no other code."""
     scene = coarse_rope(segments)
@@ -101,13 +102,13 @@ def test_order_of_the_step(segments):
         assert np.log2(against[1] / against[2]) > ORDER
     for name in ("pos_w", "ball_pos_w", "ball_vel_w"):
         first, second, third = (getattr(flight, name) for flight in flights)
-        assert np.log2(np.linalg.norm(first - second) / np.linalg.norm(second - third)) > ORDER
+        assert np.log2(norm(first - second) / norm(second - third)) > ORDER
 
 
 def test_twist_is_all_that_is_left():
     """Without damping the fine step meets MuJoCo closer than the bodies' twist would
     allow with it.
     """
-    scene = dataclasses.replace(load_scene(SCENES / "hard_throw.toml"), joint_damping=0.0)
+    scene = replace(load_scene(SCENES / "hard_throw.toml"), joint_damping=0.0)
     vehicle, ball, _ = errors(fly(scene, 2.5e-4, "float64"), oracle(scene))
     assert max(vehicle, ball) < 3e-5

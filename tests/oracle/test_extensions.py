@@ -2,10 +2,12 @@
 they are not there.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -25,9 +27,7 @@ DISTINCT = 10.0  # times that agreement an effect must move the payload for the 
 
 def fine(plant):
     """The plant in float64 with a step of 1 ms."""
-    return dataclasses.replace(
-        plant, sim=dataclasses.replace(plant.sim, precision="float64", substep=1e-3)
-    )
+    return replace(plant, sim=replace(plant.sim, precision="float64", substep=1e-3))
 
 
 def swing(plant, effect=None):
@@ -69,13 +69,11 @@ def changed(plant, **parts):
     vehicle, rest = plant.vehicle, dict(parts)
     for name in ("thrust", "body", "motor"):
         if name in rest:
-            vehicle = dataclasses.replace(
-                vehicle, **{name: dataclasses.replace(getattr(vehicle, name), **rest.pop(name))}
-            )
-    return dataclasses.replace(
+            vehicle = replace(vehicle, **{name: replace(getattr(vehicle, name), **rest.pop(name))})
+    return replace(
         plant,
         vehicle=vehicle,
-        **{k: dataclasses.replace(getattr(plant, k), **v) for k, v in rest.items()},
+        **{k: replace(getattr(plant, k), **v) for k, v in rest.items()},
     )
 
 
@@ -106,7 +104,7 @@ number of segments.
 """
 
 
-@pytest.mark.parametrize("name", CASES)
+@mark.parametrize("name", CASES)
 def test_extension_is_the_reference_plants(name):
     plant = fine(paper_plant())
     extended = changed(plant, **CASES[name])
@@ -157,25 +155,25 @@ def test_release_by_pull_and_kick_are_the_reference_plants():
     (plain, _), _ = let_go(plant)
     early = changed(plant, release={"lag_tension": 0.05})
     opened, calm = let_go(early)
-    assert opened[0] == pytest.approx(opened[1], abs=2e-4)
+    assert opened[0] == approx(opened[1], abs=2e-4)
     assert plain - opened[0] > 5e-3
     kick = np.array([0.1, 0.0, -0.05])
     _, kicked = let_go(changed(early, release={"kick_w": tuple(kick)}))
     for before, after in zip(calm, kicked):
-        np.testing.assert_allclose(after - before, kick, atol=1e-6)
-    np.testing.assert_allclose(kicked[0], kicked[1], atol=5e-3)
+        assert_allclose(after - before, kick, atol=1e-6)
+    assert_allclose(kicked[0], kicked[1], atol=5e-3)
     _, shot = let_go(changed(early, release={"kick_along": 0.2}))
     for before, after in zip(calm, shot):
-        assert np.linalg.norm(after - before) == pytest.approx(0.2, rel=1e-6)
-    np.testing.assert_allclose(shot[0], shot[1], atol=5e-3)
+        assert norm(after - before) == approx(0.2, rel=1e-6)
+    assert_allclose(shot[0], shot[1], atol=5e-3)
 
 
-@pytest.mark.parametrize("segments", [1, 15])
+@mark.parametrize("segments", [1, 15])
 def test_a_payload_that_swings_through_pulls_by_more_than_its_weight(segments):
     plant = changed(fine(paper_plant()), rope={"segments": segments}, release={"lag": 0.05})
     (plain, _), _ = let_go(plant, ask=15)
     late, _ = let_go(changed(plant, release={"lag_tension": 0.05}), ask=15)
-    assert late[0] == pytest.approx(
+    assert late[0] == approx(
         late[1], abs=2e-4
     )  # of several rods, half the first one's load is left out
     assert late[0] - plain > 5e-3
@@ -206,11 +204,11 @@ def test_flight_under_drag_and_wind():
     def rates(_, y):
         air = y[3:] - wind
         across = np.cross([0.0, 0.0, 1.0], air)
-        push = side * across + lift * np.cross(air, across / np.linalg.norm(across)) - drag * air
+        push = side * across + lift * np.cross(air, across / norm(across)) - drag * air
         return np.concatenate(
             (
                 y[3:],
-                np.array([0, 0, -GRAVITY]) + np.linalg.norm(air) / plant.rope.payload_mass * push,
+                np.array([0, 0, -GRAVITY]) + norm(air) / plant.rope.payload_mass * push,
             )
         )
 
@@ -227,14 +225,14 @@ def test_flight_under_drag_and_wind():
         atol=1e-12,
         dense_output=True,
     )
-    assert sim.get("time_to_impact")[0] == pytest.approx(path.t[-1], abs=1e-7)
-    np.testing.assert_allclose(sim.get("landing_w")[0], path.y[:3, -1], atol=1e-6)
+    assert sim.get("time_to_impact")[0] == approx(path.t[-1], abs=1e-7)
+    assert_allclose(sim.get("landing_w")[0], path.y[:3, -1], atol=1e-6)
     away = np.array([0.1, 0.3])
     gone = flown(plant.rope, plant.air, *(np.tile(x, (2, 1)) for x in (pos, vel)), away)
-    np.testing.assert_allclose(np.hstack(gone), path.sol(away).T, atol=1e-6)
+    assert_allclose(np.hstack(gone), path.sol(away).T, atol=1e-6)
     at = path.sol(np.linspace(0, path.t[-1], plant.release.clearance_samples))[:3]
-    nearest = np.linalg.norm(at.T - sim.get("release_pos_w")[0], axis=1).min()
-    assert sim.get("clearance")[0] == pytest.approx(nearest, abs=1e-6)
+    nearest = norm(at.T - sim.get("release_pos_w")[0], axis=1).min()
+    assert sim.get("clearance")[0] == approx(nearest, abs=1e-6)
 
 
 def spring_pendulum(
@@ -248,7 +246,7 @@ def spring_pendulum(
     damping = 1.4 * np.sqrt(mass / give)
 
     def rates(_, y):
-        reach = np.linalg.norm(y[:2])
+        reach = norm(y[:2])
         along = y[:2] / reach
         pull = (reach - length) / give + damping * y[2:] @ along
         return np.concatenate((y[2:], down - pull / mass * along))
@@ -258,7 +256,7 @@ def spring_pendulum(
     ).y[:2, -1]
 
 
-@pytest.mark.parametrize("steps", [12, 18])
+@mark.parametrize("steps", [12, 18])
 def test_a_rope_that_gives_is_a_spring(steps):
     """A thousand times heavier vehicle holds the mount still; what the rope's give changes is what
     a spring changes.
@@ -270,19 +268,19 @@ def test_a_rope_that_gives_is_a_spring(steps):
         for name in ("p_gain", "i_gain", "d_gain")
     }
     grown |= {"max_thrust": heavy * v.controller.max_thrust, "feedforward_gain": (0.0, 0.0, 0.0)}
-    v = dataclasses.replace(
+    v = replace(
         v,
-        body=dataclasses.replace(
+        body=replace(
             v.body, mass=heavy * v.body.mass, inertia=tuple(heavy * x for x in v.body.inertia)
         ),
-        thrust=dataclasses.replace(v.thrust, k_f=heavy * v.thrust.k_f),
-        controller=dataclasses.replace(v.controller, **grown),
-        battery=dataclasses.replace(
+        thrust=replace(v.thrust, k_f=heavy * v.thrust.k_f),
+        controller=replace(v.controller, **grown),
+        battery=replace(
             v.battery, resistance=v.battery.resistance / heavy, capacity=heavy * v.battery.capacity
         ),
     )
     plant = changed(
-        dataclasses.replace(plant, vehicle=v),
+        replace(plant, vehicle=v),
         rope={"payload_offset": 0.0, "payload_inertia": 1e-9, "rope_mass": 1e-5},
     )
     tilt = np.array([np.sin(angle), 0.0, -np.cos(angle)])
@@ -303,10 +301,8 @@ def test_a_rope_that_gives_is_a_spring(steps):
     give, mass, length = 2e-3, plant.rope.payload_mass, plant.rope.length
     expected = [spring_pendulum(g, mass, length, angle, 0.02 * steps) for g in (give, 1e-6)]
     change = hung(give) - hung(0.0)
-    assert np.linalg.norm(change) > 5e-4
-    np.testing.assert_allclose(
-        change, expected[0] - expected[1], atol=0.12 * np.linalg.norm(change)
-    )  # the mount drifts
+    assert norm(change) > 5e-4
+    assert_allclose(change, expected[0] - expected[1], atol=0.12 * norm(change))  # the mount drifts
 
 
 def test_ground_effect_lifts_as_the_formula_says():
@@ -321,15 +317,13 @@ def test_ground_effect_lifts_as_the_formula_says():
         sim.step()
         rise.append(sim.get("vel_w")[0, 2] / 1e-3)
     ratio = vehicle.rotors.radius / (4 * height)
-    assert rise[1] - rise[0] == pytest.approx(effect * (1 / (1 - ratio**2) - 1) * GRAVITY, rel=2e-3)
+    assert rise[1] - rise[0] == approx(effect * (1 / (1 - ratio**2) - 1) * GRAVITY, rel=2e-3)
 
 
 def test_asymmetric_motor_is_first_order_one_way():
     vehicle = plain_vehicle(paper_plant().vehicle)
-    slow = dataclasses.replace(vehicle.motor, kind="asymmetric", time_constant_down=0.1)
-    sim = bare_quadrotor(
-        dataclasses.replace(vehicle, motor=slow), 1, precision="float64", step=5e-4
-    )
+    slow = replace(vehicle.motor, kind="asymmetric", time_constant_down=0.1)
+    sim = bare_quadrotor(replace(vehicle, motor=slow), 1, precision="float64", step=5e-4)
     sim.place(np.array([[0.0, 0.0, 1.0]]))
     before = sim.get("motor_speed")[0, 0]
     sim.set_command(np.array([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]]))
@@ -338,10 +332,10 @@ def test_asymmetric_motor_is_first_order_one_way():
     acting = 3 * 0.02 - vehicle.queue.delay
     target = np.sqrt(0.5) * before  # of half the thrust
     expected = target + (before - target) * np.exp(-acting / 0.1)
-    assert sim.get("motor_speed")[0, 0] == pytest.approx(expected, rel=1e-6)
+    assert sim.get("motor_speed")[0, 0] == approx(expected, rel=1e-6)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("part", "message"),
     [
         ({"rope": {"payload_drag": -1.0}}, "payload_drag"),
@@ -353,10 +347,10 @@ def test_asymmetric_motor_is_first_order_one_way():
     ],
 )
 def test_unphysical_values_are_refused(part, message):
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         HybridSim(changed(paper_plant(), **part), 1)
 
 
 def test_the_reference_refuses_what_it_does_not_know():
-    with pytest.raises(ValueError, match=r"does not know release\.rope_tail"):
+    with raises(ValueError, match=r"does not know release\.rope_tail"):
         ReferencePlant(changed(paper_plant(), release={"rope_tail": 1.0}))

@@ -4,14 +4,14 @@ import math
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from pytest import mark
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
 
 PIXEL_TOLERANCE = 1e-9  # px; the bar: 1e4 times the rounding of float64 at 1,000 px
-LENSES = pytest.mark.parametrize(
+LENSES = mark.parametrize(
     "params",
     [
         FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5),

@@ -3,11 +3,12 @@
 The reference shares the equations and no code: float64 NumPy and MuJoCo's rope without twist, RK4.
 """
 
-import dataclasses
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import mark
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams, QueueParams
@@ -29,10 +30,10 @@ RELEASE = np.arange(COUNT) % 2 == 1
 def plant() -> PlantParams:
     """The paper's plant with a delay and a lag that fall inside substeps."""
     base = paper_plant()
-    return dataclasses.replace(
+    return replace(
         base,
-        vehicle=dataclasses.replace(base.vehicle, queue=QueueParams(0.0213)),
-        release=dataclasses.replace(base.release, lag=LAG),
+        vehicle=replace(base.vehicle, queue=QueueParams(0.0213)),
+        release=replace(base.release, lag=LAG),
     )
 
 
@@ -53,12 +54,10 @@ def reference() -> ReferencePlant:
     return flown
 
 
-@pytest.mark.parametrize("precision", ["float64"])
+@mark.parametrize("precision", ["float64"])
 def test_whole_plant(precision):
     pos, vel = start()
-    sim = HybridSim(
-        dataclasses.replace(plant(), sim=numerics(SUBSTEPS[precision], precision)), COUNT
-    )
+    sim = HybridSim(replace(plant(), sim=numerics(SUBSTEPS[precision], precision)), COUNT)
     sim.place(pos, vel_w=vel)
     separation = np.full(COUNT, np.nan)
     for k, command in enumerate(random_commands(0, STEPS, COUNT)):
@@ -69,14 +68,10 @@ def test_whole_plant(precision):
         )
     state = reference().state
     bound = WITHIN[precision]
-    assert np.linalg.norm(sim.get("pos_w") - state.pos_w, axis=1).max() < bound
+    assert norm(sim.get("pos_w") - state.pos_w, axis=1).max() < bound
     held = ~RELEASE
-    assert (
-        np.linalg.norm(sim.get("payload_pos_w") - state.payload_pos_w, axis=1)[held].max() < bound
-    )
+    assert norm(sim.get("payload_pos_w") - state.payload_pos_w, axis=1)[held].max() < bound
     assert np.abs(sim.get("voltage") - state.battery_voltage).max() < VOLTAGE
     np.testing.assert_array_equal(sim.get("attached") != 0, state.attached)
     np.testing.assert_allclose(separation, reference().landing.separation_time, atol=1e-6)
-    assert np.linalg.norm(state.pos_w - pos, axis=1).min() > 0.1, (
-        "the vehicles must have gone somewhere"
-    )
+    assert norm(state.pos_w - pos, axis=1).min() > 0.1, "the vehicles must have gone somewhere"

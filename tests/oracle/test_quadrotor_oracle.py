@@ -2,11 +2,13 @@
 them.
 """
 
-import dataclasses
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from sim.hybrid import HybridSim
 from sim.params import QueueParams, VehicleParams
@@ -38,13 +40,11 @@ STATES = {
 
 def vehicle_with(delay: float = 0.0213, **kinds: str) -> VehicleParams:
     """The paper's vehicle; its command switches inside a substep."""
-    vehicle = dataclasses.replace(paper_plant().vehicle, queue=QueueParams(delay))
-    parts = {
-        name: dataclasses.replace(getattr(vehicle, name), kind=kind) for name, kind in kinds.items()
-    }
+    vehicle = replace(paper_plant().vehicle, queue=QueueParams(delay))
+    parts = {name: replace(getattr(vehicle, name), kind=kind) for name, kind in kinds.items()}
     if kinds.get("controller") == "motor_mixing":
-        parts["controller"] = dataclasses.replace(parts["controller"], gyro_share=(0.4, 0.5, 1.3))
-    return dataclasses.replace(vehicle, **parts)
+        parts["controller"] = replace(parts["controller"], gyro_share=(0.4, 0.5, 1.3))
+    return replace(vehicle, **parts)
 
 
 @lru_cache
@@ -71,18 +71,16 @@ def flown(vehicle: VehicleParams, step: float, steps: int, precision: str) -> Hy
     return sim
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@mark.parametrize("precision", ["float32", "float64"])
 def test_a_second_of_full_range_commands(precision):
     vehicle = vehicle_with()
     body, _ = reference(vehicle, 5e-4, STEPS)  # 0.03 mm from half of it
-    apart = np.linalg.norm(
-        flown(vehicle, SUBSTEP, STEPS, precision).get("pos_w") - body[:, :3], axis=1
-    )
+    apart = norm(flown(vehicle, SUBSTEP, STEPS, precision).get("pos_w") - body[:, :3], axis=1)
     assert apart.max() < WITHIN
-    assert np.linalg.norm(body[:, :3], axis=1).min() > 0.1, "the vehicles must have gone somewhere"
+    assert norm(body[:, :3], axis=1).min() > 0.1, "the vehicles must have gone somewhere"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "changes",
     [
         {},
@@ -103,9 +101,7 @@ def test_every_state_of_every_block(changes):
     body, blocks = reference(vehicle, 1e-3, 10)
     sim = flown(vehicle, 1e-3, 10, "float64")
     for name, columns in STATES.items():
-        np.testing.assert_allclose(
-            sim.get(name), body[:, columns], atol=SAME_EQUATIONS * 100, err_msg=name
-        )
+        assert_allclose(sim.get(name), body[:, columns], atol=SAME_EQUATIONS * 100, err_msg=name)
     assert np.abs(sim.get("pos_w") - body[:, :3]).max() < SAME_EQUATIONS
     inner = {
         "setpoint": blocks[:, 0:3],
@@ -118,8 +114,8 @@ def test_every_state_of_every_block(changes):
     if vehicle.motor.kind == "first_order":
         inner["motor_speed"] = blocks[:, 9:13]
     for name, expected in inner.items():
-        np.testing.assert_allclose(sim.get(name), expected, rtol=1e-4, atol=1e-4, err_msg=name)
-    np.testing.assert_allclose(sim.get("charge_used"), blocks[:, 13], rtol=1e-6, atol=1e-12)
+        assert_allclose(sim.get(name), expected, rtol=1e-4, atol=1e-4, err_msg=name)
+    assert_allclose(sim.get("charge_used"), blocks[:, 13], rtol=1e-6, atol=1e-12)
 
 
 def test_orders_of_the_integrators():
@@ -137,5 +133,5 @@ def test_orders_of_the_integrators():
 
     for integrator, order in (("euler", 1.0), ("rk4", 4.0)):
         ends = [end(integrator, h) for h in (1e-3, 5e-4, 2.5e-4)]
-        seen = np.log2(np.linalg.norm(ends[0] - ends[1]) / np.linalg.norm(ends[1] - ends[2]))
-        assert seen == pytest.approx(order, abs=0.35)
+        seen = np.log2(norm(ends[0] - ends[1]) / norm(ends[1] - ends[2]))
+        assert seen == approx(order, abs=0.35)

@@ -2,10 +2,11 @@
 in NumPy.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import mark, raises
 
 from bench.mujoco_c import timed_scene
 from tests.oracle.bare_rope import BareScene
@@ -27,16 +28,16 @@ throw [m].
 
 
 def hard_throw(**changes):
-    return dataclasses.replace(load_scene(SCENES / "hard_throw.toml"), **changes)
+    return replace(load_scene(SCENES / "hard_throw.toml"), **changes)
 
 
 def apart(run, bare):
     """Largest distance of ball and quadrotor [m]."""
-    ball = np.linalg.norm(run.ball_pos_w[-1] - bare.ball[0])
-    return max(ball, np.linalg.norm(run.pos_w[-1] - bare.body[:3]))
+    ball = norm(run.ball_pos_w[-1] - bare.ball[0])
+    return max(ball, norm(run.pos_w[-1] - bare.body[:3]))
 
 
-@pytest.mark.parametrize("name", ["hard_throw", "whip"])
+@mark.parametrize("name", ["hard_throw", "whip"])
 def test_oracle_is_converged(name):
     scene = load_scene(SCENES / f"{name}.toml")
     fine, coarse = converged(scene, 20e-6), converged(scene, 40e-6)
@@ -47,7 +48,7 @@ def test_oracle_is_converged(name):
 def test_whip_goes_slack_and_snaps_far_from_the_fold():
     scene = load_scene(SCENES / "whip.toml")
     run = converged(scene, 40e-6, np.arange(0.0, 0.5001, 0.01))
-    extent = np.linalg.norm(run.cable_points_w[:, -1] - run.cable_points_w[:, 0], axis=1)
+    extent = norm(run.cable_points_w[:, -1] - run.cable_points_w[:, 0], axis=1)
     extent /= scene.segments * scene.segment_length
     slackest = np.argmin(extent)
     assert extent[slackest] < 0.8
@@ -59,7 +60,7 @@ def test_whip_goes_slack_and_snaps_far_from_the_fold():
         assert np.abs(angles[1::2]).max() < np.radians(15.0)
 
 
-@pytest.mark.parametrize("segments", [1, 3, 15])
+@mark.parametrize("segments", [1, 3, 15])
 def test_two_ropes_agree_without_damping(segments):
     scene = hard_throw(
         segments=segments,
@@ -84,7 +85,7 @@ def test_two_ropes_differ_by_twist_in_the_damping_only():
     run = converged(scene)
     assert apart(run, bare) < TWIST_DAMPING
     undamped = converged(hard_throw(joint_damping=0.0))
-    assert np.linalg.norm(undamped.ball_pos_w[-1] - run.ball_pos_w[-1]) > 50 * TWIST_DAMPING
+    assert norm(undamped.ball_pos_w[-1] - run.ball_pos_w[-1]) > 50 * TWIST_DAMPING
 
 
 def test_fold_beyond_a_right_angle():
@@ -96,18 +97,18 @@ def test_fold_beyond_a_right_angle():
     for bare in (fine, coarse):
         bare.advance(scene.duration)
     assert np.all(np.isfinite(fine.body))
-    assert np.linalg.norm(fine.ball[0] - coarse.ball[0]) < 1e-7
+    assert norm(fine.ball[0] - coarse.ball[0]) < 1e-7
 
 
 def test_oracle_refuses_times_off_its_steps():
-    with pytest.raises(ValueError, match=r"0\.5 s is no multiple of the step 0\.0007"):
+    with raises(ValueError, match=r"0\.5 s is no multiple of the step 0\.0007"):
         converged(load_scene(SCENES / "whip.toml"), 7e-4)
 
 
 def test_scene_file_with_an_unknown_key(tmp_path):
     path = tmp_path / "scene.toml"
     path.write_text((SCENES / "hard_throw.toml").read_text().replace("mount =", "mounts ="))
-    with pytest.raises(ValueError, match=r"scene\.toml.*mounts.*mount"):
+    with raises(ValueError, match=r"scene\.toml.*mounts.*mount"):
         load_scene(path)
 
 

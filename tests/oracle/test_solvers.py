@@ -2,17 +2,19 @@
 and start anew as it does; closed forms of a box and of two cables."""
 
 import contextlib
-import dataclasses
 import gc
 import importlib.util
 import math
 import sys
 import weakref
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import warp as wp
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, importorskip, mark, param, raises
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
@@ -30,10 +32,10 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant
 
 SCENE = load_scene(SCENES / "hard_throw.toml")
-needs_physx = pytest.mark.skipif(
+needs_physx = mark.skipif(
     importlib.util.find_spec("ovphysx") is None, reason="PhysX is not installed: make physx"
 )
-PHYSX = pytest.param("physx", 0.002, 0.012, marks=needs_physx)
+PHYSX = param("physx", 0.002, 0.012, marks=needs_physx)
 SOLVERS = [("exchanged_chain", 0.002, 0.002), ("mujoco_warp", 0.0005, 0.001), PHYSX]
 """Name, substep [s], and how far a second of random flight may end from the fused chain [m]; PhysX
 is of first order. A separation within a substep frees the vehicle at its end only."""
@@ -41,8 +43,8 @@ is of first order. A separation within a substep frees the vehicle at its end on
 
 def on(plant: PlantParams, solver: str, substep: float) -> PlantParams:
     """The plant with its bodies in a solver."""
-    numerics = dataclasses.replace(plant.sim, solver=solver, substep=substep)
-    return dataclasses.replace(plant, sim=numerics)
+    numerics = replace(plant.sim, solver=solver, substep=substep)
+    return replace(plant, sim=numerics)
 
 
 def off_converged(solver: str, substep: float) -> float:
@@ -52,13 +54,13 @@ def off_converged(solver: str, substep: float) -> float:
         for name, step in ((solver, substep), ("chain", 2e-4))
     )
     pairs = ((found.ball_pos_w, truth.ball_pos_w), (found.pos_w, truth.pos_w))
-    return max(float(np.linalg.norm(a - b)) for a, b in pairs)
+    return max(float(norm(a - b)) for a, b in pairs)
 
 
 def test_the_exchange_costs_the_chain_no_accuracy():
     """Measured 0.15 mm of the ball and 0.22 mm of the vehicle, fused and exchanged alike."""
     exchanged, fused = (off_converged(name, 2e-3) for name in ("exchanged_chain", "chain"))
-    assert exchanged == pytest.approx(fused, abs=2e-5)
+    assert exchanged == approx(fused, abs=2e-5)
     assert exchanged < 4e-4
 
 
@@ -72,15 +74,15 @@ def test_physx_converges_onto_the_chain():
     """Of first order in its step; measured 8.1 and 2.0 mm."""
     coarse, fine = (off_converged("physx", step) for step in (2e-3, 5e-4))
     assert coarse < 0.01
-    assert coarse / fine == pytest.approx(4.0, rel=0.15)
+    assert coarse / fine == approx(4.0, rel=0.15)
 
 
 def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> HybridSim:
     """Random vehicles and ropes, a second of drawn commands, and releases on the way."""
     experiment = config.load(Experiment, config.find("train", "state"))
     plant = on(plant_of(experiment), solver, substep)
-    lag = dataclasses.replace(plant.release, lag=0.1113)  # within a substep
-    plant, spreads = dataclasses.replace(plant, release=lag), experiment.task.start
+    lag = replace(plant.release, lag=0.1113)  # within a substep
+    plant, spreads = replace(plant, release=lag), experiment.task.start
     sim = HybridSim(plant, count, device, 4, ropes=tether_lengths(plant.rope, spreads))
     sim.randomize(spreads)
     rng, weight = np.random.default_rng(5), GRAVITY * plant.total_mass
@@ -92,19 +94,19 @@ def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> 
     return sim
 
 
-@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+@mark.parametrize(("solver", "substep", "near"), SOLVERS)
 def test_a_solver_flies_and_lets_go_as_the_fused_chain_does(solver, substep, near):
     """Masses, cable lengths, batteries, latch and lag of each environment are the same: a
     twentieth more mass alone would move a vehicle by half a metre."""
     ours, theirs = flown("chain", 0.002), flown(solver, substep)
     for name in ("attached", "release_timer", "separation_time", "mass_scale"):
-        np.testing.assert_allclose(theirs.get(name), ours.get(name), atol=1e-5, err_msg=name)
+        assert_allclose(theirs.get(name), ours.get(name), atol=1e-5, err_msg=name)
     for name in ("pos_w", "payload_pos_w", "landing_w", "release_pos_w"):
-        np.testing.assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
-    np.testing.assert_allclose(theirs.get("voltage"), ours.get("voltage"), atol=1e-3)
+        assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
+    assert_allclose(theirs.get("voltage"), ours.get("voltage"), atol=1e-3)
 
 
-@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+@mark.parametrize(("solver", "substep", "near"), SOLVERS)
 def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
     """One environment stands still, another's velocity is no number: the third flies as ever."""
     sims = [HybridSim(on(paper_plant(), solver, substep), 3) for _ in range(2)]
@@ -118,14 +120,14 @@ def test_what_is_masked_or_broken_is_put_back(solver, substep, near):
         sick.step(mask)
         well.step()
     assert sick.get("status").tolist() == [0, NONFINITE, 0]
-    np.testing.assert_array_equal(sick.get("pos_w")[0], 0.0)
-    np.testing.assert_array_equal(sick.get("payload_pos_w")[2], well.get("payload_pos_w")[2])
+    assert_array_equal(sick.get("pos_w")[0], 0.0)
+    assert_array_equal(sick.get("payload_pos_w")[2], well.get("payload_pos_w")[2])
     sick.place(np.zeros((3, 3)))
     sick.step()
     assert not sick.get("status").any()
 
 
-@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+@mark.parametrize(("solver", "substep", "near"), SOLVERS)
 def test_what_stood_still_flies_on_from_there(solver, substep, near):
     sim = HybridSim(on(paper_plant(), solver, substep), 2)
     sim.set_command(np.zeros((2, 4)))
@@ -135,23 +137,21 @@ def test_what_stood_still_flies_on_from_there(solver, substep, near):
     for _ in range(5):
         sim.step()
     assert first[2] < -0.5
-    np.testing.assert_allclose(sim.get("vel_w")[1], first, atol=1e-3)
+    assert_allclose(sim.get("vel_w")[1], first, atol=1e-3)
 
 
 def hanging(name: str, **vehicle) -> HybridSim:
     """A payload of ``configs/rope`` on a vehicle without blocks, whose command is a wrench."""
     experiment = config.load(Experiment, config.find("train", f"state_{name}"))
     plant = on(plant_of(experiment), "mujoco_warp", 0.00025)
-    body = dataclasses.replace(plant.vehicle.body, **vehicle)
+    body = replace(plant.vehicle.body, **vehicle)
     controller = plant.vehicle.controller
-    strong = dataclasses.replace(
-        controller, max_thrust=max(controller.max_thrust, GRAVITY * body.mass)
-    )
-    without = dataclasses.replace(plant.vehicle, body=body, controller=strong)
-    return HybridSim(dataclasses.replace(plant, vehicle=without), 1, direct=True)
+    strong = replace(controller, max_thrust=max(controller.max_thrust, GRAVITY * body.mass))
+    without = replace(plant.vehicle, body=body, controller=strong)
+    return HybridSim(replace(plant, vehicle=without), 1, direct=True)
 
 
-@pytest.mark.parametrize("name", ["box", "two_cables", "rod_gripper"])
+@mark.parametrize("name", ["box", "two_cables", "rod_gripper"])
 def test_other_payloads_hang_where_the_geometry_says(name):
     """And weigh what they weigh: a vehicle that lifts them by their weight stays."""
     sim = hanging(name)
@@ -159,9 +159,9 @@ def test_other_payloads_hang_where_the_geometry_says(name):
     for _ in range(25):
         sim.set_command(np.array([[weight, 0.0, 0.0, 0.0]]))
         sim.step()
-    np.testing.assert_allclose(sim.get("pos_w"), 0.0, atol=2e-3)
+    assert_allclose(sim.get("pos_w"), 0.0, atol=2e-3)
     below = sim.get("pos_w")[0, 2] + rope.mount[2] - sim.get("payload_pos_w")[0, 2]
-    assert below == pytest.approx(rope.length + rope.payload_offset, abs=2e-3)
+    assert below == approx(rope.length + rope.payload_offset, abs=2e-3)
 
 
 def test_two_cables_turn_as_a_bifilar_pendulum():
@@ -184,7 +184,7 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
     inertia = rope.payload_mass / 12.0 * (rope.payload_sides[0] ** 2 + rope.payload_sides[1] ** 2)
     stiff = rope.payload_mass * GRAVITY * rope.cables_apart**2
     expected = math.sqrt(stiff / (4.0 * inertia * rope.length))
-    assert math.pi / np.diff(crossings).mean() == pytest.approx(expected, rel=0.02)
+    assert math.pi / np.diff(crossings).mean() == approx(expected, rel=0.02)
 
 
 def test_a_cable_pulls_or_is_slack():
@@ -197,8 +197,8 @@ def test_a_cable_pulls_or_is_slack():
         for _ in range(8):
             sim.set_command(np.array([[thrust, 0.0, 0.0, 0.0]]))
             sim.step()
-        apart = np.linalg.norm(sim.get("pos_w") - sim.get("payload_pos_w"))
-        assert (apart < reach - 0.01) if slack else apart == pytest.approx(reach, abs=3e-3)
+        apart = norm(sim.get("pos_w") - sim.get("payload_pos_w"))
+        assert (apart < reach - 0.01) if slack else apart == approx(reach, abs=3e-3)
 
 
 def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch):
@@ -224,43 +224,43 @@ def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch
     assert made[0]() is not None, parts
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize(("solver", "substep", "near"), SOLVERS)
+@mark.gpu
+@mark.parametrize(("solver", "substep", "near"), SOLVERS)
 def test_a_solver_flies_on_a_gpu_as_the_fused_chain_does(solver, substep, near):
     if solver == "mujoco_warp":
-        pytest.importorskip("mujoco_warp")
+        importorskip("mujoco_warp")
     ours, theirs = (
         flown(*build, device="cuda:0") for build in (("chain", 0.002), (solver, substep))
     )
     for name in ("pos_w", "payload_pos_w", "landing_w"):
-        np.testing.assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
+        assert_allclose(theirs.get(name), ours.get(name), atol=near, err_msg=name)
 
 
 def test_what_a_solver_cannot_hold_is_refused():
     box = plant_of(config.load(Experiment, config.find("train", "state_box")))
-    with pytest.raises(ValueError, match=r"payload_sides is .*'mujoco_warp'"):
+    with raises(ValueError, match=r"payload_sides is .*'mujoco_warp'"):
         HybridSim(on(box, "chain", 0.002), 1)
     plant = paper_plant()
-    giving = dataclasses.replace(plant.rope, compliance=1e-3)
-    with pytest.raises(ValueError, match="'exchanged_chain' with compliance"):
-        HybridSim(dataclasses.replace(on(plant, "exchanged_chain", 0.002), rope=giving), 1)
+    giving = replace(plant.rope, compliance=1e-3)
+    with raises(ValueError, match="'exchanged_chain' with compliance"):
+        HybridSim(replace(on(plant, "exchanged_chain", 0.002), rope=giving), 1)
     in_joint = (LawParams("rope joint", (), "joint_rate", 1e-3),)
-    with pytest.raises(ValueError, match="law on the rope's joint"):
-        HybridSim(dataclasses.replace(on(plant, "exchanged_chain", 0.002), laws=in_joint), 1)
+    with raises(ValueError, match="law on the rope's joint"):
+        HybridSim(replace(on(plant, "exchanged_chain", 0.002), laws=in_joint), 1)
     exact = on(plant, "mujoco_warp", 0.002)
-    exact = dataclasses.replace(exact, sim=dataclasses.replace(exact.sim, precision="float64"))
-    with pytest.raises(ValueError, match="precision 'float64'; expected 'float32'"):
+    exact = replace(exact, sim=replace(exact.sim, precision="float64"))
+    with raises(ValueError, match="precision 'float64'; expected 'float32'"):
         HybridSim(exact, 1)
-    with pytest.raises(ValueError, match="half the height of the box"):
-        dataclasses.replace(plant.rope, payload_sides=(0.1, 0.1, 0.1))
-    with pytest.raises(ValueError, match=r"expected a box .* and no gripper"):
-        dataclasses.replace(plant.rope, cables_apart=0.06)
+    with raises(ValueError, match="half the height of the box"):
+        replace(plant.rope, payload_sides=(0.1, 0.1, 0.1))
+    with raises(ValueError, match=r"expected a box .* and no gripper"):
+        replace(plant.rope, cables_apart=0.06)
 
 
 def test_the_command_line_and_the_configuration_choose_the_solver():
     args = build_parser().parse_args(["compare", "--solver", "physx", "--set", "rope.length=0.4"])
     assert args.overrides == ["sim.solver=physx", "rope.length=0.4"]
-    with pytest.raises(ConfigError, match=r"solver.*exchanged_chain"):
+    with raises(ConfigError, match=r"solver.*exchanged_chain"):
         load_policy("state", None, ["sim.solver=bullet"])
 
 
@@ -278,22 +278,22 @@ def test_a_vehicle_that_is_held_is_held_in_the_solver_too():
 
 def test_the_last_rod_carries_the_ball():
     """Against a thousand pieces of the rod."""
-    rope = dataclasses.replace(paper_plant().rope, rope_mass=0.05, payload_inertia=3e-5)
+    rope = replace(paper_plant().rope, rope_mass=0.05, payload_inertia=3e-5)
     pieces, share = 1000, rope.segment_mass / 1000
     heights = -rope.segment_length * (np.arange(pieces) + 0.5) / pieces
     heights = np.append(heights, -rope.segment_length - rope.payload_offset)
     masses = np.append(np.full(pieces, share), rope.payload_mass)
     centre = np.average(heights, weights=masses)
     inertia = masses @ (heights - centre) ** 2 + rope.payload_inertia
-    assert rod_inertial(rope, True) == pytest.approx((masses.sum(), centre, inertia), rel=1e-5)
+    assert rod_inertial(rope, True) == approx((masses.sum(), centre, inertia), rel=1e-5)
 
 
-@pytest.mark.parametrize("drag", [0.0, 0.05])
+@mark.parametrize("drag", [0.0, 0.05])
 def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
     """Where a hinge's rate is twice the rod's; with the payload's drag."""
     plant = paper_plant()
-    rope = dataclasses.replace(plant.rope, payload_drag=drag)
-    plant = dataclasses.replace(plant, rope=rope)
+    rope = replace(plant.rope, payload_drag=drag)
+    plant = replace(plant, rope=rope)
     segments, tilt = plant.rope.segments, math.radians(60.0)
     direction = np.tile([0.0, math.sin(tilt), -math.cos(tilt)], (1, segments, 1))
     rate = np.tile([6.0, 0.0, 0.0], (1, segments, 1))
@@ -305,4 +305,4 @@ def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
         for _ in range(5):
             sim.step()
         found.append(sim.get("payload_vel_w"))
-    np.testing.assert_allclose(found[1], found[0], atol=0.01)
+    assert_allclose(found[1], found[0], atol=0.01)

@@ -1,6 +1,7 @@
 """Two vehicles on one load against MuJoCo's bodies, with a release at two times."""
 
 import numpy as np
+from numpy.testing import assert_allclose
 
 from tests.physics.test_team import around, commands, hung, plant
 from visthrow.cooperative.referee import MujocoTeam
@@ -19,6 +20,6 @@ def test_the_load_and_both_vehicles_fly_as_on_mujoco():
     tree, referee = sims
     assert not tree.get("attached").any()
     assert np.abs(tree.get("landing_w")[:, :2]).max() > 0.2
-    np.testing.assert_allclose(tree.load[0].numpy(), referee.load[0].numpy(), atol=LOAD)
-    np.testing.assert_allclose(tree.get("landing_w"), referee.get("landing_w"), atol=4.0 * LOAD)
-    np.testing.assert_allclose(tree.get("pos_w"), referee.get("pos_w"), atol=2.0 * LOAD)
+    assert_allclose(tree.load[0].numpy(), referee.load[0].numpy(), atol=LOAD)
+    assert_allclose(tree.get("landing_w"), referee.get("landing_w"), atol=4.0 * LOAD)
+    assert_allclose(tree.get("pos_w"), referee.get("pos_w"), atol=2.0 * LOAD)

@@ -17,7 +17,6 @@ What another page has run already, with the same arguments and files, is not run
 wrote is copied. A training is evaluated with 4 throws for 200."""
 
 import contextlib
-import dataclasses
 import hashlib
 import io
 import os
@@ -27,6 +26,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
@@ -60,7 +60,7 @@ PATIENCE = 300.0
 """For the processes of one block [s]."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Block:
     """One fence.
 

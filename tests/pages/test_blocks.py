@@ -1,6 +1,6 @@
 """The runner of blocks catches a page that shows what does not work."""
 
-import pytest
+from pytest import mark, raises
 
 from tests.pages.blocks import ROOT, Runner, blocks_of, pages
 
@@ -48,7 +48,7 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
     assert (tmp_path / "again_md" / "made.txt").exists()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "said"),
     [
         ("```sh\nfalse\n```\n", "status 1"),
@@ -69,11 +69,11 @@ def test_a_good_page_runs_and_nothing_runs_twice(tmp_path, capfd):
     ],
 )
 def test_what_does_not_run_fails(tmp_path, text, said):
-    with pytest.raises((AssertionError, SystemExit), match=said):
+    with raises((AssertionError, SystemExit), match=said):
         run(tmp_path, text)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "said"),
     [
         ("<!-- not run: no idea -->\n```sh\nfalse\n```\n", "no reason"),
@@ -86,7 +86,7 @@ def test_what_does_not_run_fails(tmp_path, text, said):
 def test_what_hides_a_block_fails(tmp_path, text, said):
     page = tmp_path / "page.md"
     page.write_text(text)
-    with pytest.raises(ValueError, match=said):
+    with raises(ValueError, match=said):
         blocks_of(page, root=tmp_path)
 
 

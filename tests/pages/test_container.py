@@ -9,7 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
-import pytest
+from pytest import mark, skip
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGE = "visthrow-test"
@@ -28,9 +28,9 @@ def builder(base: str) -> str:
     """Return a program that can build images on a base; skips the test where there is none."""
     name = next((name for name in BUILDERS if succeeds(name, "info")), None)
     if name is None:
-        pytest.skip(f"none of {', '.join(BUILDERS)} is installed and answers")
+        skip(f"none of {', '.join(BUILDERS)} is installed and answers")
     if not succeeds(name, "inspect", "--type", "image", base) and not succeeds(name, "pull", base):
-        pytest.skip(f"{name} cannot pull {base}")
+        skip(f"{name} cannot pull {base}")
     return name
 
 
@@ -45,7 +45,7 @@ def visthrow(name: str, words: str) -> str:
     return subprocess.check_output([*command, *words.split()], text=True)
 
 
-@pytest.mark.slow
+@mark.slow
 def test_the_image_flies_on_recorded_poses():
     base = os.environ.get("VISTHROW_BASE", "python:3.12-slim")
     name = builder(base)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from pytest import approx, mark, raises
 
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
@@ -40,7 +40,7 @@ def run(name: str, words: str, monkeypatch) -> None:
     runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
 
 
-@pytest.mark.parametrize("name", RUNS)
+@mark.parametrize("name", RUNS)
 def test_an_example_runs(name, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(trainer, "EVALUATED", 4)
@@ -71,7 +71,7 @@ def test_a_camera_is_calibrated(tmp_path, monkeypatch, capsys):
     )
     run("calibrate_camera", words, monkeypatch)
     made = config.load(CameraParams, tmp_path / "my_camera.toml").fisheye
-    assert made.fx == pytest.approx(drawn.LENS.fx, rel=0.01)
+    assert made.fx == approx(drawn.LENS.fx, rel=0.01)
 
 
 def test_a_flight_is_exported(tmp_path, monkeypatch, capsys):
@@ -85,7 +85,7 @@ def test_a_reward_term_is_trained_with(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rewards, "kinetic", rewards.kinetic)
     monkeypatch.setattr(trainer, "EVALUATED", 4)
-    with pytest.raises(SystemExit, match="0"):
+    with raises(SystemExit, match="0"):
         run(
             "add_reward",
             "train laptop --iterations 1 --set ppo.environments=8 --out calmer --device cpu",
@@ -104,7 +104,7 @@ def test_a_detector_finds_what_its_network_says(monkeypatch):
     seen = images.DETECTORS["mine"](lens, camera.payload_radius, camera.goal_side).detect(picture)
     left, right = program["network"](picture)[1][::2]
     (u, _), _ = lens.project(torch.tensor(seen.ball.ray_c))
-    assert float(u) == pytest.approx((left + right) / 2, abs=0.5)
+    assert float(u) == approx((left + right) / 2, abs=0.5)
     assert seen.goal.rays_c.shape == (4, 3)
 
 

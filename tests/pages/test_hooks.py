@@ -1,6 +1,6 @@
 """The reference prints itself: every key of the shipped configurations, every command."""
 
-import pytest
+from pytest import mark
 
 from docs import hooks
 from tests.pages.blocks import ROOT, pages
@@ -12,7 +12,7 @@ SHOWN = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "name", "only"), SHOWN)
+@mark.parametrize(("kind", "name", "only"), SHOWN)
 def test_every_key_has_a_row(kind, name, only):
     path = config.find(kind, name)
     values = config.to_dict(config.load(kinds.schema_of(kind, path.stem), path))

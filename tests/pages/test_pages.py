@@ -2,7 +2,7 @@
 
 import re
 
-import pytest
+from pytest import fixture, mark
 
 from tests.pages.blocks import ROOT, Runner, blocks_of, pages
 
@@ -16,7 +16,7 @@ MOST_WORDS = 15_000
 COMMENTS = r"<!--.*?-->"
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def runner(tmp_path_factory):
     runner = Runner(tmp_path_factory.mktemp("pages"))
     yield runner
@@ -29,7 +29,7 @@ def runner(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_blocks_run(runner, page):
     if blocks := blocks_of(page):
         runner.run(blocks)
@@ -57,7 +57,7 @@ def mean_words(text: str) -> float:
     return sum(len(part.split()) for part in found) / len(found) if found else 0.0
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+@mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
 def test_sentences_are_short(page):
     assert mean_words(page.read_text(encoding="utf-8")) < MEAN_WORDS
 

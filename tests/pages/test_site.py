@@ -11,11 +11,11 @@ import subprocess
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-import pytest
+from pytest import fixture, mark
 
 from tests.pages.blocks import ROOT
 
-pytestmark = pytest.mark.site
+pytestmark = mark.site
 SITE = ROOT / "out" / "site"
 PROBE = ROOT / "tests" / "pages" / "site_probe.html"
 PHONE = 400  # px, as in the probe
@@ -36,7 +36,7 @@ OPTIONS = [
 ]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def result(tmp_path_factory):
     """Return what the probe measures of a copy of the site."""
     browser = shutil.which("chromium") or shutil.which("google-chrome")

@@ -1,9 +1,11 @@
 """The simulator's blocks and rope where mechanics has a formula."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 from scipy.optimize import root
 from scipy.special import ellipk
 
@@ -30,11 +32,9 @@ def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
     the load's.
     """
     body = BodyParams(HELD, (0.01 * HELD,) * 3)
-    strong = dataclasses.replace(plant.vehicle.controller, max_thrust=HELD * GRAVITY)
-    vehicle = dataclasses.replace(
-        plant.vehicle, body=body, controller=strong, queue=QueueParams(0.0)
-    )
-    changed = dataclasses.replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
+    strong = replace(plant.vehicle.controller, max_thrust=HELD * GRAVITY)
+    vehicle = replace(plant.vehicle, body=body, controller=strong, queue=QueueParams(0.0))
+    changed = replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
     sim = HybridSim(
         PlantParams(vehicle, changed, plant.release, numerics(substep, "float64")), 1, direct=True
     )
@@ -50,7 +50,7 @@ def advance(sim, steps: int) -> None:
         assert not np.any(sim.get("status") & NONFINITE)
 
 
-@pytest.mark.parametrize("amplitude", [0.05, 1.2])
+@mark.parametrize("amplitude", [0.05, 1.2])
 def test_pendulum_period(amplitude):
     """One rigid segment swings as a physical pendulum:
 
@@ -80,8 +80,8 @@ def test_pendulum_period(amplitude):
         window = slice(max(k - 1, 0), k + 3)
         crossings.append(np.polyval(np.polyfit(angles[window], times[window], 3), 0.0))
     period = np.mean(np.diff(crossings))
-    assert period == pytest.approx(expected, rel=PERIOD)
-    assert np.linalg.norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
+    assert period == approx(expected, rel=PERIOD)
+    assert norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
 
 
 def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
@@ -96,7 +96,7 @@ def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
     below = rope.payload_mass + mass * np.arange(rope.segments - 1, -1, -1)
     stiffness = (below + 0.5 * mass) * GRAVITY * length
     stiffness[-1] += rope.payload_mass * GRAVITY * rope.payload_offset
-    np.testing.assert_allclose(sim.get("stiffness")[0], stiffness, rtol=1e-6)
+    assert_allclose(sim.get("stiffness")[0], stiffness, rtol=1e-6)
 
 
 def turning_shape(rope, rate: float) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_motor_step():
     ``1 - exp(-t / T)``; the set-point itself is the root of the thrust over k_f.
     """
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
-    vehicle = dataclasses.replace(vehicle, queue=QueueParams(0.0))
+    vehicle = replace(vehicle, queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 1, "rk4", 0.001, precision="float64")
     first = sim.get("motor_speed")[0, 0]
     sim.set_command([[8.0, 0.0, 0.0, 0.0]])
@@ -186,15 +186,15 @@ def test_motor_step():
     for k in range(1, 6):
         advance(sim, 1)
         expected = last + (first - last) * np.exp(-0.02 * k / vehicle.motor.time_constant)
-        np.testing.assert_allclose(sim.get("motor_speed")[0], expected, rtol=1e-8)
+        assert_allclose(sim.get("motor_speed")[0], expected, rtol=1e-8)
 
 
 def test_battery_sags_to_where_source_and_load_meet():
     """At a steady load the voltage is the upper root of ``u^2 - u_oc u + R P = 0``."""
     vehicle = paper_plant().vehicle
-    vehicle = dataclasses.replace(vehicle, aero=dataclasses.replace(vehicle.aero, kind="none"))
-    endless = dataclasses.replace(vehicle.battery, capacity=1e9)
-    vehicle = dataclasses.replace(vehicle, battery=endless, queue=QueueParams(0.0))
+    vehicle = replace(vehicle, aero=replace(vehicle.aero, kind="none"))
+    endless = replace(vehicle.battery, capacity=1e9)
+    vehicle = replace(vehicle, battery=endless, queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
     start = sim.get("voltage")[0]
     sim.set_command([[10.0, 0.0, 0.0, 0.0]])
@@ -208,7 +208,7 @@ def test_battery_sags_to_where_source_and_load_meet():
     )
     power = cell.idle_power + np.sum(thrust.torque_ratio * lift * speed) / cell.efficiency
     source = cell.ocv[0]
-    assert voltage == pytest.approx(
+    assert voltage == approx(
         (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0, abs=1e-6
     )
     assert voltage < start - 0.3, "ten newtons must sag more than hover"
@@ -219,7 +219,7 @@ def test_battery_counts_its_charge():
     for the sag.
     """
     sim = bare_quadrotor(
-        dataclasses.replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64"
+        replace(paper_plant().vehicle, queue=QueueParams(0.0)), 1, precision="float64"
     )
     vehicle = sim.vehicles[0]
     weight = vehicle.body.mass * GRAVITY
@@ -231,7 +231,7 @@ def test_battery_counts_its_charge():
     )
     advance(sim, 50)
     expected = power / voltage / 3600.0 / vehicle.battery.capacity
-    assert sim.get("charge_used")[0] == pytest.approx(expected, rel=0.05)
+    assert sim.get("charge_used")[0] == approx(expected, rel=0.05)
 
 
 def test_gyroscopic_torques_do_no_work():
@@ -240,12 +240,12 @@ def test_gyroscopic_torques_do_no_work():
     Rotors at equal speeds would cancel; here two stand still. No thrust coefficient that matters,
     no air: only Euler's equation and the rotors' momentum are left."""
     base = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="first_order")
-    still = dataclasses.replace(base.motor, time_constant=1e30)
+    still = replace(base.motor, time_constant=1e30)
     # No thrust worth the name, and motors that never reach a set-point; hover needs none because
     # gravity is off.
-    weak = dataclasses.replace(base.thrust, k_f=1e-30)
-    idle = dataclasses.replace(base.controller, min_thrust=0.0, geometric_gain=0.0)
-    vehicle = dataclasses.replace(base, motor=still, thrust=weak, controller=idle)
+    weak = replace(base.thrust, k_f=1e-30)
+    idle = replace(base.controller, min_thrust=0.0, geometric_gain=0.0)
+    vehicle = replace(base, motor=still, thrust=weak, controller=idle)
     rate = np.array([[6.0, -9.0, 4.0]])
     inertia = np.array(vehicle.body.inertia)
 
@@ -259,8 +259,8 @@ def test_gyroscopic_torques_do_no_work():
     spun, plain = run([4000.0, 0.0, 0.0, 4000.0]), run([0.0, 0.0, 0.0, 0.0])
     energy = 0.5 * np.sum(inertia * rate[0] ** 2)
     for end in (spun, plain):
-        assert 0.5 * np.sum(inertia * end**2) == pytest.approx(energy, rel=1e-8)
-    assert np.linalg.norm(spun - plain) > 1.0, "the rotors must have turned the rate"
+        assert 0.5 * np.sum(inertia * end**2) == approx(energy, rel=1e-8)
+    assert norm(spun - plain) > 1.0, "the rotors must have turned the rate"
 
 
 def test_hover_is_an_equilibrium():
@@ -268,53 +268,49 @@ def test_hover_is_an_equilibrium():
     compensation is not.
     """
     plant = paper_plant()
-    ideal = dataclasses.replace(
-        plant.vehicle, battery=dataclasses.replace(plant.vehicle.battery, kind="ideal")
-    )
-    sim = HybridSim(dataclasses.replace(plant, vehicle=ideal, sim=numerics(precision="float64")), 1)
+    ideal = replace(plant.vehicle, battery=replace(plant.vehicle.battery, kind="ideal"))
+    sim = HybridSim(replace(plant, vehicle=ideal, sim=numerics(precision="float64")), 1)
     sim.place(np.array([[0.0, 0.0, 2.0]]))
     weight = GRAVITY * (ideal.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
     sim.set_command([[weight, 0.0, 0.0, 0.0]])
     advance(sim, 50)
-    np.testing.assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, 2.0], atol=1e-9)
-    np.testing.assert_allclose(sim.get("vel_w")[0], 0.0, atol=1e-9)
+    assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, 2.0], atol=1e-9)
+    assert_allclose(sim.get("vel_w")[0], 0.0, atol=1e-9)
     _, _, centres, velocities, _ = rods(sim)
     assert np.abs(velocities).max() < 1e-9
-    assert centres[0, -1, 2] == pytest.approx(2.0 - 0.02 - 0.33 - 0.033, abs=1e-9)
+    assert centres[0, -1, 2] == approx(2.0 - 0.02 - 0.33 - 0.033, abs=1e-9)
 
 
 def test_quadrotor_without_thrust_falls_freely():
     """No gravity-free hover thrust, no air: ``z = -g t^2 / 2`` and the rate stays."""
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
-    idle = dataclasses.replace(vehicle.controller, min_thrust=0.0)
-    vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
+    idle = replace(vehicle.controller, min_thrust=0.0)
+    vehicle = replace(vehicle, controller=idle, queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
     advance(sim, 25)
-    np.testing.assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, -0.5 * GRAVITY * 0.25], atol=1e-12)
+    assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, -0.5 * GRAVITY * 0.25], atol=1e-12)
 
 
 def test_external_wrench():
     """Force over mass and torque over inertia, added to a vehicle in free fall."""
     vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
-    idle = dataclasses.replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
-    vehicle = dataclasses.replace(vehicle, controller=idle, queue=QueueParams(0.0))
+    idle = replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
+    vehicle = replace(vehicle, controller=idle, queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
     sim.set_wrench([[0.3, -0.2, 0.1], [0.0, 0.0, 0.0]], [[0.0, 0.0, 0.0], [0.0, 0.0, 1e-4]])
     advance(sim, 10)
     time = 0.2
     expected = np.array([0.3, -0.2, 0.1]) / vehicle.body.mass * time
-    np.testing.assert_allclose(sim.get("vel_w"), [expected, np.zeros(3)], atol=1e-12)
-    np.testing.assert_allclose(sim.get("pos_w")[0], expected * time / 2.0, atol=1e-12)
+    assert_allclose(sim.get("vel_w"), [expected, np.zeros(3)], atol=1e-12)
+    assert_allclose(sim.get("pos_w")[0], expected * time / 2.0, atol=1e-12)
     spun = [0.0, 0.0, 1e-4 / vehicle.body.inertia[2] * time]
-    np.testing.assert_allclose(sim.get("rate_b"), [np.zeros(3), spun], atol=1e-12)
+    assert_allclose(sim.get("rate_b"), [np.zeros(3), spun], atol=1e-12)
 
 
 def test_a_rope_does_not_keep_a_wrench_from_acting():
     """The same push on vehicle, rope and payload: all of their mass is accelerated."""
     plant = paper_plant()
-    plant = dataclasses.replace(
-        plant, vehicle=plain_vehicle(plant.vehicle), sim=numerics(precision="float64")
-    )
+    plant = replace(plant, vehicle=plain_vehicle(plant.vehicle), sim=numerics(precision="float64"))
     pushed, free = (HybridSim(plant, 1, extensions=frozenset({"push"})) for _ in range(2))
     pushed.set_wrench([[0.2, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     totals = []
@@ -323,4 +319,4 @@ def test_a_rope_does_not_keep_a_wrench_from_acting():
         masses, _, _, velocities, _ = rods(sim)
         vehicle = plant.vehicle.body.mass * sim.get("vel_w")[0, 0]
         totals.append(vehicle + np.sum(masses * velocities[0, :, 0]))
-    assert totals[0] - totals[1] == pytest.approx(0.2 * 0.02, rel=1e-2)
+    assert totals[0] - totals[1] == approx(0.2 * 0.02, rel=1e-2)

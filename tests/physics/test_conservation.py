@@ -2,10 +2,10 @@
 mass in free fall.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, LawParams
@@ -47,7 +47,7 @@ def free(**changes):
         "rate_b": (5.0, -8.0, 3.0),
         "cable_rate_w": (2.0, 15.0, 1.0),
     }
-    return dataclasses.replace(scene, **{**start, **changes})
+    return replace(scene, **{**start, **changes})
 
 
 def history(scene, substep, precision, **options):
@@ -62,7 +62,7 @@ def history(scene, substep, precision, **options):
     return np.array(energies), np.array(momenta)
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@mark.parametrize("precision", ["float32", "float64"])
 def test_free_chain_keeps_energy_and_momentum(precision):
     scene = free()
     energies, momenta = history(scene, 2e-3, precision, gravity=0.0)
@@ -109,7 +109,7 @@ def test_joint_damping_takes_what_its_law_says():
         energies.append(energy(sim)[0])
         powers.append(damping * np.square(relative_rates(sim)).sum())
     expected = period * (np.sum(powers) - 0.5 * (powers[0] + powers[-1]))
-    assert energies[0] - energies[-1] == pytest.approx(expected, rel=DISSIPATION)
+    assert energies[0] - energies[-1] == approx(expected, rel=DISSIPATION)
 
 
 def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
@@ -120,13 +120,13 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
         segments=1, segment_length=0.5, rate_b=(1.0, -4.0, 3.0), cable_rate_w=(2.0, 6.0, 1.0)
     )
     plant = scene_plant(scene, 2.5e-4, "float64", 0.01)
-    rubbing = dataclasses.replace(plant.rope, mount_damping=FRICTION)
+    rubbing = replace(plant.rope, mount_damping=FRICTION)
     law = LawParams("rope joint", (), "joint_rate", FRICTION)
     ends = []
     for same in (
         plant,
-        dataclasses.replace(plant, rope=rubbing),
-        dataclasses.replace(plant, laws=(law,)),
+        replace(plant, rope=rubbing),
+        replace(plant, laws=(law,)),
     ):
         sim = HybridSim(
             same, 1, gravity=0.0, extensions=EVERYTHING if same.rope.mount_damping else frozenset()
@@ -154,7 +154,7 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
     assert np.abs(lawful - rubbed).max() < HELD * moved.max()
 
 
-@pytest.mark.parametrize("precision", ["float32", "float64"])
+@mark.parametrize("precision", ["float32", "float64"])
 def test_free_fall(precision):
     """Whatever rope and vehicle do, the total momentum grows by m g t."""
     scene = free()

@@ -2,10 +2,11 @@
 with more delay.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import mark
 
 from sim.hybrid import HybridSim
 from visthrow import config
@@ -22,12 +23,12 @@ STEPS = 50
 """Of 20 ms, a second."""
 
 
-@pytest.mark.parametrize("extra_delay", [0.0, 0.02])
-@pytest.mark.parametrize("loaded", [True, False])
+@mark.parametrize("extra_delay", [0.0, 0.02])
+@mark.parametrize("loaded", [True, False])
 def test_settles_and_damps_with_margin(extra_delay, loaded):
     plant = plant_of(config.load(Experiment, config.find("train", "state")))
-    queue = dataclasses.replace(plant.vehicle.queue, delay=plant.vehicle.queue.delay + extra_delay)
-    plant = dataclasses.replace(plant, vehicle=dataclasses.replace(plant.vehicle, queue=queue))
+    queue = replace(plant.vehicle.queue, delay=plant.vehicle.queue.delay + extra_delay)
+    plant = replace(plant, vehicle=replace(plant.vehicle, queue=queue))
     simulator = HybridSim(plant, 2)
     ropes = np.tile([0.0, 0.0, -1.0], (2, plant.rope.segments, 1))
     ropes[1] = (np.sin(SWING), 0.0, -np.cos(SWING))
@@ -43,11 +44,9 @@ def test_settles_and_damps_with_margin(extra_delay, loaded):
             controller.step(pos_w, simulator.get("quat_wb"), vel_w, GOAL, mass), [not loaded] * 2
         )
         simulator.step()
-        distance.append(np.linalg.norm(simulator.get("pos_w") - GOAL, axis=1))
-        swing.append(
-            np.linalg.norm((simulator.get("payload_pos_w") - simulator.get("pos_w"))[:, :2], axis=1)
-        )
-        rate.append(np.linalg.norm(simulator.get("rate_b"), axis=1))
+        distance.append(norm(simulator.get("pos_w") - GOAL, axis=1))
+        swing.append(norm((simulator.get("payload_pos_w") - simulator.get("pos_w"))[:, :2], axis=1))
+        rate.append(norm(simulator.get("rate_b"), axis=1))
     distance, swing, rate = (
         np.array(rows).reshape(SECONDS, STEPS, 2) for rows in (distance, swing, rate)
     )

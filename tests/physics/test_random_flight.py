@@ -3,12 +3,13 @@
 A rope that never fails may do so by false damping; so its segments' rates are held against a run at
 0.1 ms."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 import warp as wp
+from numpy.testing import assert_allclose
+from pytest import mark
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import FALLBACK, NONFINITE
@@ -101,7 +102,7 @@ def test_hardly_a_failed_state_without_terminations():
     assert fallbacks < 0.01
 
 
-@pytest.mark.slow
+@mark.slow
 def test_a_million_steps_with_terminations(capsys):
     ended, failed = fly_with_terminations(4000, 250, seed=11)
     with capsys.disabled():
@@ -109,8 +110,8 @@ def test_a_million_steps_with_terminations(capsys):
     assert failed == 0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("episode", [50, 250])
+@mark.slow
+@mark.parametrize("episode", [50, 250])
 def test_a_million_steps_without_terminations(episode, capsys):
     episodes, failed, fallbacks = fly_freely(4000, 250, seed=12, episode=episode)
     with capsys.disabled():
@@ -125,7 +126,7 @@ def segment_rates(
     substep: float, precision: str, count: int, seed: int, steps: int = 10
 ) -> np.ndarray:
     """Rates of all rods over the first 0.2 s [1/s], shape (T, E, L, 3)."""
-    plant = dataclasses.replace(plant_of(experiment()), sim=numerics(substep, precision))
+    plant = replace(plant_of(experiment()), sim=numerics(substep, precision))
     sim, rows = started(count, seed, plant), []
     for command in random_commands(seed, steps, count):
         sim.set_command(command)
@@ -138,17 +139,17 @@ def segment_rates(
 def assert_same_rates(coarse: np.ndarray, fine: np.ndarray) -> None:
     rms = [np.sqrt(np.square(r).sum(-1).mean((1, 2))) for r in (coarse, fine, coarse - fine)]
     assert np.ptp(rms[1]) > 0.5, "the rope must have been driven"
-    np.testing.assert_allclose(rms[0] / rms[1], 1.0, atol=RATE_RATIO)
+    assert_allclose(rms[0] / rms[1], 1.0, atol=RATE_RATIO)
     assert (rms[2] / rms[1]).max() < RATE_DIFFERENCE
     rods = [np.sqrt(np.square(r).sum(-1).mean((0, 1))) for r in (coarse, fine)]
-    np.testing.assert_allclose(rods[0] / rods[1], 1.0, atol=ROD_RATIO)
+    assert_allclose(rods[0] / rods[1], 1.0, atol=ROD_RATIO)
 
 
 def test_segments_turn_as_fast_as_at_a_fine_step():
     assert_same_rates(segment_rates(0.002, "float32", 64, 3), segment_rates(1e-4, "float64", 64, 3))
 
 
-@pytest.mark.slow
+@mark.slow
 def test_segments_turn_as_fast_as_at_a_fine_step_in_many_flights():
     assert_same_rates(
         segment_rates(0.002, "float32", 2048, 4), segment_rates(1e-4, "float64", 2048, 4)

@@ -1,9 +1,11 @@
 """The reference's blocks against closed forms and conservation laws."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import fixture, mark
 
 from sim.params import GRAVITY
 from sim.reference import vehicle_blocks
@@ -22,7 +24,7 @@ EXACT = 1e-12
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def vehicle():
     return paper_plant().vehicle
 
@@ -41,14 +43,12 @@ def test_queue_switches_at_the_delay_exactly(vehicle):
     start = quadrotor.blocks[0, 9]
     weight = plain.body.mass * GRAVITY
     fly(quadrotor, (2.0 * weight, 0.0, 0.0, 0.0), 1)
-    np.testing.assert_allclose(quadrotor.blocks[0, 9:13], start, rtol=EXACT)
+    assert_allclose(quadrotor.blocks[0, 9:13], start, rtol=EXACT)
     fly(quadrotor, (2.0 * weight, 0.0, 0.0, 0.0), 2)
     answered = 0.06 - plain.queue.delay
     final = np.sqrt(2.0 * weight / 4.0 / plain.thrust.k_f)
     expected = final + (start - final) * np.exp(-answered / plain.motor.time_constant)
-    np.testing.assert_allclose(
-        quadrotor.blocks[0, 9:13], expected, rtol=1e-9
-    )  # RK4, 15 us to the power of 4
+    assert_allclose(quadrotor.blocks[0, 9:13], expected, rtol=1e-9)  # RK4, 15 us to the power of 4
 
 
 def test_queue_takes_the_latest_that_is_due():
@@ -91,12 +91,12 @@ def test_mixer_delivers_what_fits(vehicle):
     )
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
     delivered = [np.sum(thrusts * y), -np.sum(thrusts * x), ratio * np.sum(thrusts * spin)]
-    np.testing.assert_allclose(delivered, torque[0], atol=EXACT)
+    assert_allclose(delivered, torque[0], atol=EXACT)
     assert abs(thrusts.sum() - 4.0) < EXACT
     assert (tilt_share[0], yaw_share[0]) == (1.0, 1.0)
 
 
-@pytest.mark.parametrize("torque", [(0.0, 0.0, 0.1), (0.3, 0.1, 0.3), (0.05, 0.15, -0.1)])
+@mark.parametrize("torque", [(0.0, 0.0, 0.1), (0.3, 0.1, 0.3), (0.05, 0.15, -0.1)])
 def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
     rotors, ratio = vehicle.rotors, vehicle.thrust.torque_ratio
     thrusts, tilt_share, yaw_share = vehicle_blocks.mixer(
@@ -106,15 +106,15 @@ def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
     assert thrusts.max() < 3.5 + EXACT
     x, y, spin = np.array(rotors.x), np.array(rotors.y), np.array(rotors.spin)
     roll, pitch, yaw = np.sum(thrusts * y), -np.sum(thrusts * x), ratio * np.sum(thrusts * spin)
-    np.testing.assert_allclose(roll * torque[1], pitch * torque[0], atol=EXACT)
+    assert_allclose(roll * torque[1], pitch * torque[0], atol=EXACT)
     assert abs(yaw) < abs(torque[2])
-    np.testing.assert_allclose([roll, pitch], tilt_share[0] * np.array(torque[:2]), atol=EXACT)
-    np.testing.assert_allclose(yaw, yaw_share[0] * torque[2], atol=EXACT)
+    assert_allclose([roll, pitch], tilt_share[0] * np.array(torque[:2]), atol=EXACT)
+    assert_allclose(yaw, yaw_share[0] * torque[2], atol=EXACT)
     assert abs(np.ptp(thrusts) - 3.47) < 1e-9  # what there is, is used
 
 
 def test_gyroscopic_torque_does_no_work(vehicle):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     rate, speed = rng.normal(size=(5, 3)) * 5.0, rng.uniform(500.0, 4000.0, (5, 4))
     nothing = np.zeros((5, 4))
     still = np.zeros((5, 3)), np.zeros((5, 3)), nothing, nothing
@@ -123,14 +123,12 @@ def test_gyroscopic_torque_does_no_work(vehicle):
         vehicle.rotors, arms, nothing, nothing, speed, nothing, rate, still
     )
     assert np.abs(torque).max() > 1e-3
-    np.testing.assert_allclose(np.sum(torque * rate, axis=1), 0.0, atol=1e-15)
+    assert_allclose(np.sum(torque * rate, axis=1), 0.0, atol=1e-15)
 
 
 def test_rotors_and_body_keep_their_angular_momentum(vehicle):
     """Spinning rotors up without drag torque turns the body back: J_z w_z + h stays what it was."""
-    frictionless = dataclasses.replace(
-        plain_vehicle(vehicle), thrust=dataclasses.replace(vehicle.thrust, torque_ratio=0.0)
-    )
+    frictionless = replace(plain_vehicle(vehicle), thrust=replace(vehicle.thrust, torque_ratio=0.0))
     spin = np.array(vehicle.rotors.spin)
     speed_dot = np.array([[100.0, -50.0, 20.0, 400.0]])
     arms = rotor_arms(frictionless, VehicleErrors.none(1))
@@ -150,7 +148,7 @@ def test_rotors_and_body_keep_their_angular_momentum(vehicle):
 
 
 def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     velocity = rng.normal(size=(20, 3)) * 4.0
     arms = rotor_arms(vehicle, VehicleErrors.none(20))
     force, torque, thrust_change, torque_change = vehicle_blocks.aerodynamics(
@@ -161,7 +159,7 @@ def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
         assert not np.any(nothing)
 
 
-@pytest.mark.parametrize("battery", ["ideal", "sag"])
+@mark.parametrize("battery", ["ideal", "sag"])
 def test_hover_is_an_equilibrium(vehicle, battery):
     """Thrust equals weight at the start; a battery that holds 16.7 V makes the rotors a little fast
     afterwards.
@@ -173,37 +171,35 @@ def test_hover_is_an_equilibrium(vehicle, battery):
     force, torque, rates, _ = vehicle_rates(
         plain, VehicleErrors.none(1), state, command, np.zeros((1, 3)), np.zeros((1, 3))
     )
-    np.testing.assert_allclose(force[0], (0.0, 0.0, weight), atol=1e-9)
+    assert_allclose(force[0], (0.0, 0.0, weight), atol=1e-9)
     assert abs(rates[0, 14]) < 1e-9
     if battery == "ideal":
-        np.testing.assert_allclose(rates, 0.0, atol=1e-9)
-        np.testing.assert_allclose(torque, 0.0, atol=EXACT)
+        assert_allclose(rates, 0.0, atol=1e-9)
+        assert_allclose(torque, 0.0, atol=EXACT)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("controller", "motor"), [("betaflight", "first_order"), ("geometric", "instant")]
 )
 def test_rates_reach_their_command(vehicle, controller, motor):
     plain = plain_vehicle(vehicle, controller=controller, motor=motor)
     quadrotor = ReferenceQuadrotor(plain)
     fly(quadrotor, (plain.body.mass * GRAVITY, 2.0, -1.0, 0.5), 40)
-    np.testing.assert_allclose(quadrotor.body[0, 10:13], (2.0, -1.0, 0.5), atol=0.15)
+    assert_allclose(quadrotor.body[0, 10:13], (2.0, -1.0, 0.5), atol=0.15)
 
 
 def test_thrown_vehicle_falls_freely(vehicle):
     """No thrust at all: instantaneous rotors at f_min = 0 and no air."""
-    idle = dataclasses.replace(vehicle.controller, kind="geometric", min_thrust=0.0)
-    plain = dataclasses.replace(
+    idle = replace(vehicle.controller, kind="geometric", min_thrust=0.0)
+    plain = replace(
         plain_vehicle(vehicle, motor="instant"),
         controller=idle,
-        queue=dataclasses.replace(vehicle.queue, delay=0.0),
+        queue=replace(vehicle.queue, delay=0.0),
     )
     quadrotor = ReferenceQuadrotor(plain)
     quadrotor.reset(np.zeros((1, 3)), LEVEL, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3)))
     fly(quadrotor, (0.0, 0.0, 0.0, 0.0), 10)
-    np.testing.assert_allclose(
-        quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT
-    )
+    assert_allclose(quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT)
 
 
 def test_turning_body_keeps_momentum_and_energy(vehicle):
@@ -220,4 +216,4 @@ def test_turning_body_keeps_momentum_and_energy(vehicle):
     momentum = inertia * body[0, 10:]
     axis, cross = np.array([x, y, z]), np.cross
     turned = momentum + 2.0 * cross(axis, cross(axis, momentum) + w * momentum)
-    np.testing.assert_allclose(turned, inertia * rate[0], rtol=1e-9)
+    assert_allclose(turned, inertia * rate[0], rtol=1e-9)

@@ -1,9 +1,10 @@
 """Each extra of the reference plant does what it says, and nothing when it is off."""
 
-import dataclasses
+from dataclasses import asdict, replace
 
 import numpy as np
-import pytest
+from numpy.testing import assert_array_equal
+from pytest import approx, raises
 
 from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
@@ -20,7 +21,7 @@ def short(plant, segments=2):
     """The same rope in few segments: the extras do not depend on their number and the tests take
     less time.
     """
-    return dataclasses.replace(plant, rope=dataclasses.replace(plant.rope, segments=segments))
+    return replace(plant, rope=replace(plant.rope, segments=segments))
 
 
 def start(extras, plant=None, count=1, speed=0.0, height=1.5, seed=0, segments=2):
@@ -44,7 +45,7 @@ def hover(reference, periods, release=False):
 
 
 def test_all_off_by_default():
-    values = dataclasses.asdict(ReferenceExtras())
+    values = asdict(ReferenceExtras())
     del values["wind_time_constant"]  # of a wind that does not blow
     assert not np.any(np.hstack([np.ravel(value) for value in values.values()]))
 
@@ -58,7 +59,7 @@ def test_payload_drag_slows_by_its_equation():
     clean = start(ReferenceExtras(), speed=speed)
     lost = hover(clean, 2).payload_vel_w[0, 0] - hover(reference, 2).payload_vel_w[0, 0]
     inertia = 0.058  # within 40 ms the ball alone is slowed, the rope leans later
-    assert lost == pytest.approx(k * speed**2 / inertia * 0.04, rel=0.1)
+    assert lost == approx(k * speed**2 / inertia * 0.04, rel=0.1)
     flying = hover(start(ReferenceExtras(payload_drag=k), speed=speed), 7, True)
     free = hover(start(ReferenceExtras(), speed=speed), 7, True)
     assert not flying.attached[0]
@@ -80,15 +81,15 @@ def test_wind_has_its_deviation_and_memory():
     first = reference._wind[:, 0].copy()
     hover(reference, 2)
     later = reference._wind[:, 0]
-    assert later.std() == pytest.approx(0.5, rel=0.15)
-    assert np.mean(first * later) == pytest.approx(0.25 * np.exp(-0.4), rel=0.25)
+    assert later.std() == approx(0.5, rel=0.15)
+    assert np.mean(first * later) == approx(0.25 * np.exp(-0.4), rel=0.25)
     assert not np.any(reference._wind[:, 1:])
 
 
 def test_stretch_is_weight_over_stiffness_and_holds():
     state = hover(start(ReferenceExtras(stretch_stiffness=1000.0, stretch_damping=1.0)), 5)
     below = state.pos_w[0, 2] - state.payload_pos_w[0, 2]
-    assert below == pytest.approx(0.02 + 0.33 + 0.033 + 0.058 * GRAVITY / 1000.0, abs=2e-6)
+    assert below == approx(0.02 + 0.33 + 0.033 + 0.058 * GRAVITY / 1000.0, abs=2e-6)
 
 
 def test_joint_damping_calms_the_swing():
@@ -113,12 +114,12 @@ def test_centre_of_mass_offset_tips_the_vehicle():
 
 def test_thrust_gain_lifts_by_its_share():
     state = hover(start(ReferenceExtras(thrust_gain_error=0.1)), 1)
-    assert state.vel_w[0, 2] == pytest.approx(0.1 * GRAVITY * 0.02, rel=1e-3)
+    assert state.vel_w[0, 2] == approx(0.1 * GRAVITY * 0.02, rel=1e-3)
 
 
 def test_motors_differ():
     reference = start(ReferenceExtras(motor_gain_sigma=0.05), count=200)
-    assert reference._errors.thrust_gain.std() == pytest.approx(0.05, rel=0.1)
+    assert reference._errors.thrust_gain.std() == approx(0.05, rel=0.1)
     assert np.abs(hover(reference, 1).rate_b).max() > 0.01
 
 
@@ -129,7 +130,7 @@ def test_delay_jitter_moves_the_switch():
     due = reference._queue_times[-1]
     assert due.min() > 0.019
     assert due.max() < 0.025
-    assert due.std() == pytest.approx(3e-3 / np.sqrt(3.0), rel=0.15)
+    assert due.std() == approx(3e-3 / np.sqrt(3.0), rel=0.15)
 
 
 def test_release_lag_jitter_moves_the_separation():
@@ -138,7 +139,7 @@ def test_release_lag_jitter_moves_the_separation():
     opened = reference.landing.separation_time
     assert opened.min() > 0.1
     assert opened.max() < 0.12
-    assert opened.std() == pytest.approx(1e-2 / np.sqrt(3.0), rel=0.15)
+    assert opened.std() == approx(1e-2 / np.sqrt(3.0), rel=0.15)
 
 
 def test_measured_is_the_state_of_before_with_noise():
@@ -147,17 +148,17 @@ def test_measured_is_the_state_of_before_with_noise():
     for _ in range(4):
         hover(reference, 1)
     late = reference.measured()
-    assert late.time == pytest.approx(0.05, abs=1e-12)
-    assert late.pos_w[0, 0] == pytest.approx(0.05, abs=1e-6)
+    assert late.time == approx(0.05, abs=1e-12)
+    assert late.pos_w[0, 0] == approx(0.05, abs=1e-6)
     noisy = start(
         ReferenceExtras(mocap_position_sigma=1e-3, mocap_angle_sigma=1e-2, gyro_sigma=0.1),
         count=500,
     )
     measured = noisy.measured()
-    assert (measured.pos_w - noisy.state.pos_w).std() == pytest.approx(1e-3, rel=0.1)
-    assert (2.0 * measured.quat_wb[:, :3]).std() == pytest.approx(1e-2, rel=0.1)
-    assert measured.rate_b.std() == pytest.approx(0.1, rel=0.1)
-    np.testing.assert_array_equal(start(ReferenceExtras()).measured().pos_w, [[0.0, 0.0, 1.5]])
+    assert (measured.pos_w - noisy.state.pos_w).std() == approx(1e-3, rel=0.1)
+    assert (2.0 * measured.quat_wb[:, :3]).std() == approx(1e-2, rel=0.1)
+    assert measured.rate_b.std() == approx(0.1, rel=0.1)
+    assert_array_equal(start(ReferenceExtras()).measured().pos_w, [[0.0, 0.0, 1.5]])
 
 
 def test_battery_starts_used():
@@ -170,8 +171,8 @@ def test_battery_starts_used():
 def test_payload_and_rope_vary():
     reference = start(ReferenceExtras(payload_mass_sigma=0.02, rope_length_sigma=0.01), count=200)
     below = 1.5 - reference.state.payload_pos_w[:, 2] - 0.053
-    assert below.std() == pytest.approx(0.0033, rel=0.2)
-    assert reference._payload_mass.std() == pytest.approx(0.02 * 0.058, rel=0.2)
+    assert below.std() == approx(0.0033, rel=0.2)
+    assert reference._payload_mass.std() == approx(0.02 * 0.058, rel=0.2)
 
 
 def test_same_seed_same_flight():
@@ -179,7 +180,7 @@ def test_same_seed_same_flight():
     ends = [
         hover(start(realistic, paper_plant(), 3, seed=seed), 2).payload_pos_w for seed in (1, 1, 2)
     ]
-    np.testing.assert_array_equal(ends[0], ends[1])
+    assert_array_equal(ends[0], ends[1])
     assert np.all(ends[0] != ends[2])
 
 
@@ -200,5 +201,5 @@ def test_realistic_plant_throws_and_lands():
 
 
 def test_bad_extras_are_refused():
-    with pytest.raises(ValueError, match="gyro_sigma is -1"):
+    with raises(ValueError, match="gyro_sigma is -1"):
         ReferenceExtras(gyro_sigma=-1.0)

@@ -1,9 +1,11 @@
 """The reference plant against closed forms and conservation laws."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import mark, raises
 
 from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
@@ -30,7 +32,7 @@ def unloaded(**changes):
         "rate_b": (1.0, -2.0, 3.0),
         "cable_rate_w": (2.0, 6.0, 1.0),
     }
-    return dataclasses.replace(scene, **{**start, **changes})
+    return replace(scene, **{**start, **changes})
 
 
 def momentum(bare):
@@ -63,12 +65,10 @@ def test_everything_together_falls_freely():
     bare.advance(time)
     total, moment = momentum(bare)
     gravity = np.array([0.0, 0.0, -GRAVITY])
-    np.testing.assert_allclose(
+    assert_allclose(
         total, start + mass * gravity * time, atol=1e-7
     )  # order 4 of the joints' motion
-    np.testing.assert_allclose(
-        moment, first + start * time + 0.5 * mass * gravity * time**2, atol=1e-8
-    )
+    assert_allclose(moment, first + start * time + 0.5 * mass * gravity * time**2, atol=1e-8)
 
 
 def test_energy_stays_without_damping_and_falls_with_it():
@@ -93,7 +93,7 @@ def test_pendulum_period():
         cable_rate_w=(0.0, 0.0, 0.0),
         direction=(np.sin(amplitude), 0.0, -np.cos(amplitude)),
     )
-    scene = dataclasses.replace(
+    scene = replace(
         scene, schedule=(Wrench(0.0, (0.0, 0.0, scene.total_mass * GRAVITY), (0.0, 0.0, 0.0)),)
     )
     reach = scene.segment_length + scene.ball_offset
@@ -125,8 +125,8 @@ def test_hover_stays():
     weight = (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass) * GRAVITY
     for _ in range(5):
         reference.step(np.array([[weight, 0.0, 0.0, 0.0]]))
-    np.testing.assert_allclose(reference.state.pos_w, HIGH, atol=ROUND_OFF)
-    np.testing.assert_allclose(
+    assert_allclose(reference.state.pos_w, HIGH, atol=ROUND_OFF)
+    assert_allclose(
         reference.state.payload_pos_w, [[0.0, 0.0, 1.5 - 0.02 - 0.33 - 0.033]], atol=ROUND_OFF
     )
 
@@ -154,7 +154,7 @@ def test_steps_of_the_plant_have_converged():
         ends.append(reference.state)
     assert np.abs(ends[0].pos_w - ends[1].pos_w).max() < 1e-6
     assert np.abs(ends[0].payload_pos_w - ends[1].payload_pos_w).max() < 1e-6
-    np.testing.assert_allclose(ends[0].attached, False)
+    assert_allclose(ends[0].attached, False)
 
 
 def test_separation_is_exact_and_continuous():
@@ -173,9 +173,9 @@ def test_separation_is_exact_and_continuous():
     # Half-way through the step the rope opens: over 20 ms no point jumps, all move on with their
     # velocity, but for gravity and the swing's centripetal acceleration.
     moved = after.payload_pos_w - before.payload_pos_w - 0.02 * before.payload_vel_w
-    assert np.linalg.norm(moved) < 0.5 * 3 * GRAVITY * 0.02**2
-    lengths = np.linalg.norm(np.diff(after.cable_points_w, axis=1), axis=-1)
-    np.testing.assert_allclose(lengths, 0.022, atol=1e-12)
+    assert norm(moved) < 0.5 * 3 * GRAVITY * 0.02**2
+    lengths = norm(np.diff(after.cable_points_w, axis=1), axis=-1)
+    assert_allclose(lengths, 0.022, atol=1e-12)
 
 
 def test_vehicle_flies_on_alone_after_separation():
@@ -190,16 +190,16 @@ def test_vehicle_flies_on_alone_after_separation():
     for _ in range(3):
         reference.step(command)
         alone.step(command)
-    np.testing.assert_allclose(reference.state.pos_w, alone.body[:, :3], atol=ROUND_OFF)
+    assert_allclose(reference.state.pos_w, alone.body[:, :3], atol=ROUND_OFF)
 
 
-@pytest.mark.parametrize("step", [2e-3, 1.3e-3])  # a landing lies within a step, of whatever length
+@mark.parametrize("step", [2e-3, 1.3e-3])  # a landing lies within a step, of whatever length
 def test_landing_equals_the_closed_form_without_rope_mass(step):
     """A rope of 10 mg: the ball flies a parabola from separation."""
     plain = plain_plant()
-    rope = dataclasses.replace(plain.rope, segments=2, rope_mass=1e-5, joint_damping=0.0)
-    release = dataclasses.replace(plain.release, lag=0.04)
-    plant = dataclasses.replace(plain, rope=rope, release=release)
+    rope = replace(plain.rope, segments=2, rope_mass=1e-5, joint_damping=0.0)
+    release = replace(plain.release, lag=0.04)
+    plant = replace(plain, rope=rope, release=release)
     reference = ReferencePlant(plant, step=step)
     direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (1, 2, 1))
     swing = np.cross([0.0, -5.0, 0.0], direction)
@@ -220,7 +220,7 @@ def test_landing_equals_the_closed_form_without_rope_mass(step):
     landing = reference.landing
     assert landing.landed[0]
     assert abs(landing.time[0] - opened.time - time) < 1e-4
-    np.testing.assert_allclose(
+    assert_allclose(
         landing.point_w[0], (*(p + v * time)[:2], plant.release.landing_height), atol=3e-4
     )
 
@@ -230,17 +230,13 @@ def test_environments_do_not_see_each_other():
     for _ in range(3):
         pair.step(np.array([[3.0, 1.0, 0.0, 0.0], [1.0, 0.0, 5.0, 0.0]]), np.array([True, False]))
         single.step(np.array([[3.0, 1.0, 0.0, 0.0]]), True)
-    np.testing.assert_allclose(
-        pair.state.payload_pos_w[0], single.state.payload_pos_w[0], atol=1e-12
-    )
+    assert_allclose(pair.state.payload_pos_w[0], single.state.payload_pos_w[0], atol=1e-12)
     assert pair.state.latched.tolist() == [True, False]
 
 
 def test_wrong_shapes_are_named():
     reference = ReferencePlant(plain_plant())
-    with pytest.raises(
-        ValueError, match=r"cable_dir_w has shape \(1, 3, 3\), expected \(1, 15, 3\)"
-    ):
+    with raises(ValueError, match=r"cable_dir_w has shape \(1, 3, 3\), expected \(1, 15, 3\)"):
         reference.reset(HIGH, LEVEL, STILL, STILL, np.zeros((1, 3, 3)))
-    with pytest.raises(ValueError, match="step is 0"):
+    with raises(ValueError, match="step is 0"):
         ReferencePlant(plain_plant(), step=0.0)

@@ -2,10 +2,12 @@
 plain NumPy.
 """
 
-import dataclasses
+from dataclasses import fields, replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import mark
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, PlantParams, QueueParams
@@ -25,8 +27,8 @@ def plant(
     lag: float, precision: str = "float32", control_period: float = PERIOD, **vehicle
 ) -> PlantParams:
     base = paper_plant()
-    changed = dataclasses.replace(base.vehicle, **vehicle)
-    release = dataclasses.replace(base.release, lag=lag)
+    changed = replace(base.vehicle, **vehicle)
+    release = replace(base.release, lag=lag)
     return PlantParams(
         changed, base.rope, release, numerics(precision=precision, control_period=control_period)
     )
@@ -50,7 +52,7 @@ def thrown(sim: HybridSim, commands: np.ndarray, asked_at: int) -> list[dict]:
     return rows
 
 
-@pytest.mark.parametrize("lag", [0.0, 0.004, 0.02, 0.1037, 0.11])
+@mark.parametrize("lag", [0.0, 0.004, 0.02, 0.1037, 0.11])
 def test_the_latch_keeps_and_the_lag_is_exact(lag):
     """Asked for once, at the start of step 3; separation follows by itself, in the right step and
     at the right time.
@@ -62,7 +64,7 @@ def test_the_latch_keeps_and_the_lag_is_exact(lag):
     assert len(times) == 1
     (step,) = times
     since = (step - asked_at) * PERIOD + rows[step]["separation_time"]
-    np.testing.assert_allclose(since, lag, atol=CLOCK)
+    assert_allclose(since, lag, atol=CLOCK)
     for k, row in enumerate(rows):
         assert np.all(row["attached"] == (k < step))
         assert np.all(row["release_timer"] < 0.0) == (k < asked_at)
@@ -77,7 +79,7 @@ def test_asking_again_or_no_more_changes_nothing():
         once.step()
         often.step()
         for name in ("payload_pos_w", "pos_w", "attached", "separated", "release_timer"):
-            np.testing.assert_array_equal(once.get(name), often.get(name))
+            assert_array_equal(once.get(name), often.get(name))
 
 
 def test_nothing_separates_unasked():
@@ -86,7 +88,7 @@ def test_nothing_separates_unasked():
     assert all(np.all(row["attached"] == 1) and not np.any(row["separated"]) for row in rows)
 
 
-@pytest.mark.parametrize("lag", [0.11, 0.104])
+@mark.parametrize("lag", [0.11, 0.104])
 def test_separation_is_the_state_of_a_run_that_ends_there(lag):
     """A second simulator with periods of 2 ms is stopped at the separation: same substeps, same
     state.
@@ -102,13 +104,9 @@ def test_separation_is_the_state_of_a_run_that_ends_there(lag):
     for _ in range(round(lag / 0.002)):
         stopped.set_command(command)
         stopped.step()
-    np.testing.assert_allclose(
-        sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE
-    )
-    np.testing.assert_allclose(
-        sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE
-    )
-    np.testing.assert_allclose(sim.get("release_pos_w"), stopped.get("pos_w"), atol=SAME_STATE)
+    assert_allclose(sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE)
+    assert_allclose(sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE)
+    assert_allclose(sim.get("release_pos_w"), stopped.get("pos_w"), atol=SAME_STATE)
 
 
 def test_a_lag_inside_a_substep_lies_between_its_neighbours():
@@ -126,8 +124,8 @@ def test_a_lag_inside_a_substep_lies_between_its_neighbours():
 
     (before, vel), (inside, _), (after, vel_after) = at(0.1030), at(0.1037), at(0.1044)
     middle = 0.5 * (before + after) - 0.0007 * (vel_after - vel) / 4.0
-    np.testing.assert_allclose(inside, middle, atol=2e-6)
-    assert np.linalg.norm(inside - before) > 1e-4
+    assert_allclose(inside, middle, atol=2e-6)
+    assert norm(inside - before) > 1e-4
 
 
 def test_landing_flight_and_clearance():
@@ -151,13 +149,13 @@ def test_landing_flight_and_clearance():
     time = (vel[:, 2] + np.sqrt(vel[:, 2] ** 2 + 2.0 * GRAVITY * drop)) / GRAVITY
     landing = pos + time[:, None] * vel
     landing[:, 2] = params.release.landing_height
-    np.testing.assert_allclose(sim.get("time_to_impact"), time, atol=ROUND_OFF)
-    np.testing.assert_allclose(sim.get("landing_w"), landing, atol=5 * ROUND_OFF)
+    assert_allclose(sim.get("time_to_impact"), time, atol=ROUND_OFF)
+    assert_allclose(sim.get("landing_w"), landing, atol=5 * ROUND_OFF)
     fractions = np.linspace(0.0, 1.0, params.release.clearance_samples)[:, None]
     flight = pos + (fractions * time)[..., None] * vel
     flight[..., 2] -= 0.5 * GRAVITY * (fractions * time) ** 2
-    least = np.linalg.norm(flight - sim.get("release_pos_w"), axis=-1).min(axis=0)
-    np.testing.assert_allclose(sim.get("clearance"), least, atol=ROUND_OFF)
+    least = norm(flight - sim.get("release_pos_w"), axis=-1).min(axis=0)
+    assert_allclose(sim.get("clearance"), least, atol=ROUND_OFF)
     assert np.ptp(time) > 0.1, "the throws must differ"
 
 
@@ -171,7 +169,7 @@ def test_outputs_stay_after_the_landing_step():
         sim.step()
         if kept is not None:
             for name, value in kept.items():
-                np.testing.assert_array_equal(sim.get(name), value)
+                assert_array_equal(sim.get(name), value)
             assert sim.get("separated")[0] == 0
         if sim.get("separated")[0]:
             kept = {
@@ -184,10 +182,8 @@ def test_outputs_stay_after_the_landing_step():
 def test_the_vehicle_flies_on_alone():
     """After separation it climbs by its own thrust over its own mass: no rope pulls, drag off."""
     aero = paper_plant().vehicle.aero
-    calm = dataclasses.replace(
-        aero, **{f.name: 0.0 for f in dataclasses.fields(aero) if f.name != "kind"}
-    )
-    ideal = dataclasses.replace(paper_plant().vehicle.battery, kind="ideal")
+    calm = replace(aero, **{f.name: 0.0 for f in fields(aero) if f.name != "kind"})
+    ideal = replace(paper_plant().vehicle.battery, kind="ideal")
     params = plant(0.0, "float64", aero=calm, battery=ideal)
     sim = HybridSim(params, 1)
     weight = (params.vehicle.body.mass + params.rope.rope_mass + params.rope.payload_mass) * GRAVITY
@@ -196,7 +192,7 @@ def test_the_vehicle_flies_on_alone():
         sim.set_command([[weight, 0.0, 0.0, 0.0]], [k == 0])
         sim.step()
         speeds.append(sim.get("vel_w")[0, 2])
-    np.testing.assert_allclose(
+    assert_allclose(
         np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9
     )
 
@@ -214,8 +210,8 @@ def test_payload_of_the_outputs_is_the_end_of_the_rope():
     n, u = sim.get("cable_dir_w").astype(float), sim.get("cable_vel_w").astype(float)
     pos = sim.get("pos_w") + rotate(quat, mount) + np.einsum("l,elx->ex", reach, n)
     vel = sim.get("vel_w") + rotate(quat, np.cross(rate, mount)) + np.einsum("l,elx->ex", reach, u)
-    np.testing.assert_allclose(sim.get("payload_pos_w"), pos, atol=ROUND_OFF)
-    np.testing.assert_allclose(sim.get("payload_vel_w"), vel, atol=10 * ROUND_OFF)
+    assert_allclose(sim.get("payload_pos_w"), pos, atol=ROUND_OFF)
+    assert_allclose(sim.get("payload_vel_w"), vel, atol=10 * ROUND_OFF)
     points = sim.cable_points_w()
-    np.testing.assert_allclose(points[:, 0], sim.get("pos_w") + rotate(quat, mount), atol=ROUND_OFF)
-    np.testing.assert_allclose(points[:, -1] + rope.payload_offset * n[:, -1], pos, atol=ROUND_OFF)
+    assert_allclose(points[:, 0], sim.get("pos_w") + rotate(quat, mount), atol=ROUND_OFF)
+    assert_allclose(points[:, -1] + rope.payload_offset * n[:, -1], pos, atol=ROUND_OFF)

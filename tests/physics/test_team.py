@@ -1,9 +1,10 @@
 """Several vehicles on one load: conservation laws, a single vehicle's chain, releases."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, PlantParams
@@ -19,7 +20,7 @@ TILT = np.radians(35.0)
 
 def plant(share: float = 0.075, segments: int = 5) -> PlantParams:
     base = paper_plant()
-    rope = dataclasses.replace(
+    rope = replace(
         base.rope,
         segments=segments,
         length=0.5,
@@ -28,7 +29,7 @@ def plant(share: float = 0.075, segments: int = 5) -> PlantParams:
         payload_inertia=0.0,
         joint_damping=0.0,
     )
-    return dataclasses.replace(base, rope=rope)
+    return replace(base, rope=rope)
 
 
 def around(team: int, tilt: float = TILT) -> np.ndarray:
@@ -69,8 +70,8 @@ def test_one_vehicle_is_the_fused_chain():
             sim.step()
     moved = np.abs(single.get("payload_pos_w") - [0.0, 0.0, 1.0]).max()
     assert moved > 0.2
-    np.testing.assert_allclose(team.load[0].numpy(), single.get("payload_pos_w"), atol=SECOND_ORDER)
-    np.testing.assert_allclose(team.get("pos_w"), single.get("pos_w"), atol=SECOND_ORDER)
+    assert_allclose(team.load[0].numpy(), single.get("payload_pos_w"), atol=SECOND_ORDER)
+    assert_allclose(team.get("pos_w"), single.get("pos_w"), atol=SECOND_ORDER)
 
 
 def test_two_halves_at_one_place_fly_as_one_vehicle_with_half_the_load():
@@ -81,11 +82,11 @@ def test_two_halves_at_one_place_fly_as_one_vehicle_with_half_the_load():
         two.set_command(command)
         one.step()
         two.step()
-    np.testing.assert_allclose(two.load[0].numpy(), one.load[0].numpy(), atol=SAME_BITS)
-    np.testing.assert_allclose(two.get("pos_w"), np.repeat(one.get("pos_w"), 2, 0), atol=SAME_BITS)
+    assert_allclose(two.load[0].numpy(), one.load[0].numpy(), atol=SAME_BITS)
+    assert_allclose(two.get("pos_w"), np.repeat(one.get("pos_w"), 2, 0), atol=SAME_BITS)
 
 
-@pytest.mark.parametrize("team", [2, 3])
+@mark.parametrize("team", [2, 3])
 def test_momentum_changes_by_gravity_alone(team):
     sim = hung(plant(), around(team), direct=True)
     rng = np.random.default_rng(team)
@@ -103,7 +104,7 @@ def test_momentum_changes_by_gravity_alone(team):
     assert np.abs(sim.get("cable_vel_w")).max() > 0.1
     mass = team * sim.params.total_mass
     expected = before + [0.0, 0.0, -0.2 * GRAVITY * mass]
-    np.testing.assert_allclose(momentum(sim), expected, atol=2e-4)  # of 1.2 N s
+    assert_allclose(momentum(sim), expected, atol=2e-4)  # of 1.2 N s
 
 
 def momentum(sim: TeamSim) -> np.ndarray:
@@ -122,7 +123,7 @@ def momentum(sim: TeamSim) -> np.ndarray:
 
 def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():
     params = plant()
-    late = dataclasses.replace(params.release, lag=params.release.lag + 0.03)
+    late = replace(params.release, lag=params.release.lag + 0.03)
     sim = hung(params, around(2), releases=[params.release, late])
     gone = {}
     for k, command in enumerate(commands(12, 2)):
@@ -135,11 +136,11 @@ def test_each_end_goes_after_its_own_lag_and_the_last_one_makes_the_landing():
         if len(gone) == 2:
             break
         assert np.abs(after - before).max() < 2.0  # no jump at the first separation
-    assert gone[0] == pytest.approx(0.04 + params.release.lag, abs=1e-5)
-    assert gone[1] == pytest.approx(0.04 + late.lag, abs=1e-5)
+    assert gone[0] == approx(0.04 + params.release.lag, abs=1e-5)
+    assert gone[1] == approx(0.04 + late.lag, abs=1e-5)
     pos, vel = (array.numpy()[0].astype(float) for array in sim.load)
     height = params.release.landing_height
     time = (vel[2] + np.sqrt(vel[2] ** 2 + 2.0 * GRAVITY * (pos[2] - height))) / GRAVITY
     landing = pos + time * vel - [0.0, 0.0, 0.5 * GRAVITY * time**2]
-    np.testing.assert_allclose(sim.get("landing_w")[1], landing, atol=1e-4)
+    assert_allclose(sim.get("landing_w")[1], landing, atol=1e-4)
     assert np.abs(sim.get("landing_w")[0] - landing).max() > 0.01

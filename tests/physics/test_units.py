@@ -3,9 +3,10 @@ field is right.
 """
 
 import dataclasses
+from dataclasses import fields, replace
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
@@ -27,7 +28,7 @@ def plant() -> PlantParams:
     there.
     """
     p = plant_of(config.load(Experiment, config.find("train", "state")))
-    rope = dataclasses.replace(
+    rope = replace(
         p.rope,
         payload_drag=2e-3,
         mount_damping=1e-4,
@@ -37,20 +38,20 @@ def plant() -> PlantParams:
         payload_lift=2e-4,
         compliance=1e-3,
     )
-    release = dataclasses.replace(
+    release = replace(
         p.release, lag_tension=2e-3, kick_w=(0.1, 0.05, 0.02), kick_along=0.1, rope_tail=0.3
     )
-    air = dataclasses.replace(p.air, wind_w=(0.5, -0.3, 0.1), ground_effect=1.0)
-    thrust = dataclasses.replace(p.vehicle.thrust, k_1=2e-5)
-    body = dataclasses.replace(p.vehicle.body, com=(1e-3, -2e-3, 1e-3))
-    vehicle = dataclasses.replace(p.vehicle, thrust=thrust, body=body)
-    return dataclasses.replace(
+    air = replace(p.air, wind_w=(0.5, -0.3, 0.1), ground_effect=1.0)
+    thrust = replace(p.vehicle.thrust, k_1=2e-5)
+    body = replace(p.vehicle.body, com=(1e-3, -2e-3, 1e-3))
+    vehicle = replace(p.vehicle, thrust=thrust, body=body)
+    return replace(
         p,
         vehicle=vehicle,
         rope=rope,
         release=release,
         air=air,
-        sim=dataclasses.replace(p.sim, precision="float64"),
+        sim=replace(p.sim, precision="float64"),
     )
 
 
@@ -81,13 +82,11 @@ def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
     return {name: sim.get(name) * size for name, size in sizes.items()}
 
 
-@pytest.mark.parametrize("kind", ["betaflight", "motor_mixing"])
+@mark.parametrize("kind", ["betaflight", "motor_mixing"])
 def test_a_plant_in_other_units_flies_the_same_flight(kind):
     p = plant()
-    vehicle = dataclasses.replace(
-        p.vehicle, controller=dataclasses.replace(p.vehicle.controller, kind=kind)
-    )
-    p = dataclasses.replace(p, vehicle=vehicle)
+    vehicle = replace(p.vehicle, controller=replace(p.vehicle.controller, kind=kind))
+    p = replace(p, vehicle=vehicle)
     usual, other = flown(p, Units(1.0, 1.0)), flown(in_units(p, UNITS), UNITS)
     for name, value in usual.items():
         np.testing.assert_allclose(other[name], value, rtol=ROUNDING, atol=ROUNDING, err_msg=name)
@@ -96,13 +95,13 @@ def test_a_plant_in_other_units_flies_the_same_flight(kind):
 def test_units_lead_back():
     there = in_units(plant(), UNITS)
     for got, expected in zip(numbers(in_units(there, UNITS.inverse)), numbers(plant())):
-        assert got == pytest.approx(expected, rel=1e-12)
+        assert got == approx(expected, rel=1e-12)
 
 
 def numbers(value: object) -> list[float]:
     """All numbers of nested dataclasses."""
     if dataclasses.is_dataclass(value):
-        return [x for f in dataclasses.fields(value) for x in numbers(getattr(value, f.name))]
+        return [x for f in fields(value) for x in numbers(getattr(value, f.name))]
     return (
         [x for item in value for x in numbers(item)]
         if isinstance(value, tuple)
@@ -115,5 +114,5 @@ def numbers(value: object) -> list[float]:
 def test_every_field_of_plant_and_task_has_a_dimension():
     task = config.load(Experiment, config.find("train", "any")).task
     assert isinstance(in_units(task, UNITS, TASK), TaskParams)
-    with pytest.raises(ValueError, match="control_period: no dimension told"):
+    with raises(ValueError, match="control_period: no dimension told"):
         in_units(plant().sim, UNITS, {})

@@ -12,7 +12,7 @@ firmware has tests of its own beside these."""
 import os
 import time
 
-import pytest
+from pytest import fixture, mark, skip
 
 from hil.links.backends import make_backend
 from hil.links.backends.autopilot import ARMED
@@ -25,7 +25,7 @@ from hil.params import HilParams
 from hil.poses.sources.open_source import parties
 from visthrow import config
 
-pytestmark = pytest.mark.sitl
+pytestmark = mark.sitl
 
 ANSWER = 15.0
 """Time in which an autopilot that runs says something [s]."""
@@ -54,7 +54,7 @@ class Bench:
     def __init__(self, kind: str, *overrides: str):
         address = os.environ.get(f"VISTHROW_SITL_{kind.upper()}")
         if not address:
-            pytest.skip(f"VISTHROW_SITL_{kind.upper()} is not set")
+            skip(f"VISTHROW_SITL_{kind.upper()} is not set")
         names = {"ardupilot": "fake", "px4": "fake_px4"}
         self.kind = kind
         self.params = config.load(
@@ -121,7 +121,7 @@ class Bench:
         self.link.close()
 
 
-@pytest.fixture
+@fixture
 def bench():
     made = []
 
@@ -142,7 +142,7 @@ NO_MECHANISM = {
 """Software has no gripper: a bare servo output, an actuator set."""
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_every_parameter_of_the_audit_exists(bench, kind):
     """Names are those of this firmware: each is answered."""
     desk = bench(kind, *NO_MECHANISM[kind])
@@ -150,7 +150,7 @@ def test_every_parameter_of_the_audit_exists(bench, kind):
     assert "no answer" not in desk.tables[0], desk.tables[0]
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_clocks_are_known(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind])
     desk.turn(3.0)
@@ -204,14 +204,14 @@ Not what the audit wants of its position: here it comes from a GPS.
 """
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_it_is_taken_and_armed(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     flying(desk)
     assert desk.backend._heartbeat.base_mode & ARMED
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_a_step_of_the_roll_rate(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     params = flying(desk)
@@ -225,7 +225,7 @@ def test_a_step_of_the_roll_rate(bench, kind):
     assert half[0] < HALF_STEP
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_the_release_is_answered_and_moves(bench, kind):
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])
     params = flying(desk)
@@ -236,7 +236,7 @@ def test_the_release_is_answered_and_moves(bench, kind):
     assert desk.status.release == "accepted", (record.note, record.sends)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_the_autopilots_own_hold_takes_over(bench, kind):
     """It needs a position: in ArduPilot's software the simulated GPS, in PX4's whatever its
     estimator is fed with.
@@ -250,7 +250,7 @@ def test_the_autopilots_own_hold_takes_over(bench, kind):
     assert desk.status.mode == HOLD, (desk.status, desk.backend.texts[-5:])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", KINDS)
 def test_silence_ends_in_the_autopilots_own_hands(bench, kind):
     """PX4 leaves OFFBOARD; ArduPilot stays in its mode and levels."""
     desk = bench(kind, *NO_MECHANISM[kind], *TAKE[kind])

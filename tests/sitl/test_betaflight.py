@@ -18,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx, fixture, mark
 
 from bench.sitl import override
 from bench.sitl.direct import opened, throw
@@ -35,7 +36,7 @@ from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors
 
-pytestmark = pytest.mark.sitl
+pytestmark = mark.sitl
 
 SPEED = float(os.environ.get("VISTHROW_SITL_SPEED", "0.5"))
 """Of both clocks."""
@@ -103,7 +104,7 @@ def program() -> Path:
     return found[0]
 
 
-@pytest.fixture(scope="session")
+@fixture(scope="session")
 def settings(tmp_path_factory):
     """A folder with the firmware's settings, written and read back once, and what was read."""
     folder = tmp_path_factory.mktemp("firmware")
@@ -175,14 +176,14 @@ class Bench:
         self.firmware.stop()
 
 
-@pytest.fixture
+@fixture
 def bench(tmp_path, settings):
     desk = Bench(tmp_path, settings[0])
     yield desk
     desk.close()
 
 
-@pytest.fixture
+@fixture
 def stiff(tmp_path):
     """With `STIFF` gains: those of the throws hold no rate against the ball, as the training's do
     not.
@@ -235,7 +236,7 @@ def test_it_is_taken_armed_and_follows_steps(stiff):
         force = np.array(bench.rows[first:])[-25:, 4].mean()
         asked = share * hover[0] / bench.plant.mass[0]
         print(f"thrust x {share}: {force:.2f} of {asked:.2f} m/s^2")
-        assert force == pytest.approx(asked, rel=LIFT)
+        assert force == approx(asked, rel=LIFT)
 
 
 def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
@@ -255,7 +256,7 @@ def test_its_d_and_its_gyro_are_those_of_its_settings(bench):
     seen = time > SETTLED
     _, slope, offset = np.polyfit(time[seen], np.array(rows)[seen], 2)
     print(f"\nlead {1e3 * offset / slope:.2f} ms, {1e3 * LEAD:.2f} by the settings")
-    assert offset / slope == pytest.approx(LEAD, rel=0.05)
+    assert offset / slope == approx(LEAD, rel=0.05)
 
 
 def test_silence_idles_the_motors_and_disarms(bench):
@@ -315,7 +316,7 @@ def test_a_pilot_hands_over_by_msp_override_and_a_throw_lands(tmp_path):
     assert error < MISS
 
 
-@pytest.mark.parametrize("state", endings.STATES)
+@mark.parametrize("state", endings.STATES)
 def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     """The runner killed in hover and in a throw: the last sticks expire, or count until the pilot
     switches off, as the version's row of the table of facts says.
@@ -325,12 +326,12 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     print(f"\n{version_text(found['version'])}, {state}: {told}")
     assert (told["expired"] is not None) == expires
     if expires:
-        assert told["expired"] == pytest.approx(FACTS["override_window"], abs=0.1)
+        assert told["expired"] == approx(FACTS["override_window"], abs=0.1)
     assert told["back"] < 0.2, "the pilot's switch gives the sticks back"
 
 
-@pytest.mark.parametrize("state", endings.STATES)
-@pytest.mark.parametrize("way", [*endings.REASONS, "output raises", "SIGINT twice"])
+@mark.parametrize("state", endings.STATES)
+@mark.parametrize("way", [*endings.REASONS, "output raises", "SIGINT twice"])
 def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeypatch):
     """In hover and in a throw: the runner descends, except where it is gone at once, and the
     firmware disarms when it falls silent.
@@ -450,7 +451,7 @@ def test_a_whole_throw(tmp_path):
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
 
 
-@pytest.mark.parametrize("state", endings.STATES)
+@mark.parametrize("state", endings.STATES)
 def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path, state):
     """SIGKILL in hover and in a throw: the motors stop and it disarms, with nothing of the runner
     left.

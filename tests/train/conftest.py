@@ -2,18 +2,18 @@
 
 import os
 
-import pytest
+from pytest import fixture
 
 from visthrow import cli
 from visthrow.training import trainer
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def same_bits(one_thread):
     """The same bits need the same number of threads."""
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def few_throws(monkeypatch):
     """An evaluation throws 4 times for 200: that it is made, written and printed does not hang on
     how many.
@@ -21,7 +21,7 @@ def few_throws(monkeypatch):
     monkeypatch.setattr(trainer, "EVALUATED", 4)
 
 
-@pytest.fixture
+@fixture
 def signalled(monkeypatch):
     """Function that runs a command's training of four iterations, sends a signal in the second, and
     resumes it.

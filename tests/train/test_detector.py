@@ -7,8 +7,9 @@ from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from pytest import mark, raises
 
 from bench import detector
 from camera.detectors.contours import Prior
@@ -69,7 +70,7 @@ def hanging():
     return now, np.array([[1.0, 0.2, 0.0]])
 
 
-@pytest.mark.parametrize("by", sorted(NEAR))
+@mark.parametrize("by", sorted(NEAR))
 def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
     rope = config.load(RopeParams, config.find("rope", "paper"))
@@ -86,7 +87,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     now, goal = hanging()
     points, valid = eyes.look(now, now, goal, np.array([True]))
     pilot = KeypointCamera(camera, dtype=torch.float64)
-    quat = torch.tensor(now.quat_wb / np.linalg.norm(now.quat_wb))
+    quat = torch.tensor(now.quat_wb / norm(now.quat_wb))
     from visthrow.onboard.observations import rotation_from_quat
 
     tensors = (
@@ -99,7 +100,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert valid.all()
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
-    with pytest.raises(ValueError, match="expected one of learnt, contours"):
+    with raises(ValueError, match="expected one of learnt, contours"):
         RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, method="magic")
 
 
@@ -153,7 +154,7 @@ def test_the_command_throws_with_the_eyes_that_its_options_name(monkeypatch, cap
     assert "vision by learnt on hybrid" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", ["ball", "goal"])
+@mark.parametrize("name", ["ball", "goal"])
 def test_a_throw_is_refused_where_the_hover_does_not_see(name):
     loaded = load_policy("vision")
     plant, rng = batch_plant(loaded.experiment, "hybrid", 2.0, 0, 2, 0)
@@ -163,7 +164,7 @@ def test_a_throw_is_refused_where_the_hover_does_not_see(name):
     flight.run([hover(0.5), throw(0.2)])
     assert flight.failures == [f"refused: the {name} is not seen in the hover", None]
     assert flight.open.tolist() == [False, True]
-    off = np.linalg.norm(plant.state.pos_w - home, axis=1)
+    off = norm(plant.state.pos_w - home, axis=1)
     assert off[0] < 0.3, "it hovers on"
 
 
@@ -186,7 +187,7 @@ def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
         assert 1e-3 < np.arccos(track.ball_ray_c @ ray) < track.ball_within
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "said"),
     [
         (["throw", "--policy", "state"], "a vision policy"),
@@ -199,7 +200,7 @@ def test_what_cannot_be_done_is_refused(capsys, words, said):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "said"),
     [
         (["--frames", "0"], "--frames 0"),

@@ -5,8 +5,9 @@ after a stop.
 import signal
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, fixture, mark
+from torch.testing import assert_close
 
 from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
@@ -56,7 +57,7 @@ def words(folder, *extra):
     ]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of four iterations without interruption."""
     torch.set_num_threads(1)
@@ -85,7 +86,7 @@ def trained(iterations, sign=1.0, *extra, seed=1):
     return trainer, losses
 
 
-@pytest.mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(5))
 def test_every_seed_learns(seed):
     _, losses = trained(6, seed=seed)
     assert losses[-1] < 0.5 * losses[0]
@@ -123,7 +124,7 @@ def test_the_targets_are_as_old_as_the_poses_that_the_teacher_learnt_from(monkey
     monkeypatch.setattr(ThrowEnv, "exact_frame", noted)
     trainer, _ = trained(1)
     latency = trainer.algorithm.teacher.contract["observation"]["latency"]
-    assert sorted(ages) == pytest.approx([np.mean(latency)])
+    assert sorted(ages) == approx([np.mean(latency)])
     assert max(latency) > 0.0
 
 
@@ -146,7 +147,7 @@ def test_the_exported_policy_remembers_as_the_network_does(whole):
     memory = policy.begin(5)
     for seen, wanted in zip(obs, estimates):
         estimate, memory = policy.estimator.step(seen, memory)
-        torch.testing.assert_close(estimate, wanted, rtol=0, atol=AGREES)
+        assert_close(estimate, wanted, rtol=0, atol=AGREES)
 
 
 def test_the_pilot_remembers_as_training_does(whole):
@@ -180,7 +181,7 @@ def test_the_pilot_remembers_as_training_does(whole):
             seen = env.carry(action)["actor"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM])
+@mark.parametrize("number", [signal.SIGTERM])
 def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
     folder = tmp_path / "run"
     signalled(Distillation, words(folder), number)
@@ -195,7 +196,7 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
     for name, value in policy.estimator.parts().items():
-        torch.testing.assert_close(taken.estimator.parts()[name], value, rtol=0, atol=AGREES)
+        assert_close(taken.estimator.parts()[name], value, rtol=0, atol=AGREES)
     assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
     assert "the policy is one with a memory" in capsys.readouterr().err
     # as it was trained
@@ -208,7 +209,7 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     assert "the policy is one without a memory" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "said"),
     [
         ('distillation.teacher="vision"', "has the layout 'vision'; expected 'state'"),

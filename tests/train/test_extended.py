@@ -1,9 +1,9 @@
 """A diagnosis is trained in, and a law that was found flies the data again."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from sim.params import LawParams
 from tests.flown import fly, setting_with
@@ -17,7 +17,7 @@ LAW = LawParams("payload force", (), "vertical_cross_vel", 0.03)
 SMALL = ["ppo.environments=12", "ppo.steps=4", "ppo.hidden=[8]", "ppo.minibatches=2"]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_training_in_an_extended_simulator():
     """Two iterations with effects, plants drawn from what is uncertain of them, and a law."""
     plain = config.load(Experiment, config.find("train", "state"), SMALL)
@@ -38,7 +38,7 @@ def test_training_in_an_extended_simulator():
             "rope_elastic": 1e-3,
         },
     )
-    trainer = Trainer(dataclasses.replace(found, laws=(LAW,), diagnosed=loose), "cpu", 0)
+    trainer = Trainer(replace(found, laws=(LAW,), diagnosed=loose), "cpu", 0)
     figures = [trainer.step() for _ in range(2)]
     assert all(np.isfinite(f["value"]) for f in figures)
     assert trainer.algorithm.env.sim.extensions >= {
@@ -62,10 +62,10 @@ def after_start(window):
     return residual - states @ np.linalg.lstsq(states, residual, rcond=None)[0]
 
 
-@pytest.mark.slow
+@mark.slow
 def test_a_law_that_was_found_flies_the_data_again():
     setting = setting_with({})
-    lawful = dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, laws=(LAW,)))
+    lawful = replace(setting, plant=replace(setting.plant, laws=(LAW,)))
     logs = fly(lawful, noise=0.5, free=1, throws=0, seconds=3.0)
     left = {}
     for name, plant in (("without", setting.plant), ("with", lawful.plant)):

@@ -9,8 +9,8 @@ import sys
 import time
 
 import numpy as np
-import pytest
 import torch
+from pytest import fixture, mark
 
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
@@ -54,7 +54,7 @@ def same(one, two):
     return (two / "progress.csv").read_text().count("\n") == 1 + 4
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of four iterations without interruption."""
     torch.set_num_threads(1)
@@ -76,7 +76,7 @@ def test_its_policy_is_one_like_any_other(whole):
     assert (action - policy.act(obs)).abs().max() < 1e-6
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT])
+@mark.parametrize("number", [signal.SIGINT])
 def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled, number):
     folder = tmp_path / "run"
     signalled(FirstOrder, words(folder), number)
@@ -92,7 +92,7 @@ def test_what_it_cannot_train_is_refused(tmp_path, capsys):
     assert 'layout = "state"' in capsys.readouterr().err
 
 
-@pytest.mark.gpu
+@mark.gpu
 def test_replayed_from_graphs_it_computes_what_it_computes_eagerly():
     """Six iterations: three that warm up, one that captures, two that replay, with fresh noise
     each.

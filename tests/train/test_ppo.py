@@ -7,10 +7,11 @@ import copy
 import io
 from types import SimpleNamespace
 
-import pytest
 import torch
+from pytest import approx, mark
 from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
+from torch.testing import assert_close
 
 from visthrow import config
 from visthrow.task import Experiment, PPOParams
@@ -99,7 +100,7 @@ def iterate(alg: PPO, seed: int) -> dict[str, float]:
     return alg.update()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "changes",
     [
         {},
@@ -119,11 +120,11 @@ def test_the_update_is_rsl_rls(changes):
     for seed in range(3):
         mine, other = iterate(ours, seed), iterate(theirs, seed)
         common = {name: mine[name] for name in other}  # ours reports the spread too
-        assert common == pytest.approx(other, rel=1e-3, abs=1e-5)
-        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+        assert common == approx(other, rel=1e-3, abs=1e-5)
+        assert ours.learning_rate == approx(theirs.learning_rate, rel=1e-5)
     for a, b in zip((ours.actor, ours.critic), (theirs.actor, theirs.critic)):
         for name, value in b.state_dict().items():
-            torch.testing.assert_close(a.state_dict()[name], value, **SAME)
+            assert_close(a.state_dict()[name], value, **SAME)
     moved = max(float((a - b.detach()).abs().max()) for a, b in zip(start, ours.actor.parameters()))
     assert moved > 100 * SAME["atol"]
     assert (abs(ours.learning_rate / p.learning_rate - 1.0) > 0.1) == (p.schedule == "adaptive")
@@ -171,9 +172,9 @@ def test_the_critic_learns_alone_while_the_actor_is_held():
     )
     iterate(alg, 0)
     for a, b in zip(held, alg.actor.parameters()):
-        torch.testing.assert_close(a, b.detach(), rtol=0, atol=0)
+        assert_close(a, b.detach(), rtol=0, atol=0)
     assert all(not torch.equal(a, b) for a, b in zip(moving, alg.critic.parameters()))
-    assert alg.learning_rate == pytest.approx(params().learning_rate)
+    assert alg.learning_rate == approx(params().learning_rate)
 
 
 def test_a_rollout_keeps_the_memory_that_a_captured_update_reads():
@@ -193,7 +194,7 @@ def test_a_state_that_was_saved_goes_on_the_same():
     assert second.learning_rate == first.learning_rate != params().learning_rate
     assert iterate(first, 1) == iterate(second, 1)
     for a, b in zip(first._parameters, second._parameters):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+        assert_close(a, b, rtol=0, atol=0)
 
 
 def test_the_sample_is_the_gaussians():
@@ -254,18 +255,18 @@ def reached(seed: int, iterations: int = 24) -> tuple[float, list[float]]:
         return float((training.alg.actor(seen) - seen["actor"]).norm(dim=-1).mean()), targets
 
 
-@pytest.mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(5))
 def test_every_seed_learns_with_ever_smaller_steps(seed):
     distance, targets = reached(seed)
     assert distance < REACHED
-    assert targets[0] == pytest.approx(0.015)
+    assert targets[0] == approx(0.015)
     assert targets == sorted(set(targets), reverse=True)
-    assert targets[-1] == pytest.approx(0.015 - 0.012 * 23 / 24)
+    assert targets[-1] == approx(0.015 - 0.012 * 23 / 24)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-@pytest.mark.parametrize("products", ["float32", "bfloat16"])
+@mark.gpu
+@mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@mark.parametrize("products", ["float32", "bfloat16"])
 def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
     """Five iterations: the first launches, the second captures, three replay."""
     p = params(products=products, schedule="fixed")
@@ -273,7 +274,7 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
     for seed in range(5):
         launched._updates = 0
         figures = [iterate(alg, seed) for alg in (captured, launched, theirs)]
-        assert figures[0] == pytest.approx(figures[1], rel=1e-3, abs=1e-5)
+        assert figures[0] == approx(figures[1], rel=1e-3, abs=1e-5)
     assert captured._graph is not None
     assert launched._graph is None
     for a, b, c in zip(
@@ -281,18 +282,18 @@ def test_the_captured_update_is_the_launched_one_and_rsl_rls(products):
         launched._parameters,
         [*theirs.actor.parameters(), *theirs.critic.parameters()],
     ):
-        torch.testing.assert_close(a, b, **SAME)
+        assert_close(a, b, **SAME)
         if products == "float32":
-            torch.testing.assert_close(a, c, **SAME)
+            assert_close(a, c, **SAME)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@mark.gpu
+@mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_the_rate_of_a_captured_update_is_rsl_rls():
     for kl in (1e-5, 1.0):
         ours, theirs = (build(params(desired_kl=kl), own, "cuda:0") for own in (True, False))
         for seed in range(4):
             iterate(ours, seed)
             iterate(theirs, seed)
-        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
+        assert ours.learning_rate == approx(theirs.learning_rate, rel=1e-5)
         assert abs(ours.learning_rate / 1e-3 - 1.0) > 0.1

@@ -7,8 +7,9 @@ import socket
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_array_equal
+from pytest import fixture, mark
 
 from visthrow import config
 from visthrow.task import Experiment
@@ -75,7 +76,7 @@ def process(rank: int, port: int, folder: Path) -> None:
     ranks.leave()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def folder(tmp_path_factory):
     """What two processes left."""
     folder = tmp_path_factory.mktemp("ranks")
@@ -95,17 +96,17 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.mark.parametrize("name", RUNS)
+@mark.parametrize("name", RUNS)
 def test_two_processes_learn_one_policy_from_data_of_their_own(folder, name):
     first, second = (np.load(folder / f"{name}-{rank}.npz") for rank in range(2))
-    np.testing.assert_array_equal(first["whole"], second["whole"])
+    assert_array_equal(first["whole"], second["whole"])
     assert not np.array_equal(first["places"], second["places"])
 
 
-@pytest.mark.parametrize("name", RUNS)
+@mark.parametrize("name", RUNS)
 def test_each_process_goes_on_bit_for_bit_where_it_was(folder, name):
     first = np.load(folder / f"{name}-0.npz")
-    np.testing.assert_array_equal(first["whole"], first["resumed"])
+    assert_array_equal(first["whole"], first["resumed"])
 
 
 def test_a_process_that_a_checkpoint_does_not_know_throws_on_its_own(folder):
@@ -117,7 +118,7 @@ def test_a_process_that_a_checkpoint_does_not_know_throws_on_its_own(folder):
     third.ranks = Ranks(rank=2, world=3)
     for trainer in (first, third):
         trainer.load(folder / "ppo.pt")
-    np.testing.assert_array_equal(weights(first), weights(third))
+    assert_array_equal(weights(first), weights(third))
     assert not torch.equal(
         first.algorithm.env.views.state["pos_w"], third.algorithm.env.views.state["pos_w"]
     )

@@ -10,7 +10,7 @@ import sys
 import time
 
 import numpy as np
-import pytest
+from pytest import fixture, importorskip, mark
 
 from visthrow.onboard.policy import Policy
 from visthrow.paper.sweep.sweep_record import collect, status
@@ -40,7 +40,7 @@ PATIENCE = 300.0
 """Longest wait for what takes seconds on an idle machine [s]."""
 
 
-@pytest.fixture
+@fixture
 def path(tmp_path):
     found = tmp_path / "list.toml"
     found.write_text(LIST)
@@ -96,7 +96,7 @@ def same(work, one, two):
         assert rows(source, two) == 30
 
 
-@pytest.mark.slow
+@mark.slow
 def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_path):
     """A SIGKILL of everything, a SIGKILL of the parent alone, a Ctrl-C; the end equals a run
     without any of it, bit for bit.
@@ -143,12 +143,12 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
     assert training.is_file()
 
 
-@pytest.mark.slow
+@mark.slow
 def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
     """The same tasks as jobs of submitit's local executor, in pieces that end before the training
     does.
     """
-    pytest.importorskip("submitit")
+    importorskip("submitit")
     from visthrow.paper.sweep import pool
     from visthrow.paper.sweep.cluster import Cluster
 

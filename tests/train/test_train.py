@@ -14,9 +14,10 @@ import sys
 import time
 from types import SimpleNamespace
 
-import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_array_equal
+from pytest import fixture, mark, raises
+from torch.testing import assert_close
 
 from visthrow import cli, config
 from visthrow.common import storage
@@ -50,7 +51,7 @@ def weights(folder):
     return [w.numpy() for w in Policy.load(folder / "policy.npz").weights]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of four iterations without interruption."""
     torch.set_num_threads(1)
@@ -66,11 +67,11 @@ def test_a_training_stops_at_the_first_loss_that_is_not_finite(tmp_path, capsys)
     assert "value inf" in error
 
 
-@pytest.mark.parametrize("name", ["value", "surrogate", "entropy", "spread", "cost"])
+@mark.parametrize("name", ["value", "surrogate", "entropy", "spread", "cost"])
 def test_a_training_names_what_is_not_finite_and_when(name):
     run = SimpleNamespace(ranks=Ranks(), iteration=4)
     Trainer._check_losses(run, {"value": 1.0, name: 2.0, "landing_error": math.nan})
-    with pytest.raises(TrainError, match=f"iteration 5: {name} nan is not finite"):
+    with raises(TrainError, match=f"iteration 5: {name} nan is not finite"):
         Trainer._check_losses(run, {"value": 1.0} | {name: math.nan})
 
 
@@ -137,7 +138,7 @@ def test_resume_goes_on_bit_for_bit(whole, tmp_path):
     assert train(folder, "--iterations", "2") == 0
     assert train(folder, "--resume") == 0
     for a, b in zip(weights(whole), weights(folder), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
     assert (folder / "progress.csv").read_text().count("\n") == 1 + 4
 
 
@@ -148,7 +149,7 @@ def iterations_of(folder) -> list[int]:
     ]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
+@mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=["Ctrl-C", "SIGTERM"])
 def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(
     whole, tmp_path, monkeypatch, capsys, number
 ):
@@ -176,7 +177,7 @@ def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(
     assert (folder / "summary.json").exists()
     assert not (folder / "evaluation.json").exists()
     for a, b in zip(weights(whole), weights(folder), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
 
 
 def test_minutes_leave_a_policy(tmp_path, capsys):
@@ -224,9 +225,9 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
     for a, b in zip(
         [*shipped.weights, *shipped.biases], [*taken.weights, *taken.biases], strict=True
     ):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
-    torch.testing.assert_close(taken.mean, shipped.mean, atol=1e-4, rtol=0)
-    torch.testing.assert_close(taken.std, shipped.std, atol=1e-4, rtol=1e-4)
+        assert_close(a, b, rtol=0, atol=0)
+    assert_close(taken.mean, shipped.mean, atol=1e-4, rtol=0)
+    assert_close(taken.std, shipped.std, atol=1e-4, rtol=1e-4)
     assert taken.contract["rope"]["length"] == 0.5
     assert json.loads((folder / "provenance.json").read_text())["from"]["policy"] == "state"
     assert "landed" in capsys.readouterr().out
@@ -240,7 +241,7 @@ def test_a_policy_of_another_task_is_not_taken_up(tmp_path, capsys):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "said"),
     [
         (["--iterations", "-3"], "--iterations -3"),
@@ -278,10 +279,10 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
     monkeypatch.setattr(storage.os, "fsync", fsync)
     assert train(folder, "--resume") == 0
     for a, b in zip(weights(whole), weights(folder), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "words"),
     [
         (
@@ -368,4 +369,4 @@ def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
     assert train(folder, "--resume") == 0
     assert iterations_of(folder) == [1, 2, 3, 4]
     for a, b in zip(weights(whole), weights(folder), strict=True):
-        np.testing.assert_array_equal(a, b)
+        assert_array_equal(a, b)

@@ -6,7 +6,7 @@ import importlib
 import shlex
 from pathlib import Path
 
-import pytest
+from pytest import fixture, mark, raises
 
 from bench import camera as bench_camera
 from bench import report, start, train
@@ -18,7 +18,7 @@ from visthrow.paper import measurements
 from visthrow.task import Experiment
 
 
-@pytest.fixture
+@fixture
 def kept(tmp_path, monkeypatch) -> Path:
     monkeypatch.setattr(measurements, "FOLDER", tmp_path)
     return tmp_path
@@ -54,7 +54,7 @@ TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
 RECORDS = sorted(measurements.FOLDER.glob("*.json"))
 
 
-@pytest.mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
+@mark.parametrize("path", RECORDS, ids=lambda path: path.stem)
 def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
     """Its options are taken, its configurations are there and take their changes, its policies are
     there or made by the line before.
@@ -84,12 +84,12 @@ def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
 
 def test_records_refuse_what_they_are_not(kept):
     (kept / "half.json").write_text('{"bench": "sim"')
-    with pytest.raises(StorageError, match=r"half\.json: not a readable record"):
+    with raises(StorageError, match=r"half\.json: not a readable record"):
         measurements.load(kept / "half.json")
     (kept / "other.json").write_text("{}")
-    with pytest.raises(StorageError, match="missing"):
+    with raises(StorageError, match="missing"):
         measurements.load(kept / "other.json")
-    with pytest.raises(StorageError, match="expected lower-case"):
+    with raises(StorageError, match="expected lower-case"):
         report.record_path("../x")
 
 
@@ -98,7 +98,7 @@ def test_mistakes_are_told(capsys):
     assert "no record" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("of", "words", "message"),
     [
         (sim_cpu, "--batch 0", "expected positive"),

@@ -5,7 +5,7 @@ over UDP.
 import argparse
 import json
 
-import pytest
+from pytest import mark, raises
 
 from bench import faults as hil_faults
 from bench import runner
@@ -21,11 +21,11 @@ more. A minute is short for a line, the recorder's buffers breathe.
 
 
 def test_a_run_that_does_not_start_says_why(tmp_path):
-    with pytest.raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
+    with raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
         Pair(("--config", "fake", "--set", "policy=nobody"), hil_soak.STILL).fly(tmp_path / "run")
 
 
-@pytest.mark.slow
+@mark.slow
 def test_a_minute_at_200_hz(tmp_path):
     """No tick of ours is missed and memory stays flat; how long a tick takes is for a quiet machine
     to say.
@@ -77,7 +77,7 @@ ENDS = {
 """By fault what the runner does from then on, in this order, maybe with more between and after."""
 
 
-@pytest.mark.slow
+@mark.slow
 def test_every_fault_over_udp(tmp_path):
     """The same outcomes between two processes as in lock step (tests/loopback); times are the
     machine's.
@@ -101,8 +101,8 @@ def test_every_fault_over_udp(tmp_path):
     assert [event["what"] for event in figures["killed"]["events"]] == ["levelled: no set-points"]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
+@mark.slow
+@mark.parametrize("kind", ["ardupilot", "px4", "betaflight"])
 def test_every_way_to_end_a_run_over_udp(kind, tmp_path):
     """In hover and in throw: it lands, or does by itself what the table says; the
     summary is there.

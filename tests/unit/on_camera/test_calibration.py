@@ -5,8 +5,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, mark, raises
 
 from camera.calibrate import boards, files
 from camera.calibrate.boards import BoardParams, calibrate_from_boards
@@ -24,7 +24,7 @@ FORMATS = {
     "ros.yaml": lens_files.write_ros,
     "basalt.json": lens_files.write_basalt,
 }
-EVERY_FORMAT = pytest.mark.parametrize("name", list(FORMATS))
+EVERY_FORMAT = mark.parametrize("name", list(FORMATS))
 
 FIT_RMS_PX = 1e-3  # measured 5.5e-4 px on the worst of the four cameras over its whole image
 FIT_MAX_PX = 0.02  # measured 0.015 px in the corners of the 512 px image, where ds and eucm end
@@ -41,23 +41,23 @@ def test_round_trip_is_exact(tmp_path, name):
 
 
 @EVERY_FORMAT
-@pytest.mark.parametrize("share", [0.0, 0.1, 0.35, 0.6, 0.8])
+@mark.parametrize("share", [0.0, 0.1, 0.35, 0.6, 0.8])
 def test_a_file_cut_short_is_refused_by_name(tmp_path, name, share):
     path = tmp_path / name
     FORMATS[name](path, LENS)
     text = path.read_text()
     path.write_text(text[: int(share * len(text))])
-    with pytest.raises(ValueError, match=name):
+    with raises(ValueError, match=name):
         files.read(path)
 
 
 @EVERY_FORMAT
 def test_a_missing_file_is_refused(tmp_path, name):
-    with pytest.raises(ValueError, match="not a file"):
+    with raises(ValueError, match="not a file"):
         files.read(tmp_path / name)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("name", "old", "new", "message"),
     [
         ("opencv.yaml", "camera_matrix:", "lens:", "lacks the key 'camera_matrix'.*'lens'"),
@@ -77,7 +77,7 @@ def test_wrong_content_is_named(tmp_path, name, old, new, message):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, 1))
-    with pytest.raises(ValueError, match=message) as caught:
+    with raises(ValueError, match=message) as caught:
         files.read(path)
     assert name in str(caught.value)
 
@@ -88,7 +88,7 @@ def test_a_lens_that_folds_inside_its_field_of_view_is_refused(tmp_path):
         path, FisheyeParams(640, 480, 160.0, 160.0, 320.0, 240.0, k1=-0.3, fov_deg=100.0)
     )
     path.write_text(path.read_text().replace("100.0", "200.0"))
-    with pytest.raises(ValueError, match=r"ros\.yaml: theta_d"):
+    with raises(ValueError, match=r"ros\.yaml: theta_d"):
         files.read(path)
 
 
@@ -101,11 +101,11 @@ def test_field_of_view_without_the_key(tmp_path):
     # Equidistant: the corner's outer edge, (320.5, 240.5) px from the centre, is seen at its
     # distance / fx.
     expected = 2.0 * math.degrees(math.hypot(320.5, 240.5) / 200.0)
-    assert files.read(path)[1].fov_deg == pytest.approx(expected, abs=1e-9)
+    assert files.read(path)[1].fov_deg == approx(expected, abs=1e-9)
     assert files.read(path, fov_deg=150.0)[1].fov_deg == 150.0
 
 
-@pytest.mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
+@mark.parametrize("key", ["T_cam_imu", "T_imu_cam"])
 def test_the_place_of_the_imu_is_the_mount(tmp_path, key):
     path, there = tmp_path / "kalibr.yaml", MountParams((0.03, 0.01, -0.02), (3.0, -20.0, 40.0))
     lens_files.write_kalibr(path, FisheyeParams(641, 481, 200.0, 200.0, 320.0, 240.0))
@@ -117,15 +117,15 @@ def test_the_place_of_the_imu_is_the_mount(tmp_path, key):
     text = path.read_text()
     path.write_text(f"{text}  {key}: {matrix.tolist()}\n")
     mount = files.read_mount(path)
-    assert mount.position_b == pytest.approx(there.position_b)
-    assert mount.rpy_deg == pytest.approx(there.rpy_deg)
+    assert mount.position_b == approx(there.position_b)
+    assert mount.rpy_deg == approx(there.rpy_deg)
     path.write_text(f"{text}  {key}: {(2.0 * matrix).tolist()}\n")
-    with pytest.raises(ValueError, match="no rotation"):
+    with raises(ValueError, match="no rotation"):
         files.read_mount(path)
 
 
-@pytest.mark.parametrize("camera", [0, 1])
-@pytest.mark.parametrize("name", ["tumvi_512", "euroc"])
+@mark.parametrize("camera", [0, 1])
+@mark.parametrize("name", ["tumvi_512", "euroc"])
 def test_real_basalt_files_fit(name, camera):
     lenses = []
     for model in ("ds", "eucm"):
@@ -148,20 +148,20 @@ def test_real_basalt_files_fit(name, camera):
 
 def test_fit_is_not_stretched_past_what_the_image_sees():
     _, params, _ = files.read(DATA / "euroc_ds_calib.json", fov_deg=190.0)
-    assert params.fov_deg == pytest.approx(113.9, abs=0.1)
+    assert params.fov_deg == approx(113.9, abs=0.1)
     _, narrower, _ = files.read(DATA / "tumvi_512_ds_calib.json", fov_deg=180.0)
     assert narrower.fov_deg == 180.0
 
 
 def test_basalt_refusals(tmp_path):
-    with pytest.raises(ValueError, match=r"camera 2 was requested; expected a number below 2,"):
+    with raises(ValueError, match=r"camera 2 was requested; expected a number below 2,"):
         files.read(DATA / "euroc_ds_calib.json", 2)
     path = tmp_path / "short.json"
     path.write_text((DATA / "euroc_ds_calib.json").read_text()[:900])
-    with pytest.raises(ValueError, match=r"short\.json: is no complete YAML .cut short"):
+    with raises(ValueError, match=r"short\.json: is no complete YAML .cut short"):
         files.read(path)
     path.write_text(json.dumps([1, 2]))
-    with pytest.raises(ValueError, match=r"holds no camera of a known tool"):
+    with raises(ValueError, match=r"holds no camera of a known tool"):
         files.read(path)
 
 
@@ -227,9 +227,7 @@ def test_calibration_from_rendered_boards():
     assert error.max() < 0.25
 
 
-@pytest.mark.parametrize(
-    "kind", ["past 90 deg", "past 90 deg, left", "wrong corners", "shifted corners"]
-)
+@mark.parametrize("kind", ["past 90 deg", "past 90 deg, left", "wrong corners", "shifted corners"])
 def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch):
     truth = FisheyeParams(
         640, 640, 191.2, 191.0, 319.6, 321.1, -0.0132, -0.0041, 0.0017, -0.0005, 200.0
@@ -260,14 +258,14 @@ def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch
     found, report = calibrate_from_boards([], board, 190.0)
     assert list(report.left_out) == [5]
     assert math.isnan(report.image_rms_px[5])
-    assert found.fx == pytest.approx(191.2, abs=0.6)
+    assert found.fx == approx(191.2, abs=0.6)
     assert report.rms_px < 0.2
 
 
 def test_board_refusals():
     board = BoardParams(8, 6, 0.04)
     grey = np.full((100, 100), 128, np.uint8)
-    with pytest.raises(ValueError, match="was found in 0 of 2 pictures"):
+    with raises(ValueError, match="was found in 0 of 2 pictures"):
         calibrate_from_boards([grey, grey], board)
-    with pytest.raises(ValueError, match="expected one size"):
+    with raises(ValueError, match="expected one size"):
         calibrate_from_boards([grey, grey[:50]], board)

@@ -5,8 +5,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, mark, raises
 
 from camera.calibrate.files import read
 from camera.calibrate.foreign import HOLDS_PX
@@ -364,8 +364,8 @@ def rays_within(half_fov):
     )
 
 
-@pytest.mark.parametrize("line_end", ["\n", "\r\n"])
-@pytest.mark.parametrize("name", LENSES)
+@mark.parametrize("line_end", ["\n", "\r\n"])
+@mark.parametrize("name", LENSES)
 def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
     text, published = LENSES[name]
     path = tmp_path / "calibration"
@@ -387,7 +387,7 @@ def test_a_lens_is_that_of_its_file(name, line_end, tmp_path):
     assert report.max_px < WORST_PX.get(published.__qualname__, HOLDS_PX)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "names",
     [
         ("ocam", "svo ocam", "py-ocamcalib"),
@@ -421,7 +421,7 @@ def test_one_camera_of_several_is_chosen_by_number_or_name(tmp_path):
     )
     (tmp_path / "rigs.yaml").write_text(nameless)
     assert "camera 1 of 2 in the file (0, 1)" in read(tmp_path / "rigs.yaml", camera="1")[2].remarks
-    with pytest.raises(ValueError, match=r"camera cam7 was requested.*cam0, cam1"):
+    with raises(ValueError, match=r"camera cam7 was requested.*cam0, cam1"):
         read(path, camera="cam7")
 
 
@@ -433,7 +433,7 @@ T265 = (
 """Four numbers of Kannala and Brandt under another label."""
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "said"),
     [
         (
@@ -476,7 +476,7 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
     assert read(path)[2].model == "pinhole-radtan"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "message"),
     [
         (camodocal("CATA", projection_parameters={"a": 1}), "model_type is 'CATA'; expected one"),
@@ -496,11 +496,11 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
 def test_what_is_not_read_is_refused_by_its_name(text, message, tmp_path):
     path = tmp_path / "calibration"
     path.write_text(text)
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         read(path)
 
 
-@pytest.mark.parametrize("path", sorted(CALIBRATIONS.iterdir()), ids=lambda path: path.name)
+@mark.parametrize("path", sorted(CALIBRATIONS.iterdir()), ids=lambda path: path.name)
 def test_files_of_the_same_lens_agree(path):
     """Line ends, heads, padding and boxes that were refused once; one is fitted."""
     _, lens, report = read(path)
@@ -510,4 +510,4 @@ def test_files_of_the_same_lens_agree(path):
         return
     assert (lens.fx, lens.fy, lens.cx, lens.cy) == (191.2, 191.0, 319.6, 321.1)
     assert lens.coefficients == KB
-    assert lens.fov_deg == pytest.approx(233.4, abs=0.05)
+    assert lens.fov_deg == approx(233.4, abs=0.05)

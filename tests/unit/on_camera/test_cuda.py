@@ -1,7 +1,7 @@
 """The camera inside a CUDA graph: replay equals eager."""
 
-import pytest
 import torch
+from pytest import mark
 
 from camera.history import push
 from camera.keypoint_noise import StepDraw, apply_noise
@@ -13,8 +13,8 @@ ENVIRONMENTS = 4096
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@mark.gpu
+@mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_graph_replay_equals_eager():
     params = CameraParams(
         BENT, MountParams(), KeypointNoiseParams(drop_probability=0.1), 0.25, 0.033

@@ -2,12 +2,15 @@
 what nuisances do.
 """
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import (
     BallSeen,
@@ -60,12 +63,12 @@ def rendered(clutter=(), goal=GOAL, ball=BALL) -> np.ndarray:
     ).numpy()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def scene():
     return rendered()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def cluttered():
     """Neither goal nor payload in view, only what resembles them."""
     far = (
@@ -87,10 +90,10 @@ def off(seen: FrameDetections) -> np.ndarray:
     found, ok = detected_keypoints(CAMERA, seen, ROT[0].numpy())
     assert ok.all()
     pixels = [CAMERA.fisheye.denormalize(points.double()).numpy() for points in (found, true[0])]
-    return np.linalg.norm(pixels[0] - pixels[1], axis=1)
+    return norm(pixels[0] - pixels[1], axis=1)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("nuisance", "worst"),
     [
         (NuisanceParams(), TOLERANCE),
@@ -100,11 +103,11 @@ def off(seen: FrameDetections) -> np.ndarray:
         (NuisanceParams(occlusion=0.5), 2.5),
     ],
 )
-@pytest.mark.parametrize("seed", [0, 1])
+@mark.parametrize("seed", [0, 1])
 def test_ball_and_goal_are_found_under_each_nuisance(scene, nuisance, worst, seed):
     box = CAMERA.fisheye.denormalize(keypoints(CAMERA, POS, ROT, GOAL, BALL)[0][0, 4:]).numpy()
     ball = (*box.mean(axis=0), 0.5 * (box[2, 0] - box[0, 0]))
-    frame = degrade(scene, nuisance, np.random.default_rng(seed), ball)
+    frame = degrade(scene, nuisance, default_rng(seed), ball)
     seen = DETECTOR.detect(frame, known())
     assert seen.ball is not None
     assert seen.goal is not None
@@ -114,35 +117,32 @@ def test_ball_and_goal_are_found_under_each_nuisance(scene, nuisance, worst, see
 
 
 def test_the_ball_is_as_far_away_as_its_size_says(scene):
-    seen = DETECTOR.detect(degrade(scene, NuisanceParams(), np.random.default_rng(0)))
+    seen = DETECTOR.detect(degrade(scene, NuisanceParams(), default_rng(0)))
     eye = POS[0] + ROT[0] @ CAMERA.position_b
     ball_c = (CAMERA.rot_cb @ ROT[0].T @ (BALL[0] - eye)).numpy()
     distance = 0.033 / math.sin(seen.ball.half_angle)
-    assert distance == pytest.approx(np.linalg.norm(ball_c), rel=0.05)
-    assert math.acos(seen.ball.ray_c @ ball_c / np.linalg.norm(ball_c)) < 0.5 / LENS.fx
+    assert distance == approx(norm(ball_c), rel=0.05)
+    assert math.acos(seen.ball.ray_c @ ball_c / norm(ball_c)) < 0.5 / LENS.fx
 
 
 def test_what_only_resembles_them_is_refused(cluttered):
-    frame = degrade(cluttered, NuisanceParams(), np.random.default_rng(0))
+    frame = degrade(cluttered, NuisanceParams(), default_rng(0))
     seen = DETECTOR.detect(frame, known())
     assert seen.goal is None, "no rim"
     assert seen.ball is None, "not round"
 
 
 def test_known_things_narrow_the_search(scene):
-    frame = degrade(scene, NuisanceParams(), np.random.default_rng(0))
+    frame = degrade(scene, NuisanceParams(), default_rng(0))
     found = DETECTOR.detect(frame)
     for wrong in (
-        dataclasses.replace(known(), ball_distance=(1.0, 2.0)),
-        dataclasses.replace(known(), ball_ray_c=np.array([0.0, 0.8, 0.6])),
+        replace(known(), ball_distance=(1.0, 2.0)),
+        replace(known(), ball_ray_c=np.array([0.0, 0.8, 0.6])),
     ):
         assert DETECTOR.detect(frame, wrong).ball is None
-    high = dataclasses.replace(known(), height=2.6)
+    high = replace(known(), height=2.6)
     assert DETECTOR.detect(frame, high).goal is None, "a square of twice the size"
-    assert (
-        DETECTOR.detect(frame, dataclasses.replace(known(), ball_ray_c=found.ball.ray_c)).ball
-        is not None
-    )
+    assert DETECTOR.detect(frame, replace(known(), ball_ray_c=found.ball.ray_c)).ball is not None
 
 
 def test_a_rounder_ball_scores_higher():
@@ -158,30 +158,30 @@ def test_a_rounder_ball_scores_higher():
 
 
 def test_wrong_pictures():
-    with pytest.raises(ValueError, match=r"expected \(400, 400, 3\) and uint8"):
+    with raises(ValueError, match=r"expected \(400, 400, 3\) and uint8"):
         DETECTOR.detect(np.zeros((400, 300, 3), np.uint8))
-    with pytest.raises(ValueError, match="float64"):
+    with raises(ValueError, match="float64"):
         DETECTOR.detect(np.zeros((400, 400, 3)))
     assert DETECTOR.detect(np.zeros((400, 400, 3), np.uint8)) == FrameDetections(None, None)
 
 
 def cone(axis, half_angle, n=64):
     """Unit rays on a circular cone, shape (n, 3)."""
-    axis = np.array(axis) / np.linalg.norm(axis)
+    axis = np.array(axis) / norm(axis)
     helper = np.cross(axis, [0.3, 0.5, -0.8])
-    x = helper / np.linalg.norm(helper)
+    x = helper / norm(helper)
     angle = 2 * math.pi * np.arange(n) / n
     across = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(axis, x)
     return math.cos(half_angle) * axis + math.sin(half_angle) * across, axis
 
 
-@pytest.mark.parametrize("axis", [(0, 0, 1), (1, 0.2, 0.1), (0.4, -0.9, -0.5)])
+@mark.parametrize("axis", [(0, 0, 1), (1, 0.2, 0.1), (0.4, -0.9, -0.5)])
 def test_a_cone_is_found_in_every_direction(axis):
     rays, axis = cone(axis, 0.08)
     found, half_angle, misfit, share = cone_fit(rays)
-    np.testing.assert_allclose(found, axis, atol=1e-12)
-    assert half_angle == pytest.approx(0.08, abs=1e-12)
-    assert (misfit, share) == (pytest.approx(0.0, abs=1e-9), 1.0)
+    assert_allclose(found, axis, atol=1e-12)
+    assert half_angle == approx(0.08, abs=1e-12)
+    assert (misfit, share) == (approx(0.0, abs=1e-9), 1.0)
 
 
 def test_bites_out_of_an_outline_do_not_shrink_it():
@@ -190,21 +190,21 @@ def test_bites_out_of_an_outline_do_not_shrink_it():
     inner, _ = cone((0.2, 0.1, 1.0), 0.055)
     rays[10:31] = inner[10:31]
     found, half_angle, _, share = cone_fit(rays)
-    assert half_angle == pytest.approx(0.08, rel=1e-6)
-    np.testing.assert_allclose(found, axis, atol=1e-7)
-    assert share == pytest.approx(43 / 64)
+    assert half_angle == approx(0.08, rel=1e-6)
+    assert_allclose(found, axis, atol=1e-7)
+    assert share == approx(43 / 64)
 
 
-@pytest.mark.parametrize("yaw", np.linspace(-3.1, 3.1, 9))
+@mark.parametrize("yaw", np.linspace(-3.1, 3.1, 9))
 def test_corners_are_named_by_the_world(yaw):
     """Whatever the heading and however the detector turned about the square."""
     rot_wb = rotation_from_vector(torch.tensor([[0.1, 0.2, 0.0]], dtype=torch.float64))[0]
     turn = rotation_from_vector(torch.tensor([[0.0, 0.0, yaw]], dtype=torch.float64))[0]
     rot_wc = (turn @ rot_wb @ CAMERA.rot_cb.T).numpy()
     corners_w = goal_square(0.25).numpy() + [0.5, -0.8, -1.3]
-    rays = corners_w / np.linalg.norm(corners_w, axis=1, keepdims=True) @ rot_wc
+    rays = corners_w / norm(corners_w, axis=1, keepdims=True) @ rot_wc
     for order in ([2, 3, 0, 1], [1, 0, 3, 2]):
-        np.testing.assert_allclose(ordered_corners(rays[order], rot_wc), rays, atol=1e-12)
+        assert_allclose(ordered_corners(rays[order], rot_wc), rays, atol=1e-12)
 
 
 def test_exact_rays_give_the_keypoints_of_training():
@@ -214,18 +214,18 @@ def test_exact_rays_give_the_keypoints_of_training():
     to_c = (CAMERA.rot_cb @ ROT[0].T).numpy()
     ball = to_c @ (BALL[0] - eye).numpy()
     corners = (goal_square(0.25).numpy() + [*GOAL[0].tolist(), 0.0] - eye.numpy()) @ to_c.T
-    distance = np.linalg.norm(ball)
+    distance = norm(ball)
     seen = FrameDetections(
         BallSeen(ball / distance, math.asin(0.033 / distance), 1.0),
         GoalSeen(
-            corners[[3, 0, 1, 2]] / np.linalg.norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True),
+            corners[[3, 0, 1, 2]] / norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True),
             1.0,
         ),
     )
     camera = KeypointCamera(CAMERA.params)
     found, valid = detected_keypoints(camera, seen, ROT[0].numpy())
     assert valid.all()
-    np.testing.assert_allclose(found.numpy(), true[0].numpy(), atol=2e-6)
+    assert_allclose(found.numpy(), true[0].numpy(), atol=2e-6)
     found, valid = detected_keypoints(camera, FrameDetections(None, None), ROT[0].numpy())
     assert not valid.any()
     assert not found.any()

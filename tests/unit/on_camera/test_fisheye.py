@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-import pytest
 import torch
+from pytest import mark, raises
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
@@ -14,7 +14,7 @@ BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -
 NARROW = FisheyeParams(
     512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0
 )  # a TUM-VI-like lens
-LENSES = pytest.mark.parametrize(
+LENSES = mark.parametrize(
     "params", [EQUIDISTANT, BENT, NARROW], ids=["equidistant", "bent", "narrow"]
 )
 
@@ -79,7 +79,7 @@ def test_closed_form_at_90_and_110_degrees():
 
 
 @LENSES
-@pytest.mark.parametrize("degrees", [5.0, 60.0, 89.999, 90.0, 90.001, 95.0, 99.0, 109.0, 140.0])
+@mark.parametrize("degrees", [5.0, 60.0, 89.999, 90.0, 90.001, 95.0, 99.0, 109.0, 140.0])
 def test_gradcheck_past_90_degrees(params, degrees):
     lens = Fisheye(params)
     t = math.radians(degrees)
@@ -101,7 +101,7 @@ def test_unprojection_gradient(params):
 
 
 @LENSES
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_value_and_gradient_are_finite_everywhere(params, dtype):
     lens = Fisheye(params)
     special = [
@@ -190,7 +190,7 @@ def test_pixels_beyond_the_field_of_view_do_not_unproject():
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "message"),
     [
         ({"k1": -0.3}, "stops growing"),
@@ -203,7 +203,7 @@ def test_pixels_beyond_the_field_of_view_do_not_unproject():
 )
 def test_bad_intrinsics_are_refused(change, message):
     values = {**EQUIDISTANT.__dict__, **change}
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         Fisheye(FisheyeParams(**values))
 
 
@@ -212,7 +212,7 @@ def test_monotonic_limit_closed_form():
     # 114.6 deg.
     fits = FisheyeParams(640, 640, 100.0, 100.0, 320.0, 320.0, k1=-1 / 12, fov_deg=2 * 114.0)
     Fisheye(fits)
-    with pytest.raises(ValueError, match=r"114\.59"):
+    with raises(ValueError, match=r"114\.59"):
         Fisheye(FisheyeParams(640, 640, 100.0, 100.0, 320.0, 320.0, k1=-1 / 12, fov_deg=2 * 115.0))
 
 

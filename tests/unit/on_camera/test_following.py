@@ -3,8 +3,9 @@
 import math
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from pytest import approx, fixture
 
 from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
 from camera.detectors.following import LOST, MEMORY, READ, BallGoalTracker
@@ -41,7 +42,7 @@ def throw(frames=40, pitch=0.8, thrust=16.0):
         pull = -thrust / LENGTH * (up - r * (r @ up)) - r * (v @ v)
         v = v + dt * pull
         r = r + dt * v
-        r /= np.linalg.norm(r)
+        r /= norm(r)
     return np.array(rots), np.array(rays)
 
 
@@ -56,9 +57,7 @@ def followed(rots, rays, blind, seed=0):
         known = following.prior(rot, rot[:, 2], EYE, (0.2, 0.6), stamp)
         noisy = rot.T @ ray + READ * rng.standard_normal(3)
         ball = (
-            None
-            if i in blind
-            else BallSeen(noisy / np.linalg.norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
+            None if i in blind else BallSeen(noisy / norm(noisy), math.asin(RADIUS / LENGTH), 1.0)
         )
         seen = following.take(FrameDetections(ball, None), rot, stamp)
         angle = lambda of: math.acos(min(1.0, float(of @ rot.T @ ray)))  # noqa: E731, B023
@@ -120,7 +119,7 @@ def square(rot, place, score, eye=EYE):
         + [*place, 0.0]
         - eye
     )
-    return GoalSeen(corners / np.linalg.norm(corners, axis=1, keepdims=True) @ rot, score)
+    return GoalSeen(corners / norm(corners, axis=1, keepdims=True) @ rot, score)
 
 
 def goals(frames, eyes=None):
@@ -152,7 +151,7 @@ def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed(
             assert following.take(FrameDetections(None, goal, (goal,)), rot, 0.0).goal is goal
             continue
         to = rot @ known.goal_ray_c
-        assert np.linalg.norm(eye[:2] - to[:2] * eye[2] / to[2] - place) < 0.02, (
+        assert norm(eye[:2] - to[:2] * eye[2] / to[2] - place) < 0.02, (
             "the vehicle flies, the goal lies"
         )
         assert following.take(FrameDetections(None, None), rot, i * PERIOD).goal is None
@@ -189,7 +188,7 @@ def test_a_goal_is_found_again_where_it_was_carried():
     assert told[:100] == [0.9] * 100
     first = told[100:].index(0.9)
     # the old one has 1 - 1/e of its evidence and loses it as fast as the new one gains
-    assert first * PERIOD == pytest.approx(MEMORY * math.log(2.0 - math.exp(-1.0)), abs=0.04)
+    assert first * PERIOD == approx(MEMORY * math.log(2.0 - math.exp(-1.0)), abs=0.04)
     assert told[100 + first :] == [0.9] * (100 - first)
 
 
@@ -210,7 +209,7 @@ def bayes(detector, probability, off, within):
     return odds / (1.0 + odds)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def learnt():
     camera = config.load(CameraParams, config.find("camera", "fisheye"))
     return LearntDetector(Fisheye(camera.fisheye), RADIUS, camera.goal_side)
@@ -228,7 +227,7 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
     assert chosen(learnt, [0.4], [here], Prior()) is None
     ball = chosen(learnt, [0.66, 0.4], [there, here], Prior(ball_ray_c=here, ball_within=within))
     np.testing.assert_allclose(ball.ray_c, here)
-    assert ball.score == pytest.approx(bayes(learnt, 0.4, 0.0, within), abs=1e-6)
+    assert ball.score == approx(bayes(learnt, 0.4, 0.0, within), abs=1e-6)
     assert chosen(learnt, [0.66], [there], Prior(ball_ray_c=here, ball_within=within)) is None
     assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
 
@@ -239,7 +238,7 @@ def test_where_a_goal_is_expected_a_faint_square_counts_with_its_own_probability
     )
     rays = [corners + toward(angle) for angle in (0.0, 0.8)]
     things = torch.tensor(
-        np.array([one / np.linalg.norm(one, axis=1, keepdims=True) for one in rays]),
+        np.array([one / norm(one, axis=1, keepdims=True) for one in rays]),
         dtype=torch.float32,
     )
     known = Prior(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
@@ -247,8 +246,8 @@ def test_where_a_goal_is_expected_a_faint_square_counts_with_its_own_probability
     def scores(known, *p):
         return [one.score for one in learnt._squares(torch.tensor(p), things, known)]
 
-    assert scores(known, 0.9, 0.6) == pytest.approx([0.9, 0.6])
-    assert scores(known, 0.3, 0.2) == pytest.approx([0.2])
+    assert scores(known, 0.9, 0.6) == approx([0.9, 0.6])
+    assert scores(known, 0.3, 0.2) == approx([0.2])
     assert scores(Prior(), 0.3, 0.2) == []
 
 

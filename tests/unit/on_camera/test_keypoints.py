@@ -3,8 +3,8 @@
 import math
 from dataclasses import replace
 
-import pytest
 import torch
+from pytest import approx, mark, raises
 
 from camera.fisheye import Fisheye
 from camera.keypoints import (
@@ -138,7 +138,7 @@ def test_goal_below_a_level_vehicle_closed_form():
     assert torch.allclose(points[0, 4:], box, atol=1e-9)
 
 
-@pytest.mark.parametrize(("distance", "tolerance"), [(0.2, 2e-3), (0.38, 3e-4), (0.6, 1e-4)])
+@mark.parametrize(("distance", "tolerance"), [(0.2, 2e-3), (0.38, 3e-4), (0.6, 1e-4)])
 def test_payload_box_against_the_dense_outline(distance, tolerance):
     # Tolerances: the box's second-order error up to 105 deg off the axis; at 0.38 m, the rope's
     # length, a thirtieth of the noise.
@@ -183,7 +183,7 @@ def test_payload_box_layout_and_smoothness():
     assert torch.autograd.gradcheck(lambda p: payload_keypoints(camera, p)[0], (ball_c,))
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_keypoints_are_finite_in_every_pose(dtype):
     camera = KeypointCamera(PARAMS, dtype=dtype)
     special = torch.tensor(
@@ -211,10 +211,10 @@ def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
     assert valid[0, :4].all()
     assert not valid[0, 4:].any()
     # 102 deg of 110 towards the image's top; the square's corners lie about it.
-    assert points[0, :4, 1].mean() == pytest.approx(-102.0 / 110.0, abs=5e-3)
+    assert points[0, :4, 1].mean() == approx(-102.0 / 110.0, abs=5e-3)
 
 
-@pytest.mark.parametrize("reads", ["edge", "zero"])
+@mark.parametrize("reads", ["edge", "zero"])
 def test_what_invalid_points_read(reads):
     camera = KeypointCamera(
         replace(PARAMS, noise=KeypointNoiseParams(invalid_reads=reads)), dtype=torch.float64
@@ -272,10 +272,10 @@ def test_batch_of_many_equals_batch_of_one_bit_for_bit():
         assert torch.equal(seen[0], valid[i])
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("field", "value"),
     [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))],
 )
 def test_bad_sizes_are_refused(field, value):
-    with pytest.raises(ValueError, match=field):
+    with raises(ValueError, match=field):
         KeypointCamera(replace(PARAMS, **{field: value}))

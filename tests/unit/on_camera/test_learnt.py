@@ -5,8 +5,9 @@ check`.
 import math
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, raises
+from torch.testing import assert_close
 
 from camera.detectors.learnt import (
     CELL,
@@ -46,7 +47,7 @@ def test_a_patch_is_upright_and_bent_by_no_lens():
     """
     about = ray(1.2, 0.7)
     views = views_about(about, torch.tensor([0.3]), NORTH)
-    torch.testing.assert_close(views.axes[0] @ views.axes[0].T, torch.eye(3), atol=1e-6, rtol=0)
+    assert_close(views.axes[0] @ views.axes[0].T, torch.eye(3), atol=1e-6, rtol=0)
     assert (views.axes[0, 1] @ NORTH[0]) < 0.0, "down is away from north"
     v, u = torch.meshgrid(torch.arange(320.0), torch.arange(320.0), indexing="ij")
     rays, _ = LENS.unproject(torch.stack([u, v], -1).reshape(-1, 2))
@@ -66,7 +67,7 @@ def test_a_patch_is_upright_and_bent_by_no_lens():
     assert (shown[0] - expected[None, :]).abs().max() < 2.0, "the columns of a patch"
     assert (shown[1] - expected[:, None]).abs().max() < 2.0, "its rows"
     points = torch.rand(1, 5, 2) - 0.5
-    torch.testing.assert_close(views.points(views.rays(points)), points, atol=1e-6, rtol=0)
+    assert_close(views.points(views.rays(points)), points, atol=1e-6, rtol=0)
 
 
 def test_places_are_where_the_grid_says():
@@ -76,7 +77,7 @@ def test_places_are_where_the_grid_says():
     rays, sizes = places_of(grids, LENS)["ball"]
     pixel, _ = LENS.project(rays[:1])
     np.testing.assert_allclose(pixel[0].numpy(), [12.75 * CELL - 0.5, 7.0 * CELL - 0.5], atol=1e-3)
-    assert sizes[0] == pytest.approx(0.5 * CELL / LENS.params.fx)
+    assert sizes[0] == approx(0.5 * CELL / LENS.params.fx)
 
 
 def labels() -> Labels:
@@ -138,8 +139,8 @@ def test_probabilities_are_calibrated():
     logits = 4.0 * torch.randn(20000, generator=generator, dtype=torch.float64)
     hits = (torch.rand(20000, generator=generator) < (0.5 * logits - 1.0).sigmoid()).double()
     factor, offset = platt(logits, hits)
-    assert factor == pytest.approx(0.5, abs=0.03)
-    assert offset == pytest.approx(-1.0, abs=0.08)
+    assert factor == approx(0.5, abs=0.03)
+    assert offset == approx(-1.0, abs=0.08)
 
 
 def test_networks_are_written_and_read(tmp_path):
@@ -151,19 +152,19 @@ def test_networks_are_written_and_read(tmp_path):
     assert read.calibration["ball"] == (0.7, -0.2, 1.4)
     assert read.made_by == {"steps": 3}
     patch = torch.rand(2, 3, PATCH["goal"], PATCH["goal"])
-    torch.testing.assert_close(read.goal(patch), made.goal(patch), atol=2e-3, rtol=0)
-    with pytest.raises(ValueError, match="no detector written by"):
+    assert_close(read.goal(patch), made.goal(patch), atol=2e-3, rtol=0)
+    with raises(ValueError, match="no detector written by"):
         Networks.load(tmp_path / "none.npz")
     (tmp_path / "empty.npz").touch()
-    with pytest.raises(ValueError, match="no detector written by"):
+    with raises(ValueError, match="no detector written by"):
         Networks.load(tmp_path / "empty.npz")
     (tmp_path / "b.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:2000])
-    with pytest.raises(ValueError, match="no detector written by"):
+    with raises(ValueError, match="no detector written by"):
         Networks.load(tmp_path / "b.npz")
 
 
 def test_frames_of_another_size_are_refused():
-    with pytest.raises(ValueError, match="expected multiples of 16 px"):
+    with raises(ValueError, match="expected multiples of 16 px"):
         LearntDetector(
             Fisheye(FisheyeParams(100, 100, 30.0, 30.0, 49.5, 49.5, fov_deg=180.0)),
             0.033,
@@ -171,7 +172,7 @@ def test_frames_of_another_size_are_refused():
             networks=Networks(),
         )
     detector = LearntDetector(LENS, 0.033, 0.25, networks=Networks())
-    with pytest.raises(ValueError, match="expected"):
+    with raises(ValueError, match="expected"):
         detector.detect(np.zeros((10, 10, 3), np.uint8))
 
 
@@ -182,5 +183,5 @@ def test_other_lenses_and_configs():
         assert lens.circle_inside_image
     for name in config.available("detector"):
         assert config.load(FitParams, config.find("detector", name)).fresh >= 1
-    with pytest.raises(ValueError, match="no more fresh frames"):
+    with raises(ValueError, match="no more fresh frames"):
         FitParams(1, 1, 1, 9, 1, 8, 1, 1e-3, 0.0, 1, 0)

@@ -1,7 +1,7 @@
 """History ring and detector imperfections."""
 
-import pytest
 import torch
+from pytest import approx, mark, raises
 
 from camera.history import at_latency, push
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
@@ -60,13 +60,13 @@ def test_noise_has_the_stated_spread():
     )
     # 160,000 points: the spread is known to 0.2 %, the drop-out rate to 0.001 (one sigma); the
     # margins are five of them.
-    assert points[seen].std() == pytest.approx((0.01**2 + 0.002**2) ** 0.5, rel=0.01)
-    assert bias.std() == pytest.approx(0.002, rel=0.01)
-    assert 1.0 - seen.float().mean() == pytest.approx(0.2, abs=0.005)
+    assert points[seen].std() == approx((0.01**2 + 0.002**2) ** 0.5, rel=0.01)
+    assert bias.std() == approx(0.002, rel=0.01)
+    assert 1.0 - seen.float().mean() == approx(0.2, abs=0.005)
     assert (points[~seen] == 0.0).all()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("reads", "expected"), [("edge", [[0.6, 0.8], [0.0, 0.0]]), ("zero", [[0.0, 0.0], [0.0, 0.0]])]
 )
 def test_what_invalid_and_dropped_points_read(reads, expected):
@@ -87,13 +87,13 @@ def test_wrong_points_lie_anywhere_in_the_image_and_count_as_seen():
     draw = draw_step(SAMPLES, 8, generator)._replace(wrong=wrong)
     exact, unseen = torch.full((SAMPLES, 8, 2), 0.3), torch.zeros(SAMPLES, 8, dtype=torch.bool)
     points, seen = apply_noise(params, exact, unseen, torch.zeros_like(exact), draw)
-    assert seen.float().mean() == pytest.approx(0.25, abs=0.006)
+    assert seen.float().mean() == approx(0.25, abs=0.006)
     # Uniform in -1 to 1: mean 0, spread 1 / sqrt(3); 40,000 of them.
     assert points[seen].mean(0).abs().max() < 0.015
-    assert points[seen].std(0) == pytest.approx([3**-0.5, 3**-0.5], rel=0.015)
+    assert points[seen].std(0) == approx([3**-0.5, 3**-0.5], rel=0.015)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "change",
     [
         {"step_std": -1.0},
@@ -104,10 +104,10 @@ def test_wrong_points_lie_anywhere_in_the_image_and_count_as_seen():
     ],
 )
 def test_bad_noise_is_refused(change):
-    with pytest.raises(ValueError, match=next(iter(change))):
+    with raises(ValueError, match=next(iter(change))):
         KeypointNoiseParams(**change)
 
 
-@pytest.mark.parametrize(("latency", "length"), [(0.0, 1), (0.5, 2), (1.0, 2), (2.2, 4)])
+@mark.parametrize(("latency", "length"), [(0.0, 1), (0.5, 2), (1.0, 2), (2.2, 4)])
 def test_history_length_holds_the_latency(latency, length):
     assert KeypointNoiseParams(latency=latency).history_length == length

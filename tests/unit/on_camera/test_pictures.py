@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from pytest import mark, raises
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -42,7 +42,7 @@ def throw_scene(pitch_deg: float):
     return points[0], valid[0], frame
 
 
-@pytest.mark.parametrize("pitch_deg", [0.0, 30.0])
+@mark.parametrize("pitch_deg", [0.0, 30.0])
 def test_drawn_ball_and_goal_lie_where_the_keypoints_say(pitch_deg):
     points, valid, frame = throw_scene(pitch_deg)
     assert valid.all()
@@ -99,7 +99,7 @@ def test_overlay_marks_invalid_points_even_far_outside():
     image = draw_overlay(CAMERA, points, valid)
     assert not np.array_equal(image, all_seen)
     assert image[:8, -8:].max() > 100, "cut off to the image's corner"
-    with pytest.raises(ValueError, match="expected \\(320, 320, 3\\)"):
+    with raises(ValueError, match="expected \\(320, 320, 3\\)"):
         draw_overlay(CAMERA, points, valid, np.zeros((10, 10, 3), np.uint8))
     lens = replace(LENS, width=480, cx=239.5)
     wide = KeypointCamera(replace(CAMERA.params, fisheye=lens), dtype=torch.float64)
@@ -140,7 +140,7 @@ def test_turned_view_looks_where_it_says():
 
 def test_image_refusals():
     frames = torch.zeros(1, 3, 10, 10)
-    with pytest.raises(ValueError, match=r"expected \(B, C, 320, 320\)"):
+    with raises(ValueError, match=r"expected \(B, C, 320, 320\)"):
         rectify(frames, CAMERA.fisheye, ViewParams(10, 10, 90.0))
-    with pytest.raises(ValueError, match="below 180 deg"):
+    with raises(ValueError, match="below 180 deg"):
         rectify(torch.zeros(1, 3, 320, 320), CAMERA.fisheye, ViewParams(10, 10, 190.0))

@@ -7,8 +7,10 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose
+from pytest import fixture, importorskip, raises
+from torch.testing import assert_close
 
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb, rotation_from_vector
@@ -18,7 +20,7 @@ from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import photographs, pyramid
 
-pytest.importorskip("skimage", reason="photographs of visthrow[detector]")
+importorskip("skimage", reason="photographs of visthrow[detector]")
 
 LENS = FisheyeParams(192, 192, 50.0, 50.0, 95.5, 95.5, k1=-0.01, fov_deg=200.0)
 CAMERA = CameraParams(
@@ -30,7 +32,7 @@ the lens bends it a little.
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def renderer():
     return Renderer(LENS, samples=8)
 
@@ -74,8 +76,8 @@ def test_ball_and_square_are_where_the_lens_puts_them(renderer):
     area = cv2.moments(
         corners[0].float().numpy()
     )  # of the quadrangle: its nearer half is the larger one
-    np.testing.assert_allclose(centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
-    np.testing.assert_allclose(
+    assert_allclose(centroid(yellow(image)), ball[0].numpy(), atol=CENTRE)
+    assert_allclose(
         centroid(green(image)), [area["m10"] / area["m00"], area["m01"] / area["m00"]], atol=CENTRE
     )
     assert truth.ball_seen.all()
@@ -110,7 +112,7 @@ def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
     rolled, _ = lens.project(truth_of(scenes, lens).ball_c)
     still, _ = lens.project(truth_of(replace(scenes, shutter=torch.zeros(1, 3)), lens).ball_c)
     assert (rolled - still).norm() > 3.0
-    np.testing.assert_allclose(
+    assert_allclose(
         centroid(yellow(renderer.render(scenes)[0].numpy())), rolled[0].numpy(), atol=2 * CENTRE
     )
 
@@ -131,10 +133,8 @@ def test_nuisances_are_off_and_on(renderer):
     assert not plain.shutter.any()
     assert not plain.things[..., 0].any()
     assert not plain.rope[:, 3].any()
-    torch.testing.assert_close(
-        plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4)
-    )
-    torch.testing.assert_close(
+    assert_close(plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4))
+    assert_close(
         plain.pose,
         random_scenes(CAMERA, renderer.textures, 4, 1).pose,
         msg="the same moments all the same",
@@ -149,13 +149,13 @@ def test_photographs_and_what_is_none(tmp_path):
     rows = pyramid(photographs(names=("grass",)))
     assert rows.shape == (1, 3 * sum((512 >> k) ** 2 for k in range(7)))
     finest, coarsest = rows[0, : 512 * 512 * 3].reshape(-1, 3), rows[0, -8 * 8 * 3 :].reshape(-1, 3)
-    np.testing.assert_allclose(finest.mean(0), coarsest.mean(0), atol=2.0)
-    with pytest.raises(ValueError, match="no photograph in"):
+    assert_allclose(finest.mean(0), coarsest.mean(0), atol=2.0)
+    with raises(ValueError, match="no photograph in"):
         photographs(tmp_path)
     (tmp_path / "a.png").write_bytes(b"no picture")
-    with pytest.raises(ValueError, match="no picture that OpenCV can read"):
+    with raises(ValueError, match="no picture that OpenCV can read"):
         pyramid(photographs(tmp_path))
-    with pytest.raises(ValueError, match="samples 0"):
+    with raises(ValueError, match="samples 0"):
         Renderer(LENS, samples=0)
 
 

@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx
 
 from bench.cooperative import split
 from visthrow.cli import main
@@ -19,7 +19,7 @@ def test_the_shipped_policy_lands_under_every_fault(tmp_path, capsys):
     assert all(row["landed"] == 1.0 and row["contact"] == 0.0 for row in rows.values())
     assert rows["none"]["error_mean"] < 0.03
     assert max(row["error_mean"] for row in rows.values()) < 0.04
-    assert rows["late"]["apart_mean"] == pytest.approx(0.03, abs=1e-3)
+    assert rows["late"]["apart_mean"] == approx(0.03, abs=1e-3)
 
 
 def test_a_drawn_flight_ends_where_and_when_the_load_lands():
@@ -27,9 +27,9 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
     track = record_throw(experiment, policy.act, target=2.0, seed=0)
     assert track.released
     off = np.linalg.norm(track.flight_w[-1, :2] - track.goal_w[:2])
-    assert off == pytest.approx(track.landing_error, abs=1e-3)
+    assert off == approx(track.landing_error, abs=1e-3)
     landing_height = experiment.release.landing_height
-    assert track.flight_w[-1, 2] == pytest.approx(landing_height, abs=1e-3)
+    assert track.flight_w[-1, 2] == approx(landing_height, abs=1e-3)
     assert np.diff(np.append(track.time, track.flight_time)).min() > 0.0
     centres = track.frames_w.mean(axis=(2, 3))
     np.testing.assert_allclose(centres, track.pos_w, atol=1e-6)

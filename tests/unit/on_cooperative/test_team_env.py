@@ -4,8 +4,9 @@ import math
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx, fixture, mark, raises
+from torch.testing import assert_close
 
 from sim.params import GRAVITY
 from visthrow import config
@@ -21,7 +22,7 @@ def experiment(name: str = "pair", *changes: str) -> TeamExperiment:
     return config.load(TeamExperiment, config.find("cooperative", name), changes)
 
 
-@pytest.fixture
+@fixture
 def env() -> TeamEnv:
     torch.manual_seed(3)
     return TeamEnv(as_flown(experiment(), "none"), seed=3, count=8)
@@ -76,10 +77,10 @@ def test_faults_are_those_of_vehicle_zero():
     assert parts["vehicles"][0].thrust.gain == (0.9,) * 4
     assert parts["vehicles"][1].thrust.gain == (1.0,) * 4
     lags = [r.lag for r in members(as_flown(experiment(), "late"))["releases"][:2]]
-    assert lags[0] - lags[1] == pytest.approx(0.03)
+    assert lags[0] - lags[1] == approx(0.03)
     trained = members(experiment())
     assert {r.lag for r in trained["releases"][1::2]} == {experiment().release.lag}
-    assert min(v.thrust.gain[0] for v in trained["vehicles"]) == pytest.approx(0.88)
+    assert min(v.thrust.gain[0] for v in trained["vehicles"]) == approx(0.88)
 
 
 def test_a_camera_sees_keypoints_in_place_of_load_and_goal():
@@ -90,7 +91,7 @@ def test_a_camera_sees_keypoints_in_place_of_load_and_goal():
 
 
 def test_a_goal_that_is_fitted_over_a_throw_is_refused():
-    with pytest.raises(ConfigError, match=r"observation\.located"):
+    with raises(ConfigError, match=r"observation\.located"):
         TeamEnv(experiment("pair_vision", "task.observation.located=true"), count=4)
 
 
@@ -99,7 +100,7 @@ def test_one_policy_of_both_sees_with_both_and_releases_at_once():
     observed = env.get_observations()["actor"]
     assert observed.shape == (4, 2 * env.layout.dimension)
     places = observed.unflatten(1, (2, -1))[:, :, :3].flatten(0, 1)
-    torch.testing.assert_close(places, env.views.state["pos_w"], atol=0.2, rtol=0.0)
+    assert_close(places, env.views.state["pos_w"], atol=0.2, rtol=0.0)
     actions = env._start_action.tile(4, 2)
     actions[:, 4::5] = torch.tensor([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     _, reward, done, _ = env.step(actions)
@@ -109,7 +110,7 @@ def test_one_policy_of_both_sees_with_both_and_releases_at_once():
 
 
 def test_rows_that_are_no_whole_worlds_are_refused():
-    with pytest.raises(ValueError, match="7 rows; expected a multiple of 2"):
+    with raises(ValueError, match="7 rows; expected a multiple of 2"):
         TeamEnv(experiment(), count=7)
 
 
@@ -141,7 +142,7 @@ def least_gaps(env: TeamEnv) -> list[tuple[float, str]]:
     return least
 
 
-@pytest.mark.parametrize("vehicles", [2, 3])
+@mark.parametrize("vehicles", [2, 3])
 def test_the_gap_is_the_least_over_all_pairs(vehicles):
     torch.manual_seed(vehicles)
     changes = experiment("pair", f"team.vehicles={vehicles}")
@@ -151,7 +152,7 @@ def test_the_gap_is_the_least_over_all_pairs(vehicles):
     state["attached"].copy_(torch.rand(env.rows) < 0.6)
     expected = least_gaps(env)
     assert {kind for _, kind in expected} == {"load", "vehicle", "cable"}
-    torch.testing.assert_close(env.gap().tolist(), [gap for gap, _ in expected], atol=1e-5, rtol=0)
+    assert_close(env.gap().tolist(), [gap for gap, _ in expected], atol=1e-5, rtol=0)
 
 
 def test_three_vehicles_release_when_all_asked_and_land_after_the_last():
@@ -171,10 +172,10 @@ def test_three_vehicles_release_when_all_asked_and_land_after_the_last():
         released = env.last["released"]
     assert released.tolist() == [False, False, False, True]
     last = {name: value[3].double() for name, value in env.last.items()}
-    assert last["apart"] == pytest.approx(0.03, abs=1e-4)
+    assert last["apart"] == approx(0.03, abs=1e-4)
     pos, vel, height = last["load_w"], last["load_vel_w"], env.cfg.release.landing_height
     fall = (vel[2] + (vel[2].square() + 2.0 * GRAVITY * (pos[2] - height)).sqrt()) / GRAVITY
-    torch.testing.assert_close(last["landing_w"][:2], (pos + fall * vel)[:2], atol=1e-4, rtol=0.0)
+    assert_close(last["landing_w"][:2], (pos + fall * vel)[:2], atol=1e-4, rtol=0.0)
 
 
 def test_three_vehicles_learn():
@@ -206,10 +207,10 @@ def test_the_load_clears_the_vehicle_that_it_flies_past():
     height = 1.0 + 2.0 * time - 0.5 * GRAVITY * time.square()
     passing = ((2.0 * time - 0.9).square() + 0.01 + (height - 1.2).square()).sqrt().min().item()
     clearance = env._clearance(torch.tensor([0.55, 0.2])).tolist()
-    assert clearance == pytest.approx([passing, 0.8], abs=0.01)
+    assert clearance == approx([passing, 0.8], abs=0.01)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("coefficient", "conditions", "asked"),
     [
         ("team.contact_cost", ["team.rotor_reach=0.33"], -1.0),
@@ -245,7 +246,7 @@ def test_a_step_is_paid_as_worked_by_hand(coefficient, conditions, asked):
         "proximity": last["clearance"] - 5.0,
     }[coefficient.split(".")[-1]]
     paid = (rewards[1] - rewards[0]) / (10.0 * env.cfg.task.reward.scale)
-    torch.testing.assert_close(paid, env._rows(expected), atol=1e-4, rtol=1e-4)
+    assert_close(paid, env._rows(expected), atol=1e-4, rtol=1e-4)
     assert expected.abs().min() > 0.01
 
 
@@ -262,7 +263,7 @@ def test_cables_start_from_mounts_that_move_as_the_load_does():
     rate_w = (turn @ state["rate_b"][..., None])[..., 0]
     velocities = state["vel_w"] + torch.linalg.cross(rate_w, turn @ env._mount)
     for values in map(env._worlds, (ends, velocities)):
-        torch.testing.assert_close(values[:, 0], values[:, 1], atol=1e-5, rtol=0.0)
+        assert_close(values[:, 0], values[:, 1], atol=1e-5, rtol=0.0)
         assert (values[0, 0] - values[1, 0]).norm() > 0.01
 
 
@@ -289,5 +290,5 @@ def test_a_bias_points_from_the_target_to_where_loads_land():
         "apart": np.full(4, 0.01),
     }
     figures = _summary(values, 2.0, 0.2)
-    assert figures["bias"] == pytest.approx([0.2, -0.2])
+    assert figures["bias"] == approx([0.2, -0.2])
     assert (figures["landed"], figures["contact"]) == (0.75, 0.25)

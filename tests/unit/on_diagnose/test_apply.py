@@ -5,7 +5,8 @@ read.
 import json
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark, raises
 
 from sim.params import LawParams
 from tests.unit.on_diagnose.test_models import ball_log
@@ -31,7 +32,7 @@ def shipped() -> Experiment:
     return config.load(Experiment, config.find("train", "state"))
 
 
-@pytest.fixture
+@fixture
 def diagnosis(tmp_path):
     """A diagnosis as explain writes it; a function that changes entries."""
 
@@ -65,9 +66,9 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert cli.main(["diagnose", "apply", given, "--out", str(out), "--plants", "8"]) == 0
     capsys.readouterr()
     after, before = config.load(Experiment, out), shipped()
-    np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
-    assert after.vehicle.body.mass == pytest.approx(before.vehicle.body.mass + 0.006)
-    assert after.rope.length == pytest.approx(before.rope.length - 0.004)
+    assert_allclose(after.vehicle.thrust.gain, 1.03)
+    assert after.vehicle.body.mass == approx(before.vehicle.body.mass + 0.006)
+    assert after.rope.length == approx(before.rope.length - 0.004)
     assert after.air.wind_w == (0.2, 0.0, 0.0)
     assert after.sensing.frame_tilt == (0.01, 0.0, 0.0)
     assert after.diagnosed.effects == (
@@ -77,11 +78,11 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
         "wind_x",
         "release_lag",
     )  # no tilted frame
-    np.testing.assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
+    assert_allclose(np.array(after.diagnosed.covariance)[:4, :4], COVARIANCE[:4, :4])
     lags = [
         plant.release.lag for plant in drawn_plants(after, 0)
     ]  # what varies from throw to throw does so in training
-    assert np.std(lags) == pytest.approx(0.01, rel=0.5)
+    assert np.std(lags) == approx(0.01, rel=0.5)
     assert len(set(lags)) == 8
     assert after.vehicle.motor == before.vehicle.motor
     assert after.ppo == before.ppo
@@ -103,8 +104,8 @@ def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
     assert cli.main(["diagnose", "apply", more, "--out", str(second)]) == 0
     capsys.readouterr()
     after = config.load(Experiment, second)
-    assert after.rope.length == pytest.approx(shipped().rope.length - 0.003)
-    np.testing.assert_allclose(after.vehicle.thrust.gain, 1.03)
+    assert after.rope.length == approx(shipped().rope.length - 0.003)
+    assert_allclose(after.vehicle.thrust.gain, 1.03)
 
 
 def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, capsys):
@@ -135,7 +136,7 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, caps
         == 0
     )
     after = config.load(Experiment, out)
-    assert (after.release.lag, after.rope.length) == pytest.approx((0.11, 0.5))
+    assert (after.release.lag, after.rope.length) == approx((0.11, 0.5))
 
 
 def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
@@ -190,7 +191,7 @@ def test_draws_keep_what_is_pinned_together():
     plants = drawn_plants(replace(before, diagnosed=loose), 1)
     gain = np.array([p.vehicle.thrust.gain[0] for p in plants]) - 1.0
     mass = np.array([p.vehicle.body.mass for p in plants]) - before.vehicle.body.mass
-    assert np.std(gain) == pytest.approx(0.01, rel=0.15)
+    assert np.std(gain) == approx(0.01, rel=0.15)
     assert np.corrcoef(gain, mass)[0, 1] > 0.97
     assert drawn_plants(before, 1) == [plant_of(before)]
     assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
@@ -202,7 +203,7 @@ def test_a_config_without_diagnosis_keeps_its_contract():
     assert "com" not in contract_of(before)["vehicle"]["body"]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("changes", "message"),
     [
         ({"theta": {"no_such": 1.0}, "covariance": [[1.0]]}, "no effects of the throw"),
@@ -271,13 +272,11 @@ def test_other_models_have_extended_setups(diagnosis, tmp_path):
         == 0
     )
     assert setups.load(out).effects == {"ball_drag": 0.03}
-    assert setups.load(again).effects == pytest.approx({"ball_drag": 0.06})
+    assert setups.load(again).effects == approx({"ball_drag": 0.06})
     logs = [ball_log(drag=0.03, seed=1)]
     plain, extended = (setups.model_of(setups.load(name), logs) for name in ("jugglebot", out))
-    np.testing.assert_allclose(
-        extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9
-    )
-    assert extended.effects[0].bounds[0] == pytest.approx(plain.effects[0].bounds[0] - 0.03)
+    assert_allclose(extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9)
+    assert extended.effects[0].bounds[0] == approx(plain.effects[0].bounds[0] - 0.03)
 
 
 def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys):
@@ -352,17 +351,17 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys)
         ("thrust = 1.0", "no effect 'thrust'"),
     ):
         out.write_text(f'base = "diagnose/jugglebot.toml"\n[effects]\n{entry}\n')
-        with pytest.raises(LogError, match=message):
+        with raises(LogError, match=message):
             setups.model_of(setups.load(out), [ball_log(seed=1)])
 
 
 def test_a_broken_covariance_is_refused():
-    with pytest.raises(ConfigError, match="one row and one column"):
+    with raises(ConfigError, match="one row and one column"):
         DiagnosedParams(("rope_length",), ((1.0, 2.0),), 2)
     from dataclasses import replace
 
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
-    with pytest.raises(ConfigError, match="no covariance"):
+    with raises(ConfigError, match="no covariance"):
         drawn_plants(replace(shipped(), diagnosed=bad), 0)
 
 
@@ -401,6 +400,6 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
     assert cli.main([*command, "--hover", "0.3645", "--delay", "0.003"]) == 0
     after = config.load(Experiment, out)
     assert after.vehicle.controller.kind == "motor_mixing"
-    assert after.vehicle.controller.p_gain[0] == pytest.approx(0.01748, rel=1e-3)
+    assert after.vehicle.controller.p_gain[0] == approx(0.01748, rel=1e-3)
     assert after.vehicle.queue.delay == 0.003
     assert "# Not in the block: tpa_rate 65" in out.read_text()

@@ -4,13 +4,13 @@ Minutes, hence slow.
 """
 
 import numpy as np
-import pytest
+from pytest import mark
 from scipy.stats import binom
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.select import result, search
 
-pytestmark = pytest.mark.slow
+pytestmark = mark.slow
 
 EFFECTS = catalogue(20)
 NULLS, SINGLES, PAIRS = 100, 30, 20
@@ -51,7 +51,7 @@ def test_null_worlds_raise_no_false_alarm():
     assert binom.sf(len(alarms) - 1, NULLS, 0.01) > SURE, [a.reasons for a in alarms]
 
 
-@pytest.mark.parametrize(("floors", "found"), [(6.0, 0.75), (10.0, 0.92), (15.0, 0.97)])
+@mark.parametrize(("floors", "found"), [(6.0, 0.75), (10.0, 0.92), (15.0, 0.97)])
 def test_single_effects_are_found_and_named_rightly(floors, found):
     right = wrong = 0
     for truth, model in worlds(SINGLES, 1, floors, int(floors)):

@@ -3,7 +3,7 @@ looked at where they lead.
 """
 
 import numpy as np
-import pytest
+from pytest import approx
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.select import result, search
@@ -46,7 +46,7 @@ def explained(size: float):
 def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_leads():
     diagnosis = explained(SIZE)
     assert diagnosis.named == (NAME,)
-    assert diagnosis[NAME].estimate == pytest.approx(SIZE * EFFECTS[3].floor, rel=0.1)
+    assert diagnosis[NAME].estimate == approx(SIZE * EFFECTS[3].floor, rel=0.1)
     assert diagnosis.overall == result.KNOWN
 
 

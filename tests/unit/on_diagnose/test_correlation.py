@@ -5,7 +5,9 @@ noise, and what it is there for.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 from scipy.signal import lfilter
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
@@ -39,7 +41,7 @@ def flown(seed: int, colour: str, **options) -> SyntheticModel:
     model = SyntheticModel(
         effects=catalogue(SOME), seed=seed, noise=1e-6, rate=RATE, throws=4, **options
     )
-    rng = np.random.default_rng([seed, 1])
+    rng = default_rng([seed, 1])
     for i, window in enumerate(model._windows):
         own = [noise(rng, len(window.residual) // 6, colour).ravel() for _ in range(2)]
         model._windows[i] = replace(
@@ -53,7 +55,7 @@ def estimated(model: SyntheticModel) -> dict[int, Correlation]:
     return correlations(model.windows({}), priors.slab * priors.floor, 2)
 
 
-@pytest.mark.parametrize("order", [1, 2])
+@mark.parametrize("order", [1, 2])
 def test_inner_products_are_those_of_the_dense_covariance(order):
     window = flown(1, "white").windows({})[0]
     known = Correlation(0.02, 0.9, order, 1.7)
@@ -65,17 +67,17 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
     floors = np.ones(SOME)
     z, gram = marginal.columns(window, floors), marginal.gram_of(told, floors, 2)
     inverse = np.linalg.inv(dense)
-    np.testing.assert_allclose(
+    assert_allclose(
         gram.inner.sum(0), z.T @ inverse @ z, rtol=1e-6, atol=1e-9 * np.abs(gram.inner).max()
     )
-    assert gram.square.sum() == pytest.approx(window.residual @ inverse @ window.residual)
-    assert 2.0 * gram.log_sigma == pytest.approx(np.linalg.slogdet(dense)[1])
-    other = np.random.default_rng(0).normal(size=len(window.residual)) * window.sigma
+    assert gram.square.sum() == approx(window.residual @ inverse @ window.residual)
+    assert 2.0 * gram.log_sigma == approx(np.linalg.slogdet(dense)[1])
+    other = default_rng(0).normal(size=len(window.residual)) * window.sigma
     again = marginal.with_residual(gram, told, floors, other)
-    np.testing.assert_allclose(
+    assert_allclose(
         again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max()
     )
-    assert again.square.sum() == pytest.approx(other @ inverse @ other)
+    assert again.square.sum() == approx(other @ inverse @ other)
 
 
 def test_white_noise_is_white():
@@ -85,7 +87,7 @@ def test_white_noise_is_white():
     )
 
 
-@pytest.mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
+@mark.parametrize(("colour", "order"), [("first", 1), ("second", 2)])
 def test_time_order_and_size_are_those_planted(colour, order):
     for seed in (3,):
         found = estimated(flown(seed, colour))

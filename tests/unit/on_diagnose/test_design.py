@@ -5,7 +5,7 @@ vehicle that can fly it.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import setup
@@ -42,7 +42,7 @@ def hovered(params):
     )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def quadrotor():
     params = replace(setup.load("nanobench_cf21").flyer, every=6, window=2.0, step=0.04)
     return hovered(params)
@@ -60,16 +60,14 @@ def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
     ]
     best = chosen[int(np.argmax(rates))]
     found = design.optimise(aim, best, simulate, design.Limits(), seed=1, steps=1)
-    assert found.start == pytest.approx(max(rates), rel=0.02)  # but for the noise
+    assert found.start == approx(max(rates), rel=0.02)  # but for the noise
     assert found.rate > 1.15 * found.start
     (again,) = simulate([found.manoeuvre])
     assert again.used < 1.0
-    assert aim.nats(aim.information(again.model)) / best.seconds == pytest.approx(
-        found.rate, rel=0.02
-    )
+    assert aim.nats(aim.information(again.model)) / best.seconds == approx(found.rate, rel=0.02)
 
 
-@pytest.mark.parametrize("base", BASES.values(), ids=lambda m: m.name)
+@mark.parametrize("base", BASES.values(), ids=lambda m: m.name)
 def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(base: Manoeuvre):
     same, own = design.designed(base, design.Limits(), design.START).reference(), base.reference()
     for name in ("pos_w", "yaw", "rates_b", "thrust_factor", "release"):
@@ -104,7 +102,7 @@ def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
         assert not any(np.isfinite(m.release) for m in flown)
 
 
-@pytest.mark.parametrize("name", ["cf_payload", "nanobench_cf21"])
+@mark.parametrize("name", ["cf_payload", "nanobench_cf21"])
 def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name):
     """The log's input, attitude and path belong together by the setup's own numbers: hardly
     anything is left without any effect.
@@ -119,11 +117,11 @@ def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name
 
 def test_a_ball_flies_no_manoeuvre():
     model = BallModel.__new__(BallModel)
-    with pytest.raises(DiagnoseError, match="flown by a vehicle"):
+    with raises(DiagnoseError, match="flown by a vehicle"):
         fly_manoeuvres.simulator_of(model, None)
 
 
-@pytest.mark.parametrize("limits", [{"speed": 0.0}, {"half": (1.0, -1.0)}, {"highest": 0.5}])
+@mark.parametrize("limits", [{"speed": 0.0}, {"half": (1.0, -1.0)}, {"highest": 0.5}])
 def test_limits_that_leave_no_room_are_refused(limits):
-    with pytest.raises(DiagnoseError, match="above"):
+    with raises(DiagnoseError, match="above"):
         design.Limits(**limits)

@@ -1,6 +1,7 @@
 """What another flight may differ by, as far as the flights do not say otherwise."""
 
 import numpy as np
+from numpy.random import default_rng
 
 from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance
 from visthrow.diagnose.likelihood.marginal import Statistics
@@ -45,7 +46,7 @@ def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter()
     """Of sixteen flights nothing of a third of the size is left; where they scatter by more than
     that, the scatter is.
     """
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     assert interval(flights(np.full(16, SIZE), rng))[1] < 0.3
     apart = 2.0 * allowed(SIZE) * rng.standard_normal(16)
     found = interval(flights(SIZE + apart, rng))[1]
@@ -54,7 +55,7 @@ def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter()
 
 def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
     """Worlds of three to eight flights, each with its own deviation among them."""
-    rng, held = np.random.default_rng(3), 0
+    rng, held = default_rng(3), 0
     for _ in range(TRIED):
         deviation = abs(rng.standard_normal()) * allowed(SIZE)
         size, sd = interval(

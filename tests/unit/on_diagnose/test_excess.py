@@ -3,7 +3,7 @@
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from visthrow.diagnose.select import excess
 
@@ -23,7 +23,7 @@ class Phase:
         return self.noise.latent_sd[block, self.phase]
 
 
-@pytest.mark.parametrize(("metres_a_newton", "excessive"), [(1e-4, False), (1.0, True)])
+@mark.parametrize(("metres_a_newton", "excessive"), [(1e-4, False), (1.0, True)])
 def test_a_force_that_moves_no_landing_is_nothing_unknown(metres_a_newton, excessive, monkeypatch):
     """The throw's force of 10 N stands out from the calm phase's 1 N; it moves the vehicle by 1 mm
     in one case, by 10 m in the other.

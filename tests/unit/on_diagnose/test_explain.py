@@ -3,7 +3,7 @@
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, fixture
 
 from bench.diagnose.altered import with_values
 from bench.diagnose.cases import logs_of
@@ -16,7 +16,7 @@ from visthrow.task import Experiment, drawn_plants
 MODEL = ("--only", "com_x", "--set", "rope.segments=1", "--device", "cpu", "--no-report")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flights():
     """Three throws of a vehicle whose centre of mass lies 3 mm forward."""
     return logs_of(Recipe(4, "rod", {"com_x": 3e-3}, 30.0, free=0, throws=3))
@@ -42,7 +42,7 @@ def test_a_copied_log_counts_once(flights, tmp_path):
     assert twice["duplicates"] == {"3": 0}
     assert (twice["flights"], once["model"], once["plant"]) == (3, "throw", "state")
     assert once["overrides"] == ["rope.segments=1"]
-    assert twice["theta"] == pytest.approx(once["theta"])
+    assert twice["theta"] == approx(once["theta"])
 
 
 def test_what_was_explained_is_what_training_draws(flights, tmp_path):
@@ -55,8 +55,8 @@ def test_what_was_explained_is_what_training_draws(flights, tmp_path):
     (sd,) = np.sqrt(diagnosed.covariance[0])
     assert 2e-5 < sd < 4e-4, "of 3 mm that three throws show to a few hundredths"
     centres = [plant.vehicle.body.com[0] for plant in drawn_plants(config.load(Experiment, out), 0)]
-    assert np.mean(centres) == pytest.approx(3e-3, abs=3.0 * sd)
-    assert np.std(centres) == pytest.approx(sd, rel=0.5)
+    assert np.mean(centres) == approx(3e-3, abs=3.0 * sd)
+    assert np.std(centres) == approx(sd, rel=0.5)
 
 
 def test_one_bad_log_of_three_does_not_refuse_the_others(flights, tmp_path):

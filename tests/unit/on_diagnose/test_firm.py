@@ -4,7 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.marginal import Statistics
@@ -29,7 +29,7 @@ def promised(nats, came):
     return held_out.borne_out(statistics, np.ones((count, 1)), np.ones(1))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("nats", "came", "sure"),
     [
         ([30.0, 40.0, 35.0], [29.0, 41.0, 36.0], True),
@@ -49,7 +49,7 @@ def promised(nats, came):
 )
 def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
     share, low, _ = promised(nats, came)
-    assert share == pytest.approx(sum(came) / sum(nats))
+    assert share == approx(sum(came) / sum(nats))
     assert (low > 0.0) == sure
 
 
@@ -139,7 +139,7 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     assert diagnosis.overall == result.KNOWN
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("after", "verb"),
     [
         (0.050, "rises from 34 to 50 mm"),

@@ -6,7 +6,8 @@ import json
 from dataclasses import asdict
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import fixture, mark
 from scipy.spatial.transform import Rotation
 
 from sim.params import GRAVITY
@@ -60,7 +61,7 @@ WRONG = {
 }
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def logs():
     return [flown(seed) for seed in range(3)]
 
@@ -72,14 +73,14 @@ def changed(log, change):
     )
 
 
-@pytest.mark.parametrize("name", WRONG)
+@mark.parametrize("name", WRONG)
 def test_each_mistake_is_suspected_and_put_right(logs, name):
     wrong = [changed(log, WRONG[name]) for log in logs]
     found = suspected(wrong, PLANT)
     assert [m.name for m in found] == [name.split(" ")[0]]
     assert found[0].logs == 3
     for log, meant in zip(wrong, logs):
-        np.testing.assert_allclose(
+        assert_allclose(
             found[0].mended(log)["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
         )
 
@@ -109,7 +110,7 @@ def simulated(logs):
     return ThrowModel(logs, PLANT, only=["com_x"])
 
 
-@pytest.mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])
+@mark.parametrize(("change", "names"), [("rate_axes", ["rate_axes", "rate_unit"]), ("", [])])
 def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     """A mistake that is there stays put right; one that is suspected without reason is dropped
     again.
@@ -129,6 +130,4 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     assert all(m.nats > 100.0 for m in model.mistakes)
     assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2
     for log, meant in zip(logs, flights):
-        np.testing.assert_allclose(
-            log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9
-        )
+        assert_allclose(log["command"].values, meant["command"].values, rtol=1e-4, atol=1e-9)

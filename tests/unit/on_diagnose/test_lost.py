@@ -5,7 +5,7 @@ been taken for.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.select import result, search
@@ -49,7 +49,7 @@ def lost_of(model) -> list[int]:
     return lost(linearise(problem, np.zeros(len(model.effects)), windows=windows))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("shaken", "rough", "expected"),
     [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])],
 )

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pytest import approx, importorskip, raises
 from scipy.spatial.transform import Rotation
 
 from tests import logfiles
@@ -174,9 +175,9 @@ def test_what_is_not_known_is_asked(tmp_path):
     columns = {name: values for name, values in table().items() if name != "millis"}
     found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")
     assert any("how far are the rows apart" in question for question in found.questions)
-    with pytest.raises(LogError, match="none of its 2 columns holds numbers that change"):
+    with raises(LogError, match="none of its 2 columns holds numbers that change"):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
-    with pytest.raises(LogError, match=r"a\.ulg: says itself what it holds"):
+    with raises(LogError, match=r"a\.ulg: says itself what it holds"):
         table_of(tmp_path / "a.ulg")
 
 
@@ -248,7 +249,7 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
 
 def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     file = REAL / "payload_cf_single" / "log206.csv.gz"
-    with pytest.raises(
+    with raises(
         LogError,
         match=(
             r"36\.9 is 36\.9 kg, but .* carries 0\.0408 kg in N: grams\? Expected kilograms: --mass"
@@ -308,18 +309,18 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     }
     seen = FlightLog(late, {"source": "b.npz"})
     offset, correlation, by = offset_of(onboard, seen)
-    assert offset == pytest.approx(-37.42, abs=0.01)
+    assert offset == approx(-37.42, abs=0.01)
     assert correlation > 0.9
     assert by == "body rates"
     onboard.save(tmp_path / "a.npz")
     seen.save(tmp_path / "b.npz")
     (log,) = read(f"{tmp_path}/a.npz+{tmp_path}/b.npz")
-    assert log["pos_w"].time == pytest.approx(whole["pos_w"].time[300:], abs=0.01)
+    assert log["pos_w"].time == approx(whole["pos_w"].time[300:], abs=0.01)
     assert set(log.channels) == {"rate_b", "acc_b", "command", "pos_w", "quat_wb"}
     stranger = log_of(flight(20.0, seed=9))
-    with pytest.raises(LogError, match="not one flight"):
+    with raises(LogError, match="not one flight"):
         join([onboard, FlightLog({"quat_wb": stranger["quat_wb"]}, {"source": "c.npz"})])
-    with pytest.raises(LogError, match="nothing in it that the others measured too"):
+    with raises(LogError, match="nothing in it that the others measured too"):
         join(
             [
                 onboard,
@@ -364,7 +365,7 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
         seen, {"estimated": ["vel_w", "rate_b"], "ingest": {"rate_b": {}, "quat_wb": {}}}
     )
     log = join([run, box])
-    assert log.meta["joined"][0]["offset_s"] == pytest.approx(-5.0, abs=NEAR)
+    assert log.meta["joined"][0]["offset_s"] == approx(-5.0, abs=NEAR)
     assert np.array_equal(log["rate_b"].values, box["rate_b"].values)
     assert log.meta["estimated"] == ["vel_w"]
     assert log.meta["ingest"]["rate_b"]["clock"] == "box"
@@ -378,7 +379,7 @@ def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
     """A ULog holds ``thrust_body`` and rates; hover is at 0.37 of full, with a slope of 0.8 about
     it.
     """
-    pytest.importorskip("pyulog")
+    importorskip("pyulog")
     columns, plant = flight(20.0), paper_plant()
     weight = 9.81 * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     force = np.linalg.norm(columns["acc_b"], axis=1) / 9.81
@@ -431,8 +432,8 @@ def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
     assert "throttle / 0.37" in mistake.equation
     command = made["command"]
     true = weight * np.interp(command.time + 0.05, columns["time"], smooth)
-    assert np.mean(command.values[:, 0]) == pytest.approx(np.mean(true), rel=0.02)
-    assert np.polyfit(true, command.values[:, 0], 1)[0] == pytest.approx(1.0, abs=SLOPE)
+    assert np.mean(command.values[:, 0]) == approx(np.mean(true), rel=0.02)
+    assert np.polyfit(true, command.values[:, 0], 1)[0] == approx(1.0, abs=SLOPE)
     recorded = record_of(made)
     assert len(recorded.vehicle.time) == len(recorded.attitude.time) > 1000, (
         "attitudes lie between the positions"

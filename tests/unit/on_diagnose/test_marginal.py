@@ -5,7 +5,9 @@ planted ones.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark, raises
 
 from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
@@ -30,7 +32,7 @@ def alone(gram, levels, window, latents=False):
     )
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def fitted():
     model = SyntheticModel(effects=EFFECTS, throws=4)
     windows, floors = model.windows({}), Priors.of(model.effects, model.channels).floor
@@ -56,16 +58,12 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
         v, s = dense(windows[at], grams[at], levels, floors, at)
         part = statistics(grams, levels)[at]
         inverse = np.linalg.inv(v)
-        np.testing.assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(
-            part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6
-        )
+        assert_allclose(part.information, s.T @ inverse @ s, rtol=1e-6, atol=1e-6)
+        assert_allclose(part.score, s.T @ inverse @ windows[at].residual, rtol=1e-6, atol=1e-6)
         g = windows[at].latent
         whole = g.T @ inverse @ g
-        np.testing.assert_allclose(
-            part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max()
-        )
-        np.testing.assert_allclose(
+        assert_allclose(part.latent_information, whole, rtol=1e-5, atol=1e-4 * np.abs(whole).max())
+        assert_allclose(
             part.latent_score, g.T @ inverse @ windows[at].residual, rtol=1e-5, atol=1e-3
         )
 
@@ -94,29 +92,29 @@ def test_likelihood_is_that_of_the_dense_covariance(fitted):
         sign, log_det = np.linalg.slogdet(v)
         assert sign > 0
         dense_value = -0.5 * (log_det + window.residual @ np.linalg.solve(v, window.residual))
-        assert likelihood(of, choice, 0) == pytest.approx(dense_value, abs=1e-3)
+        assert likelihood(of, choice, 0) == approx(dense_value, abs=1e-3)
 
 
 def test_broken_derivatives_are_told_with_their_window(fitted):
     gram = fitted[4][3]
-    with pytest.raises(
+    with raises(
         DiagnoseError,
         match=f"flight {gram.flight}, phase {gram.phase}: the normal equations are singular",
     ):
         Stack([fitted[4][0], replace(gram, inner=-1e6 * gram.inner)]).values(fitted[3])
 
 
-@pytest.mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
+@mark.parametrize(("sensor", "gust"), [(1.0, 1.0), (2.0, 0.5)])
 def test_noise_levels_are_found_again(sensor, gust):
     model = SyntheticModel(effects=EFFECTS, throws=8, noise=sensor, gust=gust, seed=3)
     windows = model.windows({})
     levels, _ = noise.fit(windows, [marginal.gram_of(w, np.ones(6), 2) for w in windows])
-    np.testing.assert_allclose(levels.scale, sensor, rtol=0.1)
+    assert_allclose(levels.scale, sensor, rtol=0.1)
     found = np.mean([levels.latent_sd[0, p] for p in ("flight", "hover", "throw")])
-    assert found == pytest.approx(gust * GUST[0], rel=0.5)
+    assert found == approx(gust * GUST[0], rel=0.5)
 
 
-@pytest.mark.parametrize("device", ["cpu", "cpu:0"])
+@mark.parametrize("device", ["cpu", "cpu:0"])
 def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted, device):
     """Whether each window is looked at by itself or all at once, as on a GPU."""
     _, windows, floors, _, _ = fitted
@@ -130,14 +128,12 @@ def test_outliers_lose_their_weight_and_good_windows_are_left_alone(fitted, devi
     assert second is windows[1]
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def bad_window(fitted):
     """Number of the window, levels and grams."""
     _, windows, floors, _, _ = fitted
     bad = next(i for i, w in enumerate(windows) if w.phase == "throw")
-    push = windows[bad].latent @ np.random.default_rng(0).normal(
-        0.0, 1.0, windows[bad].latent.shape[1]
-    )
+    push = windows[bad].latent @ default_rng(0).normal(0.0, 1.0, windows[bad].latent.shape[1])
     spoilt = [
         replace(w, residual=w.residual + push) if i == bad else w for i, w in enumerate(windows)
     ]
@@ -151,7 +147,7 @@ def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window
     assert again.latent_sd[0, "throw"] < 2.0 * levels.latent_sd[0, "throw"]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "spoil",
     [
         lambda w: replace(w, residual=np.full_like(w.residual, np.nan)),
@@ -163,12 +159,12 @@ def test_one_bad_window_does_not_raise_the_level_of_its_phase(fitted, bad_window
 )
 def test_broken_windows_are_named(fitted, spoil):
     _, windows, floors, _, _ = fitted
-    with pytest.raises(DiagnoseError, match="window of flight 0"):
+    with raises(DiagnoseError, match="window of flight 0"):
         marginal.gram_of(spoil(windows[0]), floors, 2)
 
 
 def test_a_model_without_latent_forces_works():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     n = 50
     s, x = rng.normal(size=(n, 2)), np.ones((n, 1))
     window = Window(
@@ -185,14 +181,14 @@ def test_a_model_without_latent_forces_works():
     )
     levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
     part = alone(grams[0], levels, 0)
-    assert np.linalg.solve(part.information, part.score) == pytest.approx([0.3, 0.0], abs=0.05)
+    assert np.linalg.solve(part.information, part.score) == approx([0.3, 0.0], abs=0.05)
 
 
 def test_information_that_is_negative_beyond_rounding_is_an_error(fitted):
     *_, levels, grams = fitted
     part = alone(grams[0], levels, 0)
     wrong = 1e6 * np.array([[1.0, 1.01], [1.01, 1.0]])
-    with pytest.raises(DiagnoseError, match=r"eigenvalue -1\.0e-02 relative to its diagonal"):
+    with raises(DiagnoseError, match=r"eigenvalue -1\.0e-02 relative to its diagonal"):
         marginal.gather(
             grams[:1], [replace(part, information=wrong, score=np.zeros(2))], np.zeros(2)
         )

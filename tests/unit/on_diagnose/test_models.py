@@ -7,7 +7,8 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, mark, raises
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
@@ -68,11 +69,7 @@ def swing_log(
         slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10
     ).y[0]
     return FlightLog(
-        {
-            "angle": Channel(
-                time, angle + offset + np.random.default_rng(1).normal(0, noise, len(time)), "rad"
-            )
-        }
+        {"angle": Channel(time, angle + offset + default_rng(1).normal(0, noise, len(time)), "rad")}
     )
 
 
@@ -102,21 +99,21 @@ class TestBall:
         estimates = found(
             BallModel(logs, BALL), ["ball_drag", "frame_tilt_x", "frame_tilt_y", "top_spin"]
         )
-        assert estimates["ball_drag"][0] == pytest.approx(0.04, rel=0.03)
+        assert estimates["ball_drag"][0] == approx(0.04, rel=0.03)
         assert near(estimates, "ball_drag", 0.04)
         assert near(estimates, "top_spin", 0.0)
 
     def test_spin_is_found(self):
         logs = [ball_log(spin=(0.0, 0.0, 0.3), seed=i, heading=2.1 * i) for i in range(3)]
         estimates = found(BallModel(logs, BALL), ["side_spin", "ball_drag"])
-        assert estimates["side_spin"][0] == pytest.approx(0.3, rel=0.05)
+        assert estimates["side_spin"][0] == approx(0.3, rel=0.05)
 
     def test_wind_shows_where_the_drag_is(self):
         """Without drag there is no wind: derivatives of the model as it stands say
         nothing of it.
         """
         truth, stamps, paths = beside_aeroid.world(240000100)
-        seen = paths + np.random.default_rng(1).normal(0.0, 5e-4, paths.shape)
+        seen = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
         diagnosis = search.explain(beside_aeroid.model_of(stamps, seen), laws=False)
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
@@ -124,7 +121,7 @@ class TestBall:
             abs(diagnosis[name].estimate - size) < 3.0 * diagnosis[name].sd
             for name, size in truth.items()
         )
-        unseen = paths + np.random.default_rng(2).normal(0.0, 5e-4, paths.shape)
+        unseen = paths + default_rng(2).normal(0.0, 5e-4, paths.shape)
         others = beside_aeroid.model_of(stamps, unseen)
         errors = on_others(others, others, diagnosis.theta, diagnosis).errors
         before, after, noise = errors["payload_pos_w"]
@@ -143,7 +140,7 @@ class TestBall:
     def test_nothing_that_falls(self):
         time = np.arange(0, 3, 0.01)
         still = FlightLog({"payload_pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world")})
-        with pytest.raises(LogError, match="no stretch"):
+        with raises(LogError, match="no stretch"):
             BallModel([still], BALL)
 
 
@@ -170,7 +167,7 @@ class TestPendulum:
             "encoder_offset": 0.01,
         }
         assert all(near(estimates, name, truth[name]) for name in names), estimates
-        assert estimates["pendulum_length"][0] == pytest.approx(0.01, rel=0.02)
+        assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
 
 
 class TestStand:
@@ -180,7 +177,7 @@ class TestStand:
         power = 2e-8 * speed**3
         current = (volts - np.sqrt(volts**2 - 0.4 * power)) / 0.2
         time = 2.0 * np.arange(12)
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         values = {
             "thrust": (thrust * (1 + rng.normal(0, 0.005, 12)), "N"),
             "rotor_speed": (speed, "rad/s"),
@@ -199,7 +196,7 @@ class TestStand:
         vehicle = fitting.vehicle_of(setups.Setup("", stand=STAND), result, base)
         speed = np.array([600.0, 1200.0, 1700.0])
         told = vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed
-        assert told == pytest.approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
+        assert told == approx(1.4e-6 * speed**2 + 3e-4 * speed, rel=0.02)
 
     def test_command_line_writes_a_vehicle(self, tmp_path, capsys):
         for i in range(3):
@@ -226,26 +223,24 @@ class TestStand:
         assert cli.main(["config", "vehicle", str(out / "vehicle.toml")]) == 0
         vehicle = config.load(fitting.VehicleParams, out / "vehicle.toml")
         speed = 1000.0
-        assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == pytest.approx(
-            1.7, rel=0.03
-        )
+        assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == approx(1.7, rel=0.03)
         record = json.loads((out / "fit.json").read_text())
         assert np.shape(record["covariance"]) == (len(record["effects"]),) * 2
         assert len(record["logs"]) == 3
 
 
 class TestFlyer:
-    @pytest.mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
+    @mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
     def test_a_map_without_thrust_is_refused(self, thrust_map):
-        with pytest.raises(ConfigError, match="thrust_map"):
+        with raises(ConfigError, match="thrust_map"):
             replace(FLYER, thrust_map=thrust_map)
 
-    @pytest.mark.parametrize("phase", [0.0, 0.003, 0.0085])
+    @mark.parametrize("phase", [0.0, 0.003, 0.0085])
     def test_held_commands_pass_the_motors_lag_exactly(self, phase):
         """Closed form: thrust falls to each command by itself, wherever in a step of the
         integration that one comes.
         """
-        rng, fine, tau, mass = np.random.default_rng(3), 1e-4, 0.03, 0.03
+        rng, fine, tau, mass = default_rng(3), 1e-4, 0.03, 0.03
         params = replace(
             FLYER,
             input="thrust_command",
@@ -297,7 +292,7 @@ class TestFlyer:
         )
         assert diagnosis.overall == "NO EFFECT"
 
-    @pytest.mark.parametrize("stated", [(), ("wind_x=0", "wind_y=0")])
+    @mark.parametrize("stated", [(), ("wind_x=0", "wind_y=0")])
     def test_wind_is_told_as_wind_unless_the_air_is_stated_to_stand(self, stated, monkeypatch):
         plain = flown.attitude
 
@@ -348,11 +343,11 @@ class TestFlyer:
         assert good < 0.1 * bad
 
     def test_missing_channels_are_named(self):
-        with pytest.raises(LogError, match="missing everywhere: quat_wb"):
+        with raises(LogError, match="missing everywhere: quat_wb"):
             FlyerModel(
                 [FlightLog({k: v for k, v in fly(3.0).channels.items() if k != "quat_wb"})], FLYER
             )
-        with pytest.raises(ConfigError, match="single motors"):
+        with raises(ConfigError, match="single motors"):
             FlyerParams(
                 **{
                     **vars(FLYER),
@@ -386,7 +381,7 @@ TRIM = TrimParams(
 
 def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
     """Hover in which each motor is told its share of the weight's quarter."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     time = np.arange(0, 8, 0.01)
     command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
     pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
@@ -405,7 +400,7 @@ class TestTrim:
             TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM),
             ["motor_fl", "motor_fr", "motor_rl", "motor_rr"],
         )
-        assert estimates["motor_rl"][0] == pytest.approx(-0.2, abs=0.02)
+        assert estimates["motor_rl"][0] == approx(-0.2, abs=0.02)
         assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
 
 
@@ -418,7 +413,7 @@ class TestGimbal:
         """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
         of scipy's.
         """
-        rng = np.random.default_rng(2)
+        rng = default_rng(2)
         time = np.arange(0, 20, 1 / 30)
 
         def seen(t):
@@ -475,24 +470,24 @@ class TestGimbal:
 
 class TestSetups:
     def test_one_model_a_setup(self):
-        with pytest.raises(ConfigError, match="ball and stand: a setup has one model"):
+        with raises(ConfigError, match="ball and stand: a setup has one model"):
             setups.Setup("", ball=BALL, stand=STAND)
-        with pytest.raises(ConfigError, match="has no model"):
+        with raises(ConfigError, match="has no model"):
             setups.model_of(setups.Setup("bare"), [])
 
     def test_a_simulated_vehicle_gets_what_a_flight_showed(self):
         sizes = {"motor_tau": 0.007, "mass_quad": 0.01, "rotor_drag_xy": 0.02}
         found = SimpleNamespace(names=tuple(sizes), theta=np.array(list(sizes.values())))
         vehicle = fitting.vehicle_of(setups.Setup("", flyer=FLYER), found, paper_plant().vehicle)
-        assert vehicle.motor.time_constant == pytest.approx(FLYER.motor_time_constant + 0.007)
-        assert vehicle.body.mass == pytest.approx(FLYER.mass + 0.01)
-        assert vehicle.aero.drag_x == vehicle.aero.drag_y == pytest.approx(FLYER.drag_xy + 0.02)
+        assert vehicle.motor.time_constant == approx(FLYER.motor_time_constant + 0.007)
+        assert vehicle.body.mass == approx(FLYER.mass + 0.01)
+        assert vehicle.aero.drag_x == vehicle.aero.drag_y == approx(FLYER.drag_xy + 0.02)
 
     def test_fit_refuses_what_is_not_there(self):
         model = BallModel([ball_log()], BALL)
-        with pytest.raises(DiagnoseError, match="did you mean 'ball_drag'"):
+        with raises(DiagnoseError, match="did you mean 'ball_drag'"):
             fitting.fit(model, ["bal_drag"])
-        with pytest.raises(DiagnoseError, match="nothing to fit"):
+        with raises(DiagnoseError, match="nothing to fit"):
             fitting.fit(model, [])
-        with pytest.raises(LogError, match="no effect 'x'"):
+        with raises(LogError, match="no effect 'x'"):
             model.residuals({"x": 1.0})

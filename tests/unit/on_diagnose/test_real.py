@@ -11,7 +11,7 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from visthrow import cli
 from visthrow.diagnose.inputs import setup as setups
@@ -43,7 +43,7 @@ SETUPS = {
     "slungload_camera": "slungload_camera",
 }
 
-pytestmark = pytest.mark.slow
+pytestmark = mark.slow
 
 
 def explained(setup: str, *paths: str | Path):
@@ -63,7 +63,7 @@ def explained(setup: str, *paths: str | Path):
     return diagnosis, named, rms
 
 
-@pytest.mark.parametrize("folder", list(SETUPS))
+@mark.parametrize("folder", list(SETUPS))
 def test_every_file_gets_a_verdict(folder):
     root = FULL / folder if (FULL / folder).is_dir() else DATA / folder
     files = sorted(p for p in root.iterdir() if p.name.endswith((".csv.gz", ".bbl")))
@@ -91,7 +91,7 @@ def test_two_drones_run_on_two_clocks():
     folder = REAL / "payload_cf_two_drones"
     rows = check(setups.read_logs(sorted(folder.glob("*.gz")), "cf_payload_pair"))[1].rows
     (row,) = [row for row in rows if "rms_m" in row.figures]
-    assert row.figures["delay_s"] == pytest.approx(0.0054, abs=0.002)
+    assert row.figures["delay_s"] == approx(0.0054, abs=0.002)
     assert row.figures["rms_m"] < 1e-3
 
 
@@ -115,7 +115,7 @@ def test_pendulum_has_three_frictions():
     )
     assert diagnosis.overall == IN_PART  # what is left is a hundred times the encoder's noise
     assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named
-    assert diagnosis["pendulum_length"].estimate == pytest.approx(-0.0167, abs=3e-4)
+    assert diagnosis["pendulum_length"].estimate == approx(-0.0167, abs=3e-4)
     assert diagnosis["encoder_scale"].verdict != FOUND  # a spring at the joint does the same
     assert rms(diagnosis.theta) < 0.1 * rms({})
 
@@ -133,7 +133,7 @@ def test_a_cut_propeller_is_found_and_tape_is_not():
     )
     assert diagnosis.overall == KNOWN
     assert "motor_rl" in named
-    assert diagnosis["motor_rl"].estimate == pytest.approx(-0.15, abs=0.04)
+    assert diagnosis["motor_rl"].estimate == approx(-0.15, abs=0.04)
     assert set(diagnosis.theta) <= {"motor_rl", "added_rl"}
     diagnosis, named, _ = explained("crazypad", folder / "tape_on_propeller_M3__E8_log00.csv.gz")
     assert diagnosis.overall == NO_EFFECT
@@ -174,7 +174,7 @@ def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
         for f in diagnosis.findings
         if f.name in ("rope_length", "marker_z") and f.verdict in NAMED
     )
-    assert length.estimate == pytest.approx(0.010, abs=2e-3)
+    assert length.estimate == approx(0.010, abs=2e-3)
     assert rms(diagnosis.theta, 1) < 0.5 * rms({}, 1)
 
 
@@ -204,7 +204,7 @@ def test_the_camera_sees_the_load_nearer_the_axis():
         "slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz"))
     )
     assert "focal_scale" in named
-    assert diagnosis["focal_scale"].estimate == pytest.approx(
+    assert diagnosis["focal_scale"].estimate == approx(
         -0.12, abs=0.025
     )  # -0.11 in these pieces, -0.13 in the whole bags
     assert named & {"camera_tilt_x", "marker_rot_y"}
@@ -212,12 +212,12 @@ def test_the_camera_sees_the_load_nearer_the_axis():
     assert rms(diagnosis.theta) < 0.6 * rms({})
 
 
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
+@mark.filterwarnings("error::RuntimeWarning")
+@mark.parametrize(
     "how",
     ["three rows", "one row again and again", "backwards", "shuffled", "holes", "huge", "zeros"],
 )
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("setup", "path"),
     [
         ("pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"),

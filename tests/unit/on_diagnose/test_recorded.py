@@ -1,7 +1,9 @@
 """What a replay takes from a log."""
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, raises
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -18,11 +20,9 @@ def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> 
     at, seen = np.arange(0.0, 10.0, 0.005), np.arange(0.0, 10.0, 1.0 / rate)
     seen = seen[(seen <= gap[0]) | (seen >= gap[1])]
     values = np.sin(2.0 * np.pi * 10.0 * seen)[:, None] * SWING
-    values += noise * np.random.default_rng(0).standard_normal(values.shape)
-    still = np.zeros((len(at), 3)) + 1e-4 * np.random.default_rng(1).standard_normal((len(at), 3))
-    quat = np.column_stack(
-        (1e-4 * np.random.default_rng(2).standard_normal((len(at), 3)), np.ones(len(at)))
-    )
+    values += noise * default_rng(0).standard_normal(values.shape)
+    still = np.zeros((len(at), 3)) + 1e-4 * default_rng(1).standard_normal((len(at), 3))
+    quat = np.column_stack((1e-4 * default_rng(2).standard_normal((len(at), 3)), np.ones(len(at))))
     return FlightLog(
         {
             "pos_w": Channel(at, still, "m", "world"),
@@ -39,24 +39,24 @@ def test_a_gyro_of_1_kHz_is_as_good_in_a_quarter_of_its_samples():
     """Its noise is halved and white, and the motion that it saw is all there."""
     log = flight(1000.0, 0.02)
     gyro = record_of(log).gyro
-    assert len(gyro.time) == pytest.approx(2500, abs=5)
-    np.testing.assert_allclose(np.diff(gyro.time), 0.004, atol=1e-9)
-    assert gyro.sigma == pytest.approx(0.01, rel=0.1)
+    assert len(gyro.time) == approx(2500, abs=5)
+    assert_allclose(np.diff(gyro.time), 0.004, atol=1e-9)
+    assert gyro.sigma == approx(0.01, rel=0.1)
     left = gyro.values - np.sin(2.0 * np.pi * 10.0 * gyro.time)[:, None] * SWING
-    assert np.std(left) == pytest.approx(0.0101, rel=0.05)
+    assert np.std(left) == approx(0.0101, rel=0.05)
     assert abs(np.corrcoef(left[:-1].ravel(), left[1:].ravel())[0, 1]) < 0.08
     swing = (
         np.sin(2.0 * np.pi * 10.0 * gyro.time)
         @ gyro.values
         / np.sum(np.sin(2.0 * np.pi * 10.0 * gyro.time) ** 2)
     )
-    np.testing.assert_allclose(swing, SWING, rtol=5e-3)
+    assert_allclose(swing, SWING, rtol=5e-3)
 
 
 def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
     time = record_of(flight(1000.0, 0.02, (4.0, 5.0))).gyro.time
     assert not np.any((time > 4.0) & (time < 5.0))
-    assert np.sum(time <= 4.0) == pytest.approx(1000, abs=3)
+    assert np.sum(time <= 4.0) == approx(1000, abs=3)
 
 
 def test_a_log_without_commands_is_told_what_makes_them():
@@ -64,9 +64,7 @@ def test_a_log_without_commands_is_told_what_makes_them():
     time = np.arange(20.0)
     pos = Channel(time, np.zeros((20, 3)), "m", "world")
     quat = Channel(time, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1)), "1", "world")
-    with pytest.raises(
-        DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"
-    ):
+    with raises(DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"):
         record_of(FlightLog({"pos_w": pos, "quat_wb": quat}))
 
 
@@ -78,4 +76,4 @@ def test_rounding_counts_as_noise_of_a_twelfth_of_its_steps_square():
     ramp = np.round(0.2 * at[:, None] * [1.0, 1.1, 1.2] / step) * step
     log.channels["rate_b"] = Channel(at, ramp, "rad/s", "body")
     sigma = record_of(log).gyro.sigma
-    assert sigma == pytest.approx(step * 12**-0.5, rel=0.5)
+    assert sigma == approx(step * 12**-0.5, rel=0.5)

@@ -8,7 +8,7 @@ import zlib
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx, importorskip, mark, raises
 
 from tests.unit.on_logs.test_check import flight
 from visthrow.common.errors import LogError
@@ -42,7 +42,7 @@ def card(path: Path, version: int) -> None:
 
 
 def hdf5(path: Path) -> None:
-    h5py = pytest.importorskip("h5py")
+    h5py = importorskip("h5py")
     with h5py.File(path, "w") as file:
         file["time"], file["drone/pos"], file["imu/acc"] = (
             TIME,
@@ -66,7 +66,7 @@ def matlab(path: Path) -> None:
 
 
 def mcap(path: Path) -> None:
-    writer_of = pytest.importorskip("mcap.writer")
+    writer_of = importorskip("mcap.writer")
     with path.open("wb") as file:
         writer = writer_of.Writer(file)
         writer.start()
@@ -90,7 +90,7 @@ def mcap(path: Path) -> None:
 
 def bag(path: Path, ros: int = 1) -> None:
     """A bag of poses and of an IMU."""
-    module = pytest.importorskip(f"rosbags.rosbag{ros}")
+    module = importorskip(f"rosbags.rosbag{ros}")
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
@@ -142,7 +142,7 @@ WRITERS = {
 }
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@mark.parametrize("name", WRITERS)
 def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
@@ -150,40 +150,40 @@ def test_positions_and_forces_come_out_as_they_went_in(name, tmp_path):
     (log,) = read(path, found.mapping)
     assert {"pos_w", "acc_b"} <= set(log.channels)
     every = 2 if name in ("log00", "log01", "a.mcap") else 1
-    assert log["pos_w"].values == pytest.approx(
+    assert log["pos_w"].values == approx(
         COLUMNS["pos_w"][1::2] if every == 2 else COLUMNS["pos_w"], abs=1e-5
     )
-    assert log["acc_b"].values == pytest.approx(COLUMNS["acc_b"], abs=1e-4)
-    assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(0.01 * every, rel=1e-3)
+    assert log["acc_b"].values == approx(COLUMNS["acc_b"], abs=1e-4)
+    assert np.median(np.diff(log["pos_w"].time)) == approx(0.01 * every, rel=1e-3)
     assert (found.mapping.clocks is not None) == (name not in ("a.h5", "a.mat")), (
         "tables with clocks of their own"
     )
-    with pytest.raises(LogError, match="needs a mapping"):
+    with raises(LogError, match="needs a mapping"):
         read(path)
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@mark.parametrize("name", WRITERS)
 def test_damage_is_said(name, tmp_path):
     path = tmp_path / name
     WRITERS[name](path)
     path.write_bytes(path.read_bytes()[:300])
-    with pytest.raises(LogError, match=path.name):
+    with raises(LogError, match=path.name):
         table_of(path)
 
 
-@pytest.mark.parametrize("version", [1, 2])
+@mark.parametrize("version", [1, 2])
 def test_a_spoilt_byte_of_a_card_is_noticed_by_its_checksum(version, tmp_path):
     path = tmp_path / "log00"
     card(path, version)
     data = bytearray(path.read_bytes())
     data[-10] ^= 1
     path.write_bytes(data)
-    with pytest.raises(LogError, match="its checksum is wrong"):
+    with raises(LogError, match="its checksum is wrong"):
         table_of(path)
 
 
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
     (tmp_path / "a.h5").write_bytes(b"\x89HDF")
-    with pytest.raises(LogError, match=r"pip install 'visthrow\[recordings\]'"):
+    with raises(LogError, match=r"pip install 'visthrow\[recordings\]'"):
         table_of(tmp_path / "a.h5")

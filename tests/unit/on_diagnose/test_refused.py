@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
@@ -34,7 +34,7 @@ def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
     return lambda t: {name: factor * t[name] for name in names}
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("data", "change", "words"),
     [
         (SWING, nothing("theta_rad"), "no stretch of these logs"),
@@ -55,5 +55,5 @@ def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
 )
 def test_spoiled_channels_are_refused(data, change, words):
     assert model(*data, lambda _: {}).stretches  # as it is, it can be looked at
-    with pytest.raises(LogError, match=words):
+    with raises(LogError, match=words):
         model(*data, change)

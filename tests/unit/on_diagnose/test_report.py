@@ -5,7 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark, raises
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
@@ -48,12 +50,12 @@ class Throwing(SyntheticModel):
         missing = np.array(
             [ARMS[n] * (size * floors[n] - theta.get(n, 0.0)) for n, size in self.truth.items()]
         )
-        scatter = np.array([np.random.default_rng(int(n)).normal(0.0, 2e-3, 3) for n in numbers])
+        scatter = np.array([default_rng(int(n)).normal(0.0, 2e-3, 3) for n in numbers])
         off = np.tile([*missing, 0.0], (len(numbers), 1)) + scatter
         return PredictedLandings(numbers, np.zeros_like(off), off, 0.1 * off)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def found():
     model = Throwing(effects=EFFECTS, truth=TRUTH, seed=1)
     return model, search.explain(model, laws=False)
@@ -68,18 +70,18 @@ def test_landings_are_told_in_millimetres(found, measured):
     landing = measured.landing
     assert landing.held_out
     assert landing.throws == 6
-    assert landing.before == pytest.approx(np.hypot(*alone.values()), rel=0.1)
+    assert landing.before == approx(np.hypot(*alone.values()), rel=0.1)
     assert landing.low <= landing.after <= landing.high < 0.5 * landing.before
-    assert landing.released_before == pytest.approx(0.1 * landing.before)
+    assert landing.released_before == approx(0.1 * landing.before)
     for name, moved in landing.moved.items():
-        assert moved == pytest.approx(alone[name], rel=0.2)
+        assert moved == approx(alone[name], rel=0.2)
     text = report.summary(found[1], measured)
     assert f"It moves landings by {1e3 * landing.moved['effect_03']:.0f} mm." in text
     assert f"falls from {1e3 * landing.before:.0f} to {1e3 * landing.after:.0f} mm" in text
     assert report.to_json(found[1], measured)["gain"]["landing"]["after"] == landing.after
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def measured(found):
     return gain.measure(found[1])
 
@@ -100,25 +102,25 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
         forms.predicted(window, point.noise, residual)[0]
         for residual in (window.residual, window.residual + late)
     )
-    np.testing.assert_allclose(spoilt[~late], plain[~late])
-    np.testing.assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
+    assert_allclose(spoilt[~late], plain[~late])
+    assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
 
 
 def test_no_black_box_where_no_latent_force_acts(found):
     point = found[1].work.before
-    assert blackbox.table_of(point, np.random.default_rng(0)) is not None
+    assert blackbox.table_of(point, default_rng(0)) is not None
     still = replace(point, noise=replace(point.noise, latent_sd={}))
-    assert blackbox.table_of(still, np.random.default_rng(0)) is None
+    assert blackbox.table_of(still, default_rng(0)) is None
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("share", "text"), [(-1e-6, "0"), (0.0, "0"), (-0.0, "0"), (0.496, "50"), (-0.02, "-2")]
 )
 def test_nothing_has_no_sign(share, text):
     assert report.percent(share) == text
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def hidden(found):
     return blind.hide(found[1], draws=60)
 
@@ -132,7 +134,7 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
         assert 2.0 < curve.limit / curve.sizes[0] < 20.0
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def degenerate():
     same = {"effect_07": ("effect_03", 0.5)}
     model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same=same, seed=2)
@@ -175,16 +177,16 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND
 
 
-@pytest.mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1"])
+@mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1"])
 def test_measurements_that_are_none_are_refused(item):
-    with pytest.raises(DiagnoseError, match=item.split("=")[0]):
+    with raises(DiagnoseError, match=item.split("=")[0]):
         measures.narrowed(EFFECTS, measures.parsed([item]))
 
 
-@pytest.mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
+@mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
 def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
     r = manoeuvre.reference()
-    assert r.time[-1] == pytest.approx(manoeuvre.seconds, abs=0.05)
+    assert r.time[-1] == approx(manoeuvre.seconds, abs=0.05)
     assert np.abs(r.vel_w[[0, -1]]).max() < 1e-6
     assert np.abs(r.acc_w).max() < 12.0
     assert r.pos_w[:, 2].min() > (0.5 if manoeuvre.payload else 0.08)
@@ -213,7 +215,7 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
         return fly_manoeuvres.SimulatedFlight(chosen, reference, None, truth, None, None)
 
     flights = [level(0.0), level(0.2 * np.pi)]
-    assert [flight.swing for flight in flights] == pytest.approx([90.0, 54.0])
+    assert [flight.swing for flight in flights] == approx([90.0, 54.0])
     assert [flight.simulated(lambda _: "a model").model for flight in flights] == [None, "a model"]
 
 
@@ -264,7 +266,7 @@ def test_an_event_is_left_out_or_weighs_little(found):
     assert sum(text.startswith("**EVENT.**") for text in parts) == 2
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("channel", "unit"),
     [
         ("pos_w", "m"),
@@ -293,7 +295,7 @@ def test_the_recording_is_written(tmp_path, found):
     assert (tmp_path / "d.rrd").stat().st_size > 10_000
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("arguments", "said"),
     [
         (["explain", "nothing.npz"], "nothing.npz"),

@@ -5,6 +5,8 @@ to training.
 from dataclasses import replace
 
 import numpy as np
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
 
 from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
@@ -54,7 +56,7 @@ def on_days(rng, *deviations):
 
 
 def test_what_is_drawn_anew_each_day_drifts():
-    rng = np.random.default_rng(8)
+    rng = default_rng(8)
     worlds = [on_days(rng, 0.012, 0.0) for _ in range(40)]
     assert all(w.by == DAY for w in worlds if w.found)
     assert np.mean([w.found for w in worlds]) > 0.8
@@ -64,7 +66,7 @@ def test_what_is_drawn_anew_each_day_drifts():
 
 
 def test_what_is_drawn_anew_each_flight_does_not_drift():
-    rng = np.random.default_rng(9)
+    rng = default_rng(9)
     worlds = [on_days(rng, 0.0, 0.012) for _ in range(20)]
     assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
     assert "15 flights" in worlds[0].sentence
@@ -78,7 +80,7 @@ def told(rng, **deviation):
 
 
 def test_deviations_are_found_with_their_size():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     worlds = [told(rng, release_lag=0.012) for _ in range(40)]
     assert np.mean([w["lag_jitter"].found for w in worlds]) > 0.9
     assert not any(w["gust"].found for w in worlds)
@@ -90,13 +92,13 @@ def test_deviations_are_found_with_their_size():
 
 
 def test_equal_flights_do_not_vary():
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     worlds = [told(rng) for _ in range(60)]
     assert not any(s.found for w in worlds for s in w.values())
 
 
 def test_three_flights_say_nothing():
-    statistics = flights(np.random.default_rng(7), count=3, release_lag=0.05)
+    statistics = flights(default_rng(7), count=3, release_lag=0.05)
     assert varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) == ()
 
 
@@ -113,16 +115,16 @@ def test_training_draws_what_varies():
     }
     theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)
     assert theta == {"rope_length": 0.01, "release_lag": 0.0}
-    np.testing.assert_allclose(covariance, np.diag([1e-8, 1e-4]))
+    assert_allclose(covariance, np.diag([1e-8, 1e-4]))
     theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
     assert theta == {"release_lag": 0.02}
-    np.testing.assert_allclose(covariance, [[1.01e-4]])
+    assert_allclose(covariance, [[1.01e-4]])
 
 
 def test_shares_of_days_come_before_those_of_flights():
-    statistics, days = campaign(np.random.default_rng(11), 5, 0.0, 0.0)
+    statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
     moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
     statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
     shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
-    np.testing.assert_allclose(shares[:, 0], moved, atol=0.5)
+    assert_allclose(shares[:, 0], moved, atol=0.5)
     assert np.all(shares[:, 1:] == 0.0)

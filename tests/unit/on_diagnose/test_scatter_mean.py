@@ -5,7 +5,8 @@ varies beside it or not.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from tests.unit.on_diagnose.test_scatter import LEAST, NAMES, PRIORS, flights
@@ -42,7 +43,7 @@ def told(mean: float, deviation: float, seed: int):
     """Verdict on a release that is late by so much in all flights and by so much more or less in
     each [s].
     """
-    found = flights(np.random.default_rng(seed), release_lag=deviation)
+    found = flights(default_rng(seed), release_lag=deviation)
     common = np.zeros(len(NAMES))
     common[0] = mean / PRIORS.floor[0]
     found = replace(found, score=found.score + found.information @ common)
@@ -70,9 +71,9 @@ def test_a_deviation_is_about_the_mean():
 
 
 def test_what_flights_have_of_their_own_is_integrated_out():
-    found, K, j, size = flights(np.random.default_rng(3), count=1), len(NAMES), 2, 1.7
+    found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
     left, own, score = freed(found, Varies(flights={j: size})), found.information[0], found.score[0]
-    theta = np.random.default_rng(4).normal(size=K)
+    theta = default_rng(4).normal(size=K)
 
     def misfit(x):
         there = theta + np.eye(K)[j] * x[:, None]
@@ -89,7 +90,7 @@ def test_what_flights_have_of_their_own_is_integrated_out():
     np.testing.assert_allclose(told, whole, rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", [1])
+@mark.parametrize("seed", [1])
 def test_an_effect_that_is_there_in_all_flights_is_named_and_does_not_vary(seed):
     diagnosis = search.explain(drawn(np.full(12, 8.0), seed=seed), laws=False)
     assert diagnosis.named == ("cmd_delay",)
@@ -97,9 +98,9 @@ def test_an_effect_that_is_there_in_all_flights_is_named_and_does_not_vary(seed)
 
 
 # Less than what flights may differ by, and more.
-@pytest.mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
+@mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
-    sizes = 14.0 + deviation * np.random.default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
+    sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
     said = []
     diagnosis = search.explain(drawn(sizes, seed=seed), laws=False, progress=said.append)
     assert any("cmd_delay differs from flight to flight" in line for line in said)
@@ -115,7 +116,7 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
 
 
 def test_an_effect_that_varies_about_nothing_is_not_named():
-    sizes = 6.0 * np.random.default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
+    sizes = 6.0 * default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
     diagnosis = search.explain(drawn(sizes, seed=5), laws=False)
     assert not diagnosis.theta
     assert jitter(diagnosis).found

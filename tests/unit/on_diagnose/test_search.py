@@ -5,7 +5,8 @@ guard is needed.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, mark, raises
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
@@ -57,7 +58,7 @@ def test_nothing_is_found_where_nothing_is():
     assert len(diagnosis.findings) == len(EFFECTS)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@mark.parametrize("sign", [1.0, -1.0])
 def test_one_effect_is_named_with_its_size_and_interval(sign):
     model = world(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
     diagnosis = search.explain(model, laws=False)
@@ -87,7 +88,7 @@ def hiding(own: float, **options) -> SyntheticModel:
     return altered(change, seed=3, **options)
 
 
-@pytest.mark.parametrize("beside", [{}, {"effect_04": 10.0}])
+@mark.parametrize("beside", [{}, {"effect_04": 10.0}])
 def test_two_effects_that_hide_each_other_are_named_together(beside):
     """Neither brings a single nat alone, nor does what looks like both."""
     diagnosis = search.explain(hiding(0.15, truth=beside), laws=False)
@@ -130,8 +131,8 @@ def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     assert {f.name for f in group} == {"effect_03", "effect_07"}
     assert all(set(f.partners) == {"effect_03", "effect_07"} - {f.name} for f in group)
     assert len(diagnosis.theta) == 1
-    assert diagnosis["effect_03"].estimate == pytest.approx(12.0 * EFFECTS[3].floor, rel=0.1)
-    assert diagnosis["effect_07"].estimate == pytest.approx(24.0 * EFFECTS[7].floor, rel=0.15)
+    assert diagnosis["effect_03"].estimate == approx(12.0 * EFFECTS[3].floor, rel=0.1)
+    assert diagnosis["effect_07"].estimate == approx(24.0 * EFFECTS[7].floor, rel=0.15)
     assert "effect_03 + 0.5 N/(N) effect_07 = 0.04" in diagnosis["effect_03"].joint
     assert diagnosis["effect_03"].manoeuvres
 
@@ -199,7 +200,7 @@ def test_a_simulation_that_fails_is_out_of_domain():
     assert len(diagnosis.findings) == 12
 
 
-@pytest.mark.slow
+@mark.slow
 def test_a_few_windows_that_fail_are_left_out():
     some = altered(
         lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
@@ -243,21 +244,21 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
 def test_no_window_is_an_error_that_says_so():
     empty = world()
     empty._windows = []
-    with pytest.raises(DiagnoseError, match="no stretch of flight"):
+    with raises(DiagnoseError, match="no stretch of flight"):
         search.explain(empty)
 
 
 def test_catalogues_that_contradict_themselves_are_refused():
     twice = (*EFFECTS, EFFECTS[0])
-    with pytest.raises(DiagnoseError, match="share a name: effect_00"):
+    with raises(DiagnoseError, match="share a name: effect_00"):
         Priors.of(twice, ("pos_w", "payload_pos_w"))
-    with pytest.raises(ValueError, match=r"floor is 0\.0; expected above 0"):
+    with raises(ValueError, match=r"floor is 0\.0; expected above 0"):
         replace(EFFECTS[0], floor=0.0)
 
 
 def small_causes(seed: int) -> SyntheticModel:
     """Every effect at its floor: nothing that matters."""
-    signs = np.random.default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
+    signs = default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
     return world(truth={e.name: s for e, s in zip(EFFECTS, signs)}, seed=seed, gust=0.3, noise=0.5)
 
 
@@ -285,17 +286,15 @@ def _priors(count: int) -> Priors:
     )
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -3.0])
-@pytest.mark.parametrize("where", [(0, 0), (1, 0)])
+@mark.parametrize("bad", [np.nan, np.inf, -3.0])
+@mark.parametrize("where", [(0, 0), (1, 0)])
 def test_information_that_no_flights_can_give_is_refused(bad, where):
     information = np.eye(3) * 4.0
     information[where] = information[where[::-1]] = 9.0 * bad
     priors = evidence.Priors(
         np.ones(3), np.full(3, 6.0), np.full(3, -9.0), np.full(3, 9.0), np.ones(3, dtype=bool)
     )
-    with pytest.raises(
-        DiagnoseError, match="information on the effects is not finite or not positive"
-    ):
+    with raises(DiagnoseError, match="information on the effects is not finite or not positive"):
         evidence.log_evidence(information, np.ones(3), priors, [0, 1])
 
 
@@ -317,16 +316,16 @@ def test_evidence_is_the_integral():
 
         return np.log(quad(weight, low, high)[0] / quad(mass, low, high)[0])
 
-    assert evidence.log_evidence(information, score, priors, []) == pytest.approx(
+    assert evidence.log_evidence(information, score, priors, []) == approx(
         integral(evidence.SPIKE, -6, 6), abs=1e-6
     )
-    assert evidence.log_evidence(information, score, priors, [0]) == pytest.approx(
+    assert evidence.log_evidence(information, score, priors, [0]) == approx(
         integral(6.0, -1.0, 9.0), abs=1e-6
     )
 
 
 def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     few, many = (_threshold(count) for count in (4, 400))
     assert few < many
     information, priors, least = _information(40), _priors(40), _threshold(40)
@@ -337,7 +336,7 @@ def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds(
 
 
 def _information(count: int) -> np.ndarray:
-    root = np.random.default_rng(count).normal(size=(count, 3 * count))
+    root = default_rng(count).normal(size=(count, 3 * count))
     return root @ root.T / 50.0
 
 
@@ -347,5 +346,5 @@ def _threshold(count: int) -> float:
     return evidence.threshold(
         Statistics(np.arange(1), information, one, one[:, 0], one[:, 0], one[0]),
         _priors(count),
-        np.random.default_rng(1),
+        default_rng(1),
     )

@@ -2,10 +2,10 @@
 nominal ones do.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import fixture
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
@@ -26,7 +26,7 @@ def swayed(log: FlightLog) -> FlightLog:
     """The log with :data:`SWAY` added to what was measured."""
     size, rate, phase = SWAY
     moved = {
-        name: dataclasses.replace(
+        name: replace(
             c, values=c.values + size * np.sin(2.0 * np.pi * rate * c.time[:, None] + phase)
         )
         for name, c in log.channels.items()
@@ -41,7 +41,7 @@ BENDING = 0.1
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def logs():
     return fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=2.0)
 

@@ -2,11 +2,12 @@
 effects recovered.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, raises
 from scipy.spatial.transform import Rotation, Slerp
 
 from camera.keypoints import KeypointCamera, keypoints
@@ -58,7 +59,7 @@ def estimate(windows, keep):
     return np.linalg.solve(information, score), np.sqrt(np.diag(np.linalg.inv(information)))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def planted():
     """A free flight and a throw of a plant with some effects, and the model that lacks them."""
     logs = fly(setting_with(PLANTED), noise=0.2, free=1, throws=1, seconds=2.0)
@@ -122,7 +123,7 @@ def test_landings_are_predicted_from_before_the_throw(planted):
     assert (
         np.abs(right.measured[0] - (last + fall * rate)).max() < 4e-3
     )  # a chord over five samples of the path
-    assert right.measured[0, 2] == pytest.approx(paper_plant().release.landing_height)
+    assert right.measured[0, 2] == approx(paper_plant().release.landing_height)
     assert right.released_errors[0] < 5e-3
     assert right.errors[0] < 0.02
     assert wrong.errors[0] > 0.03
@@ -139,13 +140,12 @@ def test_initial_states_follow_the_effects(planted):
     problem = Problem(model, tuple(range(len(windows))))
     nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
     follow, behind = (
-        moved(problem, point, there)
-        for point in (nominal, dataclasses.replace(nominal, about=None))
+        moved(problem, point, there) for point in (nominal, replace(nominal, about=None))
     )
     assert curvature(problem, nominal, follow) < 0.2 * curvature(problem, nominal, behind)
     back = moved(problem, follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
-        np.testing.assert_allclose(again.residual, w.residual, atol=1e-9)
+        assert_allclose(again.residual, w.residual, atol=1e-9)
 
 
 def test_what_is_known_of_the_sensors_is_taken_off():
@@ -164,15 +164,15 @@ def test_what_is_known_of_the_sensors_is_taken_off():
 def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
     setting = setting_with({})
     vehicle = setting.plant.vehicle
-    bare = dataclasses.replace(vehicle, aero=dataclasses.replace(vehicle.aero, kind="none"))
-    plant = dataclasses.replace(setting.plant, vehicle=bare)
-    aero = generalised(dataclasses.replace(setting, plant=plant)).plant.vehicle.aero
+    bare = replace(vehicle, aero=replace(vehicle.aero, kind="none"))
+    plant = replace(setting.plant, vehicle=bare)
+    aero = generalised(replace(setting, plant=plant)).plant.vehicle.aero
     assert aero.kind == "rotor_drag"
     assert not any(getattr(aero, name) for name in AERODYNAMICS)
 
 
 def test_the_catalogue_is_sound():
-    plant = dataclasses.replace(
+    plant = replace(
         generalised(setting_with({})),
         camera=config.load(CameraParams, config.find("camera", "fisheye")),
     )
@@ -202,15 +202,11 @@ def looked_at(log: FlightLog, camera: CameraParams) -> FlightLog:
     payload landed.
     """
     lens, turn = camera.fisheye, np.degrees(HIDDEN["camera_tilt_x"])
-    lens = dataclasses.replace(
+    lens = replace(
         lens, fx=lens.fx * (1 + HIDDEN["camera_focal"]), fy=lens.fy * (1 + HIDDEN["camera_focal"])
     )
-    mount = dataclasses.replace(
-        camera.mount, rpy_deg=tuple(np.add(camera.mount.rpy_deg, (turn, 0.0, 0.0)))
-    )
-    real = KeypointCamera(
-        dataclasses.replace(camera, fisheye=lens, mount=mount), dtype=torch.float64
-    )
+    mount = replace(camera.mount, rpy_deg=tuple(np.add(camera.mount.rpy_deg, (turn, 0.0, 0.0))))
+    real = KeypointCamera(replace(camera, fisheye=lens, mount=mount), dtype=torch.float64)
     goal = np.array([1.5, -1.0, 0.0])  # far from below, so that rows differ
     pos, quat, ball = (log[name] for name in ("pos_w", "quat_wb", "payload_pos_w"))
     slerp = Slerp(quat.time, Rotation.from_quat(quat.values))
@@ -281,9 +277,9 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
 
 def test_mistakes_are_told(planted):
     logs, _ = planted
-    with pytest.raises(DiagnoseError, match="no effect '"):
+    with raises(DiagnoseError, match="no effect '"):
         ThrowModel(logs, paper_plant(), only=["no_such"])
-    with pytest.raises(DiagnoseError, match="command"):
+    with raises(DiagnoseError, match="command"):
         ThrowModel(
             [type(logs[0])({k: v for k, v in logs[0].channels.items() if k != "command"}, {})],
             paper_plant(),
@@ -294,22 +290,20 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
     """Where a controller makes up for no voltage: it carries the weight at the share of throttle,
     whatever a log begins with.
     """
-    flight, plant = dataclasses.replace(record_of(planted[0][0]), voltage=None), paper_plant()
-    climbing = dataclasses.replace(flight, command=flight.command * [2.0, 1.0, 1.0, 1.0])
+    flight, plant = replace(record_of(planted[0][0]), voltage=None), paper_plant()
+    climbing = replace(flight, command=flight.command * [2.0, 1.0, 1.0, 1.0])
     weight = 0.25 * plant.total_mass * GRAVITY
-    mixing = dataclasses.replace(
+    mixing = replace(
         plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight
     )
-    calibrated = dataclasses.replace(
-        plant, vehicle=dataclasses.replace(plant.vehicle, controller=mixing)
-    )
+    calibrated = replace(plant, vehicle=replace(plant.vehicle, controller=mixing))
     told = hover_state(flight, calibrated, 1)
-    assert told["voltage"][0] == pytest.approx(16.5, abs=0.02)
+    assert told["voltage"][0] == approx(16.5, abs=0.02)
     assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
     assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
 
 
 def test_a_path_comes_down_between_two_points():
     path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
-    np.testing.assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
+    assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
     assert np.isnan(landing._crossing(path, 0.7)).all()

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from tests.unit.on_logs.test_check import faults, flight, log_of
 from visthrow.diagnose.inputs import setup
@@ -48,12 +48,12 @@ def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
     )
 
 
-@pytest.mark.parametrize("number", FLIGHTS)
+@mark.parametrize("number", FLIGHTS)
 def test_flights_as_they_are(number):
     assert bad(FLIGHTS[number]) == ""
 
 
-@pytest.mark.parametrize("number", [204, 205])
+@mark.parametrize("number", [204, 205])
 def test_exchanged_axes_are_named_with_their_evidence(number):
     found = bad(changed(FLIGHTS[number], PATHS, lambda v: v[:, [1, 0, 2]]))
     assert "fit with (y,x,z) of positions and velocities" in found
@@ -73,7 +73,7 @@ def test_an_exchanged_accelerometer_is_named():
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("streams", "row"),
     [
         (("quat_wb", "rate_b", "acc_b", "thrust_command"), "d(vel_w)/dt, quat_wb acc_b"),
@@ -84,7 +84,7 @@ def test_an_exchanged_accelerometer_is_named():
 def test_late_streams_are_named_with_their_offset(streams, row):
     (checked,) = check([shifted(FLIGHTS[204], *streams)], CRAZYFLIE)
     (found,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
-    assert found.figures["delay_s"] == pytest.approx(LATE, abs=0.02)
+    assert found.figures["delay_s"] == approx(LATE, abs=0.02)
     assert contradictions([checked])
 
 
@@ -102,7 +102,7 @@ def test_early_thrust_is_named():
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("names", "factor", "words"),
     [
         (("thrust_command",), 101.97, "times the model's 0.0419 kg: in g of thrust"),
@@ -120,7 +120,7 @@ def test_units_are_named_by_their_ratio(names, factor, words):
     assert all(part in found for part in words.split(".*")), found
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("mass", "words"),
     [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")],
 )
@@ -148,7 +148,7 @@ def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
     assert any("the thrust's scale differs from flight to flight" in text for text in texts)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("factor", "words"),
     [
         (0.5, "rear left reads 0.50 of the others in flight: half"),

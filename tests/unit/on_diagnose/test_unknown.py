@@ -6,7 +6,10 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
@@ -58,8 +61,8 @@ def turned(knots: dict, angle: float) -> dict:
 
 
 def random_knots(seed: int = 0) -> dict:
-    rng = np.random.default_rng(seed)
-    unit = lambda v: v / np.linalg.norm(v, axis=1, keepdims=True)  # noqa: E731
+    rng = default_rng(seed)
+    unit = lambda v: v / norm(v, axis=1, keepdims=True)  # noqa: E731
     k = 6
     return {
         "time": np.arange(k) * 0.1,
@@ -76,7 +79,7 @@ def random_knots(seed: int = 0) -> dict:
     }
 
 
-@pytest.mark.parametrize("block", laws.BLOCKS)
+@mark.parametrize("block", laws.BLOCKS)
 def test_terms_turn_with_the_world(block):
     """Frame-covariant: forces turn with the world about the vertical, torques in the body do not
     notice.
@@ -92,9 +95,7 @@ def test_terms_turn_with_the_world(block):
     assert len(every) > 300
     values = table(every, knots)
     again = table(every, turned(knots, angle))
-    np.testing.assert_allclose(
-        again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max()
-    )
+    assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
 def test_a_torque_in_the_joint_acts_on_both_sides():
@@ -106,10 +107,10 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
     torque_b = table(terms, knots)
     found = laws.loads(laws.JOINT, knots, torque_b)
     assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
-    np.testing.assert_allclose(found["vehicle force"], -found["payload force"])
+    assert_allclose(found["vehicle force"], -found["payload force"])
     away = knots["payload_pos_w"] - knots["pos_w"]
     along = away - rotate(knots["quat_wb"], knots["mount_b"])
-    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    along /= norm(along, axis=1, keepdims=True)
     for i in range(len(terms)):
         on_vehicle = rotate(knots["quat_wb"], found["vehicle torque"][:, :, i])
         about_it = on_vehicle + np.cross(away, found["payload force"][:, :, i])
@@ -117,7 +118,7 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
             np.einsum("ki,ki->k", rotate(knots["quat_wb"], torque_b[:, :, i]), along)[:, None]
             * along
         )
-        np.testing.assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
+        assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
 
 
 def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
@@ -127,7 +128,7 @@ def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
     assert values[:3].any()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("term", "unit", "formula"),
     [
         (laws.Term("vehicle force", ("speed",), "vel"), "kg m^-1", "F = c |v| v"),
@@ -194,7 +195,7 @@ def test_a_law_takes_no_name_away_that_says_the_same():
     diagnosis = search.explain(with_a_name_for_the_law(0.0198))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_01",)
-    assert diagnosis["effect_01"].estimate == pytest.approx(0.02, abs=1e-3)
+    assert diagnosis["effect_01"].estimate == approx(0.02, abs=1e-3)
 
 
 def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
@@ -251,7 +252,7 @@ def test_the_table_takes_up_what_no_name_explains():
     """Weights from some flights predict the hidden drag in a flight that they have not seen."""
     model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3, throws=12)
     point = search.explain(model, laws=False).work.before
-    table = table_of(point, np.random.default_rng(0))
+    table = table_of(point, default_rng(0))
     flights = [w.flight for w in point.windows]
     trained = train(point, table, flights)
     weights = trained.weights(trained.groups != 5)
@@ -259,18 +260,18 @@ def test_the_table_takes_up_what_no_name_explains():
     window = point.windows[index]
     asked = (table.columns(window) @ weights)[: 3 * 11].reshape(3, 11).T
     velocity = window.knots["vel_w"]
-    truth = -0.02 * np.linalg.norm(velocity, axis=1)[:, None] * velocity
-    assert np.linalg.norm(asked - truth) < LEFT * np.linalg.norm(truth)
+    truth = -0.02 * norm(velocity, axis=1)[:, None] * velocity
+    assert norm(asked - truth) < LEFT * norm(truth)
     data = unexplained(point, 0)
     again = ForceTable(
         *(np.array(data[k]) for k in ("mean", "deviation", "centres")), tuple(data["weights"])
     )
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
-    assert np.linalg.norm(drag - truth) < LEFT * np.linalg.norm(truth)
+    assert norm(drag - truth) < LEFT * norm(truth)
 
 
-@pytest.mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
+@mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
 def test_terms_are_screened_beside_what_varies(days):
     """As if each were an effect of the problem: else what flights have of their own is taken for a
     law.
@@ -285,12 +286,10 @@ def test_terms_are_screened_beside_what_varies(days):
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
         _, (wide,) = terms.extended(problem, [calm], [own])
-        np.testing.assert_allclose(
-            screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6
-        )
-        np.testing.assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
+        assert_allclose(screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
+        assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
         cross = wide.information[-1, :-1] / own.floor
-        np.testing.assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())
+        assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())
 
 
 def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
@@ -302,8 +301,8 @@ def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
     point = SimpleNamespace(information=information, score=score)
     both, name = 0.5 * score @ np.linalg.solve(information, score), 0.5 * score[0] ** 2 / 4.0
     nats = terms.unexplained_nats(point, priors, [0, 1], 1, 0)
-    assert nats == pytest.approx(both - name, rel=1e-3)
+    assert nats == approx(both - name, rel=1e-3)
     (law,) = terms.laws(SimpleNamespace(priors=priors, effects=effects), point, [0, 1], 5.0)
     covariance = np.linalg.inv(information + np.diag(priors.slab**-2.0))
-    assert law.sd == pytest.approx(term.floor * covariance[1, 1] ** 0.5)
-    assert law.covariance == pytest.approx((law.sd**2,))
+    assert law.sd == approx(term.floor * covariance[1, 1] ** 0.5)
+    assert law.covariance == approx((law.sd**2,))

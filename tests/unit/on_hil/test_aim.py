@@ -5,7 +5,7 @@ lead astray.
 import math
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 from scipy.integrate import solve_ivp
 
 from hil.control.aim import AimParams, ReleaseCheck
@@ -42,17 +42,17 @@ def fallen(pos, vel, drag):
     ]
 
 
-@pytest.mark.parametrize("drag", [0.0, 1.04e-3])
-@pytest.mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
+@mark.parametrize("drag", [0.0, 1.04e-3])
+@mark.parametrize("vel", [(4.0, 0.3, 2.0), (-1.0, 2.0, -3.0), (0.0, 0.0, 0.0)])
 def test_prediction_against_an_integrator(vel, drag):
     pos = (0.4, -0.1, 1.2)
     found = ReleaseCheck(None, AHEAD, HEIGHT, {**ROPE, "payload_drag": drag}).landing(at(pos, vel))
-    assert found == pytest.approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
+    assert found == approx(fallen(pos, vel, drag / 0.058), abs=2e-3)
 
 
 def test_a_payload_below_the_ground_or_without_end_is_judged():
     aim = ReleaseCheck(None, AHEAD, HEIGHT, ROPE)
-    assert aim.landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == pytest.approx((1.0, 2.0))
+    assert aim.landing(at((1.0, 2.0, -0.1), (0.0, 0.0, -1.0))) == approx((1.0, 2.0))
     assert all(map(math.isfinite, aim.landing(at((1.0, 2.0, 1.0), (0.0, 0.0, 100.0)))))
 
 
@@ -79,15 +79,13 @@ def test_what_is_held_back_and_when_it_is_given_up():
     )
 
 
-@pytest.mark.parametrize(
-    "wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}]
-)
+@mark.parametrize("wrong", [{"bound": 0.0, "patience": 0.4}, {"bound": 0.5, "patience": -1.0}])
 def test_numbers_that_hold_nothing_back(wrong):
-    with pytest.raises(ConfigError, match="expected above 0"):
+    with raises(ConfigError, match="expected above 0"):
         AimParams(**wrong)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "path", sorted(config.find("hil", "fake").parent.glob("*.toml")), ids=lambda path: path.stem
 )
 def test_every_shipped_run_holds_back_what_leads_astray(path):
@@ -106,7 +104,7 @@ def test_a_policy_that_asks_in_hover_never_releases():
     decisions = fly(runner, 5.0)
     asked = [d for d in decisions if d.note.startswith("release refused: it would land at")]
     assert runner.backend.release_times == []
-    assert asked[-1].time - asked[0].time == pytest.approx(0.28, abs=0.021)
+    assert asked[-1].time - asked[0].time == approx(0.28, abs=0.021)
     assert all(d.observation[19] < 0.5 for d in asked), (
         "the policy is told of no release: there was none"
     )

@@ -2,7 +2,7 @@
 the release's book-keeping.
 """
 
-import pytest
+from pytest import approx, mark
 
 from hil.links.backends.audit import (
     GIVE_UP,
@@ -56,7 +56,7 @@ def test_good_parameters_pass_at_once():
     assert "WRONG" not in tables[0]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("name", "value", "text"),
     [
         ("GUID_OPTIONS", 5.0, "GUID_OPTIONS is 5; expected with the bits of 8 set"),
@@ -120,7 +120,7 @@ def test_a_release_is_sent_at_its_time_and_repeated_until_it_is_answered():
     release = Release(0.5)
     release.start(0.1)
     release.start(0.2)
-    assert sends(release, 0.2) == pytest.approx([0.1, 0.14, 0.18], abs=0.006)
+    assert sends(release, 0.2) == approx([0.1, 0.14, 0.18], abs=0.006)
     release.answer(True)
     assert (release.state, sends(release, 2.0, 0.2)) == (ACCEPTED, [])
     release.start(3.0)

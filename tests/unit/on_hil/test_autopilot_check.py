@@ -3,7 +3,7 @@
 import json
 from types import SimpleNamespace
 
-import pytest
+from pytest import approx, fixture, mark, raises
 
 from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
@@ -30,7 +30,7 @@ class Nobody:
         return OperatorInput()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def run(tmp_path_factory):
     """The folder of a run that hovers for some seconds, and what its summary keeps."""
     folder = tmp_path_factory.mktemp("hover") / "run"
@@ -48,7 +48,7 @@ def test_the_hover_of_a_run_is_its_weight(run):
     assert text.startswith("hover took 1.0")
 
 
-@pytest.mark.parametrize(("factor", "good"), [(1.05, True), (1.12, False), (0.85, False)])
+@mark.parametrize(("factor", "good"), [(1.05, True), (1.12, False), (0.85, False)])
 def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     run, tmp_path, factor, good
 ):
@@ -63,9 +63,9 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     assert found == good
     assert main(["hil", "check", "--hover-of", str(tmp_path)]) == (0 if good else 1)
     ratio = float(text.split()[2])
-    assert ratio == pytest.approx(factor, rel=0.01)
+    assert ratio == approx(factor, rel=0.01)
     share = float(text.split("the hover share is ")[1].split(",")[0])
-    assert share == pytest.approx(0.1906 * ratio, rel=2e-3), "a straight line: as much more share"
+    assert share == approx(0.1906 * ratio, rel=2e-3), "a straight line: as much more share"
 
 
 def test_a_hover_counts_once_it_has_settled(run, tmp_path):
@@ -82,7 +82,7 @@ def test_a_hover_counts_once_it_has_settled(run, tmp_path):
     assert hover_of_run(tmp_path)[1].startswith("hover took 1.0")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("height", "speed", "counted"), [(0.31, 0.14, 1), (0.29, 0.14, 0), (0.31, 0.16, 0)]
 )
 def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
@@ -99,10 +99,8 @@ def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
 def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
     for name in (CONFIG, "policy.npz"):
         (tmp_path / name).write_bytes((run / name).read_bytes())
-    with pytest.raises(RunError, match="no folder of a run; expected"):
+    with raises(RunError, match="no folder of a run; expected"):
         hover_of_run(tmp_path)
     (tmp_path / TICKS).write_text("")
-    with pytest.raises(
-        RunError, match="0 ticks of steady hover before throws; expected 50 or more"
-    ):
+    with raises(RunError, match="0 ticks of steady hover before throws; expected 50 or more"):
         hover_of_run(tmp_path)

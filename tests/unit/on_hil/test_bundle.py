@@ -6,7 +6,7 @@ import errno
 import shutil
 import zipfile
 
-import pytest
+from pytest import approx, fixture, raises
 
 from hil.control.recording.record import pack
 from hil.errors import RunError
@@ -21,7 +21,7 @@ def stopped(time, poses):
     return poses if time < LOST else []
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def aborted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "a"
     decisions = record_run(folder, saved_policy(folder.parent), seconds=6.0, poses=stopped)
@@ -41,7 +41,7 @@ def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, capsy
     assert told.startswith("It went wrong ")
     assert f"s into '{before}': {decisions[turn].reason}; the vehicle was at (" in told
     age = float(told.split(" ms old")[0].split()[-1])
-    assert age == pytest.approx(1e3 * (decisions[turn].time - LOST), abs=25.0)
+    assert age == approx(1e3 * (decisions[turn].time - LOST), abs=25.0)
 
 
 def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
@@ -54,7 +54,7 @@ def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
         write(bundle, file, name)
 
     monkeypatch.setattr(zipfile.ZipFile, "write", full)
-    with pytest.raises(RunError, match="cannot be written: No space left"):
+    with raises(RunError, match="cannot be written: No space left"):
         pack(folder)
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 

@@ -8,8 +8,9 @@ from collections import deque
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from pytest import approx, fixture, raises
 
 from camera.keypoints import KeypointCamera, goal_corners_w, keypoints
 from camera.mount import rotation_from_vector
@@ -74,9 +75,9 @@ class Hall:
         eye = state["pos_w"] + rot @ self.camera.position_b.numpy()
         points = np.vstack([goal_corners_w(self.goal)[0].numpy(), state["payload_pos_w"]])
         rays = (points - eye) @ (self.rot_cb @ rot.T).T
-        far = np.linalg.norm(rays, axis=1)
+        far = norm(rays, axis=1)
         unit = rays / far[:, None] + 1e-3 * self.rng.standard_normal((5, 3))
-        unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+        unit /= norm(unit, axis=1, keepdims=True)
         lens, radius = self.camera.fisheye, self.runner.params.camera.payload_radius
         seen = (1.0 + SCALE) * lens.project_normalized(torch.from_numpy(unit))[0]
         unit = lens.unproject(lens.denormalize(seen))[
@@ -152,7 +153,7 @@ class Hall:
         return float(np.sqrt(np.square(shown - true.numpy()).mean()))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def hall():
     # One throw of this policy lands within 3 cm; the recurrent `vision` scatters more.
     params = replace(run_params(), policy="vision_located")
@@ -167,9 +168,9 @@ def test_tilt_latency_and_thrust_are_found_in_the_runners_own_hover(hall):
     found = hall.runner.calibrating.calibration
     assert found is not None, hall.runner.calibrating.problems()
     np.testing.assert_allclose(np.degrees(found.turn_b), TILT_DEG, atol=0.15)
-    assert found.latency == pytest.approx(LATENCY, abs=0.004)
-    assert found.thrust == pytest.approx(1.0, abs=0.02)
-    assert found.scale == pytest.approx(SCALE, abs=0.004)
+    assert found.latency == approx(LATENCY, abs=0.004)
+    assert found.thrust == approx(1.0, abs=0.02)
+    assert found.scale == approx(SCALE, abs=0.004)
     told = next(d for d in hall.decisions if d.calibration is not None)
     assert Calibration.of(told.calibration) == found
     assert hall.runner.summary()["calibration"] == found.values()
@@ -231,9 +232,9 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     calibrating.take(fine)
     assert calibrating.problems() == []
     assert "yaw unknown" in str(replace(fine, turn_sigma=(1e-3, 1e-3, 0.2)))
-    with pytest.raises(ConfigError, match="expected above 0"):
+    with raises(ConfigError, match="expected above 0"):
         CalibrationParams(rate=0.0)
-    with pytest.raises(ConfigError, match="expected keypoints"):
+    with raises(ConfigError, match="expected keypoints"):
         config.load(HilParams, config.find("hil", "dry_run"), ["calibration.rate=1.0"])
     assert Spreads().keypoint == 0.01
 

@@ -2,7 +2,7 @@
 
 import math
 
-import pytest
+from pytest import mark, raises
 
 from hil.cli import ACTIONS
 from hil.poses.pose import Pose
@@ -11,7 +11,7 @@ from tests.hil_flight import OURS
 from visthrow.cli import main
 
 
-@pytest.mark.parametrize("quat", [(0.0,) * 4, (math.nan,) * 4])
+@mark.parametrize("quat", [(0.0,) * 4, (math.nan,) * 4])
 def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
     """Of the vehicle it fails; no library's sentence on quaternions comes up."""
     poses = [
@@ -44,9 +44,9 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
     assert lines[-2:] == ["parameters were read", "FAIL  hover share measured 0.9"]
 
 
-@pytest.mark.parametrize("action", ACTIONS)
+@mark.parametrize("action", ACTIONS)
 def test_each_action_has_an_example(action, capsys):
-    with pytest.raises(SystemExit):
+    with raises(SystemExit):
         main(["hil", action, "--help"])
     shown = capsys.readouterr().out.partition("examples:\n")[2].splitlines()
     commands = [line for line in shown if line.startswith("  visthrow")]

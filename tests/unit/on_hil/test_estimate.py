@@ -1,7 +1,8 @@
 """Velocity and rate from poses: closed forms of lag and noise, uneven stamps, gaps."""
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 from scipy.spatial.transform import Rotation
 
 from hil.poses.body_track import MOST_PREDICTION, TRUST, Track
@@ -33,7 +34,7 @@ def window(samples: int) -> float:
     return (samples - 0.5) * PERIOD
 
 
-@pytest.mark.parametrize("samples", [2, 3, 5, 8])
+@mark.parametrize("samples", [2, 3, 5, 8])
 def test_a_lines_lag_is_half_its_window(samples):
     acceleration = np.array([3.0, -1.0, 5.0])
     slopes, out = run(
@@ -42,26 +43,24 @@ def test_a_lines_lag_is_half_its_window(samples):
         lambda t: 0.5 * acceleration * t * t,
     )
     lag = (samples - 1) * PERIOD / 2
-    assert slopes.lag == pytest.approx(lag, abs=ROUNDING)
-    np.testing.assert_allclose(out[-1][0], acceleration * (29 * PERIOD - lag), atol=ROUNDING)
+    assert slopes.lag == approx(lag, abs=ROUNDING)
+    assert_allclose(out[-1][0], acceleration * (29 * PERIOD - lag), atol=ROUNDING)
 
 
-@pytest.mark.parametrize("window", [0.001, 0.055, 0.1])
+@mark.parametrize("window", [0.001, 0.055, 0.1])
 def test_a_parabola_is_not_late_on_uneven_stamps_either(window):
     times = np.cumsum(np.random.default_rng(0).uniform(0.003, 0.02, 30))
     slopes, out = run(EstimateParams(window, 2), times, lambda t: np.array([1.0, t, 0.5 * t * t]))
-    assert slopes.lag == pytest.approx(0.0, abs=ROUNDING)
-    np.testing.assert_allclose(out[-1][0], (0.0, 1.0, times[-1]), atol=1e-6)
-    np.testing.assert_allclose(slopes.acceleration, (0.0, 0.0, 1.0), atol=1e-4)
+    assert slopes.lag == approx(0.0, abs=ROUNDING)
+    assert_allclose(out[-1][0], (0.0, 1.0, times[-1]), atol=1e-6)
+    assert_allclose(slopes.acceleration, (0.0, 0.0, 1.0), atol=1e-4)
 
 
 def test_noise_is_what_the_weights_say():
     """A line over n even samples: sigma sqrt(12 / (n (n^2 - 1))) / T."""
     n = 5
     weights = fit_weights([i * PERIOD for i in range(n)], 1)[0]
-    assert np.sqrt(np.sum(np.square(weights))) == pytest.approx(
-        np.sqrt(12 / (n * (n * n - 1))) / PERIOD
-    )
+    assert np.sqrt(np.sum(np.square(weights))) == approx(np.sqrt(12 / (n * (n * n - 1))) / PERIOD)
 
 
 def test_body_rate_of_a_steady_turn():
@@ -74,7 +73,7 @@ def test_body_rate_of_a_steady_turn():
             lambda t: np.zeros(3),
             lambda t: start * Rotation.from_rotvec(rate_b * t),
         )
-        np.testing.assert_allclose(out[-1][1], rate_b, atol=1e-6)
+        assert_allclose(out[-1][1], rate_b, atol=1e-6)
 
 
 def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
@@ -86,7 +85,7 @@ def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
     assert slopes.rate == (4.0, 5.0, 6.0)
     assert slopes.lag == 0.0
     bare = Pose(0.01, 0.01, "vehicle", (0.01, 0.0, 0.0))
-    np.testing.assert_allclose(slopes.update(bare), (1.0, 0.0, 0.0))
+    assert_allclose(slopes.update(bare), (1.0, 0.0, 0.0))
     assert slopes.update(Pose(1.0, 1.0, "vehicle", (5.0, 0.0, 0.0))) == (0.0, 0.0, 0.0)
 
 
@@ -103,7 +102,7 @@ def test_the_window_is_one_of_time():
 
 def test_wrong_parameters():
     for seconds, order in ((0.0, 1), (0.2, 2), (0.05, 3), (float("nan"), 1)):
-        with pytest.raises(ConfigError, match=r"window is|order is 3; expected 1 to 2"):
+        with raises(ConfigError, match=r"window is|order is 3; expected 1 to 2"):
             EstimateParams(seconds, order)
 
 
@@ -117,8 +116,8 @@ def test_spin_of_a_turn_that_quickens():
         lambda t: np.zeros(3),
         lambda t: Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]),
     )
-    np.testing.assert_allclose(out[-1][1], (0.0, 3.0 + 20.0 * 7 * PERIOD, 0.0), atol=1e-6)
-    np.testing.assert_allclose(slopes.spin, (0.0, 20.0, 0.0), atol=1e-4)
+    assert_allclose(out[-1][1], (0.0, 3.0 + 20.0 * 7 * PERIOD, 0.0), atol=1e-6)
+    assert_allclose(slopes.spin, (0.0, 20.0, 0.0), atol=1e-4)
     slopes, _ = run(
         EstimateParams(window(6), 1),
         PERIOD * np.arange(8),
@@ -144,13 +143,9 @@ def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
             assert one.update(Pose(t, t, "vehicle", (0.0, 0.0, 5.0 - 5.0 * t * t), quat)) is None
     now, ahead = 7 * PERIOD, 0.02
     state = track.state(now, ahead)
-    np.testing.assert_allclose(state.vel, (0.0, 0.0, -10.0 * (now + TRUST * ahead)), atol=1e-6)
-    np.testing.assert_allclose(
-        state.rate, (0.0, 3.0 + 20.0 * (now + TRUST * ahead), 0.0), atol=1e-4
-    )
-    np.testing.assert_allclose(
-        state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6
-    )
+    assert_allclose(state.vel, (0.0, 0.0, -10.0 * (now + TRUST * ahead)), atol=1e-6)
+    assert_allclose(state.rate, (0.0, 3.0 + 20.0 * (now + TRUST * ahead), 0.0), atol=1e-4)
+    assert_allclose(state.pos, (0.0, 0.0, 5.0 - 5.0 * now**2 - 10.0 * now * ahead), atol=1e-6)
     assert track.state(now, 0.3) == track.state(now, MOST_PREDICTION), "no pose is carried further"
     assert bare.state(now, ahead).rate == (0.0, 0.0, 0.0)
-    assert track.state(now, 0.0).vel == pytest.approx((0.0, 0.0, -10.0 * now))
+    assert track.state(now, 0.0).vel == approx((0.0, 0.0, -10.0 * now))

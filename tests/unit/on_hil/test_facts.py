@@ -2,7 +2,7 @@
 
 import re
 
-import pytest
+from pytest import mark, raises
 
 from hil.links.facts import FOLDER, Fact, facts, values
 from visthrow.common.errors import ConfigError
@@ -16,7 +16,7 @@ def incomplete(fact: Fact) -> bool:
     return not re.fullmatch(r"[\w./-]+:[1-9]\d*", fact.at) or not all(map(str.strip, words))
 
 
-@pytest.mark.parametrize("firmware", FIRMWARES)
+@mark.parametrize("firmware", FIRMWARES)
 def test_each_fact_names_its_source(firmware):
     assert [name for name, fact in facts(firmware).items() if incomplete(fact)] == []
 
@@ -28,5 +28,5 @@ def test_a_row_without_a_line_is_found():
 
 def test_values_are_those_of_the_rows():
     assert values("crazyflie")["levels_after"] == facts("crazyflie")["levels_after"].value == 0.5
-    with pytest.raises(ConfigError, match=r"no facts of firmware 'crazyfly'; .*crazyflie"):
+    with raises(ConfigError, match=r"no facts of firmware 'crazyfly'; .*crazyflie"):
         facts("crazyfly")

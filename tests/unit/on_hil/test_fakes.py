@@ -6,7 +6,7 @@ import math
 import socket
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from hil.errors import LinkError, RunError
 from hil.links.device import check_device, open_port
@@ -30,7 +30,7 @@ LIMITS = (14.0, 10.0, 10.0, 4.0)
 INSIDE = np.array([0.0, 0.0, 1.0])
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("command", "text"),
     [
         ((math.nan, 0.0, 0.0, 0.0), "is not finite"),
@@ -51,7 +51,7 @@ def test_the_witness_catches_commands(command, text):
     assert text in witness.breaches[0]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("armed", "payload_w", "answered", "text"),
     [
         (False, INSIDE, False, "disarmed"),
@@ -96,13 +96,13 @@ def test_options_of_a_fake():
         {"GUID_OPTIONS": 0.0},
         "silent",
     )
-    with pytest.raises(ConfigError, match="did you mean 'silent_after'"):
+    with raises(ConfigError, match="did you mean 'silent_after'"):
         read_options(["silent_aftr=12"])
-    with pytest.raises(ConfigError, match="expected one of 'accepted', 'in-progress'"):
+    with raises(ConfigError, match="expected one of 'accepted', 'in-progress'"):
         read_options(["answer=maybe"])
-    with pytest.raises(ConfigError, match=r"servo_delay is -0.1; expected 0 or more"):
+    with raises(ConfigError, match=r"servo_delay is -0.1; expected 0 or more"):
         read_options(["servo_delay=-0.1"])
-    with pytest.raises(RunError, match="did you mean 'ardupilot'"):
+    with raises(RunError, match="did you mean 'ardupilot'"):
         make_fake("ardupilo", LevelPlant(), None)
 
 
@@ -111,12 +111,12 @@ def test_the_msp_port_serves_one_peer_after_another():
         probe.bind(("127.0.0.1", 0))
         number = probe.getsockname()[1]
     port = ListeningPort(number)
-    with pytest.raises(
+    with raises(
         LinkError,
         match=rf"tcp:127\.0\.0\.1:{number}: another program has it.*ss -tlnp.*: --msp-port PORT",
     ):
         ListeningPort(number)
-    with pytest.raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
+    with raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
         ListeningPort(99_999)
     assert port.read() is None
     assert not port.write(b"nobody there")

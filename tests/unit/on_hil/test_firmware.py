@@ -9,7 +9,7 @@ import subprocess
 import threading
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, raises, skip
 
 from hil.errors import RunError
 from hil.links import msp
@@ -29,7 +29,7 @@ from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 
 
-@pytest.fixture
+@fixture
 def params():
     return config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
 
@@ -104,13 +104,13 @@ int main(int argc, char **argv) {
 """
 
 
-@pytest.fixture
+@fixture
 def stub(tmp_path, monkeypatch):
     """Run `STUB` in lock step with samples of ours; returns what came of them, and what
     it printed.
     """
     if shutil.which("gcc") is None:
-        pytest.skip("no C compiler")
+        skip("no C compiler")
     source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port(socket.SOCK_DGRAM)
     source.write_text(STUB)
     subprocess.run(["gcc", "-o", program, source, "-lpthread"], check=True)
@@ -149,8 +149,8 @@ def test_a_clock_in_lock_step_goes_as_far_as_the_samples_let_it(stub):
         for _ in range(2)
     ]
     turns, now, _ = told[0]
-    assert float(now) == pytest.approx(1.0 + 2.0 + 0.014, abs=1e-4)
-    assert int(turns) == pytest.approx(2.014 / 50.1e-6, rel=1e-3)
+    assert float(now) == approx(1.0 + 2.0 + 0.014, abs=1e-4)
+    assert int(turns) == approx(2.014 / 50.1e-6, rel=1e-3)
     assert told[0] == told[1]
 
 
@@ -171,9 +171,7 @@ def test_samples_of_a_datagram_are_taken_one_after_the_other(stub):
         came.tolist() == alone.tolist() == [[4.0, 2.0, 3.0, rate] for rate in (1.0, 2.0, 3.0, 4.0)]
     )
     for rate in (1.0, 2.0, 3.0, 4.0):
-        assert sum(float(words[2]) == rate for words in told) == pytest.approx(
-            0.0005 / 50.1e-6, abs=1.0
-        )
+        assert sum(float(words[2]) == rate for words in told) == approx(0.0005 / 50.1e-6, abs=1.0)
 
 
 class Answers:
@@ -204,7 +202,7 @@ class Answers:
         self._server.close()
 
 
-@pytest.fixture
+@fixture
 def answers(monkeypatch):
     port = free_port()
     monkeypatch.setattr(firmware, "PORTS", (port, port + 1))
@@ -219,18 +217,18 @@ def test_command_line_writes_reads_back_and_says_what_is_refused(answers):
         line.ask(firmware.line_of("min_check", "1050"))
         assert line.read("small_angle") == "180"
         assert line.read("min_check") == "25"
-        with pytest.raises(RunError, match=r"refuses 'serial UART2 1'.*UNKNOWN COMMAND"):
+        with raises(RunError, match=r"refuses 'serial UART2 1'.*UNKNOWN COMMAND"):
             line.ask(firmware.line_of("serial UART2", "1"))
 
 
 def test_a_program_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(RunError, match=r"no firmware at .*nothing"):
+    with raises(RunError, match=r"no firmware at .*nothing"):
         Firmware(tmp_path / "nothing", tmp_path)
 
 
 def test_a_program_that_ends_at_once_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(firmware, "PORTS", (free_port(), free_port()))
-    with pytest.raises(RunError, match="does not listen"):
+    with raises(RunError, match="does not listen"):
         Firmware("/bin/false", tmp_path).start()
 
 
@@ -285,7 +283,7 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
                 answer(frame)
 
     turn(120)
-    assert fake.motors == pytest.approx([0.4, 0.2, 0.3, 0.1])
+    assert fake.motors == approx([0.4, 0.2, 0.3, 0.1])
     assert not fake.armed
     flags[0] = 0b10
     turn(120)

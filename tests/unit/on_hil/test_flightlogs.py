@@ -3,7 +3,6 @@ recorded.
 """
 
 import argparse
-import dataclasses
 import json
 import math
 import shutil
@@ -11,10 +10,14 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 
 import cv2
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, importorskip, raises
 
 from hil.control.latch import PayloadFlight, separation
 from hil.control.recording import flightlogs, view
@@ -32,14 +35,14 @@ CLOCK = 3e-3
 """Of a time that is found in poses of a tenth of a millimetre of noise [s]."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("flown")
     decisions = record_run(folder / "a", saved_policy(folder), seconds=6.0)
     return folder / "a", decisions
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def logs(run):
     return throws(read(run[0]))
 
@@ -53,24 +56,24 @@ def test_a_log_a_throw_with_what_was_decided(run, logs):
         assert result["success"]
         assert times["latch"] == latch.time
         assert times["policy_start"] <= latch.time
-        assert times["separation"] == pytest.approx(latch.time + LAG, abs=TICK)
+        assert times["separation"] == approx(latch.time + LAG, abs=TICK)
         throw = [d for d in decisions if d.action is not None and d.state == "throw"]
         shown = log["action"].values[np.searchsorted(log["action"].time, latch.time)]
-        np.testing.assert_array_equal(shown, next(d for d in throw if d.time == latch.time).action)
-        assert result["error"] == pytest.approx(2.0, abs=0.02), (
+        assert_array_equal(shown, next(d for d in throw if d.time == latch.time).action)
+        assert result["error"] == approx(2.0, abs=0.02), (
             "it falls at its feet, the goal is 2 m away"
         )
         fall = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
-        assert result["duration"] == pytest.approx(
+        assert result["duration"] == approx(
             latch.time - times["policy_start"] + LAG + fall, abs=0.03
         )
-        assert log["landing"].values[0][2] == pytest.approx(0.04)
+        assert log["landing"].values[0][2] == approx(0.04)
         attached = log["attached"]
         assert attached.values[attached.time < times["separation"]].all()
         assert not attached.values[attached.time > times["separation"]].any()
         assert log["cable_points_w"].time[-1] < times["separation"]
-        length = np.linalg.norm(np.diff(log["cable_points_w"].values, axis=1)[:, 0], axis=1)
-        np.testing.assert_allclose(length, length[0], atol=0.01)
+        length = norm(np.diff(log["cable_points_w"].values, axis=1)[:, 0], axis=1)
+        assert_allclose(length, length[0], atol=0.01)
 
 
 def test_no_tick_is_in_the_logs_of_two_throws(run, monkeypatch):
@@ -124,8 +127,8 @@ def test_what_the_other_tools_read_of_it(run, logs, tmp_path):
         "goal_w",
     ):
         assert len(log[name].time) > (5 if name in ("observation", "keypoints") else 50), name
-    assert np.median(np.diff(log["pos_w"].time)) == pytest.approx(TICK / 2, abs=1e-6)
-    assert np.median(np.diff(log["command"].time)) == pytest.approx(TICK, abs=1e-6)
+    assert np.median(np.diff(log["pos_w"].time)) == approx(TICK / 2, abs=1e-6)
+    assert np.median(np.diff(log["command"].time)) == approx(TICK, abs=1e-6)
     worked_out = {"vel_w", "rate_b", "payload_vel_w"}
     assert set(log.channels) - set(log.measured().channels) == worked_out, (
         "no gyro gave rates: they are the runner's, of the poses"
@@ -160,7 +163,7 @@ def test_poses_of_a_clock_that_drifts_are_dated_by_their_arrivals(tmp_path):
     """Stamps that gain a millisecond a second; by one offset a run's ends would be 3 ms off."""
 
     def drifting(time, poses):
-        return [dataclasses.replace(pose, stamp=1.001 * pose.stamp + 40.0) for pose in poses]
+        return [replace(pose, stamp=1.001 * pose.stamp + 40.0) for pose in poses]
 
     record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, poses=drifting)
     played = read(tmp_path / "a")
@@ -174,7 +177,7 @@ def test_a_killed_run_and_no_run(tmp_path):
     record_run(tmp_path / "a", saved_policy(tmp_path), seconds=6.0, close=False)
     (log,) = throws(read(tmp_path / "a"))
     assert log.meta["result"]["success"]
-    with pytest.raises(RunError, match="no folder of a run"):
+    with raises(RunError, match="no folder of a run"):
         throws(read(tmp_path))
 
 
@@ -182,7 +185,7 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
     """A payload pulled with three times its weight until 0.113 s, then free; 1 mm of noise, 100 Hz,
     2 % lost.
     """
-    rng, found = np.random.default_rng(0), []
+    rng, found = default_rng(0), []
     for _ in range(40):
         let_go, start, vel = (
             0.113 + 0.01 * rng.random(),
@@ -198,7 +201,7 @@ def test_where_the_rope_let_go_is_found_in_noisy_poses():
         points = points + 1e-3 * rng.standard_normal(points.shape)
         when, where = separation(times, points, 0.11)
         found.append(when - let_go)
-        assert np.linalg.norm(np.subtract(where, start)) < 0.03
+        assert norm(np.subtract(where, start)) < 0.03
     assert abs(np.mean(found)) < CLOCK
     assert np.std(found) < 2 * CLOCK
 
@@ -217,8 +220,8 @@ def test_a_ball_lost_from_sight_before_the_ground_has_landed_all_the_same():
         landing = flight.overdue(0.11 + fall + 0.2)
         assert (landing is not None) == found
         if found:
-            assert landing.time == pytest.approx(0.11 + fall, abs=1e-6)
-            np.testing.assert_allclose(landing.landing_w, (4.0 * fall, 0.0, 0.04), atol=1e-6)
+            assert landing.time == approx(0.11 + fall, abs=1e-6)
+            assert_allclose(landing.landing_w, (4.0 * fall, 0.0, 0.04), atol=1e-6)
 
 
 def test_no_separation_where_the_poses_do_not_tell():
@@ -254,7 +257,7 @@ def test_the_recording_of_a_run_holds_all(run, tmp_path):
 
 def test_the_same_run_as_mcap(run, tmp_path, capsys):
     """`hil view --out run.mcap`, read back by the library's own reader."""
-    reader = pytest.importorskip("mcap.reader")
+    reader = importorskip("mcap.reader")
     assert (
         view.run(argparse.Namespace(folder=run[0], live=False, out=str(tmp_path / "run.mcap"))) == 0
     )
@@ -304,7 +307,7 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
     texts = {name: (source / name).read_text() for name in ("poses.jsonl", "ticks.jsonl")}
 
     def write():
-        rng, places = np.random.default_rng(0), dict.fromkeys(texts, 0)
+        rng, places = default_rng(0), dict.fromkeys(texts, 0)
         files = {name: (folder / name).open("w") for name in texts}
         while any(places[name] < len(text) for name, text in texts.items()):
             for name, text in texts.items():
@@ -331,7 +334,7 @@ def test_the_live_view_follows_a_run_that_is_being_written(run, tmp_path, monkey
     assert stream.sent["signals/phase/state"] > 2
     assert stream.sent["world/trail/ball"] > 2
     assert stream.sent["events"] >= 5
-    np.testing.assert_array_equal(
+    assert_array_equal(
         [t.decision.command or () for t in played[-5:]],
         [line["command"] or () for line in ticks[-5:]],
     )

@@ -3,7 +3,9 @@
 from itertools import permutations, product
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import mark, raises
 from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
@@ -44,43 +46,41 @@ def test_there_are_24_turns_and_24_mirrors_are_refused():
         for signs in product(("", "-"), repeat=3)
     }
     for axes in every - set(AXES):
-        with pytest.raises(FrameError, match="mirror the world") as caught:
+        with raises(FrameError, match="mirror the world") as caught:
             frames(axes)
         assert set(str(caught.value).split(": ")[-1].split()) < set(AXES), (
             "what it proposes are turns"
         )
 
 
-@pytest.mark.parametrize(
-    "axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"]
-)
+@mark.parametrize("axes", ["x,y", "x,x,z", "a,b,c", "", "x,y,z,x", "xy,z,x", "--x,y,z", "x,,z"])
 def test_what_is_no_set_of_axes_is_refused(axes):
-    with pytest.raises(FrameError, match="expected x, y and z once each"):
+    with raises(FrameError, match="expected x, y and z once each"):
         frames(axes)
 
 
-@pytest.mark.parametrize("axes", AXES)
-@pytest.mark.parametrize("order", ["xyzw", "wxyz"])
+@mark.parametrize("axes", AXES)
+@mark.parametrize("order", ["xyzw", "wxyz"])
 def test_every_case_both_ways(axes, order):
-    rng = np.random.default_rng(AXES.index(axes))
+    rng = default_rng(AXES.index(axes))
     body_axes, yaw = AXES[(7 * AXES.index(axes) + 3) % 24], float(rng.uniform(-180, 180))
     convert = frames(axes, body_axes, order, yaw, tuple(map(float, rng.normal(size=3))))
     for _ in range(20):
         ours = random_pose(rng)
         back = convert.pose_from_source(convert.source_from_pose(ours))
         for name in ("pos", "vel", "rate"):
-            np.testing.assert_allclose(getattr(back, name), getattr(ours, name), atol=20 * EXACT)
+            assert_allclose(getattr(back, name), getattr(ours, name), atol=20 * EXACT)
         assert same_turn(back.quat, ours.quat)
         source = random_pose(rng)
         again = convert.source_from_pose(convert.pose_from_source(source))
-        np.testing.assert_allclose(again.pos, source.pos, atol=20 * EXACT)
+        assert_allclose(again.pos, source.pos, atol=20 * EXACT)
         assert same_turn(again.quat, source.quat)
 
 
-@pytest.mark.parametrize("axes", AXES)
+@mark.parametrize("axes", AXES)
 def test_every_case_against_matrices(axes):
     """``R_ours = Yaw A R_source B^T`` and the like, in SciPy."""
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     body_axes, yaw = AXES[-1 - AXES.index(axes)], 33.0
     convert = frames(axes, body_axes, "wxyz", yaw)
     world = Rotation.from_euler("z", yaw, degrees=True).as_matrix() @ turn_of(axes)
@@ -89,16 +89,16 @@ def test_every_case_against_matrices(axes):
         pose = random_pose(rng)
         rot = Rotation.from_quat([*pose.quat[1:], pose.quat[0]]).as_matrix()
         ours = convert.pose_from_source(pose)
-        np.testing.assert_allclose(
+        assert_allclose(
             Rotation.from_quat(ours.quat).as_matrix(), world @ rot @ body.T, atol=10 * EXACT
         )
-        np.testing.assert_allclose(ours.pos, world @ pose.pos, atol=10 * EXACT)
-        np.testing.assert_allclose(ours.vel, world @ pose.vel, atol=10 * EXACT)
-        np.testing.assert_allclose(ours.rate, body @ pose.rate, atol=10 * EXACT)
+        assert_allclose(ours.pos, world @ pose.pos, atol=10 * EXACT)
+        assert_allclose(ours.vel, world @ pose.vel, atol=10 * EXACT)
+        assert_allclose(ours.rate, body @ pose.rate, atol=10 * EXACT)
 
 
 def test_our_own_frame_changes_no_bit():
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     for _ in range(50):
         pose = random_pose(rng)
         assert frames().pose_from_source(pose) == pose
@@ -117,11 +117,11 @@ def test_level_and_north_in_mavlink_is_level_and_ahead_here():
     ahead = frames("x,-y,-z", "x,-y,-z", "wxyz").pose_from_source(level)
     assert ahead.pos == (1.0, -2.0, 3.0)
     assert same_turn(ahead.quat, (0.0, 0.0, 0.0, 1.0))
-    np.testing.assert_allclose(ahead.rate, (0.1, -0.2, -0.3), atol=EXACT)
+    assert_allclose(ahead.rate, (0.1, -0.2, -0.3), atol=EXACT)
     east = frames("y,x,-z", "x,-y,-z", "wxyz").pose_from_source(level)
-    np.testing.assert_allclose(east.pos, (2.0, 1.0, 3.0), atol=EXACT)
+    assert_allclose(east.pos, (2.0, 1.0, 3.0), atol=EXACT)
     turn = Rotation.from_quat(east.quat) * Rotation.from_quat(ahead.quat).inv()
-    np.testing.assert_allclose(turn.as_rotvec(degrees=True), (0.0, 0.0, 90.0), atol=1e-12)
+    assert_allclose(turn.as_rotvec(degrees=True), (0.0, 0.0, 90.0), atol=1e-12)
 
 
 def test_marker_offset_follows_the_attitude():
@@ -133,10 +133,10 @@ def test_marker_offset_follows_the_attitude():
     pose = convert.pose_from_source(
         Pose(0.0, 0.0, "vehicle", (0.0, -0.1, 1.0), right, (0.0, 0.0, 0.2), (2.0, 0.0, 0.0))
     )
-    np.testing.assert_allclose(pose.pos, (0.0, 0.0, 1.0), atol=EXACT)
+    assert_allclose(pose.pos, (0.0, 0.0, 1.0), atol=EXACT)
     # Turning with 2 rad/s on an arm of 0.1 m to the right the marker sinks at 0.2 m/s against the
     # centre of mass.
-    np.testing.assert_allclose(pose.vel, (0.0, 0.0, 0.4), atol=EXACT)
+    assert_allclose(pose.vel, (0.0, 0.0, 0.4), atol=EXACT)
 
 
 def test_wrong_order_and_numbers_are_refused():
@@ -145,5 +145,5 @@ def test_wrong_order_and_numbers_are_refused():
         ("yaw_offset_deg=nan", "nan"),
         ('axes="x,y"', "signed"),
     ):
-        with pytest.raises(ConfigError, match=message):
+        with raises(ConfigError, match=message):
             config.load(HilParams, config.find("hil", "dry_run"), [f"frames.vehicle.{wrong}"])

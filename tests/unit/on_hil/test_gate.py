@@ -4,8 +4,8 @@ a clock does.
 
 import math
 
-import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 
 from hil.links.clock import ManualClock, MonotonicClock, Ticker
 from hil.poses.body_track import Track
@@ -24,7 +24,7 @@ def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
     return Pose(time, time if arrival is None else arrival, "vehicle", (x, 0.0, 1.0), quat, **more)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("second", "reason"),
     [
         (pose(0.01, 0.01), None),
@@ -55,7 +55,7 @@ def turned(angle: float, norm: float = 1.0):
     return (0.0, norm * math.sin(angle / 2.0), 0.0, norm * math.cos(angle / 2.0))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("at", "limit", "reason"),
     [
         (lambda x: pose(0.01, x), 0.12 + 20.0 * 0.01**2, "jump"),  # 0.5 * 40 m/s^2
@@ -93,7 +93,7 @@ def test_a_swapped_body_is_never_taken_back_by_waiting():
     assert gate.check(pose(0.03, 0.03)) is None
 
 
-@pytest.mark.parametrize("gap", [0.01, 0.13, 0.2])
+@mark.parametrize("gap", [0.01, 0.13, 0.2])
 def test_bodies_swapped_after_a_gap_are_known_by_the_cable(gap):
     """After 0.13 s without poses the room for a jump is wider than the cable is long."""
     still, tether = (0.0, 0.0, 0.0), Tether((0.43, 0.0, 1.0), 0.6)
@@ -155,7 +155,7 @@ def test_a_marker_has_no_attitude():
     assert gate.check(pose(0.01, 0.01, None)) is None
 
 
-@pytest.mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
+@mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
 def test_a_single_marker_is_a_position(quat):
     """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
     frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
@@ -175,14 +175,14 @@ def test_a_stamp_that_is_no_time_spoils_no_velocity():
     assert track.update(Pose(1e300, 0.0, "vehicle", (0.0, 0.0, 1.0), LEVEL)) == "stamp"
     for i in range(1, 8):
         assert track.update(pose(0.01 * i, 0.01 * i)) is None
-    assert track.state(0.07).vel == pytest.approx((1.0, 0.0, 0.0))
+    assert track.state(0.07).vel == approx((1.0, 0.0, 0.0))
 
 
 def test_wrong_limits():
     for ages in ((0.1, 0.04, 0.25), (0.04, 0.1, 0.1), (0.04, 0.3, 0.25), (0.1, 0.1, 0.25)):
-        with pytest.raises(ConfigError, match="ascending"):
+        with raises(ConfigError, match="ascending"):
             GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, *ages)
-    with pytest.raises(ConfigError, match=r"quat_tolerance is 0.0; expected above 0"):
+    with raises(ConfigError, match=r"quat_tolerance is 0.0; expected above 0"):
         GateParams(0.0, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 
 
@@ -194,7 +194,7 @@ def track() -> Track:
     )
 
 
-@pytest.mark.parametrize("step", [1.0, -1.0])
+@mark.parametrize("step", [1.0, -1.0])
 def test_a_step_of_the_sources_clock_costs_nothing(step):
     body = track()
     for i in range(60):
@@ -202,7 +202,7 @@ def test_a_step_of_the_sources_clock_costs_nothing(step):
         stamp = time + (step if i >= 30 else 0.0)
         assert body.update(pose(stamp, 0.5 * time, arrival=time)) is None
         if i > 2:
-            np.testing.assert_allclose(body.state(time).vel, (0.5, 0.0, 0.0), atol=1e-9)
+            assert_allclose(body.state(time).vel, (0.5, 0.0, 0.0), atol=1e-9)
     assert body.accepted == 60
 
 
@@ -219,9 +219,9 @@ def test_a_state_is_carried_forward():
         half = 0.01 * i / 2
         body.update(pose(0.01 * i, 0.02 * i, (0.0, 0.0, math.sin(half), math.cos(half))))
     state = body.state(0.05, lead=0.02)
-    np.testing.assert_allclose(state.pos, (0.08 + 0.04, 0.0, 1.0), atol=1e-9)
-    np.testing.assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
-    assert state.age == pytest.approx(0.01)
+    assert_allclose(state.pos, (0.08 + 0.04, 0.0, 1.0), atol=1e-9)
+    assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
+    assert state.age == approx(0.01)
     assert track().state(0.0) is None
 
 
@@ -233,13 +233,13 @@ def test_late_ticks_are_counted_and_keep_their_grid():
         return ticker.take()
 
     ticker = Ticker(clock, 0.02)
-    assert [waited(ticker) for _ in range(3)] == pytest.approx([5.0, 5.02, 5.04])
+    assert [waited(ticker) for _ in range(3)] == approx([5.0, 5.02, 5.04])
     clock.time += 0.07
-    assert waited(ticker) == pytest.approx(5.11)
+    assert waited(ticker) == approx(5.11)
     assert (ticker.index, ticker.missed) == (5, 2)
-    assert ticker.late == pytest.approx(0.01)
-    assert waited(ticker) == pytest.approx(5.12)
-    assert ticker.worst == pytest.approx(0.05)
+    assert ticker.late == approx(0.01)
+    assert waited(ticker) == approx(5.12)
+    assert ticker.worst == approx(0.05)
 
 
 def test_the_monotonic_clock_keeps_its_speed():
@@ -247,5 +247,5 @@ def test_the_monotonic_clock_keeps_its_speed():
     start = clock.now()
     clock.sleep_until(start + 0.08)
     assert 0.08 <= clock.now() - start < 1.0
-    with pytest.raises(ValueError, match="above 0"):
+    with raises(ValueError, match="above 0"):
         MonotonicClock(0.0)

@@ -5,7 +5,8 @@ carelessness of the carrier.
 import math
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, fixture, mark, raises
 
 from hil.errors import RunError
 from hil.links.clock import ManualClock
@@ -36,7 +37,7 @@ def carried(frames: FrameParams, seed=0, moves=8, rest=1.2) -> list[Pose]:
     """What a source with these frames says of a vehicle that is carried about, not
     quite straight.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     pos, quat, track = np.array([0.3, -0.2, 1.0]), about(2, math.radians(rng.uniform(-5, 5))), []
     ways = {i: 0.5 * np.eye(3)[i] + rng.normal(0, 0.05, 3) for i in range(3)}
     turned = {i: (axis, angle) for i, axis, angle in TURNS}
@@ -64,13 +65,13 @@ def made(axes="x,y,z", body_axes="x,y,z", quaternion="xyzw", yaw=0.0) -> FramePa
     return FrameParams(axes, body_axes, quaternion, yaw, (0.0, 0.0, 0.0))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def track():
     """Poses in our frames."""
     return carried(OURS)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def steps(track):
     """Moves in our frames; each case writes them as its source would."""
     return find_steps(track)
@@ -81,7 +82,7 @@ def check(steps, true: FrameParams, config: FrameParams):
     return judge([MeasuredMove(source(step.before), source(step.after)) for step in steps], config)
 
 
-@pytest.mark.parametrize("axes", AXES)
+@mark.parametrize("axes", AXES)
 def test_every_axis_case_is_named(steps, axes):
     for true in (
         made(axes=axes),
@@ -98,7 +99,7 @@ def test_every_axis_case_is_named(steps, axes):
 
 
 def test_any_mixture_is_named(steps):
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     for _ in range(25):
         true, config = (
             made(
@@ -114,7 +115,7 @@ def test_any_mixture_is_named(steps):
             true.body_axes,
             true.quaternion,
         )
-        assert found.fitting.yaw_offset_deg == pytest.approx(true.yaw_offset_deg, abs=8.0)
+        assert found.fitting.yaw_offset_deg == approx(true.yaw_offset_deg, abs=8.0)
 
 
 def test_a_left_handed_world_is_told(track):
@@ -128,14 +129,12 @@ def test_a_left_handed_world_is_told(track):
 
 
 def test_moves_that_were_left_out_are_counted():
-    with pytest.raises(
-        RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"
-    ):
+    with raises(RunError, match=r"5 moves between rests; expected 8.*8\. turn it to the left"):
         judge(find_steps(carried(OURS, moves=5)), OURS)
-    with pytest.raises(RunError, match="expected 8"):
+    with raises(RunError, match="expected 8"):
         judge(find_steps(carried(OURS, rest=0.2)), OURS)
     assert find_steps([]) == []
-    with pytest.raises(RunError, match="gives no attitude"):
+    with raises(RunError, match="gives no attitude"):
         find_steps([Pose(0.0, 0.0, "vehicle", (0.0, 0.0, 0.0))])
     assert len(MOVES) == 8
 
@@ -149,10 +148,10 @@ def test_a_live_source_is_told_the_next_move_and_left_when_all_are_made(track):
     assert clock.time < 20.0
     clock = ManualClock()
     assert len(collect(RecordedSource(track), clock, 8.0)) < 8
-    assert clock.time == pytest.approx(8.0, abs=0.3)
+    assert clock.time == approx(8.0, abs=0.3)
 
 
-@pytest.mark.parametrize(("axes", "status"), [("y,x,-z", 0), ("x,-y,-z", 1)])
+@mark.parametrize(("axes", "status"), [("y,x,-z", 0), ("x,-y,-z", 1)])
 def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
     path = tmp_path / "carried.csv"
     rows = [(p.stamp, *p.pos, *p.quat) for p in carried(made("y,x,-z", "x,-y,-z", "wxyz"))]

@@ -1,6 +1,6 @@
 """Commands that wait for a vehicle that acts sooner than the one that a policy was trained with."""
 
-import pytest
+from pytest import approx, raises
 
 from hil.links.backends import make_backend
 from hil.links.backends.base import DryRun, Held
@@ -34,7 +34,7 @@ def test_each_command_goes_out_so_much_later_and_none_is_lost():
         held.send((float(tick), 0.0, 0.0, 0.0), 0.02 * tick)
         held.service(0.02 * tick)
     assert [command[0] for _, command in told.sent] == [0.0]
-    assert held.due() == pytest.approx(0.0455)
+    assert held.due() == approx(0.0455)
     told.release_due = 0.043
     assert held.due() == 0.043
     told.release_due = None
@@ -54,7 +54,7 @@ def test_nothing_goes_out_after_the_end():
 
 
 def test_a_vehicle_acts_sooner_or_later_but_not_both():
-    with pytest.raises(ConfigError, match="one of them 0"):
+    with raises(ConfigError, match="one of them 0"):
         config.load(
             HilParams, config.find("hil", "fake"), ["delay.hold=0.02", "delay.command=0.01"]
         )

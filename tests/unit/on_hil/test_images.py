@@ -2,15 +2,17 @@
 runner, live and recorded.
 """
 
-import dataclasses
 import json
 import math
 import time
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
 from camera.detectors.following import GATE, LOST
@@ -70,11 +72,11 @@ def picture(i) -> np.ndarray:
 
 def quaternion(vector) -> tuple[float, ...]:
     v = vector[0].numpy()
-    angle = np.linalg.norm(v)
+    angle = norm(v)
     return (*(v / angle * math.sin(angle / 2)).tolist(), math.cos(angle / 2))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def pictures():
     return [picture(i) for i in range(FRAMES)]
 
@@ -89,12 +91,12 @@ class Blind(Detector):
 
 def test_a_detector_of_ones_own_is_named_by_the_configuration(pictures, monkeypatch):
     params = ImageParams("camera", fisheye=SMALL, by="blind")
-    with pytest.raises(ConfigError, match=r"images.by 'blind'; known: contours, learnt"):
+    with raises(ConfigError, match=r"images.by 'blind'; known: contours, learnt"):
         Eyes(params, training())
     monkeypatch.setitem(DETECTORS, "blind", Blind)
     seen = Eyes(params, training()).look(pictures[0], 1.5)
     assert (seen.stamp, seen.corners) == (1.5, None)
-    assert seen.ball == pytest.approx((0.0, 0.0, 1.0, 0.1))
+    assert seen.ball == approx((0.0, 0.0, 1.0, 0.1))
 
 
 class Known(Blind):
@@ -105,7 +107,7 @@ class Known(Blind):
     ) / np.sqrt(1.02)
 
     def detect(self, image, prior=None):
-        return dataclasses.replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
+        return replace(super().detect(image), goal=GoalSeen(self.corners, 1.0))
 
 
 def test_what_a_camera_mounted_otherwise_sees_is_told_in_that_of_training(pictures, monkeypatch):
@@ -113,17 +115,17 @@ def test_what_a_camera_mounted_otherwise_sees_is_told_in_that_of_training(pictur
     training.
     """
     monkeypatch.setitem(DETECTORS, "known", Known)
-    mount = dataclasses.replace(training().mount, rpy_deg=(0.0, -30.0, 0.0))
+    mount = replace(training().mount, rpy_deg=(0.0, -30.0, 0.0))
     seen = Eyes(ImageParams("camera", fisheye=SMALL, mount=mount, by="known"), training()).look(
         pictures[0], 0.0
     )
     sine, cosine = 0.5, math.sqrt(0.75)
-    assert seen.ball == pytest.approx((0.0, -sine, cosine, 0.1))
+    assert seen.ball == approx((0.0, -sine, cosine, 0.1))
     turn = np.array([[1.0, 0.0, 0.0], [0.0, cosine, -sine], [0.0, sine, cosine]])
-    np.testing.assert_allclose(seen.corners, Known.corners @ turn.T, atol=1e-12)
+    assert_allclose(seen.corners, Known.corners @ turn.T, atol=1e-12)
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def folder(tmp_path_factory, pictures):
     """A folder of pictures, and the poses of the same flight as CSV."""
     import cv2
@@ -148,7 +150,7 @@ def folder(tmp_path_factory, pictures):
 
 
 def params(path: Path, **more) -> ImageParams:
-    return dataclasses.replace(ImageParams("folder", str(path), fisheye=SMALL), **more)
+    return replace(ImageParams("folder", str(path), fisheye=SMALL), **more)
 
 
 def true_keypoints(i):
@@ -174,7 +176,7 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
         quat = quaternion(vector)
         source.hint = Hint(tuple(pos.tolist()), quat, (0.2, 0.6))
         (detection,) = source.poll(PERIOD * i + 1e-9)
-        assert detection.stamp == pytest.approx(PERIOD * i)
+        assert detection.stamp == approx(PERIOD * i)
         again = Detection.of(json.loads(json.dumps(detection.values())))
         assert again == detection
         detections = Detections(camera, 0.1)
@@ -216,9 +218,9 @@ def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_w
         assert detection.corners is None, "a goal that is missed is not held"
         assert (detection.ball is not None) == (prior.ball_within < GATE * LOST) == (stamp < 0.2)
         if detection.ball is not None:
-            np.testing.assert_allclose(detection.ball[:3], prior.ball_ray_c, atol=1e-9)
-            np.testing.assert_allclose(detection.ball, first.ball, atol=0.03)
-    assert told(looker, pictures[0], 0.42, hint)[0].ball == pytest.approx(first.ball), (
+            assert_allclose(detection.ball[:3], prior.ball_ray_c, atol=1e-9)
+            assert_allclose(detection.ball, first.ball, atol=0.03)
+    assert told(looker, pictures[0], 0.42, hint)[0].ball == approx(first.ball), (
         "and it is found again"
     )
 
@@ -227,7 +229,7 @@ def test_only_the_newest_of_several_pictures_is_looked_at(folder):
     source = RecordedImages(params(folder, delay=0.03), training())
     assert source.poll(0.02) == [], "it takes its time to arrive"
     (detection,) = source.poll(PERIOD * 2 + 0.031)
-    assert detection.stamp == pytest.approx(PERIOD * 2)
+    assert detection.stamp == approx(PERIOD * 2)
 
 
 SQUARE = tuple(
@@ -237,12 +239,10 @@ SQUARE = tuple(
 """Rays to the corners of a goal below the vehicle."""
 
 
-@pytest.mark.parametrize("reads", ["edge", "zero"])
+@mark.parametrize("reads", ["edge", "zero"])
 def test_what_is_not_seen_any_more(reads):
     lens = training()
-    camera = KeypointCamera(
-        dataclasses.replace(lens, noise=dataclasses.replace(lens.noise, invalid_reads=reads))
-    )
+    camera = KeypointCamera(replace(lens, noise=replace(lens.noise, invalid_reads=reads)))
     detections, level = Detections(camera, 0.1), (0.0, 0.0, 0.0, 1.0)
     points, valid = detections.keypoints(0.0)
     assert not valid.any()
@@ -257,9 +257,7 @@ def test_what_is_not_seen_any_more(reads):
     detections.take(ahead, level)
     points, valid = detections.keypoints(2.2)
     assert not valid.any()
-    np.testing.assert_allclose(
-        np.linalg.norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6
-    )
+    assert_allclose(norm(points[0, 4:], axis=-1), 1.0 if reads == "edge" else 0.0, atol=1e-6)
     assert bool((points[0, 4:, 1] < -0.9).all()) == (reads == "edge"), (
         "gone over the upper edge, it reads there by the rule of edges alone"
     )
@@ -299,7 +297,7 @@ def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
     while eyes.failure is None and time.monotonic() < deadline:
         time.sleep(0.01)
     (detection,) = eyes.poll(0.0)
-    assert detection.stamp == pytest.approx(6.98)
+    assert detection.stamp == approx(6.98)
     assert detection.ball is not None
     assert eyes.poll(0.0) == []
     assert "gave no picture" in eyes.failure
@@ -311,7 +309,7 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
     """The vision policy's observations hold the detections, and a replay without the pictures gives
     the same actions.
     """
-    fisheye = ", ".join(f"{key}={value}" for key, value in dataclasses.asdict(SMALL).items())
+    fisheye = ", ".join(f"{key}={value}" for key, value in asdict(SMALL).items())
     columns = (
         '[{name="pos_w", columns=["x","y","z"], unit="m"}, '
         '{name="quat_wb", columns=["qx","qy","qz","qw"], unit="1", kind="quaternion"}, '
@@ -364,25 +362,25 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
 def test_wrong_pictures(folder, tmp_path):
     import cv2
 
-    with pytest.raises(SourceError, match="size is not that of images"):
+    with raises(SourceError, match="size is not that of images"):
         RecordedImages(params(folder, fisheye=None), training()).poll(1.0)
-    mount = dataclasses.replace(training().mount, position_b=(0.07, 0.0, -0.02))
-    with pytest.raises(ConfigError, match="40 mm from that of training"):
+    mount = replace(training().mount, position_b=(0.07, 0.0, -0.02))
+    with raises(ConfigError, match="40 mm from that of training"):
         Eyes(params(folder, mount=mount), training())
-    with pytest.raises(ConfigError, match=r"images\.path is none"):
+    with raises(ConfigError, match=r"images\.path is none"):
         ImageParams("folder")
-    with pytest.raises(ConfigError, match=r"no table \[images\]"):
+    with raises(ConfigError, match=r"no table \[images\]"):
         config.load(HilParams, config.find("hil", "dry_run"), ["keypoints=detector"])
     (tmp_path / STAMPS).write_text("file,time_s\na.png,0.0\n")
-    with pytest.raises(SourceError, match=r"names a\.png, which is not there"):
+    with raises(SourceError, match=r"names a\.png, which is not there"):
         RecordedImages(params(tmp_path), training())
     (tmp_path / "a.png").write_bytes(b"none")
-    with pytest.raises(SourceError, match="no picture that OpenCV can read"):
+    with raises(SourceError, match="no picture that OpenCV can read"):
         RecordedImages(params(tmp_path), training()).poll(1.0)
     (tmp_path / STAMPS).write_text("file,time_s\na.png,1.0\na.png,0.5\n")
-    with pytest.raises(SourceError, match="ascending"):
+    with raises(SourceError, match="ascending"):
         RecordedImages(params(tmp_path), training())
-    with pytest.raises(SourceError, match="no video that OpenCV can open"):
+    with raises(SourceError, match="no video that OpenCV can open"):
         RecordedImages(params(tmp_path / "a.mp4", kind="video"), training())
     assert cv2.imread(str(folder / "000.png")).shape == (280, 280, 3)
 
@@ -398,10 +396,10 @@ def test_a_video_with_stamps_beside_it(folder, pictures, tmp_path):
     writer.release()
     source = RecordedImages(params(path, kind="video"), training())
     (detection,) = source.poll(PERIOD * 2 + 1e-6)
-    assert detection.stamp == pytest.approx(PERIOD * 2), "by the video's own rate"
+    assert detection.stamp == approx(PERIOD * 2), "by the video's own rate"
     path.with_suffix(f".{STAMPS}").write_text(
         "frame,time_s\n" + "\n".join(f"{i},{1.0 + i}" for i in range(FRAMES)) + "\n"
     )
     (detection,) = RecordedImages(params(path, kind="video"), training()).poll(3.5)
-    assert detection.stamp == pytest.approx(3.0)
+    assert detection.stamp == approx(3.0)
     assert detection.ball is not None

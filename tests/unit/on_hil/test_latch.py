@@ -1,6 +1,6 @@
 """The latch by itself: when it separates, and what still hangs."""
 
-import pytest
+from pytest import approx, mark, raises
 
 from hil.control.latch import STUCK_AFTER, Latch
 from hil.errors import RunError
@@ -14,21 +14,21 @@ def latch_of(**changes) -> Latch:
     return Latch(LAG, **numbers | changes)
 
 
-@pytest.mark.parametrize(("delay", "wait"), [(0.0, 0.02), (0.01, 0.03)])
+@mark.parametrize(("delay", "wait"), [(0.0, 0.02), (0.01, 0.03)])
 def test_a_faster_mechanism_is_commanded_so_much_later(delay, wait):
     latch = latch_of(command_delay=delay)
-    assert latch.trip(1.0, ORIGIN) == pytest.approx(1.0 + wait)
+    assert latch.trip(1.0, ORIGIN) == approx(1.0 + wait)
     assert [latch.separated(1.0 + dt) for dt in (0.0, 0.049, 0.05)] == [False, False, True]
 
 
 def test_a_mechanism_as_slow_as_the_lag_is_taken_and_a_slower_one_refused():
     assert latch_of(mechanism_lag=LAG + 0.004).trip(1.0, ORIGIN) == 1.0
-    with pytest.raises(RunError, match="trained with 0"):
+    with raises(RunError, match="trained with 0"):
         latch_of(mechanism_lag=LAG + 0.006)
 
 
-@pytest.mark.parametrize("distance", [HANG - 0.11, HANG - 0.09, HANG + 0.09, HANG + 0.11])
-@pytest.mark.parametrize("axis", [0, 1, 2])
+@mark.parametrize("distance", [HANG - 0.11, HANG - 0.09, HANG + 0.09, HANG + 0.11])
+@mark.parametrize("axis", [0, 1, 2])
 def test_a_payload_that_stays_at_the_ropes_end_was_not_released(distance, axis):
     latch = latch_of()
     place = tuple(distance if i == axis else 0.0 for i in range(3))

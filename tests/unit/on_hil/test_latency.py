@@ -2,7 +2,8 @@
 
 import cv2
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, mark
 
 from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
 from hil.control.runner import Runner
@@ -15,15 +16,15 @@ BIN = 0.011
 
 
 def test_percentiles_of_many_times():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     times = np.exp(rng.normal(np.log(3e-4), 0.8, 20_000))
     stage = Stage()
     for t in times:
         stage.add(float(t))
     for share in (0.5, 0.95, 0.99):
-        assert stage.percentile(share) == pytest.approx(np.quantile(times, share), rel=BIN)
+        assert stage.percentile(share) == approx(np.quantile(times, share), rel=BIN)
     found = stage.summary()
-    assert found["max_ms"] == pytest.approx(1e3 * times.max(), rel=1e-12)
+    assert found["max_ms"] == approx(1e3 * times.max(), rel=1e-12)
     assert found["count"] == 20_000
 
 
@@ -40,20 +41,18 @@ def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
     stages = Stages()
     pose = lambda stamp, arrival, body=VEHICLE: Pose(stamp, arrival, body, (0.0, 0.0, 0.0))  # noqa: E731
     assert stages.poses([pose(0.0, 100.01), pose(0.01, 100.03)], 100.035) == {
-        "arrival": pytest.approx(0.005)
+        "arrival": approx(0.005)
     }
-    assert stages.stages["transport"].most == pytest.approx(0.01)
+    assert stages.stages["transport"].most == approx(0.01)
     stages.poses([pose(5.0, 100.05)], 100.06)
-    assert stages.stages["transport"].most == pytest.approx(0.01), (
-        "a step of the clock is no transport"
-    )
+    assert stages.stages["transport"].most == approx(0.01), "a step of the clock is no transport"
     assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
 
 
 def test_report_and_picture(tmp_path, monkeypatch):
     figures, png_of = [], parts.png_of
     monkeypatch.setattr(parts, "png_of", lambda figure: figures.append(figure) or png_of(figure))
-    stages, rng = Stages(), np.random.default_rng(0)
+    stages, rng = Stages(), default_rng(0)
     for _ in range(500):
         stages.add(
             {
@@ -101,7 +100,7 @@ def watched(*overrides: str, late: float) -> Runner:
     return runner
 
 
-@pytest.mark.parametrize("command", [0.0, 0.02])
+@mark.parametrize("command", [0.0, 0.02])
 def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(command):
     """By the time from measurement to arrival of each pose, and the delay of the command."""
     late = 0.03
@@ -109,13 +108,13 @@ def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(comma
     now = 0.39 + late
     estimate = runner.estimator.estimate(now)
     trained = runner.parts.trained_age
-    assert estimate.vehicle.pos[0] == pytest.approx(now - trained + command, abs=1e-6)
-    assert estimate.shown_age == pytest.approx(min(late, trained))
+    assert estimate.vehicle.pos[0] == approx(now - trained + command, abs=1e-6)
+    assert estimate.shown_age == approx(min(late, trained))
 
 
 def test_a_detector_is_told_the_payloads_distance_while_it_hangs():
     runner = watched(late=0.0)
     hint = runner.estimator.hint(0.39)
-    assert hint.ball_distance == pytest.approx((0.5 * runner.parts.hang, 1.4 * runner.parts.hang))
+    assert hint.ball_distance == approx((0.5 * runner.parts.hang, 1.4 * runner.parts.hang))
     runner.latch.at = 0.39
     assert runner.estimator.hint(0.39).ball_distance is None

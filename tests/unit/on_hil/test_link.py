@@ -9,7 +9,8 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import mark, raises
 from scipy.spatial.transform import Rotation
 
 from bench.processes import free_port
@@ -92,7 +93,7 @@ def test_messages_are_of_version_2():
     assert os.environ["MAVLINK20"] == "1"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "text",
     [
         "/bin/ls",
@@ -114,17 +115,17 @@ def test_messages_are_of_version_2():
     ],
 )
 def test_other_device_strings_are_refused(text):
-    with pytest.raises(LinkError, match=r"refused|numeric address|port"):
+    with raises(LinkError, match=r"refused|numeric address|port"):
         check_device(text, remote=True)
 
 
 def test_loopback_only_unless_told_otherwise():
-    with pytest.raises(LinkError, match="leaves this machine"):
+    with raises(LinkError, match="leaves this machine"):
         check_device("udp:0.0.0.0:14550")
     assert check_device("udp:192.168.1.2:14550", remote=True).host == "192.168.1.2"
     assert check_device("udpout:[::1]:14550").host == "::1"
     assert check_device("serial:/dev/ttyACM0:921600").port == 921600
-    with pytest.raises(LinkError, match="cannot connect"):
+    with raises(LinkError, match="cannot connect"):
         open_port(check_device("tcp:127.0.0.1:9"))
 
 
@@ -134,7 +135,7 @@ def test_a_port_that_is_taken_says_who_may_have_it_and_what_names_another():
     params = config.load(
         HilParams, config.find("hil", "fake"), [f"link.device=udp:127.0.0.1:{number}"]
     )
-    with pytest.raises(LinkError) as caught:
+    with raises(LinkError) as caught:
         open_source(params, Path("unused"), time.monotonic)
     first.close()
     for words in (
@@ -144,7 +145,7 @@ def test_a_port_that_is_taken_says_who_may_have_it_and_what_names_another():
         "hil fake --device udpout:127.0.0.1:PORT",
     ):
         assert words in str(caught.value)
-    with pytest.raises(LinkError, match="no such address on this machine"):
+    with raises(LinkError, match="no such address on this machine"):
         open_port(check_device("udp:192.0.2.1:14550", remote=True))  # of the range for examples
 
 
@@ -153,13 +154,13 @@ def test_what_the_fields_mean():
     assert (pose.stamp, pose.arrival, pose.pos, pose.reset) == (5e-6, 4.0, (1.0, 2.0, 3.0), 0)
     w, x, y, z = pose.quat
     angles = Rotation.from_quat([x, y, z, w]).as_euler("ZYX")
-    np.testing.assert_allclose(angles, (0.3, 0.2, 0.1), atol=1e-12)
+    assert_allclose(angles, (0.3, 0.2, 0.1), atol=1e-12)
     assert all(map(math.isnan, quaternion_from_euler(math.inf, 0.0, 0.0)))
     half = math.sqrt(0.5)
     east = pose_from_message(
         odometry(q=(half, 0.0, 0.0, half)), "payload", 0.0
     )  # facing east: forward is east
-    np.testing.assert_allclose(east.vel, (-2.0, 1.0, 3.0), atol=1e-12)
+    assert_allclose(east.vel, (-2.0, 1.0, 3.0), atol=1e-12)
     assert (east.rate, east.reset, east.stamp, east.body) == ((0.1, 0.2, 0.3), 7, 2.0, "payload")
     assert pose_from_message(odometry(child=20), "vehicle", 0.0).vel == (1.0, 2.0, 3.0)
     assert pose_from_message(odometry(vel=(math.nan, 0.0, 0.0)), "vehicle", 0.0).vel is None
@@ -248,7 +249,7 @@ def test_a_message_that_cannot_be_packed_is_not_sent(tmp_path):
     link.close()
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@mark.slow
+@mark.parametrize("seed", SEEDS)
 def test_a_million_byte_strings(seed):
     fuzz(EACH, seed)

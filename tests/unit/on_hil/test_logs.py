@@ -4,7 +4,7 @@ and wrong files.
 
 import math
 
-import pytest
+from pytest import approx, importorskip, mark, raises
 
 from hil.control.recording.record import lines
 from hil.errors import SourceError
@@ -54,17 +54,17 @@ def test_vision_poses_of_a_bin_with_stamps_of_their_own(tmp_path):
     path = tmp_path / "a.BIN"
     files.write_bin(path, {"VISP": files.VISP}, [vision(i, int(i >= 3)) for i in range(5)])
     poses = read_bin(path, VEHICLE)
-    assert [pose.stamp for pose in poses] == pytest.approx([0.99, 1.01, 1.03, 1.05, 1.07])
-    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.02, 0.04, 0.06, 0.08])
-    assert poses[2].pos == pytest.approx((0.2, 2.0, -1.5))
-    assert poses[2].quat == pytest.approx(YAWED)
+    assert [pose.stamp for pose in poses] == approx([0.99, 1.01, 1.03, 1.05, 1.07])
+    assert [pose.arrival for pose in poses] == approx([0.0, 0.02, 0.04, 0.06, 0.08])
+    assert poses[2].pos == approx((0.2, 2.0, -1.5))
+    assert poses[2].quat == approx(YAWED)
     assert [pose.reset for pose in poses] == [0, 0, 0, 1, 1]
     files.write_bin(
         path,
         {"VISP": files.VISP_OLD},
         [(name, values[:-1]) for name, values in (vision(i) for i in range(2))],
     )
-    assert read_bin(path, VEHICLE)[1].quat == pytest.approx(YAWED), "names of before 4.3"
+    assert read_bin(path, VEHICLE)[1].quat == approx(YAWED), "names of before 4.3"
 
 
 def test_an_estimate_is_that_of_one_core(tmp_path):
@@ -98,14 +98,12 @@ def test_an_estimate_is_that_of_one_core(tmp_path):
     poses = read_bin(path, (LogBody("vehicle", "XKF1", instance=1),))
     assert len(poses) == 4
     assert (poses[0].pos, poses[0].vel) == ((1.5, 0.25, -1.0), (1.0, 2.0, 3.0))
-    assert poses[0].quat == pytest.approx(YAWED)
-    with pytest.raises(SourceError, match=r"XKF1 \(instance 2\) holds no pose"):
+    assert poses[0].quat == approx(YAWED)
+    with raises(SourceError, match=r"XKF1 \(instance 2\) holds no pose"):
         read_bin(path, (LogBody("vehicle", "XKF1", instance=2),))
-    with pytest.raises(
-        SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"
-    ):
+    with raises(SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"):
         read_bin(path, VEHICLE)
-    with pytest.raises(
+    with raises(
         SourceError, match="'ATT' of the vehicle carries no pose; known: NKF1, POS, VISP, XKF1"
     ):
         read_bin(path, (LogBody("vehicle", "ATT"),))
@@ -134,8 +132,8 @@ def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
     ]
     files.write_bin(path, {"POS": files.POS, "ATT": files.ATT, "ORGN": files.ORGN}, rows)
     (pose,) = read_bin(path, (LogBody("vehicle", "POS"),))
-    assert pose.pos == pytest.approx((3.0, 2.0, -1.5), abs=0.02), "1e-7 deg are 11 mm"
-    assert pose.quat == pytest.approx(YAWED)
+    assert pose.pos == approx((3.0, 2.0, -1.5), abs=0.02), "1e-7 deg are 11 mm"
+    assert pose.quat == approx(YAWED)
 
 
 def test_a_vision_pose_of_negative_quality_or_that_was_ignored_is_none(tmp_path):
@@ -179,7 +177,7 @@ def odometry(i, velocity=(1.0, 0.0, 0.0), frame=3, quat=YAWED):
 
 
 def test_external_poses_of_a_ulg(tmp_path):
-    pytest.importorskip("pyulog")
+    importorskip("pyulog")
     path = tmp_path / "a.ulg"
     rows = [
         odometry(0),
@@ -189,21 +187,19 @@ def test_external_poses_of_a_ulg(tmp_path):
     ]
     files.write_ulg(path, {("vehicle_visual_odometry", 0): (ODOMETRY, rows)})
     poses = read_ulg(path, (LogBody("vehicle", "vehicle_visual_odometry"),))
-    assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02, 1.03])
-    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02, 0.03])
-    assert poses[1].pos == pytest.approx((0.5, 2.0, -1.0))
-    assert poses[0].quat == pytest.approx(YAWED, abs=1e-6)
-    assert poses[0].vel == pytest.approx((0.0, 1.0, 0.0), abs=1e-6), (
-        "of the body, turned into the world"
-    )
-    assert poses[1].vel == pytest.approx((1.0, 0.0, 0.0)), "of the world already"
+    assert [pose.stamp for pose in poses] == approx([1.0, 1.01, 1.02, 1.03])
+    assert [pose.arrival for pose in poses] == approx([0.0, 0.01, 0.02, 0.03])
+    assert poses[1].pos == approx((0.5, 2.0, -1.0))
+    assert poses[0].quat == approx(YAWED, abs=1e-6)
+    assert poses[0].vel == approx((0.0, 1.0, 0.0), abs=1e-6), "of the body, turned into the world"
+    assert poses[1].vel == approx((1.0, 0.0, 0.0)), "of the world already"
     assert (poses[2].vel, poses[3].quat) == (None, None), "NaN is PX4's word for unknown"
-    assert poses[0].rate == pytest.approx((0.1, 0.2, 0.3))
+    assert poses[0].rate == approx((0.1, 0.2, 0.3))
     assert poses[0].reset == 7
 
 
 def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
-    pytest.importorskip("pyulog")
+    importorskip("pyulog")
     path = tmp_path / "a.ulg"
     local = [
         "uint64_t timestamp",
@@ -231,22 +227,20 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
     }
     files.write_ulg(path, topics)
     poses = read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
-    assert [pose.quat[0] for pose in poses] == pytest.approx([QUARTER, 1.0, 1.0, 1.0])
+    assert [pose.quat[0] for pose in poses] == approx([QUARTER, 1.0, 1.0, 1.0])
     assert [pose.rate is None for pose in poses] == [True, False, False, False]
     assert [pose.reset for pose in poses] == [1, 1, 2, 2]
     assert [pose.valid for pose in poses] == [True, True, False, False]
-    with pytest.raises(
-        SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"
-    ):
+    with raises(SourceError, match=r"no vehicle_odometry in this log.*vehicle_local_position"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
     del topics["vehicle_attitude", 0]
     files.write_ulg(path, topics)
-    with pytest.raises(SourceError, match="gives no attitude"):
+    with raises(SourceError, match="gives no attitude"):
         read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
 
 
 def test_a_topic_without_a_field_says_which(tmp_path):
-    pytest.importorskip("pyulog")
+    importorskip("pyulog")
     path = tmp_path / "a.ulg"
     files.write_ulg(
         path,
@@ -257,33 +251,33 @@ def test_a_topic_without_a_field_says_which(tmp_path):
             )
         },
     )
-    with pytest.raises(SourceError, match=r"no field 'q\[0\]'; vehicle_odometry has position"):
+    with raises(SourceError, match=r"no field 'q\[0\]'; vehicle_odometry has position"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"]
 )
 def test_files_that_are_no_log(tmp_path, content, capfd):
     path = tmp_path / "x"
     path.write_bytes(content)
-    with pytest.raises(SourceError, match=r"expected an ArduPilot dataflash log \(\.BIN\)"):
+    with raises(SourceError, match=r"expected an ArduPilot dataflash log \(\.BIN\)"):
         read_bin(path, VEHICLE)
-    with pytest.raises(SourceError, match="cannot be read"):
+    with raises(SourceError, match="cannot be read"):
         read_bin(tmp_path / "none.BIN", VEHICLE)
-    pytest.importorskip("pyulog")
-    with pytest.raises(SourceError, match=r"\.ulg|no vehicle_odometry in this log"):
+    importorskip("pyulog")
+    with raises(SourceError, match=r"\.ulg|no vehicle_odometry in this log"):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
     assert capfd.readouterr() == ("", "")
 
 
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyulog", None)
-    with pytest.raises(SourceError, match=r"pip install 'visthrow\[logs\]'"):
+    with raises(SourceError, match=r"pip install 'visthrow\[logs\]'"):
         read_ulg(tmp_path / "a.ulg", (LogBody("vehicle", "vehicle_odometry"),))
 
 
-@pytest.mark.parametrize("kind", ["bin", "ulg"])
+@mark.parametrize("kind", ["bin", "ulg"])
 def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy
     looking on.
@@ -300,7 +294,7 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
             ]
             files.write_bin(tmp_path / f"{name}.bin", {"VISP": files.VISP}, rows)
         else:
-            pytest.importorskip("pyulog")
+            importorskip("pyulog")
             rows = [
                 (
                     20_000 * i + 1,
@@ -346,7 +340,7 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     assert main(["hil", "replay", str(out)]) == 0
     assert "all bit for bit the same" in capsys.readouterr().out
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
-    assert tick["observation"][2] == pytest.approx(1.333, abs=0.01), "down became up"
+    assert tick["observation"][2] == approx(1.333, abs=0.01), "down became up"
 
 
 def test_damage_in_a_bin_costs_a_few_messages(tmp_path):

@@ -2,15 +2,15 @@
 packages where they are.
 """
 
-import dataclasses
 import importlib
 import socket
 import sys
 import threading
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
-import pytest
+from pytest import fixture, mark, raises
 
 from bench.processes import free_port
 from hil.errors import LinkError, SourceError
@@ -117,7 +117,7 @@ def connect(*args):
 """
 
 
-@pytest.fixture
+@fixture
 def package(tmp_path, monkeypatch):
     """Writes a stand-in of motioncapture for other processes."""
     monkeypatch.syspath_prepend(tmp_path)
@@ -130,7 +130,7 @@ def test_a_package_that_crashes_is_started_again_on_the_ground_alone(package, mo
     package(CRASHES)
     monkeypatch.setattr("hil.poses.sources.motion_capture.RESTART_DELAY", 0.05)
     said = []
-    patient = dataclasses.replace(PARAMS, timeout=30.0)
+    patient = replace(PARAMS, timeout=30.0)
     source = MotionCaptureSource(patient, BODIES, time.monotonic, tell=said.append)
     source.hold(True)
     eventually(lambda: source.failure is not None)
@@ -165,12 +165,12 @@ def connect(kind, options):
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="the filter is Linux's")
+@mark.skipif(sys.platform != "linux", reason="the filter is Linux's")
 def test_the_package_hears_the_host_alone(package):
     """Whatever sockets it opens, other senders' datagrams do not get to them, and are counted."""
     package(HEARS_ANYBODY)
     port, said = free_port(), []
-    params = dataclasses.replace(PARAMS, timeout=30.0, settings={"port": str(port)})
+    params = replace(PARAMS, timeout=30.0, settings={"port": str(port)})
     source = MotionCaptureSource(params, BODIES, time.monotonic, tell=said.append)
     senders = {}
     for host in ("127.0.0.1", "127.0.0.2"):
@@ -193,13 +193,13 @@ def test_the_package_hears_the_host_alone(package):
 def test_a_system_that_does_not_answer_or_refuses():
     hanging = SimpleNamespace(connect=lambda *args: time.sleep(5.0))
     quick = MocapParams("vicon", "127.0.0.1", timeout=0.05)
-    with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 0.05 s"):
+    with raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 0.05 s"):
         MotionCaptureSource(quick, BODIES, time.monotonic, module=hanging)
 
     def refuse(*args):
         raise RuntimeError("Unknown motion capture type!")
 
-    with pytest.raises(SourceError, match="Unknown motion capture type"):
+    with raises(SourceError, match="Unknown motion capture type"):
         MotionCaptureSource(PARAMS, BODIES, time.monotonic, module=SimpleNamespace(connect=refuse))
 
 
@@ -214,12 +214,12 @@ def connect(kind, options):
 def test_a_package_that_holds_the_interpreter_holds_nothing_up(package):
     package(BLOCKS)
     begin = time.monotonic()
-    with pytest.raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 1 s"):
+    with raises(SourceError, match=r"vicon at 127.0.0.1: no answer within 1 s"):
         MotionCaptureSource(PARAMS, BODIES, time.monotonic)
     assert time.monotonic() - begin < 30.0
     package("def connect(*args):\n    raise RuntimeError('no such host')\n")
-    with pytest.raises(SourceError, match="RuntimeError: no such host"):
-        MotionCaptureSource(dataclasses.replace(PARAMS, timeout=60.0), BODIES, time.monotonic)
+    with raises(SourceError, match="RuntimeError: no such host"):
+        MotionCaptureSource(replace(PARAMS, timeout=60.0), BODIES, time.monotonic)
 
 
 class Client:
@@ -281,26 +281,24 @@ def test_natnet_by_streaming_id_calls_invalid_what_motive_does_not_track():
 
 def test_natnet_that_does_not_answer():
     module = SimpleNamespace(NatNetClient=lambda **kwargs: Client(**kwargs, answers=False))
-    with pytest.raises(
-        SourceError, match=r"natnet at 127.0.0.1 .*multicast\): no answer within 1 s"
-    ):
+    with raises(SourceError, match=r"natnet at 127.0.0.1 .*multicast\): no answer within 1 s"):
         NatNetSource(
             MocapParams("natnet", "127.0.0.1", timeout=1.0), IDS, time.monotonic, module=module
         )
-    with pytest.raises(SourceError, match="natnet bodies quad, ball; expected streaming ids"):
+    with raises(SourceError, match="natnet bodies quad, ball; expected streaming ids"):
         NatNetSource(MocapParams("natnet", "127.0.0.1"), BODIES, time.monotonic, module=module)
 
 
 def test_wrong_names_hosts_and_missing_packages(monkeypatch):
-    with pytest.raises(SourceError, match="expected each body once"):
+    with raises(SourceError, match="expected each body once"):
         open_mocap(PARAMS, (BODIES[0], RigidBody("payload", "quad")), time.monotonic, False)
-    with pytest.raises(LinkError, match="leaves this machine; set link"):
+    with raises(LinkError, match="leaves this machine; set link"):
         open_mocap(MocapParams("vicon", "192.168.1.9"), BODIES, time.monotonic, False)
-    with pytest.raises(LinkError, match="refused"):
+    with raises(LinkError, match="refused"):
         open_mocap(MocapParams("vicon", "vicon.local"), BODIES, time.monotonic, True)
     for system, package, bodies in (("vicon", "motioncapture", BODIES), ("natnet", "natnet", IDS)):
         monkeypatch.setitem(__import__("sys").modules, package, None)
-        with pytest.raises(SourceError, match=rf"pip install 'visthrow\[{package}\]'"):
+        with raises(SourceError, match=rf"pip install 'visthrow\[{package}\]'"):
             open_mocap(MocapParams(system, "127.0.0.1"), bodies, time.monotonic, False)
 
 
@@ -309,5 +307,5 @@ def test_a_motion_capture_on_another_machine_needs_the_configs_leave(monkeypatch
     monkeypatch.setattr(source, lambda params, *args, **options: params.host)
     params = MocapParams("vicon", "192.0.2.1", timeout=1.0)
     assert open_mocap(params, IDS, time.monotonic, True) == "192.0.2.1"
-    with pytest.raises(LinkError, match="remote"):
+    with raises(LinkError, match="remote"):
         open_mocap(params, IDS, time.monotonic, False)

@@ -3,7 +3,7 @@
 import struct
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from hil.links import msp
 from hil.links.backends.betaflight import Betaflight
@@ -22,7 +22,7 @@ def test_published_bytes():
     assert msp.pack(msp.Frame(msp.API_VERSION)) == bytes.fromhex("244d3c000101")
 
 
-@pytest.mark.parametrize("payload", [b"", b"\x00", b"$M<$X>", bytes(range(200))])
+@mark.parametrize("payload", [b"", b"\x00", b"$M<$X>", bytes(range(200))])
 def test_there_and_back_in_any_pieces(payload):
     frame = msp.Frame(105, payload, msp.ANSWER)
     data = b"noise$" + msp.pack(frame) + b"$M>" + msp.pack(frame)
@@ -45,7 +45,7 @@ def test_a_flipped_bit_is_noticed():
 
 def test_what_does_not_fit_is_not_packed():
     for frame in (msp.Frame(300), msp.Frame(1, bytes(255))):
-        with pytest.raises(ValueError, match="expected at most"):
+        with raises(ValueError, match="expected at most"):
             msp.pack(frame)
 
 
@@ -100,7 +100,7 @@ def test_no_bytes_make_the_back_end_raise_or_command():
     fuzz(10_000, 0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", SEEDS)
+@mark.slow
+@mark.parametrize("seed", SEEDS)
 def test_a_million_byte_strings(seed):
     fuzz(EACH, seed)

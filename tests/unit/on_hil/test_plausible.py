@@ -1,12 +1,12 @@
 """Units by physics: recorded flights as they are, and with each unit of the mapping wrong."""
 
-import dataclasses
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from hil.errors import SourceError
 from hil.links.clock import MonotonicClock
@@ -32,25 +32,21 @@ def flight(name: str, **units: str) -> HilParams:
     params = config.load(
         HilParams, config.find("hil", name), [f'source.file="{DATA / FLIGHTS[name]}"']
     )
-    columns = tuple(
-        dataclasses.replace(c, unit=units.get(c.name, c.unit)) for c in params.source.columns
-    )
-    time = dataclasses.replace(params.source.time, unit=units.get("time", "s"))
-    return dataclasses.replace(
-        params, source=dataclasses.replace(params.source, columns=columns, time=time)
-    )
+    columns = tuple(replace(c, unit=units.get(c.name, c.unit)) for c in params.source.columns)
+    time = replace(params.source.time, unit=units.get("time", "s"))
+    return replace(params, source=replace(params.source, columns=columns, time=time))
 
 
 def problems(params: HilParams) -> str:
     return "; ".join(unit_problems(read_poses(params), params.frames))
 
 
-@pytest.mark.parametrize("name", FLIGHTS)
+@mark.parametrize("name", FLIGHTS)
 def test_flights_as_they_are(name):
     assert problems(flight(name)) == ""
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("name", "units", "message"),
     [
         (
@@ -141,12 +137,12 @@ def test_little_data_and_a_still_vehicle_say_nothing():
 
 def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     params = flight("crazyflie_log", vel_w="m/s")
-    with pytest.raises(
+    with raises(
         SourceError,
         match=r"vel_w: the second is 1\d\d\d times .* \(source\.check_units=false lets it pass\)",
     ):
         open_source(params, tmp_path, MonotonicClock())
-    lax = dataclasses.replace(params, source=dataclasses.replace(params.source, check_units=False))
+    lax = replace(params, source=replace(params.source, check_units=False))
     assert open_source(lax, tmp_path, MonotonicClock())[2]
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
@@ -154,7 +150,7 @@ def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     assert "no column 'acc'; " in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["crazyflie_log", "slungload_log"])
+@mark.parametrize("name", ["crazyflie_log", "slungload_log"])
 def test_recorded_flights_replay(name, tmp_path, capsys):
     """Each is recorded with the vision policy looking on, and the recording gives the same actions
     again.

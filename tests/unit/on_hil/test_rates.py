@@ -5,7 +5,7 @@ Betaflight's curves at known points, their inverse, and which way is which.
 
 import math
 
-import pytest
+from pytest import approx, mark, raises
 
 from hil.links.backends.rates import RatesParams, Sticks
 from visthrow.common.errors import ConfigError
@@ -23,21 +23,19 @@ def test_known_points_of_the_curves():
     """RC rate 1 with super rate 0.7 ends at 200 / 0.3 deg/s; actual rates end at their largest, and
     begin with their slope.
     """
-    assert degrees(CLASSIC, 0, 1.0) == pytest.approx(200.0 / 0.3)
-    assert degrees(CLASSIC, 0, 0.5) == pytest.approx(100.0 / 0.65)
-    assert degrees(CLASSIC, 1, 1.0) == pytest.approx(360.0)
-    assert degrees(CLASSIC, 1, 0.5) == pytest.approx(360.0 * (0.5**4 * 0.3 + 0.5 * 0.7))
-    assert degrees(CLASSIC, 2, 1.0) == pytest.approx(min(1998.0, 200.0 * (2.5 + 14.54 * 0.5) / 0.6))
-    assert degrees(ACTUAL, 0, 1.0) == pytest.approx(670.0)
-    assert degrees(ACTUAL, 0, 0.5) == pytest.approx(70 * 0.5 + 600 * 0.25)
-    assert degrees(ACTUAL, 0, 1e-6) == pytest.approx(70e-6, rel=1e-4)
-    assert degrees(ACTUAL, 1, 0.5) == pytest.approx(
-        200 * 0.5 + 700 * 0.5 * (0.5**5 * 0.54 + 0.5 * 0.46)
-    )
-    assert degrees(LINEAR, 2, -0.5) == pytest.approx(-150.0)
+    assert degrees(CLASSIC, 0, 1.0) == approx(200.0 / 0.3)
+    assert degrees(CLASSIC, 0, 0.5) == approx(100.0 / 0.65)
+    assert degrees(CLASSIC, 1, 1.0) == approx(360.0)
+    assert degrees(CLASSIC, 1, 0.5) == approx(360.0 * (0.5**4 * 0.3 + 0.5 * 0.7))
+    assert degrees(CLASSIC, 2, 1.0) == approx(min(1998.0, 200.0 * (2.5 + 14.54 * 0.5) / 0.6))
+    assert degrees(ACTUAL, 0, 1.0) == approx(670.0)
+    assert degrees(ACTUAL, 0, 0.5) == approx(70 * 0.5 + 600 * 0.25)
+    assert degrees(ACTUAL, 0, 1e-6) == approx(70e-6, rel=1e-4)
+    assert degrees(ACTUAL, 1, 0.5) == approx(200 * 0.5 + 700 * 0.5 * (0.5**5 * 0.54 + 0.5 * 0.46))
+    assert degrees(LINEAR, 2, -0.5) == approx(-150.0)
 
 
-@pytest.mark.parametrize("params", [LINEAR, ACTUAL, CLASSIC])
+@mark.parametrize("params", [LINEAR, ACTUAL, CLASSIC])
 def test_the_inverse_is_as_near_as_microseconds_allow(params):
     sticks = Sticks(params)
     for axis in range(3):
@@ -71,7 +69,7 @@ def test_which_way_is_which():
     assert sticks.position(0, 1e3) == 2000, "beyond the end is the end"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "message"),
     [
         ((300, 1, 1), "rc_rates is .*; expected 1 to 255"),
@@ -80,5 +78,5 @@ def test_which_way_is_which():
     ],
 )
 def test_profiles_that_are_none(change, message):
-    with pytest.raises(ConfigError, match=message):
+    with raises(ConfigError, match=message):
         RatesParams("actual", change, (60, 60, 60), (0, 0, 0))

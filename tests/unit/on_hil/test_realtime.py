@@ -3,7 +3,7 @@
 import ctypes
 import os
 
-import pytest
+from pytest import raises
 
 from hil.control.realtime import RealtimeParams, keep, prepare
 from visthrow.common.errors import ConfigError
@@ -35,5 +35,5 @@ def test_a_refusal_is_said_with_its_reason(monkeypatch):
 
 
 def test_a_priority_out_of_range():
-    with pytest.raises(ConfigError, match="priority is 100; expected 0 to 99"):
+    with raises(ConfigError, match="priority is 100; expected 0 to 99"):
         RealtimeParams(priority=100)

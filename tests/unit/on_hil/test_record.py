@@ -5,7 +5,7 @@ import math
 import shutil
 
 import numpy as np
-import pytest
+from pytest import fixture, mark, raises
 
 from bench.processes import free_port
 from hil.control.recording.record import RunRecorder, lines, load_run
@@ -37,7 +37,7 @@ def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: pose
     return inputs
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def run_folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("run") / "a"
 
@@ -89,7 +89,7 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
 
 
 def test_what_is_no_run(run_folder, tmp_path, capsys):
-    with pytest.raises(RunError, match="no folder of a run; expected config"):
+    with raises(RunError, match="no folder of a run; expected config"):
         load_run(tmp_path)
     for action in (["replay"], ["view"], ["check", "--hover-of"]):
         assert main(["hil", *action, str(tmp_path / "none")]) == 2
@@ -97,11 +97,11 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     for path in run_folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     (tmp_path / "ticks.jsonl").write_text('{"n": 0\n{"n": 1}\n')
-    with pytest.raises(RunError, match="line 1 is damaged"):
+    with raises(RunError, match="line 1 is damaged"):
         load_run(tmp_path)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "expected"),
     [
         ("run --seconds 0", "expected a number above 0"),
@@ -111,7 +111,7 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     ],
 )
 def test_numbers_out_of_range_on_the_command_line(words, expected, capsys):
-    with pytest.raises(SystemExit):
+    with raises(SystemExit):
         main(["hil", *words.split()])
     assert expected in capsys.readouterr().err
 
@@ -161,7 +161,7 @@ def test_the_folder_holds_config_policy_and_hash(run_folder):
     assert len(record["policy_sha256"]) == 64
     assert {pose.body for group in poses.values() for pose in group} == {"vehicle", "payload"}
     assert len(ticks) > 200
-    with pytest.raises(StorageError, match="holds a run already"):
+    with raises(StorageError, match="holds a run already"):
         RunRecorder(run_folder, wanted)
 
 

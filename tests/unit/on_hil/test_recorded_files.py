@@ -6,7 +6,7 @@ import math
 import struct
 import warnings
 
-import pytest
+from pytest import mark
 
 from hil.links.pymav import mav
 from visthrow import cli
@@ -63,7 +63,7 @@ def checked(folder, monkeypatch, capsys):
     return status, capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("payload", "quat"),
     [
         ("mocap", LEVEL),
@@ -83,7 +83,7 @@ def test_a_ball_needs_no_attitude(payload, quat, tmp_path, monkeypatch, capsys):
     assert out.count("refused: none") == 2
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("frame", "name"),
     [
         (mav.MAV_FRAME_LOCAL_FLU, "LOCAL_FLU"),

@@ -5,7 +5,7 @@ slowly, and drift meanwhile.
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from hil.control.response import ANGLE_NOISE, Response
 
@@ -32,8 +32,8 @@ def verdict(sign: float, lag: float, delay: int, rng: np.random.Generator) -> st
     return response.problem or "turns as commanded"
 
 
-@pytest.mark.parametrize(("lag", "delay"), [(0.01, 0), (0.03, 1), (0.1, 2), (0.3, 2)])
-@pytest.mark.parametrize(
+@mark.parametrize(("lag", "delay"), [(0.01, 0), (0.03, 1), (0.1, 2), (0.3, 2)])
+@mark.parametrize(
     ("sign", "words"), [(1.0, "turns as"), (-1.0, "a sign is wrong"), (0.0, "not turn")]
 )
 def test_the_sign_of_a_rate_whatever_its_lag(sign, words, lag, delay):

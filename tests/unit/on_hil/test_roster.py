@@ -2,7 +2,7 @@
 refused is counted and said.
 """
 
-import pytest
+from pytest import mark, raises
 
 from hil.errors import LinkError
 from hil.links.pymav import Parser, mav
@@ -142,11 +142,9 @@ def test_only_those_on_the_list_are_looked_at():
     assert said == ["refused: datagram from 127.0.0.1:1001: not on link.allow"]
 
 
-@pytest.mark.parametrize(
-    "text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"]
-)
+@mark.parametrize("text", ["example.org", "10.0.0.300", "10.0.0.9:x", "", "10.0.0.9:14550:1"])
 def test_a_list_of_allowed_senders_holds_addresses(text):
-    with pytest.raises(LinkError, match=r"link\.allow .*; expected a numeric address"):
+    with raises(LinkError, match=r"link\.allow .*; expected a numeric address"):
         check_allowed((text,))
 
 

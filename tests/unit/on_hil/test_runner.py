@@ -2,11 +2,11 @@
 and how soon.
 """
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
@@ -67,15 +67,15 @@ def test_a_throw_from_idle_to_done():
         "done",
     ]
     latch = next(d.time for d in decisions if d.release)
-    assert pilot.backend.release_times == [pytest.approx(latch + LAG)], (
+    assert pilot.backend.release_times == [approx(latch + LAG)], (
         "no mechanism: the runner waits the trained lag"
     )
-    assert when(decisions, "recover") == pytest.approx(latch + LAG, abs=TICK)
+    assert when(decisions, "recover") == approx(latch + LAG, abs=TICK)
     (landing,) = pilot.latch.landings
     np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
-    assert landing.error == pytest.approx(2.0, abs=0.02)
+    assert landing.error == approx(2.0, abs=0.02)
     fall = math.sqrt(2 * (1.333 - pilot.parts.hang - 0.04) / 9.81)
-    assert landing.duration == pytest.approx(LAG + fall, abs=0.02)
+    assert landing.duration == approx(LAG + fall, abs=0.02)
     assert not pilot.errors
 
 
@@ -83,9 +83,9 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
     pilot = runner(mechanism=0.08)
     decisions = fly(pilot, 6.0)
     latch = next(d.time for d in decisions if d.release)
-    assert pilot.backend.release_times == [pytest.approx(latch + 0.03)]
+    assert pilot.backend.release_times == [approx(latch + 0.03)]
     assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
-    with pytest.raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
+    with raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
         runner(mechanism=0.12)
 
 
@@ -139,9 +139,7 @@ def lost(bodies, repeat=False, until=99.0):
                 last[pose.body] = pose
                 out.append(pose)
             elif repeat:
-                out.append(
-                    dataclasses.replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival)
-                )
+                out.append(replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival))
         return out
 
     return spoil
@@ -149,13 +147,13 @@ def lost(bodies, repeat=False, until=99.0):
 
 SWAP = {"vehicle": "payload", "payload": "vehicle"}
 BAD = {
-    "swapped": lambda p: dataclasses.replace(p, body=SWAP[p.body]),
-    "jump": lambda p: dataclasses.replace(p, pos=(p.pos[0] + 0.5, *p.pos[1:])),
-    "wxyz": lambda p: dataclasses.replace(p, quat=(p.quat[3], *p.quat[:3])),
-    "zero quaternion": lambda p: dataclasses.replace(p, quat=(0.0,) * 4),
-    "nan quaternion": lambda p: dataclasses.replace(p, quat=(math.nan,) * 4),
-    "infinite": lambda p: dataclasses.replace(p, pos=(math.inf, 0.0, 0.0)),
-    "reset counter": lambda p: dataclasses.replace(p, reset=3),
+    "swapped": lambda p: replace(p, body=SWAP[p.body]),
+    "jump": lambda p: replace(p, pos=(p.pos[0] + 0.5, *p.pos[1:])),
+    "wxyz": lambda p: replace(p, quat=(p.quat[3], *p.quat[:3])),
+    "zero quaternion": lambda p: replace(p, quat=(0.0,) * 4),
+    "nan quaternion": lambda p: replace(p, quat=(math.nan,) * 4),
+    "infinite": lambda p: replace(p, pos=(math.inf, 0.0, 0.0)),
+    "reset counter": lambda p: replace(p, reset=3),
 }
 
 
@@ -172,7 +170,7 @@ def test_poses_at_5_hz_never_start_a_throw():
     assert not pilot.backend.release_times
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("overrides", "message"),
     [
         (
@@ -197,16 +195,14 @@ GOAL = (
 )
 
 
-@pytest.mark.parametrize("x", [2.0, 9.0])
+@mark.parametrize("x", [2.0, 9.0])
 def test_a_goal_that_moves_is_looked_for_in_the_fence_once_it_is_seen(x):
     """The configured goal, which would lie outside, is none then."""
 
     def with_goal(time, poses):
         noise = 1e-4 * math.sin(1e3 * time)
         return (
-            [*poses, dataclasses.replace(poses[0], body="goal", pos=(x + noise, 0.0, 0.0))]
-            if poses
-            else poses
+            [*poses, replace(poses[0], body="goal", pos=(x + noise, 0.0, 0.0))] if poses else poses
         )
 
     overrides = (GOAL, "goal_w=[9.0, 0.0, 0.0]", "states.check=1.5")
@@ -227,8 +223,7 @@ def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
     def spoil(time, poses):
         fall = min(max(time - begun, 0.0) ** 2 * 0.5 * 9.81, 0.8)
         return [
-            dataclasses.replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload")))
-            for p in poses
+            replace(p, pos=(*p.pos[:2], p.pos[2] - fall * (p.body == "payload"))) for p in poses
         ]
 
     pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=START + 0.6)
@@ -237,7 +232,7 @@ def test_a_payload_that_comes_off_takes_no_pose_of_the_vehicle_with_it():
     assert when(decisions, "recover") < begun + 0.2, "a fall of the tolerance, 10 cm"
 
 
-@pytest.mark.parametrize("name", ["ball", "goal"])
+@mark.parametrize("name", ["ball", "goal"])
 def test_no_throw_on_pictures_that_do_not_show(name):
     """Seen in the hover and then lost, it goes back to ready; seen again, it throws."""
     hidden = (1.6, 2.6)
@@ -279,16 +274,14 @@ def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
     assert not pilot.backend.sent
 
 
-@pytest.mark.parametrize("value", [math.nan, math.inf])
+@mark.parametrize("value", [math.nan, math.inf])
 def test_a_policy_that_puts_out_no_numbers(value):
     pilot = runner(NEVER)
     act = pilot.pilot.act
 
     def broken(*args):
         out = act(*args)
-        return dataclasses.replace(
-            out, command=np.full((1, 4), value, np.float32), release=np.array([True])
-        )
+        return replace(out, command=np.full((1, 4), value, np.float32), release=np.array([True]))
 
     decisions = fly(
         pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None
@@ -296,7 +289,7 @@ def test_a_policy_that_puts_out_no_numbers(value):
     safe(pilot, decisions)
     assert "is not finite" in changes(decisions)[-1][1]
     assert not pilot.backend.release_times, "what it says of the release counts for nothing either"
-    assert when(decisions, "abort") == pytest.approx(START, abs=2 * TICK)
+    assert when(decisions, "abort") == approx(START, abs=2 * TICK)
     assert not pilot.errors
 
 
@@ -306,7 +299,7 @@ def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
     act = pilot.pilot.act
 
     def broken(*args):
-        return dataclasses.replace(act(*args), command=np.full((1, 4), math.nan, np.float32))
+        return replace(act(*args), command=np.full((1, 4), math.nan, np.float32))
 
     places = []
 
@@ -320,12 +313,12 @@ def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
 
     fly(pilot, START + 0.2, watch=watch)
     assert places[0][0] > 0.15
-    assert places[1][1] == pytest.approx(places[1][0], abs=0.02)
+    assert places[1][1] == approx(places[1][0], abs=0.02)
 
 
 def narrowed(pilot, high):
     """From the recovery on the vehicle's fence ends so far ahead [m]: it is outside of it."""
-    tight = dataclasses.replace(pilot.params.fence, vehicle_high=(high, 2.5, 2.8))
+    tight = replace(pilot.params.fence, vehicle_high=(high, 2.5, 2.8))
 
     def watch(time, decision):
         if decision.state == "recover":
@@ -356,7 +349,7 @@ def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("sends", "ended"), [(True, ["check", "ready", "abort"]), (False, ["check", "ready"])]
 )
 def test_a_fence_that_others_leave_ends_no_run_that_looks_on(sends, ended):
@@ -406,7 +399,7 @@ def test_no_exception_leaves_the_runner():
 def test_a_release_outside_of_the_fence_is_refused():
     """The payload hangs outside of its own fence from the moment that the policy asks."""
     pilot = runner(AT_ONCE)
-    tight = dataclasses.replace(pilot.params.fence, payload_low=(-3.0, -3.0, 1.2))
+    tight = replace(pilot.params.fence, payload_low=(-3.0, -3.0, 1.2))
 
     def watch(time, decision):
         if decision.state == "armed":
@@ -426,11 +419,11 @@ def test_a_failed_recording_prevents_the_next_throw_only():
 
 
 def test_another_camera_is_refused():
-    with pytest.raises(MismatchError, match="goal_side"):
+    with raises(MismatchError, match="goal_side"):
         Runner(params("camera.goal_side=0.3"), simple_policy(layout="vision"), Spy())
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("override", "message"),
     [
         ("gate.hold=0.01", "ascending"),
@@ -455,7 +448,7 @@ def test_another_camera_is_refused():
     ],
 )
 def test_wrong_configs(override, message):
-    with pytest.raises(ConfigError, match=message):
+    with raises(ConfigError, match=message):
         config.load(HilParams, config.find("hil", "dry_run"), [override])
 
 
@@ -469,15 +462,15 @@ def test_operators_abort_in_mid_throw():
     assert pilot.backend.aborts > 0
 
 
-@pytest.mark.parametrize("repeat", [False, True])
+@mark.parametrize("repeat", [False, True])
 def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
     _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, repeat), seconds=6.0)
     assert changes(decisions)[-2:] == [
         ("recover", "stale poses"),
         ("abort", "no new pose of the vehicle"),
     ]
-    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
     levelled = [d for d in decisions if d.note.startswith("level")]
     assert levelled[0].command[1:] == (0.0, 0.0, 0.0)
     assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
@@ -487,7 +480,7 @@ def test_payload_lost_but_not_the_vehicle():
     _, decisions = thrown(action=NEVER, poses=lost({"payload"}), seconds=6.0)
     assert ("recover", "stale poses") in changes(decisions)
     assert "abort" not in [state for state, _ in changes(decisions)]
-    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
 
 
 def test_a_short_gap_is_flown_through():
@@ -501,28 +494,26 @@ def spoiled(change, until=99.0):
     return lambda time, poses: [change(p) if START < time < until else p for p in poses]
 
 
-@pytest.mark.parametrize("name", BAD)
+@mark.parametrize("name", BAD)
 def test_bad_poses_are_no_poses(name):
     """Each ends as if none came: the throw is over after 0.1 s, the run after 0.25 s."""
     pilot, decisions = thrown(action=NEVER, poses=spoiled(BAD[name]), seconds=6.0)
-    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
     assert sum(pilot.tracks["vehicle"].gate.refused.values()) > 10
 
 
 HARMLESS = {
-    "clock step": lambda time, poses: [
-        dataclasses.replace(p, stamp=p.stamp + (time > START)) for p in poses
-    ],
+    "clock step": lambda time, poses: [replace(p, stamp=p.stamp + (time > START)) for p in poses],
     "clock step back": lambda time, poses: [
-        dataclasses.replace(p, stamp=p.stamp - (time > START)) for p in poses
+        replace(p, stamp=p.stamp - (time > START)) for p in poses
     ],
     "doubled": lambda time, poses: [p for p in poses for _ in range(2)],
     "one bad": spoiled(BAD["jump"], START + 0.02),
 }
 
 
-@pytest.mark.parametrize("name", HARMLESS)
+@mark.parametrize("name", HARMLESS)
 def test_harmless_faults_end_no_throw(name):
     _, decisions = thrown(action=NEVER, poses=HARMLESS[name], seconds=6.0)
     assert decisions[-1].state == "throw"
@@ -537,12 +528,12 @@ def test_poses_at_5_hz_from_mid_throw_on_end_the_run():
         return out
 
     _, decisions = thrown(action=NEVER, poses=slow, seconds=8.0)
-    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
     assert changes(decisions)[-1] == ("abort", "no new pose of the vehicle")
-    assert when(decisions, "abort") == pytest.approx(START + 0.6, abs=1.5 * TICK)
+    assert when(decisions, "abort") == approx(START + 0.6, abs=1.5 * TICK)
 
 
-@pytest.mark.parametrize("gap", [0.0, 0.15])
+@mark.parametrize("gap", [0.0, 0.15])
 def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
     """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the
     two apart.
@@ -554,8 +545,8 @@ def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
         return [] if time <= START + gap else [BAD["swapped"](p) for p in poses]
 
     pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=6.0)
-    assert when(decisions, "recover") == pytest.approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == pytest.approx(START + 0.25, abs=1.5 * TICK)
+    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
+    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
     assert all(track.gate.refused["swapped"] > 10 for track in pilot.tracks.values())
 
 
@@ -567,14 +558,14 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
             return poses
         vehicle, payload = poses
         x, y, z = payload.pos
-        low = dataclasses.replace(payload, pos=(x, y, z - 0.4))
+        low = replace(payload, pos=(x, y, z - 0.4))
         return [vehicle] if time <= START + gap else [vehicle, low]
 
     pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
     assert pilot.tracks["payload"].gate.refused["cable"] > 10
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("status", "reason"),
     [
         (
@@ -590,7 +581,7 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
 def test_an_autopilot_that_goes(status, reason):
     _, decisions = thrown(action=NEVER, status=status, seconds=5.0)
     assert changes(decisions)[-1] == ("abort", reason)
-    assert when(decisions, "abort") == pytest.approx(START, abs=1.5 * TICK)
+    assert when(decisions, "abort") == approx(START, abs=1.5 * TICK)
 
 
 def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it():

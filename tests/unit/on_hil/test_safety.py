@@ -3,7 +3,7 @@
 import math
 from dataclasses import replace
 
-import pytest
+from pytest import approx, mark
 from scipy.spatial.transform import Rotation
 
 from hil.control.safety import (
@@ -37,8 +37,8 @@ def moved(axis: int, value: float, start=MIDDLE) -> tuple[float, ...]:
     return tuple(value if i == axis else x for i, x in enumerate(start))
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("side", [-1, 1])
+@mark.parametrize("axis", range(3))
+@mark.parametrize("side", [-1, 1])
 def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
     limit = (FENCE.vehicle_low if side < 0 else FENCE.vehicle_high)[axis]
     distance = 0.4
@@ -53,8 +53,8 @@ def test_the_vehicle_is_stopped_where_it_could_not_brake(axis, side):
     assert fence_violation(FENCE, away, None) is None, "moving away from the wall is no danger"
 
 
-@pytest.mark.parametrize("axis", range(3))
-@pytest.mark.parametrize("side", [-1, 1])
+@mark.parametrize("axis", range(3))
+@mark.parametrize("side", [-1, 1])
 def test_vehicle_and_payload_have_boxes_of_their_own(axis, side):
     for name, low, high in (
         ("vehicle", FENCE.vehicle_low, FENCE.vehicle_high),
@@ -74,8 +74,8 @@ def test_a_payload_that_flies_is_not_watched():
     assert box_violation((0.0, 0.0, 0.0), (-1.0,) * 3, (1.0,) * 3) is None
 
 
-@pytest.mark.parametrize("axis", range(4))
-@pytest.mark.parametrize("side", [-1, 1])
+@mark.parametrize("axis", range(4))
+@mark.parametrize("side", [-1, 1])
 def test_the_guard_limits_each_command_and_its_change(axis, side):
     guard = Guard(GuardParams(slew_thrust=3.0, slew_rate=(4.0, 5.0, 6.0)), 14.0, (10.0, 9.0, 8.0))
     slew, high = (3.0, 4.0, 5.0, 6.0)[axis], (14.0, 10.0, 9.0, 8.0)[axis]
@@ -86,7 +86,7 @@ def test_the_guard_limits_each_command_and_its_change(axis, side):
     wanted = list(start)
     wanted[axis] = limit + side * 5.0
     sent, steps = guard.check(tuple(wanted)), 1
-    assert sent[axis] == pytest.approx(start[axis] + side * slew), "one step of the slew limit"
+    assert sent[axis] == approx(start[axis] + side * slew), "one step of the slew limit"
     while sent[axis] != limit:
         sent, steps = guard.check(tuple(wanted)), steps + 1
         assert steps < 10
@@ -102,8 +102,8 @@ def test_after_a_reset_any_command_within_the_limits_passes():
     assert guard.check((14.0, 10.0, 9.0, 8.0)) == (14.0, 10.0, 9.0, 8.0)
 
 
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("axis", range(4))
+@mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@mark.parametrize("axis", range(4))
 def test_what_is_not_finite_is_refused_and_counted(bad, axis):
     guard = Guard(GuardParams(slew_thrust=1.0, slew_rate=(1.0, 1.0, 1.0)), 14.0, (10.0, 9.0, 8.0))
     command = [7.0, 0.0, 0.0, 0.0]
@@ -112,7 +112,7 @@ def test_what_is_not_finite_is_refused_and_counted(bad, axis):
     assert guard.refused == 1
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("wanted_deg", "heading_deg", "good"),
     [(0.0, 9.0, True), (0.0, 11.0, False), (175.0, -176.0, True), (-175.0, 174.0, False)],
 )

@@ -5,7 +5,7 @@ import struct
 import time
 import tty
 
-import pytest
+from pytest import fixture, importorskip, raises
 
 from hil.errors import LinkError
 from hil.links import msp
@@ -22,10 +22,10 @@ PARAMS = config.load(
 STATUS = struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0)
 
 
-@pytest.fixture
+@fixture
 def wire():
     """The flight controller's end of a line, and a port at the other."""
-    pytest.importorskip("serial")
+    importorskip("serial")
     controller, line = os.openpty()
     tty.setraw(controller)
     tty.setraw(line)
@@ -85,8 +85,8 @@ def test_a_back_end_on_a_serial_port(wire):
 
 
 def test_a_port_that_is_none():
-    pytest.importorskip("serial")
-    with pytest.raises(LinkError, match="cannot open /dev/ttyNONE"):
+    importorskip("serial")
+    with raises(LinkError, match="cannot open /dev/ttyNONE"):
         SerialPort(Device("serial", "/dev/ttyNONE", 115200))
 
 
@@ -117,7 +117,7 @@ def test_what_went_over_the_port_is_written_down(wire, tmp_path):
     assert b"".join(data for way, data in chunks if way == b">") == b"defg", (
         "in pieces, as they came"
     )
-    with pytest.raises(StorageError, match="cannot write"):
+    with raises(StorageError, match="cannot write"):
         LoggedPort(port, tmp_path)
 
 
@@ -131,8 +131,8 @@ def test_a_full_disk_troubles_nobody(wire, tmp_path):
 
 
 def test_a_port_that_is_not_there_is_named_once():
-    pytest.importorskip("serial")
-    with pytest.raises(LinkError) as caught:
+    importorskip("serial")
+    with raises(LinkError) as caught:
         SerialPort(Device("serial", "/dev/no_such_port", 115200))
     assert str(caught.value).startswith(
         "cannot open /dev/no_such_port: No such file or directory; plugged in here: "

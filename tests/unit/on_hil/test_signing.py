@@ -5,7 +5,7 @@ what we send.
 import hashlib
 import time
 
-import pytest
+from pytest import mark, raises
 
 from hil.errors import LinkError
 from hil.links.mavlink_link import Link
@@ -43,14 +43,14 @@ def test_a_key_is_raw_hexadecimal_or_a_phrase(tmp_path):
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("data", "mode", "text"),
     [(b"short", 0o600, "5 characters; expected 32 bytes"), (KEY, 0o644, "chmod 600")],
 )
 def test_files_that_are_no_key(tmp_path, data, mode, text):
-    with pytest.raises(LinkError, match=text):
+    with raises(LinkError, match=text):
         read_key(keyed(tmp_path, data, mode))
-    with pytest.raises(LinkError, match="No such file"):
+    with raises(LinkError, match="No such file"):
         read_key(tmp_path / "none")
 
 
@@ -76,7 +76,7 @@ def test_pymavlinks_own_check_takes_what_we_send():
     assert theirs.signing.goodsig_count == 5
 
 
-@pytest.mark.parametrize("theirs", [None, bytes(32)])
+@mark.parametrize("theirs", [None, bytes(32)])
 def test_unsigned_and_wrongly_signed_messages_are_refused_and_counted(theirs):
     link, peer, got = pair(theirs=theirs)
     for _ in range(4):
@@ -112,7 +112,7 @@ def test_a_forged_time_does_not_shut_the_true_sender_out():
     assert got == ["HEARTBEAT"] * 2
 
 
-@pytest.mark.parametrize(("behind", "taken"), [(BEHIND - 100_000, True), (BEHIND + 100_000, False)])
+@mark.parametrize(("behind", "taken"), [(BEHIND - 100_000, True), (BEHIND + 100_000, False)])
 def test_a_new_stream_may_be_a_minute_behind(behind, taken):
     link, peer, got = pair()
     peer._mav.signing.timestamp = stamp_now() - behind

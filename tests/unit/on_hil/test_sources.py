@@ -7,7 +7,7 @@ import math
 import threading
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link
@@ -83,8 +83,8 @@ def test_a_local_position_takes_angles_as_well():
     )
     local = mav.MAVLink_local_position_ned_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     pose = decoder.feed(wired(local), 0.5)
-    assert pose.quat == pytest.approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
-    assert pose.rate == pytest.approx((0.1, 0.2, 0.3))
+    assert pose.quat == approx((math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)))
+    assert pose.rate == approx((0.1, 0.2, 0.3))
 
 
 def test_an_estimate_that_failed_is_no_pose():
@@ -93,7 +93,7 @@ def test_an_estimate_that_failed_is_no_pose():
     assert valid == [False, True, True, True]
 
 
-@pytest.mark.parametrize("live", [False, True])
+@mark.parametrize("live", [False, True])
 def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
     """In a recording and on a link: an ODOMETRY in other frames, a position without an attitude."""
     senders = (
@@ -124,16 +124,16 @@ def test_what_is_no_pose_is_counted_and_says_why(tmp_path, live):
         "frame LOCAL_FLU is not taken; expected LOCAL_NED or LOCAL_FRD": 1,
         "no ATTITUDE_QUATERNION or ATTITUDE within 50 ms of it": 1,
     }
-    with pytest.raises(SourceError, match=r"1 ODOMETRY of system 1.*frame LOCAL_FLU is not taken"):
+    with raises(SourceError, match=r"1 ODOMETRY of system 1.*frame LOCAL_FLU is not taken"):
         RecordedSource([], roster)
 
 
 def test_senders_that_clash_are_refused():
-    with pytest.raises(SourceError, match="no two bodies"):
+    with raises(SourceError, match="no two bodies"):
         MavlinkDecoder((BodyIds("vehicle", "ODOMETRY", 1, 0), BodyIds("payload", "ODOMETRY", 1, 2)))
-    with pytest.raises(SourceError, match="at least one"):
+    with raises(SourceError, match="at least one"):
         MavlinkDecoder(())
-    with pytest.raises(ConfigError, match="expected 1 to 255"):
+    with raises(ConfigError, match="expected 1 to 255"):
         BodyIds("vehicle", "ODOMETRY", 0, 0)
 
 
@@ -179,10 +179,10 @@ def test_a_tlog_gives_what_the_link_gave_past_damage(tmp_path):
 
 def test_files_that_are_no_tlog(tmp_path):
     path = tmp_path / "x.tlog"
-    with pytest.raises(SourceError, match="cannot be read"):
+    with raises(SourceError, match="cannot be read"):
         read_tlog(path, BODIES)
     path.write_bytes(b"\x00" * 500)
-    with pytest.raises(SourceError, match="500 bytes without a single"):
+    with raises(SourceError, match="500 bytes without a single"):
         read_tlog(path, BODIES)
 
 
@@ -193,16 +193,16 @@ MAPPING = TableMap(
 )
 
 
-@pytest.mark.parametrize("packed", [False, True])
+@mark.parametrize("packed", [False, True])
 def test_csv_with_units(tmp_path, packed):
     path = tmp_path / ("a.csv.gz" if packed else "a.csv")
     path.write_bytes(gzip.compress(CSV.encode()) if packed else CSV.encode())
     poses = read_table(path, MAPPING)
-    assert [pose.stamp for pose in poses] == pytest.approx([1.0, 1.01, 1.02])
-    assert [pose.arrival for pose in poses] == pytest.approx([0.0, 0.01, 0.02])
-    assert poses[1].pos == pytest.approx((1.5e-3, 2e-3, 3e-3))
+    assert [pose.stamp for pose in poses] == approx([1.0, 1.01, 1.02])
+    assert [pose.arrival for pose in poses] == approx([0.0, 0.01, 0.02])
+    assert poses[1].pos == approx((1.5e-3, 2e-3, 3e-3))
     half = math.sqrt(0.5)
-    assert poses[0].quat == pytest.approx((0.0, 0.0, half, half))
+    assert poses[0].quat == approx((0.0, 0.0, half, half))
     assert math.isnan(poses[2].pos[0]), "an empty cell is for the gate to refuse"
 
 
@@ -227,13 +227,13 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
     assert vehicle[0].quat is None, "no attitude yet"
     assert [pose.quat[2] > 0.5 for pose in vehicle[1:]] == [i > 6 for i in range(1, 20)]
     assert vehicle[19].quat is not None, "46 ms old"
-    assert [pose.arrival for pose in poses if pose.body == "payload"] == pytest.approx(time + 0.003)
+    assert [pose.arrival for pose in poses if pose.body == "payload"] == approx(time + 0.003)
     FlightLog({"rate_b": Channel(time, place, "rad/s", "body")}).save(tmp_path / "b.npz")
-    with pytest.raises(SourceError, match="no row with a position of a body"):
+    with raises(SourceError, match="no row with a position of a body"):
         read_table(tmp_path / "b.npz", None)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "message"),
     [
         ("t,x,y,roll,pitch,yaw\n1,2,3,4,5,6\n", "no column 'z'"),
@@ -246,22 +246,20 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
 def test_wrong_csv(tmp_path, text, message):
     path = tmp_path / "a.csv"
     path.write_text(text)
-    with pytest.raises(SourceError, match=message):
+    with raises(SourceError, match=message):
         read_table(path, MAPPING)
-    with pytest.raises(SourceError, match="no such file"):
+    with raises(SourceError, match="no such file"):
         read_table(tmp_path / "b.csv", MAPPING)
 
 
 def test_csv_without_mapping(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text(CSV)
-    with pytest.raises(
-        SourceError, match=r"columns t, x, y, z, roll, pitch, yaw, .*it needs a mapping"
-    ):
+    with raises(SourceError, match=r"columns t, x, y, z, roll, pitch, yaw, .*it needs a mapping"):
         read_table(path, None)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("settings", "message"),
     [
         (
@@ -288,7 +286,7 @@ def test_csv_without_mapping(tmp_path):
     ],
 )
 def test_wrong_mappings(settings, message):
-    with pytest.raises(ConfigError, match=message):
+    with raises(ConfigError, match=message):
         config.load(
             HilParams,
             config.find("hil", "dry_run"),
@@ -304,5 +302,5 @@ def test_recorded_poses_come_when_their_time_has_come():
     assert source.poll(0.25) == []
     assert len(source.poll(1.0)) == 1
     assert source.ended
-    with pytest.raises(SourceError, match="holds no pose"):
+    with raises(SourceError, match="holds no pose"):
         RecordedSource([])

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-import pytest
+from pytest import mark
 
 from hil.control.state_machine import Inputs, Machine, State, StateParams
 from hil.poses.gate import ABORT, HOLD, OK, WARN
@@ -64,7 +64,7 @@ STAYS = {
 }
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("state", "given"), [(state, given) for state, row in STAYS.items() for given in row]
 )
 def test_what_keeps_a_state_keeps_it_until_its_time_is_over(state, given):
@@ -76,7 +76,7 @@ def test_what_keeps_a_state_keeps_it_until_its_time_is_over(state, given):
     assert walk.after(TICK, **given) == late[state]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("state", "given", "follows", "seconds"),
     [
         ("idle", {}, "check", TICK),
@@ -113,7 +113,7 @@ def test_quiet_must_last_without_a_break():
     assert [walk.after(0.5), walk.after(TICK)] == ["armed", "throw"]
 
 
-@pytest.mark.parametrize("throws", [1, 2, 3])
+@mark.parametrize("throws", [1, 2, 3])
 def test_it_lands_after_the_last_throw(throws):
     walk = Walk("recover", throws)
     for count in range(1, throws):
@@ -127,8 +127,8 @@ def test_it_lands_after_the_last_throw(throws):
     assert walk.after(TICK, grounded=True) == "done"
 
 
-@pytest.mark.parametrize("state", WAYS)
-@pytest.mark.parametrize(
+@mark.parametrize("state", WAYS)
+@mark.parametrize(
     "given",
     [
         {"abort": True},

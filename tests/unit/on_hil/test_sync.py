@@ -3,7 +3,7 @@ of another clock.
 """
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from hil.links.clock import ManualClock, Ticker, TimeSync
 from hil.links.mavlink_link import LATE, Link, LinkSync
@@ -44,7 +44,7 @@ def test_a_longer_round_trip_that_comes_later_does_not_count():
     for sent, out, back in ((0.0, 0.002, 0.002), (0.1, 0.009, 0.001)):
         answered = sent + out + true_offset
         sync.take(int(answered * 1e9), TimeSync.stamp(sent), sent + out + back)
-    assert sync.offset == pytest.approx(true_offset, abs=1e-6)
+    assert sync.offset == approx(true_offset, abs=1e-6)
 
 
 def test_a_late_tick_skips_those_that_it_missed():
@@ -54,12 +54,12 @@ def test_a_late_tick_skips_those_that_it_missed():
     clock.time = ticker.due() + 0.07
     ticker.take()
     assert (ticker.index, ticker.missed) == (4, 3)
-    assert ticker.late == pytest.approx(0.01)
-    assert ticker.worst == pytest.approx(0.07)
-    assert ticker.due() == pytest.approx(1.1)
+    assert ticker.late == approx(0.01)
+    assert ticker.worst == approx(0.07)
+    assert ticker.due() == approx(1.1)
 
 
-@pytest.mark.parametrize("drift", [100e-6, -100e-6])
+@mark.parametrize("drift", [100e-6, -100e-6])
 def test_a_drifting_clock_is_followed(drift):
     """100 parts in a million: without forgetting, 60 s would be 6 ms off."""
     sync = TimeSync()
@@ -68,7 +68,7 @@ def test_a_drifting_clock_is_followed(drift):
     assert sync.steps == 0
 
 
-@pytest.mark.parametrize("step", [1.0, -1.0])
+@mark.parametrize("step", [1.0, -1.0])
 def test_a_clock_that_is_set_is_noticed(step):
     sync = TimeSync()
     exchanges(sync, lambda t: t + 5.0, 5.0)
@@ -113,7 +113,7 @@ def dated(offset, seconds=2.0, stamp_offset=None):
     return poses, sync, fake
 
 
-@pytest.mark.parametrize("offset", [0.0, 1.7e9, 333.25])
+@mark.parametrize("offset", [0.0, 1.7e9, 333.25])
 def test_poses_are_dated_by_their_senders_clock(offset):
     poses, sync, _ = dated(offset)
     known = [pose for pose in poses if pose.measured is not None]

@@ -1,7 +1,7 @@
 """Throws that every member of a team agrees on."""
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from hil.errors import ConfigError
 from hil.links.clock import ManualClock, Ticker
@@ -95,19 +95,19 @@ def test_two_links_agree_over_udp_on_one_clock():
     assert agreed == [NOTHING] * 10 + [RELEASE] * 6
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("member", "members"),
     [(2, ("127.0.0.1:1", "127.0.0.1:2")), (0, ("127.0.0.1:1",) * 2), (0, ("127.0.0.1:1",))],
 )
 def test_a_member_outside_of_its_team_is_refused(member, members):
-    with pytest.raises(ConfigError, match=f"member {member} of"):
+    with raises(ConfigError, match=f"member {member} of"):
         TeamLinkParams(member, members)
 
 
-@pytest.mark.parametrize("grid", [0.0, 1.234])
+@mark.parametrize("grid", [0.0, 1.234])
 def test_a_teams_ticks_are_at_multiples_of_its_clock(grid):
     ticker = Ticker(ManualClock(5.013), PERIOD, grid)
     first = ticker.due()
     assert 5.013 <= first < 5.013 + PERIOD
     ticks = (first + grid) / PERIOD
-    assert ticks == pytest.approx(round(ticks), abs=1e-6)
+    assert ticks == approx(round(ticks), abs=1e-6)

@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 
-import pytest
+from pytest import fixture, mark, raises
 
 from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
@@ -17,7 +17,7 @@ from hil.params import HilParams
 from visthrow import config
 
 
-@pytest.fixture
+@fixture
 def typed(monkeypatch):
     """The writing end of standard input, and a way to make a terminal."""
     read, write = os.pipe()
@@ -47,7 +47,7 @@ def test_lines_are_words_and_half_a_line_holds_nobody_up(typed):
     assert terminal.words("ready") == OperatorInput()
 
 
-@pytest.mark.parametrize("number", ENDING)
+@mark.parametrize("number", ENDING)
 def test_signals_that_would_end_the_process_say_abort(typed, number):
     terminal = Terminal()
     os.kill(os.getpid(), number)
@@ -65,11 +65,11 @@ def test_only_a_second_ctrl_c_raises(typed):
     os.kill(os.getpid(), signal.SIGTERM)
     os.kill(os.getpid(), signal.SIGINT)
     assert terminal.words("throw").abort
-    with pytest.raises(KeyboardInterrupt):
+    with raises(KeyboardInterrupt):
         terminal._told_to_end(signal.SIGINT, None)
 
 
-@pytest.mark.parametrize("number", PAUSING)
+@mark.parametrize("number", PAUSING)
 def test_ctrl_z_does_not_stop_it_in_mid_flight(typed, number):
     Terminal()
     assert signal.getsignal(number) is signal.SIG_IGN
@@ -88,7 +88,7 @@ def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
     assert not Terminal(False, lambda: True).words("ready").arm
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("base", "override"),
     [
         ("ardupilot", "throws=1"),
@@ -100,7 +100,7 @@ def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
 )
 def test_auto_arm_is_refused_for_what_is_not_on_this_machine(base, override):
     params = config.load(HilParams, config.find("hil", base), (override, "link.remote=true"))
-    with pytest.raises(
+    with raises(
         RunError, match=r"--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"
     ):
         require_fake(params)

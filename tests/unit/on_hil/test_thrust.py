@@ -1,8 +1,8 @@
 """Thrust to shares and back, its measurement in hover, and the vehicles that are refused."""
 
-import dataclasses
+from dataclasses import replace
 
-import pytest
+from pytest import approx, mark, raises
 
 from hil.errors import RunError
 from hil.links.backends import require_reach
@@ -18,29 +18,27 @@ BENT = HoverThrustParams(2.668, 0.37, 0.8, 0.08, 0.0)
 
 def test_there_and_back():
     for thrust in (0.6, 1.0, 2.668, 4.0, 6.0):
-        assert BENT.thrust(BENT.share(thrust)) == pytest.approx(thrust)
-    assert BENT.share(2.668) == pytest.approx(0.37)
-    assert BENT.share(3.668) - BENT.share(2.668) == pytest.approx(0.37 / 2.668 / 0.8), (
+        assert BENT.thrust(BENT.share(thrust)) == approx(thrust)
+    assert BENT.share(2.668) == approx(0.37)
+    assert BENT.share(3.668) - BENT.share(2.668) == approx(0.37 / 2.668 / 0.8), (
         "a flatter vehicle needs more share"
     )
     assert (BENT.share(-5.0), BENT.share(50.0)) == (0.0, 1.0)
-    assert BENT.thrust(0.0) == pytest.approx(0.2 * 2.668)
+    assert BENT.thrust(0.0) == approx(0.2 * 2.668)
 
 
 def test_a_lower_battery_gets_more_share():
     params = HoverThrustParams(2.668, 0.2, 1.0, 0.08, 12.0)
-    assert params.share(2.668, 12.0) == pytest.approx(0.2)
-    assert params.share(2.668, 10.8) == pytest.approx(0.2 / 0.81)
-    assert params.thrust(0.2 / 0.81, 10.8) == pytest.approx(2.668)
-    assert params.share(2.668, None) == pytest.approx(0.2), "unknown: not corrected"
-    assert params.share(2.668, 0.0) == pytest.approx(0.2 * 1.25**2), (
-        "a wrong reading does not run away"
-    )
-    assert BENT.share(2.668, 5.0) == pytest.approx(0.37), "not corrected where the config says so"
+    assert params.share(2.668, 12.0) == approx(0.2)
+    assert params.share(2.668, 10.8) == approx(0.2 / 0.81)
+    assert params.thrust(0.2 / 0.81, 10.8) == approx(2.668)
+    assert params.share(2.668, None) == approx(0.2), "unknown: not corrected"
+    assert params.share(2.668, 0.0) == approx(0.2 * 1.25**2), "a wrong reading does not run away"
+    assert BENT.share(2.668, 5.0) == approx(0.37), "not corrected where the config says so"
 
 
 def test_a_share_above_the_calibrations_is_said_as_a_surplus():
-    meter = HoverMeter(dataclasses.replace(BENT, tolerance=0.1))
+    meter = HoverMeter(replace(BENT, tolerance=0.1))
     for _ in range(LEAST_SHARES):
         meter.add(1.095 * 0.37)
     good, text = meter.summary_text(2.668 / GRAVITY)
@@ -48,7 +46,7 @@ def test_a_share_above_the_calibrations_is_said_as_a_surplus():
     assert "(+9.5 %" in text
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "wrong",
     [
         (0.0, 0.3, 1.0, 0.1, 0.0),
@@ -59,11 +57,11 @@ def test_a_share_above_the_calibrations_is_said_as_a_surplus():
     ],
 )
 def test_calibrations_that_are_none(wrong):
-    with pytest.raises(ConfigError, match=r"weight|hover|slope|tolerance|voltage"):
+    with raises(ConfigError, match=r"weight|hover|slope|tolerance|voltage"):
         HoverThrustParams(*wrong)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)]
 )
 def test_the_measured_hover_is_held_against_the_calibration(off, good):
@@ -88,7 +86,7 @@ def test_too_few_values_measure_nothing():
     )
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("name", "override", "message"),
     [
         (
@@ -112,14 +110,14 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
             config.find("hil", name),
             ["betaflight.rates.rc_rates=[30, 60, 30]", "betaflight.rates.rates=[30, 60, 30]"],
         )
-        with pytest.raises(RunError, match=r"reach 5\.2, 10\.5, 5\.2 rad/s on roll, pitch, yaw"):
+        with raises(RunError, match=r"reach 5\.2, 10\.5, 5\.2 rad/s on roll, pitch, yaw"):
             require_reach(slow, contract)
     else:
-        with pytest.raises(RunError, match=message):
+        with raises(RunError, match=message):
             require_reach(params, contract)
 
 
-@pytest.mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
+@mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
 def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name):
     """They differ from those of the fakes in devices, calibration, mechanism and the lateness of
     commands alone.
@@ -130,17 +128,17 @@ def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name)
     )
     require_reach(real, simple_policy().contract)
     assert (real.backend, getattr(real, name).audit) == (name, True)
-    swapped = dataclasses.replace(
+    swapped = replace(
         real,
         link=fake.link,
         ardupilot=fake.ardupilot,
         px4=fake.px4,
         betaflight=fake.betaflight,
-        delay=dataclasses.replace(real.delay, command=fake.delay.command),
-        source=dataclasses.replace(real.source, device=None),
+        delay=replace(real.delay, command=fake.delay.command),
+        source=replace(real.source, device=None),
     )
     assert swapped == fake
-    with pytest.raises(ConfigError, match="a recording flies dry"):
+    with raises(ConfigError, match="a recording flies dry"):
         config.load(
             HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"']
         )
@@ -153,17 +151,17 @@ def test_a_curve_of_the_rotors_is_inverted_exactly():
     params = HoverThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, 2.0, 0.055)
     motors = 0.055 + 0.945 * 0.36
     double = (2 * motors - 0.055) / 0.945
-    assert params.thrust(double) == pytest.approx(4 * 2.668)
-    assert params.share(4 * 2.668) == pytest.approx(double)
-    assert params.share(2.668) == pytest.approx(0.36)
+    assert params.thrust(double) == approx(4 * 2.668)
+    assert params.share(4 * 2.668) == approx(double)
+    assert params.share(2.668) == approx(0.36)
     assert params.share(0.0) == 0.0
     for thrust in (0.5, 2.0, 7.0):
-        assert params.thrust(params.share(thrust)) == pytest.approx(thrust)
+        assert params.thrust(params.share(thrust)) == approx(thrust)
 
 
-@pytest.mark.parametrize("wrong", [(0.5, 0.0), (2.0, 0.6), (2.0, -0.1)])
+@mark.parametrize("wrong", [(0.5, 0.0), (2.0, 0.6), (2.0, -0.1)])
 def test_curves_that_no_rotor_has_are_refused(wrong):
-    with pytest.raises(
+    with raises(
         ConfigError,
         match=r"exponent is 0.5; expected 1 to 3|idle is .*; expected 0 or more and below 0.5",
     ):

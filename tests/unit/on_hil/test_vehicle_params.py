@@ -1,6 +1,6 @@
 """Wrong vehicles in a config, and ports that a back-end must not open."""
 
-import pytest
+from pytest import mark, raises
 
 from hil.errors import LinkError, RunError
 from hil.links.backends import make_backend, mechanism_lag
@@ -15,7 +15,7 @@ def load(*overrides, name="dry_run"):
     return config.load(HilParams, config.find("hil", name), overrides)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("override", "message"),
     [
         ("ardupilot.follow_mode=5", r"expected GUIDED \(4\) or GUIDED_NOGPS \(20\)"),
@@ -38,16 +38,16 @@ def load(*overrides, name="dry_run"):
     ],
 )
 def test_wrong_vehicles(override, message):
-    with pytest.raises(ConfigError, match=message):
+    with raises(ConfigError, match=message):
         load(override)
 
 
 def test_a_servo_release_needs_its_output():
-    with pytest.raises(ConfigError, match="expected the output that the mechanism hangs on"):
+    with raises(ConfigError, match="expected the output that the mechanism hangs on"):
         load('ardupilot.release="servo"', "ardupilot.servo_output=0")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("device", "error", "message"),
     [
         ("/bin/sh", LinkError, "is refused"),
@@ -58,7 +58,7 @@ def test_a_servo_release_needs_its_output():
     ],
 )
 def test_ports_of_msp(device, error, message):
-    with pytest.raises(error, match=message):
+    with raises(error, match=message):
         make_backend(load(f'betaflight.device="{device}"', name="fake_betaflight"))
 
 
@@ -66,6 +66,6 @@ def test_which_back_end():
     assert isinstance(make_backend(load()), DryRun)
     assert mechanism_lag(load()) == 0.0
     assert mechanism_lag(load("px4.mechanism_lag=0.07", name="fake_px4")) == 0.07
-    with pytest.raises(RunError, match="backend px4 without a MAVLink link"):
+    with raises(RunError, match="backend px4 without a MAVLink link"):
         make_backend(load(name="fake_px4"))
     assert Betaflight.holds is False

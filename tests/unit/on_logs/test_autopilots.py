@@ -4,7 +4,7 @@ import math
 import struct
 
 import numpy as np
-import pytest
+from pytest import approx, mark
 
 from tests import logfiles
 from visthrow.logs import read
@@ -47,7 +47,7 @@ def outputs(name, field, size, moving, count=300, first=0.5):
     return ["uint64_t timestamp", f"float[{size}] {field}"], rows
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "channel", "word"),
     [
         ({"flags": (0, 1, 0, 1)}, "pos_w", "xy_valid"),
@@ -71,7 +71,7 @@ def test_a_reset_of_the_estimate_is_told(tmp_path):
     assert any("reset 1 times" in row.text for row in rows if row.channel == "pos_w")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("parameters", "kind"),
     [
         ({"CA_ROTOR_COUNT": 6}, "hexarotor"),
@@ -106,7 +106,7 @@ def test_six_motors_that_move_are_no_quadrotor_even_where_no_parameter_says_so(t
     assert log.meta["left_out"] == ["actuator_motors: 6 motors move, not the four of a quadrotor"]
 
 
-@pytest.mark.parametrize("shift", [0, 1, 3])
+@mark.parametrize("shift", [0, 1, 3])
 def test_motors_are_ordered_by_where_they_sit(shift, tmp_path):
     parameters: dict[str, float] = {"CA_ROTOR_COUNT": 4, "MAV_TYPE": 2}
     for i in range(4):
@@ -129,7 +129,7 @@ def test_the_instance_that_moves_is_taken(tmp_path):
     assert log.meta["ingest"]["motor_output"]["instance"] == 1
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("arming", "landed", "flown"), [(2, 0, True), (1, 0, False), (2, 1, False), (1, 1, False)]
 )
 def test_a_vehicle_on_the_desk_has_not_flown(arming, landed, flown, tmp_path):
@@ -161,7 +161,7 @@ def test_rotor_speeds_of_escs_that_log_one_by_one(tmp_path):
         messages += [("ESC", (t + k, k, 6000.0 + 100 * k, 15.0)) for k in range(4)]
     logfiles.write_bin(path, formats, messages)
     speeds = read(path)[0]["motor_speed"].values[0] * 30 / np.pi
-    assert speeds == pytest.approx([6200, 6000, 6100, 6300])
+    assert speeds == approx([6200, 6000, 6100, 6300])
 
 
 def write_tlog(path, more, count=200, local=True):
@@ -197,7 +197,7 @@ def test_messages_without_a_stamp_or_with_another_clock_share_the_clock_of_the_f
 
     log = read(write_tlog(tmp_path / "a.tlog", more))[0]
     for name in ("battery_voltage", "mocap_pos_w", "mocap_quat_wb", "acc_b"):
-        assert log[name].time[0] == pytest.approx(0.0, abs=0.02), name
+        assert log[name].time[0] == approx(0.0, abs=0.02), name
     assert "never overlap" not in str(check([log])[0].rows)
 
 
@@ -233,7 +233,7 @@ def test_another_senders_messages_are_left_out_by_name(tmp_path):
     assert "1 SYS_STATUS of system 2, component 190: of another sender" in log.meta["left_out"]
 
 
-@pytest.mark.parametrize(("frame", "known"), [(1, True), (21, True), (8, False)])
+@mark.parametrize(("frame", "known"), [(1, True), (21, True), (8, False)])
 def test_odometry_of_a_failed_tracker_or_of_another_frame_is_no_position(frame, known, tmp_path):
     nan = [math.nan] * 21
 
@@ -257,7 +257,7 @@ def test_one_stamp_that_is_ahead_of_all_others_costs_its_row_alone(tmp_path):
     logfiles.write_bin(path, {"ATT": logfiles.ATT}, rows)
     log = read(path)[0]
     assert len(log["quat_wb"].time) == 199
-    assert log["quat_wb"].time[-1] == pytest.approx(3.98)
+    assert log["quat_wb"].time[-1] == approx(3.98)
 
 
 def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
@@ -272,12 +272,12 @@ def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
     path = tmp_path / "a.BIN"
     logfiles.write_bin(path, formats, rows)
     log = read(path)[0]
-    assert log["pos_w"].time[-1] == pytest.approx(3.98)
-    assert log["pos_w"].values[0, 2] == pytest.approx(2.0)
-    assert log["quat_wb"].values[0, 0] == pytest.approx(math.sin(math.radians(5.0)), abs=1e-3)
+    assert log["pos_w"].time[-1] == approx(3.98)
+    assert log["pos_w"].values[0, 2] == approx(2.0)
+    assert log["quat_wb"].values[0, 0] == approx(math.sin(math.radians(5.0)), abs=1e-3)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("parameters", "firmware", "kind"),
     [
         ({"FRAME_CLASS": 2.0}, "ArduCopter V4.5.1", "hexarotor"),
@@ -317,9 +317,7 @@ def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware,
     assert log["motor_output"].values[0].tolist() == [1000 + 10 * n for n in order]
 
 
-@pytest.mark.parametrize(
-    ("ignored", "quality", "good"), [(0, 0, True), (1, 0, False), (0, -1, False)]
-)
+@mark.parametrize(("ignored", "quality", "good"), [(0, 0, True), (1, 0, False), (0, -1, False)])
 def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, good, tmp_path):
     rows = [
         ("VISP", (1000 * i, 0, i, swing(i), 0.0, -1.0, 0, 0, 0, 0, 0, 0, ignored, quality))

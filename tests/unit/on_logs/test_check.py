@@ -6,7 +6,9 @@ import json
 import re
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from pytest import approx, mark
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
@@ -32,7 +34,7 @@ def flight(
     """Columns of a flight along a smooth path, attitude along the thrust that it takes; noise of a
     good motion capture.
     """
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     time = np.arange(0.0, seconds, 1.0 / rate)
     tones = [
         (axis, a, w, rng.uniform(0, 6))
@@ -46,11 +48,11 @@ def flight(
         vel[:, axis] += a * w * np.cos(w * time + phase)
         acc[:, axis] -= a * w * w * np.sin(w * time + phase)
     force = acc + [0, 0, G]
-    up = force / np.linalg.norm(force, axis=1, keepdims=True)
+    up = force / norm(force, axis=1, keepdims=True)
     yaw = np.sin(rng.uniform(0.5, 0.9) * time + rng.uniform(0, 6))
     heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
     side = np.cross(up, heading)
-    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    side /= norm(side, axis=1, keepdims=True)
     turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
     step = 1e-3
     later = Rotation.from_matrix(turn.as_matrix())
@@ -58,7 +60,7 @@ def flight(
     rates[1:-1] = (later[:-2].inv() * later[2:]).as_rotvec() * rate / 2.0
     rates[0], rates[-1] = rates[1], rates[-2]
     ahead = np.column_stack([np.interp(time + DELAY, time, column) for column in rates.T])
-    thrust = 0.2 * np.linalg.norm(force, axis=1)
+    thrust = 0.2 * norm(force, axis=1)
     quat = (turn * Rotation.from_rotvec(rng.normal(0, step, (len(time), 3)))).as_quat()
     return {
         "time": time,
@@ -111,10 +113,10 @@ def test_a_good_flight_has_nothing_wrong():
     assert answers["rotor drag"] == answers["wind against frame tilt"] == "ok"
     assert answers["battery sag"] == "warn"
     (delay,) = [r for r in checked.rows if r.topic == "delay" and r.channel == "command, rate_b"]
-    assert delay.figures["delay_s"] == pytest.approx(DELAY, abs=0.003)
+    assert delay.figures["delay_s"] == approx(DELAY, abs=0.003)
 
 
-@pytest.mark.parametrize(("factor", "verdict"), [(1.3, "ok"), (1.8, "warn"), (0.0, "bad")])
+@mark.parametrize(("factor", "verdict"), [(1.3, "ok"), (1.8, "warn"), (0.0, "bad")])
 def test_a_rotor_that_reads_unlike_the_others_is_named(factor, verdict):
     columns = flight()
     speeds = np.tile(1000.0 + 20.0 * np.sin(columns["time"])[:, None], (1, 4))
@@ -168,11 +170,11 @@ def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
 
 def test_noise_is_measured_beside_motion():
     log = log_of(flight())
-    assert noise(log["pos_w"]) == pytest.approx([3e-4] * 3, rel=0.15)
-    assert noise(log["acc_b"]) == pytest.approx([0.1] * 3, rel=0.15)
+    assert noise(log["pos_w"]) == approx([3e-4] * 3, rel=0.15)
+    assert noise(log["acc_b"]) == approx([0.1] * 3, rel=0.15)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("channel", "factor", "words"),
     [
         ("rate_b", 180 / np.pi, "degrees"),
@@ -192,8 +194,8 @@ def test_wrong_units(channel, factor, words):
     assert found
 
 
-@pytest.mark.parametrize("channel", ["rate_b", "vel_w", "acc_b"])
-@pytest.mark.parametrize(
+@mark.parametrize("channel", ["rate_b", "vel_w", "acc_b"])
+@mark.parametrize(
     ("order", "signs"), [((1, 0, 2), (1, 1, 1)), ((0, 1, 2), (1, -1, -1)), ((0, 2, 1), (1, 1, 1))]
 )
 def test_wrong_axes(channel, order, signs):
@@ -272,7 +274,7 @@ def test_a_pose_stream_of_another_clock_is_told():
         if r.channel == "pos_w, est_pos_w" and r.topic == "delay" and "delay_s" in r.figures
     ]
     assert row.verdict == "warn"
-    assert row.figures["delay_s"] == pytest.approx(0.035, abs=0.002)
+    assert row.figures["delay_s"] == approx(0.035, abs=0.002)
 
 
 def test_a_drifting_clock_is_told():
@@ -283,8 +285,8 @@ def test_a_drifting_clock_is_told():
     )
     found = re.search(r"the delay runs from (\S+) to (\S+) ms", faults(log_of(columns), "warn"))
     # pieces about 32.5 and 2.5 s, of a clock that gains a millisecond a second
-    assert float(found[1]) == pytest.approx(-32.5, abs=3.0)
-    assert float(found[2]) == pytest.approx(-2.5, abs=1.0)
+    assert float(found[1]) == approx(-32.5, abs=3.0)
+    assert float(found[2]) == approx(-2.5, abs=1.0)
 
 
 def test_deviations_of_delays_hold_what_they_say():
@@ -301,7 +303,7 @@ def test_noise_that_outlasts_a_block_widens_the_deviation():
     time = np.arange(0.0, 12.0, 0.02)
     decay = np.exp(-0.02 / 0.15)
     for seed in range(200):
-        rng = np.random.default_rng(seed)
+        rng = default_rng(seed)
         late, turn = rng.uniform(-0.1, 0.1), 2.0 * np.pi * rng.uniform(0.05, 0.15, 3)
         phase = rng.uniform(0.0, 6.28, 3)
         pos = np.sin(turn * time[:, None] + phase) / turn
@@ -314,11 +316,11 @@ def test_noise_that_outlasts_a_block_widens_the_deviation():
     assert np.mean(held) > 0.9
 
 
-@pytest.mark.parametrize("width", [0.05, 0.3])
+@mark.parametrize("width", [0.05, 0.3])
 def test_a_delay_that_noise_hides_is_not_told(width):
     """Slow motion of one message: no delay, and no deviation of a few milliseconds."""
     for seed in range(6):
-        rng, time = np.random.default_rng(seed), np.arange(0.0, 20.0, 0.02)
+        rng, time = default_rng(seed), np.arange(0.0, 20.0, 0.02)
         pos = np.column_stack([width * np.sin(0.3 * time), 0 * time, 0 * time])
         vel = np.column_stack([0.3 * width * np.cos(0.3 * time), 0 * time, 0 * time])
         pos, vel = pos + rng.normal(0, 1e-3, pos.shape), vel + rng.normal(0, 5e-3, vel.shape)
@@ -338,11 +340,9 @@ def test_frozen_jumping_and_saturated_values():
     assert "saturated" in faults(log_of(columns), "warn")
 
 
-@pytest.mark.parametrize(
-    ("count", "clipped", "told"), [(60, 0, False), (60, 6, True), (40, 0, False)]
-)
+@mark.parametrize(("count", "clipped", "told"), [(60, 0, False), (60, 6, True), (40, 0, False)])
 def test_the_least_of_few_samples_is_no_rail(count, clipped, told):
-    values = np.random.default_rng(0).normal(0.0, 1.0, (count, 3))
+    values = default_rng(0).normal(0.0, 1.0, (count, 3))
     values[:clipped, 0] = np.max(values)
     log = FlightLog({"rate_b": Channel(0.02 * np.arange(count), values, "rad/s", "body")})
     assert ("saturated" in " ".join(row.text for row in check([log])[0].rows)) == told
@@ -355,9 +355,7 @@ def test_gaps_and_clocks():
     found = faults(log_of({name: values[keep] for name, values in columns.items()}), "warn")
     assert "the longest 1.21" in found
     columns = flight()
-    columns["time"] = columns["time"] + np.random.default_rng(0).uniform(
-        -0.004, 0.004, len(columns["time"])
-    )
+    columns["time"] = columns["time"] + default_rng(0).uniform(-0.004, 0.004, len(columns["time"]))
     assert "clock" in faults(log_of(columns), "warn")
     pose = flight()
     other = Channel(pose["time"] + 500.0, pose["pos_w"], "m", "world")
@@ -414,11 +412,11 @@ def test_two_vehicles_with_one_payload_tell_their_clocks():
     first, other = flight(), flight(seed=3)
     late = dict(other, time=other["time"] + 0.013)
     first["payload_pos_w"] = first["pos_w"] - [0, 0, 0.4]
-    late["payload_pos_w"] = first["payload_pos_w"] + np.random.default_rng(0).normal(
+    late["payload_pos_w"] = first["payload_pos_w"] + default_rng(0).normal(
         0, 2e-4, first["pos_w"].shape
     )
     rows = [r for r in check([log_of(first), log_of(late)])[1].rows if "rms_m" in r.figures]
-    assert rows[0].figures["delay_s"] == pytest.approx(0.013, abs=1e-3)
+    assert rows[0].figures["delay_s"] == approx(0.013, abs=1e-3)
     second = dict(late, payload_pos_w=other["pos_w"])
     assert not [r for r in check([log_of(first), log_of(second)])[1].rows if "rms_m" in r.figures]
 
@@ -442,7 +440,7 @@ def test_order_of_motors():
     assert "roll turns against the motors" in faults(log_of(swapped))
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 19])
+@mark.parametrize("count", [1, 2, 3, 19])
 def test_too_short(count):
     columns = {name: values[:count] for name, values in flight().items()}
     assert "at least 20" in faults(log_of(columns))
@@ -474,8 +472,8 @@ def test_relate_finds_delay_and_scale():
     )
     b = 2.0 * np.column_stack([np.interp(time - 0.0234, time, c) for c in a.T])
     found = relate(time, a, time, b)
-    assert found.delay == pytest.approx(0.0234, abs=5e-4)
-    assert found.scale == pytest.approx(2.0, rel=0.01)
+    assert found.delay == approx(0.0234, abs=5e-4)
+    assert found.scale == approx(2.0, rel=0.01)
     assert found.axes == "x,y,z"
     turned = relate(time, a, time, b[:, [1, 0, 2]] * [1, -1, 1])
     assert turned.axes == "y,-x,z"
@@ -570,7 +568,7 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
         assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)
 
 
-@pytest.mark.parametrize(("count", "judged"), [(20, False), (60, True)])
+@mark.parametrize(("count", "judged"), [(20, False), (60, True)])
 def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
     time = np.arange(0.0, 2.0, 0.02)
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
@@ -582,7 +580,7 @@ def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
 
 def test_delays_of_pieces_that_noise_hides_are_no_drift():
     """A slow motion goes together with itself, but each piece tells its delay to 50 ms at best."""
-    rng, time = np.random.default_rng(0), np.arange(0.0, 40.0, 0.01)
+    rng, time = default_rng(0), np.arange(0.0, 40.0, 0.01)
     pos = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
     noisy = [pos + rng.normal(0.0, 0.3, pos.shape) * [1.0, 1.0, 0.0] for _ in range(2)]
     assert physics._drift(time, pos, time, pos, "")

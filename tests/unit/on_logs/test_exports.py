@@ -6,6 +6,9 @@ import json
 
 import numpy as np
 import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, importorskip, raises
 from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
@@ -29,9 +32,9 @@ def motion(time=TIME, phase=0.0):
             9.81 - 0.1 * np.sin(time),
         ]
     )
-    up = acc / np.linalg.norm(acc, axis=1)[:, None]
+    up = acc / norm(acc, axis=1)[:, None]
     ahead = np.cross(np.cross(up, [np.cos(YAW), np.sin(YAW), 0.0]), up)
-    ahead /= np.linalg.norm(ahead, axis=1)[:, None]
+    ahead /= norm(ahead, axis=1)[:, None]
     return pos, Rotation.from_matrix(np.stack([ahead, np.cross(up, ahead), up], axis=-1))
 
 
@@ -138,7 +141,7 @@ def test_poses_of_kitti_are_matrices(tmp_path):
     proposal = propose(table, path)
     (log,) = logs_of(table, proposal.mapping, str(path))
     assert any("how far are the rows apart" in question for question in proposal.questions)
-    np.testing.assert_allclose(log["pos_w"].values, POS, atol=1e-6)
+    assert_allclose(log["pos_w"].values, POS, atol=1e-6)
     turned = (Rotation.from_quat(log["quat_wb"].values) * TURN.inv()).magnitude()
     assert np.max(turned) < 1e-6
 
@@ -154,7 +157,7 @@ def test_an_export_gives_the_motion_that_it_was_made_of(name, tmp_path):
     pos, turn = motion(time)
     good = log["pos_w"].valid
     assert np.sum(good) >= 350
-    assert log["pos_w"].values[good] == pytest.approx(pos[good], abs=2e-3)
+    assert log["pos_w"].values[good] == approx(pos[good], abs=2e-3)
     attitude = log["quat_wb"]
     _, turn = motion(attitude.time - attitude.time[0])
     ours = Rotation.from_quat(attitude.values[attitude.valid])
@@ -174,7 +177,7 @@ def test_every_column_that_is_left_out_is_listed(name, tmp_path):
 
 
 def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
-    c3d = pytest.importorskip("c3d")
+    c3d = importorskip("c3d")
     writer = c3d.Writer(point_rate=100.0, analog_rate=100.0)
     for i, place in enumerate(1e3 * POS):
         points = np.zeros((2, 5))
@@ -187,19 +190,19 @@ def test_markers_of_a_c3d_file_are_read_and_hidden_ones_are_blank(tmp_path):
         writer.write(file)
     table = table_of(path)
     assert np.sum(np.isnan(table["ball.X [mm]"])) == 50
-    assert table["ball.Z [mm]"][0] == pytest.approx(1500.0, abs=0.1)
-    assert table["time [s]"][-1] == pytest.approx(3.99)
+    assert table["ball.Z [mm]"][0] == approx(1500.0, abs=0.1)
+    assert table["time [s]"][-1] == approx(3.99)
 
 
 def test_a_table_of_matlab_is_refused_by_its_kind(tmp_path):
     """The file of an object has an array without a name, as MATLAB writes it."""
-    scipy_io = pytest.importorskip("scipy.io")
+    scipy_io = importorskip("scipy.io")
     path = tmp_path / "a.mat"
     scipy_io.savemat(path, {"a": np.arange(3.0)})
     data = bytearray(path.read_bytes())
     data[128 + 8 + 8] = 17  # the class of the array: an opaque object
     path.write_bytes(bytes(data))
-    with pytest.raises(LogError, match="an object of MATLAB"):
+    with raises(LogError, match="an object of MATLAB"):
         table_of(path)
 
 
@@ -230,8 +233,8 @@ def test_markers_of_qualisys_without_names_of_columns(extra, tmp_path):
     path.write_text(f"{head}{extra}MARKER_NAMES\tquad\tball\n{lines(rows, chr(9))}")
     table = table_of(path)
     (log,) = logs_of(table, propose(table, path).mapping, str(path))
-    np.testing.assert_allclose(log["pos_w"].values, POS, atol=1e-6)
-    np.testing.assert_allclose(log["payload_pos_w"].time[:3], [0.0, 0.01, 0.02])
+    assert_allclose(log["pos_w"].values, POS, atol=1e-6)
+    assert_allclose(log["payload_pos_w"].time[:3], [0.0, 0.01, 0.02])
 
 
 def test_a_body_that_was_never_solved_is_named(tmp_path):
@@ -314,13 +317,13 @@ def test_the_unit_of_time_can_be_told(tmp_path):
 def test_a_log_that_needs_no_mapping_is_sent_to_check(tmp_path):
     path = tmp_path / "a.ulg"
     path.write_bytes(b"ULog")
-    with pytest.raises(LogError, match="visthrow diagnose check"):
+    with raises(LogError, match="visthrow diagnose check"):
         table_of(path)
 
 
 def write_mcap(path, encodings):
     """An MCAP file with a topic of each encoding, two messages each."""
-    writer_of = pytest.importorskip("mcap.writer").Writer
+    writer_of = importorskip("mcap.writer").Writer
     with path.open("wb") as file:
         writer = writer_of(file)
         writer.start()
@@ -351,4 +354,4 @@ def test_a_mapping_reads_a_table_as_map_proposed_it(tmp_path):
     path.write_text(qualisys())
     mapping = propose(table_of(path), "a.tsv").mapping
     (log,) = read(path, mapping)
-    assert log["pos_w"].values == pytest.approx(POS, abs=1e-6)
+    assert log["pos_w"].values == approx(POS, abs=1e-6)

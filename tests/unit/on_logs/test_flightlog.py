@@ -4,14 +4,15 @@ import csv
 import json
 
 import numpy as np
-import pytest
+from numpy.testing import assert_array_equal
+from pytest import fixture, mark, raises
 
 from visthrow.common.errors import LogError
 from visthrow.logs.export import columns, export
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog, FlightRecorder
 
 
-@pytest.fixture
+@fixture
 def log() -> FlightLog:
     recorder = FlightRecorder({"plant": "test", "goal": [2.0, 0.0]})
     recorder.declare("wind", "m/s", "world")
@@ -32,7 +33,7 @@ def test_round_trip(log, tmp_path):
         assert (loaded[name].unit, loaded[name].frame) == (channel.unit, channel.frame)
         assert loaded[name].values.dtype == channel.values.dtype
         for field in ("time", "values", "valid"):
-            np.testing.assert_array_equal(getattr(loaded[name], field), getattr(channel, field))
+            assert_array_equal(getattr(loaded[name], field), getattr(channel, field))
 
 
 def test_recorder_copies_what_it_is_given():
@@ -40,18 +41,18 @@ def test_recorder_copies_what_it_is_given():
     recorder.add(0.0, pos_w=position)
     position += 1.0
     recorder.add(1.0, pos_w=position)
-    np.testing.assert_array_equal(recorder.log()["pos_w"].values, [[0, 0, 0], [1, 1, 1]])
+    assert_array_equal(recorder.log()["pos_w"].values, [[0, 0, 0], [1, 1, 1]])
 
 
 def test_hold_returns_the_last_valid_sample(log):
     # Valid at 0.005, 0.025, 0.065, 0.085 s; the one at 0.045 s is not.
     held = log["battery_voltage"].hold(np.array([-1.0, 0.005, 0.024, 0.05, 0.065, 9.0]))
-    np.testing.assert_array_equal(held, [16.0, 16.0, 16.0, 15.0, 13.0, 12.0])
-    with pytest.raises(LogError, match="no sample"):
+    assert_array_equal(held, [16.0, 16.0, 16.0, 15.0, 13.0, 12.0])
+    with raises(LogError, match="no sample"):
         Channel(np.zeros(1), np.zeros(1), "m", valid=np.zeros(1)).hold(np.zeros(1))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("time", "values", "valid", "said"),
     [
         ([0.0, 1.0], [1.0], None, r"time \(2,\), values \(1,\)"),
@@ -64,7 +65,7 @@ def test_hold_returns_the_last_valid_sample(log):
     ],
 )
 def test_contradictory_channels_are_refused(time, values, valid, said):
-    with pytest.raises(LogError, match=said):
+    with raises(LogError, match=said):
         Channel(
             np.array(time),
             np.array(values),
@@ -75,40 +76,38 @@ def test_contradictory_channels_are_refused(time, values, valid, said):
 
 
 def test_unknown_frames_are_refused():
-    with pytest.raises(LogError, match="did you mean 'world'"):
+    with raises(LogError, match="did you mean 'world'"):
         Channel(np.zeros(1), np.zeros(1), "m", "wrld")
 
 
 def test_standard_names_keep_their_unit_frame_and_shape():
     time = np.zeros(1)
-    with pytest.raises(LogError, match=r"'pos_w' is in unit and frame \('mm', 'world'\)"):
+    with raises(LogError, match=r"'pos_w' is in unit and frame \('mm', 'world'\)"):
         FlightLog({"pos_w": Channel(time, np.zeros((1, 3)), "mm", "world")})
-    with pytest.raises(LogError, match=r"samples of shape \(4,\); its name stands for \(3,\)"):
+    with raises(LogError, match=r"samples of shape \(4,\); its name stands for \(3,\)"):
         FlightLog({"pos_w": Channel(time, np.zeros((1, 4)), "m", "world")})
     FlightLog({"cable_points_w": Channel(time, np.zeros((1, 16, 3)), "m", "world")})
 
 
 def test_missing_and_undeclared_channels_name_what_exists(log):
-    with pytest.raises(LogError, match=r"no channel 'pos'; did you mean 'pos_w'"):
+    with raises(LogError, match=r"no channel 'pos'; did you mean 'pos_w'"):
         log["pos"]
-    with pytest.raises(
-        LogError, match=r"'payload_pos' was not declared; did you mean 'payload_pos_w'"
-    ):
+    with raises(LogError, match=r"'payload_pos' was not declared; did you mean 'payload_pos_w'"):
         FlightRecorder().add(0.0, payload_pos=[0, 0, 0])
     recorder = FlightRecorder()
     recorder.add(0.0, pos_w=[0, 0, 0])
     recorder.add(0.1, pos_w=[0, 0])
-    with pytest.raises(LogError, match="channel 'pos_w'"):
+    with raises(LogError, match="channel 'pos_w'"):
         recorder.log()
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.95])
+@mark.parametrize("kept", [0.0, 0.3, 0.95])
 def test_truncated_files_are_refused(log, tmp_path, kept):
     path = tmp_path / "f.npz"
     log.save(path)
     data = path.read_bytes()
     path.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(LogError, match="cut short or damaged"):
+    with raises(LogError, match="cut short or damaged"):
         FlightLog.load(path)
 
 
@@ -118,12 +117,12 @@ def test_incomplete_files_are_refused(log, tmp_path):
     arrays = dict(np.load(path))
     del arrays["pos_w/time"]
     np.savez(path, **arrays)
-    with pytest.raises(
+    with raises(
         LogError, match="incomplete: no entry 'pos_w/time'; expected a flight log, it holds "
     ):
         FlightLog.load(path)
     np.savez(path, header=np.zeros(3, dtype=np.uint8))
-    with pytest.raises(LogError, match="incomplete: Expecting value"):
+    with raises(LogError, match="incomplete: Expecting value"):
         FlightLog.load(path)
 
 
@@ -151,7 +150,7 @@ def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
         assert from_csv == [
             "" if value is None else str(value) for value in table[name].to_pylist()
         ]
-    with pytest.raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
+    with raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
         export(log, tmp_path / "f.xlsx")
 
 

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from tests import logfiles
 from visthrow import cli
@@ -31,7 +31,7 @@ PATIENCE = 20.0
 DAMAGES = 12
 SAMPLES = 200
 
-pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
+pytestmark = mark.filterwarnings("error::RuntimeWarning")
 
 
 @contextmanager
@@ -234,7 +234,7 @@ def all_of(name: str, folder: Path, count: int) -> list[bool]:
 MANY = 300
 
 
-@pytest.mark.parametrize("name", list(FORMATS))
+@mark.parametrize("name", list(FORMATS))
 def test_damaged_files(name, tmp_path):
     said = all_of(name, tmp_path, DAMAGES)
     assert not said[0]  # nothing at all
@@ -247,7 +247,7 @@ def test_a_length_that_leads_back_is_no_circle(tmp_path):
     first = data.index(b"A\x00\x00\x00vehicle_local_position") - 2  # the end of the definitions
     astray = data[16:first] * 8 + struct.pack("<HB", 400, 0) + bytes(90)
     path.write_bytes(data[:16] + astray)
-    with patience(), pytest.raises(LogError, match="leads nowhere"):
+    with patience(), raises(LogError, match="leads nowhere"):
         read(path)
 
 
@@ -269,11 +269,11 @@ def test_bytes_that_do_not_inflate(tmp_path):
     data = bytearray(gzip.compress(payload_table()))
     data[200:260] = b"\xff" * 60
     path.write_bytes(data)
-    with pytest.raises(LogError, match="cannot be read"):
+    with raises(LogError, match="cannot be read"):
         read(path, setups.load("cf_payload").table)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("channel", "words"),
     [
         (Channel(0.01 * np.arange(SAMPLES), np.full(SAMPLES, 3700.0), "V"), "no such pack"),
@@ -290,15 +290,15 @@ def test_sizes_that_only_another_unit_gives(channel, words):
         assert any(words in row.text for row in check([log])[0].rows) == bad
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", list(FORMATS))
+@mark.slow
+@mark.parametrize("name", list(FORMATS))
 def test_many_damaged_files(name, tmp_path):
     said = all_of(name, tmp_path, MANY)
     assert not all(said)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
+@mark.slow
+@mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
 def test_cut_at_many_places(name, tmp_path):
     path = tmp_path / name
     FORMATS[name](path)
@@ -315,7 +315,7 @@ def test_text_where_numbers_stood(tmp_path):
     path = tmp_path / "export.csv"
     export(own(), path)
     path.write_bytes(path.read_bytes().replace(b"True", b"Tr", 1))
-    with pytest.raises(LogError, match="holds text such as 'Tr'"):
+    with raises(LogError, match="holds text such as 'Tr'"):
         read(path)
 
 
@@ -326,5 +326,5 @@ def test_stamps_that_are_text(tmp_path):
     cells = rows[5].split(",")
     cells[at] = "late"
     path.write_text("\n".join([*rows[:5], ",".join(cells), *rows[6:]]))
-    with pytest.raises(LogError, match="column 'time'"):
+    with raises(LogError, match="column 'time'"):
         read(path)

@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 from scipy.spatial.transform import Rotation
 
 from tests import logfiles
@@ -57,9 +57,9 @@ class TestCodec:
         for value in (0, 1, -1, 63, -64, 64, 8191, -70000, 2**31 - 1, -(2**31)):
             assert blackbox_codec.Reader(signed_vb(value)).signed() == value
         assert blackbox_codec.Reader(unsigned_vb(2**32 - 1)).unsigned() == 2**32 - 1
-        with pytest.raises(blackbox_codec.Corrupt):
+        with raises(blackbox_codec.Corrupt):
             blackbox_codec.Reader(b"\xff" * 6).unsigned()
-        with pytest.raises(blackbox_codec.EndOfLog):
+        with raises(blackbox_codec.EndOfLog):
             blackbox_codec.Reader(b"\xff").unsigned()
 
     def decode(self, code: int, data: bytes, fields: int) -> list[int]:
@@ -77,7 +77,7 @@ class TestCodec:
         nine = bytes([0b10000000]) + signed_vb(7) + signed_vb(8)
         assert self.decode(blackbox_codec.TAG8_8SVB, nine, 9) == [0] * 7 + [7, 8]
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("data", "values"),
         [
             (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
@@ -92,7 +92,7 @@ class TestCodec:
     def test_three_fields_with_a_selector(self, data, values):
         assert self.decode(blackbox_codec.TAG2_3S32, data, 3) == values
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("data", "values"),
         [
             (packed("00" + bits(1, 2) + bits(-2, 2) + bits(-1, 2)), [1, -2, -1]),
@@ -138,18 +138,18 @@ class TestBlackbox:
 
     def test_units_and_axes(self):
         log = read(BBL)[0]
-        assert np.linalg.norm(log["acc_b"].values.mean(0)) == pytest.approx(9.81, rel=0.02)
-        assert log["battery_voltage"].values.mean() == pytest.approx(24.6, abs=0.1)
+        assert np.linalg.norm(log["acc_b"].values.mean(0)) == approx(9.81, rel=0.02)
+        assert log["battery_voltage"].values.mean() == approx(24.6, abs=0.1)
         assert log["motor_command"].values.shape == (98, 4)
         found = blackbox.read_blackbox(BBL)[0]
         raw = dict(zip(found.names, found.main.T))
         front_left = (raw["motor[3]"] - 158) / (2047 - 158)
-        assert log["motor_command"].values[:, 0] == pytest.approx(front_left)
-        assert log["rate_b"].values[:, 2] == pytest.approx(np.radians(raw["gyroADC[2]"]))
+        assert log["motor_command"].values[:, 0] == approx(front_left)
+        assert log["rate_b"].values[:, 2] == approx(np.radians(raw["gyroADC[2]"]))
 
     def test_decoded_csv_is_known_without_a_mapping(self):
         (log,) = read(REAL / "betaflight_bbl" / "LOG00037_start.csv.gz")
-        assert np.median(np.diff(log["rate_b"].time)) == pytest.approx(1e-3, rel=0.02)
+        assert np.median(np.diff(log["rate_b"].time)) == approx(1e-3, rel=0.02)
         assert log["throttle"].values.max() < 1.0
 
     def test_damage_costs_frames_and_nothing_else(self):
@@ -175,7 +175,7 @@ class TestBlackbox:
         for end in (30, 500, 3000, 6100, 9000, 15_003, 15_004, 15_005, 33_333):
             path.write_bytes(data[:end])
             if end < 5000:  # within the header of the first log
-                with pytest.raises(LogError, match=r"blackbox log|frame"):
+                with raises(LogError, match=r"blackbox log|frame"):
                     blackbox.read_blackbox(path)
                 continue
             logs = blackbox.read_blackbox(path)
@@ -185,13 +185,13 @@ class TestBlackbox:
     def test_no_blackbox(self, tmp_path):
         path = tmp_path / "a.bbl"
         path.write_bytes(bytes(range(256)) * 20)
-        with pytest.raises(LogError, match="no blackbox log"):
+        with raises(LogError, match="no blackbox log"):
             read(path)
         path.write_bytes(blackbox.MARKER + b"\nH Data version:2\n")
-        with pytest.raises(LogError, match="no definition of I and P frames"):
+        with raises(LogError, match="no definition of I and P frames"):
             read(path)
         path.write_bytes(BBL.read_bytes().replace(b"encoding:1,1,0", b"encoding:1,4,0"))
-        with pytest.raises(LogError, match="encoding 4"):
+        with raises(LogError, match="encoding 4"):
             read(path)
 
 
@@ -232,13 +232,13 @@ class TestTables:
                 ChannelMap("turn", ("r",), "deg/s", frame="body"),
             ),
         )
-        assert log["pos_w"].time == pytest.approx([0, 0.01, 0.02, 0.03, 0.04])
-        assert log["pos_w"].values[4] == pytest.approx([0.04, -0.02, 0.03])
-        assert log["turn"].values[0] == pytest.approx(math.pi / 2)
+        assert log["pos_w"].time == approx([0, 0.01, 0.02, 0.03, 0.04])
+        assert log["pos_w"].values[4] == approx([0.04, -0.02, 0.03])
+        assert log["turn"].values[0] == approx(math.pi / 2)
         vector = np.array([0.3, -0.7, 0.2])  # of the body, ours
         flip = np.array([1.0, -1.0, -1.0])
         expected = flip * turn.apply(flip * vector)
-        assert Rotation.from_quat(log["quat_wb"].values[0]).apply(vector) == pytest.approx(expected)
+        assert Rotation.from_quat(log["quat_wb"].values[0]).apply(vector) == approx(expected)
 
     def test_angles_turn_yaw_first(self, tmp_path):
         (log,) = read(
@@ -250,13 +250,13 @@ class TestTables:
             for axis, angle in (("z", 30), ("y", 20), ("x", 10))
         )
         expected = (yaw * pitch * roll).as_matrix()
-        assert Rotation.from_quat(log["quat_wb"].values[0]).as_matrix() == pytest.approx(expected)
+        assert Rotation.from_quat(log["quat_wb"].values[0]).as_matrix() == approx(expected)
 
     def test_what_a_clock_does_wrong_is_counted_and_left_out(self, tmp_path):
         rows = ["t,v", "0,1", "10,2", "10,3", "20,4", "5,5", "30,", ",7", "40,8"]
         (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
         notes = log.meta["ingest"]["x"]
-        assert log["x"].time == pytest.approx([0, 0.01, 0.02, 0.04])
+        assert log["x"].time == approx([0, 0.01, 0.02, 0.04])
         assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (
             1,
             1,
@@ -267,7 +267,7 @@ class TestTables:
     def test_held_values_are_one_measurement(self, tmp_path):
         rows = ["t,v", *(f"{10 * i},{i // 4}" for i in range(12))]
         (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True)))
-        assert log["x"].time == pytest.approx([0, 0.04, 0.08])
+        assert log["x"].time == approx([0, 0.04, 0.08])
 
     def test_blanks_are_no_samples_and_break_no_hold(self, tmp_path):
         """Two streams in one table: rows of the one are blank in the other; a part of a vector that
@@ -281,12 +281,12 @@ class TestTables:
             written(tmp_path, rows),
             mapping(ChannelMap("x", ("v",), "m", held=True), ChannelMap("y", ("a", "b"), "m")),
         )
-        assert log["x"].time == pytest.approx([0.01, 0.07])
+        assert log["x"].time == approx([0.01, 0.07])
         assert np.all(log["x"].valid)
         assert len(log["y"].time) == 13
         assert log["y"].valid.tolist() == [i % 3 > 0 for i in range(13)]
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         "text",
         [
             "t;v\n0;1,5\n10;2,5\n20;3,5\n",
@@ -298,7 +298,7 @@ class TestTables:
     def test_separators_and_decimal_commas(self, tmp_path, text):
         (tmp_path / "a.csv").write_text(text)
         (log,) = read(tmp_path / "a.csv", mapping(ChannelMap("x", ("v",), "m")))
-        assert log["x"].values == pytest.approx([1.5, 2.5, 3.5])
+        assert log["x"].values == approx([1.5, 2.5, 3.5])
 
     def test_no_header_and_lists_in_cells(self, tmp_path):
         (tmp_path / "a.csv").write_text(
@@ -307,12 +307,12 @@ class TestTables:
         listed = ChannelMap("pos_w", tuple(f"p[{i}]" for i in range(3)), "m")
         (tmp_path / "b.csv").write_text("t,p\n" + (tmp_path / "a.csv").read_text())
         (log,) = read(tmp_path / "b.csv", mapping(listed))
-        assert log["pos_w"].values[1] == pytest.approx([1.5, 2.0, 3.0])
+        assert log["pos_w"].values[1] == approx([1.5, 2.0, 3.0])
         assert log["pos_w"].valid.tolist() == [True, True, False]
         (tmp_path / "c.csv").write_text("0,1,2\n10,3,4\n20,5,6\n")
         columns = TableMap(TimeColumn("column 1", "ms"), (ChannelMap("x", ("column 3",), "m"),))
         (log,) = read(tmp_path / "c.csv", columns)
-        assert log["x"].values == pytest.approx([2, 4, 6])
+        assert log["x"].values == approx([2, 4, 6])
 
     def test_clocks_of_their_own_and_splits(self, tmp_path):
         rows = ["t,u,b,v", *(f"{10 * i},{2 * i},{'ab'[i // 50]},{i}" for i in range(100))]
@@ -329,17 +329,17 @@ class TestTables:
         path = tmp_path / "a.csv"
         whole = mapping(ChannelMap("y", ("v",), "m"), split=Split("b"))
         assert [log.meta["part"] for log in read(f"{path}:b*", whole)] == ["b"]
-        with pytest.raises(LogError, match="no part 'c' among 2"):
+        with raises(LogError, match="no part 'c' among 2"):
             read(f"{path}:c", whole)
         assert logs[1]["x"].time[0] == 100.0
-        assert logs[1]["y"].time[0] == pytest.approx(0.5)
+        assert logs[1]["y"].time[0] == approx(0.5)
 
     def test_scale_and_offset_are_in_the_files_unit(self, tmp_path):
         entry = ChannelMap("x", ("v",), "cm", scale=2.0, offset=3.0)
         (log,) = read(written(tmp_path, ["t,v", "0,1", "10,2", "20,-4"]), mapping(entry))
-        assert log["x"].values == pytest.approx([0.05, 0.07, -0.05])
+        assert log["x"].values == approx([0.05, 0.07, -0.05])
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("clock", "times"),
         [
             (TimeColumn("t", "ms", offset=0.5), [0.5, 0.51, 0.53]),
@@ -350,9 +350,9 @@ class TestTables:
     def test_clocks(self, clock, times, tmp_path):
         path = written(tmp_path, ["t,v", "0,1", "10,2", "30,3"])
         (log,) = read(path, TableMap(clock, (ChannelMap("x", ("v",), "m"),)))
-        assert log["x"].time == pytest.approx(times)
+        assert log["x"].time == approx(times)
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("gap", "shortest", "firsts"),
         [(0.05, 0.0, [1, 4, 6]), (0.07, 0.0, [1, 6]), (0.05, 0.015, [1, 6]), (0.05, 0.025, [6])],
     )
@@ -378,11 +378,11 @@ class TestTables:
             export(log, tmp_path / f"a.{ending}")
             (back,) = read(tmp_path / f"a.{ending}")
             for name in log.channels:
-                assert back[name].values == pytest.approx(log[name].values.astype(float))
-                assert back[name].time == pytest.approx(log[name].time)
+                assert back[name].values == approx(log[name].values.astype(float))
+                assert back[name].time == approx(log[name].time)
         assert back.meta["who"] == "me"
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("rows", "message"),
         [
             (["t,v", "0,1", "1,2,3", "2,2"], "line 3 has 3 cells"),
@@ -393,7 +393,7 @@ class TestTables:
         ],
     )
     def test_bad_tables(self, tmp_path, rows, message):
-        with pytest.raises(LogError, match=message):
+        with raises(LogError, match=message):
             read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
 
     def test_a_name_that_stands_twice_is_numbered(self, tmp_path):
@@ -410,22 +410,22 @@ class TestTables:
     def test_damaged_files(self, tmp_path):
         path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
         path.write_bytes(path.read_bytes()[:200])
-        with pytest.raises(LogError, match="cannot be read"):
+        with raises(LogError, match="cannot be read"):
             read(path, mapping(ChannelMap("x", ("v",), "m")))
         (tmp_path / "a.parquet").write_bytes(b"PAR1 no")
-        with pytest.raises(LogError, match="parquet"):
+        with raises(LogError, match="parquet"):
             read(tmp_path / "a.parquet")
-        with pytest.raises(LogError, match="needs a mapping"):
+        with raises(LogError, match="needs a mapping"):
             read(written(tmp_path, ["t,v", "0,1"]))
-        with pytest.raises(LogError, match="no such file; in that folder"):
+        with raises(LogError, match="no such file; in that folder"):
             read(tmp_path / "b.csv")
-        with pytest.raises(LogError, match=r"ending '\.doc'"):
+        with raises(LogError, match=r"ending '\.doc'"):
             read(written(tmp_path, ["t,v\0"], "a.doc"))
         (tmp_path / "run").mkdir()
-        with pytest.raises(LogError, match="a folder without"):
+        with raises(LogError, match="a folder without"):
             read(tmp_path / "run")
 
-    @pytest.mark.parametrize(
+    @mark.parametrize(
         ("change", "message"),
         [
             ({"unit": "parsec"}, "unit 'parsec'"),
@@ -438,11 +438,11 @@ class TestTables:
         ],
     )
     def test_bad_mappings(self, change, message):
-        with pytest.raises(ConfigError, match=message):
+        with raises(ConfigError, match=message):
             ChannelMap(**({"name": "pos_w", "columns": ("x", "y", "z"), "unit": "m"} | change))
 
     def test_axes(self):
-        assert turn_of("y,-x,z") @ [1.0, 2.0, 3.0] == pytest.approx([2.0, -1.0, 3.0])
+        assert turn_of("y,-x,z") @ [1.0, 2.0, 3.0] == approx([2.0, -1.0, 3.0])
 
 
 class TestAutopilots:
@@ -453,18 +453,18 @@ class TestAutopilots:
         rows = [("IMU", (1000 * i, i % 2, 0.1 + i % 2, 0.2, 0.3)) for i in range(10)]
         logfiles.write_bin(path, {"IMU": imu}, rows)
         (log,) = read(path)
-        assert log["rate_b"].values == pytest.approx(np.tile([0.1, -0.2, -0.3], (5, 1)))
+        assert log["rate_b"].values == approx(np.tile([0.1, -0.2, -0.3], (5, 1)))
 
-    @pytest.mark.parametrize("ending", ["ulg", "BIN", "tlog", "bbl", "npz"])
-    @pytest.mark.parametrize("data", [b"", b"nonsense" * 50, bytes(2000)])
+    @mark.parametrize("ending", ["ulg", "BIN", "tlog", "bbl", "npz"])
+    @mark.parametrize("data", [b"", b"nonsense" * 50, bytes(2000)])
     def test_no_such_log(self, tmp_path, ending, data):
         path = tmp_path / f"a.{ending}"
         path.write_bytes(data)
-        with pytest.raises(LogError, match=rf"a\.{ending}"):
+        with raises(LogError, match=rf"a\.{ending}"):
             read(path)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "path", sorted((config.configs_root() / "diagnose").glob("*.toml")), ids=lambda p: p.stem
 )
 def test_shipped_mappings_name_channels_with_a_meaning_where_there_is_one(path):

@@ -3,7 +3,7 @@
 import math
 
 import numpy as np
-import pytest
+from pytest import mark
 
 from tests.logfiles import ATT, write_bin
 from visthrow import logs
@@ -15,7 +15,7 @@ SIDS = ("QBfffffff", "TimeUS,Ax,Mag,FSt,FSp,TFin,TC,TR,TFout")
 SIDD = ("Qfffffffff", "TimeUS,Time,Targ,F,Gx,Gy,Gz,Ax,Ay,Az")
 
 
-@pytest.mark.parametrize(("axis", "sign"), [(7, 1.0), (8, -1.0), (9, -1.0)])
+@mark.parametrize(("axis", "sign"), [(7, 1.0), (8, -1.0), (9, -1.0)])
 def test_a_sweep_is_part_of_the_commanded_rate(tmp_path, axis, sign):
     """Forward, right, down in the log: a sweep about y and z turns round in our frame; before and
     after it nothing is added.

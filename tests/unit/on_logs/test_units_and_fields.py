@@ -6,8 +6,8 @@ import math
 import struct
 
 import numpy as np
-import pytest
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+from pytest import approx, mark, raises
 
 from tests import logfiles
 from visthrow.common.errors import ConfigError
@@ -169,12 +169,12 @@ def test_units():
     worked = {unit: (ours, size) for ours, units in IN_OURS.items() for unit, size in units.items()}
     assert worked.keys() == UNITS.keys()
     for unit, (ours, size) in worked.items():
-        assert to_si(unit, "here") == (ours, pytest.approx(size, rel=1e-10)), unit
-    with pytest.raises(ConfigError, match="here: unit 'parsec'"):
+        assert to_si(unit, "here") == (ours, approx(size, rel=1e-10)), unit
+    with raises(ConfigError, match="here: unit 'parsec'"):
         to_si("parsec", "here")
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("ending", "message", "fields", "values", "channel", "expected"),
     CASES,
     ids=[f"{ending}-{row[0]}-{row[1]}" for ending, *row in CASES],
@@ -190,7 +190,7 @@ def test_a_field_of_an_autopilot(ending, message, fields, values, channel, expec
     np.testing.assert_allclose(got, np.tile(expected, (5, 1)), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("ending", "taps"),
     [
         ("ulg", autopilot_logs.ULOG),
@@ -204,7 +204,7 @@ def test_no_field_is_untested(ending, taps):
     assert written == named
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("title", "value", "channel", "expected"),
     [
         ("gyroADC[0] (deg/s)", 180.0, "rate_b", math.pi),
@@ -227,18 +227,18 @@ def test_a_field_of_a_decoded_blackbox(title, value, channel, expected):
     table.pop(title.split(" ")[0], None)
     table |= {"time (us)": np.array([0.0, 500.0, 1000.0]), title: np.full(3, value)}
     log = blackbox.log_of_decoded(table, "a.csv")
-    assert log[channel].values.reshape(3, -1)[:, 0] == pytest.approx(expected)
-    assert log[channel].time[-1] == pytest.approx(1e-3)
+    assert log[channel].values.reshape(3, -1)[:, 0] == approx(expected)
+    assert log[channel].time[-1] == approx(1e-3)
 
 
-@pytest.mark.parametrize(("unit", "size"), [("us", 1e-6), ("ms", 1e-3), ("s", 1.0)])
+@mark.parametrize(("unit", "size"), [("us", 1e-6), ("ms", 1e-3), ("s", 1.0)])
 def test_stamps_of_a_decoded_blackbox(unit, size):
     table = {f"time ({unit})": np.array([5.0, 6.0, 8.0]), "vbatLatest": np.ones(3)}
     log = blackbox.log_of_decoded(table, "a.csv")
-    assert log["battery_voltage"].time == pytest.approx([0.0, size, 3.0 * size])
+    assert log["battery_voltage"].time == approx([0.0, size, 3.0 * size])
 
 
 def test_the_clock_of_a_blackbox_turns_over():
     table = {"time": np.array([2.0**32 - 1000.0, 1000.0, 3000.0]), "vbatLatest": np.ones(3)}
     log = blackbox.log_of_decoded(table, "a.csv")
-    assert log["battery_voltage"].time == pytest.approx([0.0, 0.002, 0.004])
+    assert log["battery_voltage"].time == approx([0.0, 0.002, 0.004])

@@ -2,12 +2,14 @@
 and both layouts' geometry.
 """
 
-import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.random import default_rng
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from camera.keypoints import KeypointCamera, keypoints
 from visthrow import config
@@ -30,7 +32,7 @@ def fitted(positions: torch.Tensor, sigma: float) -> torch.Tensor:
 
 
 def test_equals_the_least_squares_line_with_a_prior():
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     times = np.arange(12) * PERIOD
     places = 1.0 + 0.5 * times + 0.01 * rng.standard_normal(12)
     sigma = 0.02
@@ -39,7 +41,7 @@ def test_equals_the_least_squares_line_with_a_prior():
     normal = design.T @ design / sigma**2 + np.diag([0.0, goal_motion.SPEED_SIGMA**-2])
     slope = np.linalg.solve(normal, design.T @ places / sigma**2)[1]
     moving = torch.tensor(np.column_stack((places, -places)), dtype=torch.float32)[:, None]
-    np.testing.assert_allclose(fitted(moving, sigma)[0].numpy(), [slope, -slope], rtol=2e-3)
+    assert_allclose(fitted(moving, sigma)[0].numpy(), [slope, -slope], rtol=2e-3)
 
 
 def test_a_new_throw_forgets_the_last_one_and_an_unseen_goal_changes_nothing():
@@ -49,23 +51,23 @@ def test_a_new_throw_forgets_the_last_one_and_an_unseen_goal_changes_nothing():
         place = torch.tensor([[step * PERIOD, 0.0]] * 2)
         time, weight = torch.full((2,), step * PERIOD), torch.full((2,), 1e6)
         sums, velocity = goal_motion.fit(sums, time, place, weight, no)
-    np.testing.assert_allclose(velocity.numpy(), [[1.0, 0.0]] * 2, atol=2e-3)
+    assert_allclose(velocity.numpy(), [[1.0, 0.0]] * 2, atol=2e-3)
     blind = torch.tensor([1e6, 0.0])
     fresh = torch.tensor([True, False])
     sums, velocity = goal_motion.fit(
         sums, torch.tensor([0.0, 0.2]), torch.full((2, 2), 9.0), blind, fresh
     )
-    np.testing.assert_allclose(velocity.numpy(), [[0.0, 0.0], [1.0, 0.0]], atol=2e-3)
+    assert_allclose(velocity.numpy(), [[0.0, 0.0], [1.0, 0.0]], atol=2e-3)
 
 
-@pytest.mark.parametrize("kind", ["state", "vision"])
+@mark.parametrize("kind", ["state", "vision"])
 def test_both_layouts_find_the_goal_where_it_is(kind):
     """Exact frames of random attitudes and places give the goal exactly; the camera's rays meet the
     ground there.
     """
     params = config.load(Experiment, config.find("train", f"{kind}_moving"))
     layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     count = 64
     angle = 0.4 * rng.standard_normal((count, 3))
     quat = np.concatenate((np.sin(angle / 2), np.ones((count, 1))), axis=1)
@@ -84,7 +86,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
     place, weight = goal_motion.measured_goal(layout, frame, valid, camera)
     known = weight > 0
     assert known.float().mean() > 0.9
-    np.testing.assert_allclose(
+    assert_allclose(
         place[known].numpy(), goal[known, :2].numpy(), atol=2e-4
     )  # float32 at grazing rays
     if (
@@ -101,15 +103,15 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
         _, weight = goal_motion.measured_goal(
             layout, torch.cat([above, points.flatten(1)], dim=1), valid, camera
         )
-        assert weight.item() == pytest.approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
+        assert weight.item() == approx(4 / (goal_motion.ANGLE_SIGMA * 2.0) ** 2, rel=0.05)
 
 
 def test_a_located_state_layout_has_the_mean_goal():
     """Ten noisy frames of one goal: their mean less the measured position, beside the offset."""
     params = config.load(Experiment, config.find("train", "state")).task.observation
-    layout = ob.layout_of(dataclasses.replace(params, located=True))
+    layout = ob.layout_of(replace(params, located=True))
     assert layout.dimension == ob.layout_of(params).dimension + 2
-    rng, goal = np.random.default_rng(1), np.array([1.5, -0.5])
+    rng, goal = default_rng(1), np.array([1.5, -0.5])
     sums, fresh, seen = goal_motion.empty_sums(1), torch.ones(1, dtype=torch.bool), []
     for step in range(10):
         frame = torch.zeros(1, layout.frame)
@@ -123,14 +125,14 @@ def test_a_located_state_layout_has_the_mean_goal():
         fresh = torch.zeros_like(fresh)
         assert kept is frame
         wanted = np.mean(seen, axis=0) - frame[0, :2].numpy()
-        np.testing.assert_allclose(places[0].numpy(), wanted, atol=1e-5)
+        assert_allclose(places[0].numpy(), wanted, atol=1e-5)
 
 
 def test_accuracy_is_what_the_docstring_promises():
     """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a
     tenth of it.
     """
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     truth = np.array([0.5, 0.0])
 
     def spread(steps: int) -> float:
@@ -146,5 +148,5 @@ def test_accuracy_is_what_the_docstring_promises():
 
 def test_layout_and_contract_grow_by_the_velocity_alone():
     params = config.load(Experiment, config.find("train", "state_moving")).task.observation
-    still = dataclasses.replace(params, goal_velocity=False)
+    still = replace(params, goal_velocity=False)
     assert ob.layout_of(params).dimension == ob.layout_of(still).dimension + 2

@@ -2,9 +2,10 @@
 seen, the goal kept in mind.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import torch
+from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -60,18 +61,16 @@ def test_the_goal_is_the_mean_of_a_throw_and_stays_known_out_of_view():
     _, _, blind, shown, counts = fitted_goal(
         layout, frame, torch.zeros_like(valid), camera, sums, torch.full((8,), 0.8), fresh
     )
-    torch.testing.assert_close(
-        blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5
-    )
+    assert_close(blind[:, :2] + frame[:, :2], found[:, :2] + noisy[:, :2], rtol=0, atol=1e-5)
     assert (blind[:, 5] == 1.0).all()
     assert counts[:, :4].all(), "corners read where the goal would be seen"
     assert not counts[:, 4:].any(), "the payload does not"
-    torch.testing.assert_close(shown[:, 15:23], frame[:, 15:23], rtol=0, atol=0.02)
+    assert_close(shown[:, 15:23], frame[:, 15:23], rtol=0, atol=0.02)
 
 
 def test_a_goal_that_moves_is_where_it_is_now():
     layout, camera, frame, valid, offset, _ = scene()
-    layout = dataclasses.replace(layout, motion=2)
+    layout = replace(layout, motion=2)
     sums, fresh, speed = (
         goal_motion.empty_sums(8),
         torch.ones(8, dtype=torch.bool),
@@ -84,16 +83,16 @@ def test_a_goal_that_moves_is_where_it_is_now():
             layout, moved, valid, camera, sums, torch.full((8,), 0.02 * k), fresh
         )
         fresh = torch.zeros_like(fresh)
-    torch.testing.assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
-    torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=0.02)
+    assert_close(velocity, speed.expand(8, 2), rtol=0, atol=0.02)
+    assert_close(found[:, :2], offset, rtol=0, atol=0.02)
 
 
 def test_without_noise_it_is_the_truth():
     layout, camera, frame, valid, offset, ray = scene()
     assert valid.all()
     found = places(layout, frame, valid, camera)
-    torch.testing.assert_close(found[:, :2], offset, rtol=0, atol=EXACT)
-    torch.testing.assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
+    assert_close(found[:, :2], offset, rtol=0, atol=EXACT)
+    assert_close(found[:, 2:5], ray, rtol=0, atol=EXACT)
     assert (found[:, 5] == 1.0).all()
 
 
@@ -117,7 +116,7 @@ def test_what_is_not_seen_is_nought():
     assert found[:4, [0, 1, 5]].abs().max() == 0.0
     assert found[4:, 2:5].abs().max() == 0.0
     assert (found[4:, 5] == 1.0).all()
-    torch.testing.assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
+    assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
 
 
 def test_middle_is_the_median_of_what_is_valid():
@@ -126,12 +125,11 @@ def test_middle_is_the_median_of_what_is_valid():
     expected = (
         torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
     )
-    torch.testing.assert_close(middle(points, valid), expected)
+    assert_close(middle(points, valid), expected)
 
 
 def test_a_layout_counts_it():
     params = config.load(Experiment, config.find("train", "laptop_vision")).task.observation
     assert (
-        ob.layout_of(params).dimension
-        == ob.layout_of(dataclasses.replace(params, located=False)).dimension + 6
+        ob.layout_of(params).dimension == ob.layout_of(replace(params, located=False)).dimension + 6
     )

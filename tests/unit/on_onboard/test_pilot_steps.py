@@ -3,8 +3,9 @@ in training.
 """
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose
+from pytest import approx, mark
 
 from tests.hil_flight import simple_policy
 from visthrow.onboard.observations import RESPONSE, resampled
@@ -42,7 +43,7 @@ def flown(times, timed=True, policy=None):
     return [seen(pilot, PERIOD * t, PERIOD * t if timed else None) for t in times][-1]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "times",
     [
         [0, 1, 2, 3, 4, 6],  # one missed
@@ -55,11 +56,11 @@ def flown(times, timed=True, policy=None):
 )
 def test_a_history_with_gaps_is_that_of_regular_steps(times):
     even = flown(range(7), timed=False)
-    np.testing.assert_allclose(flown(times), even, atol=2e-6)
+    assert_allclose(flown(times), even, atol=2e-6)
     assert np.abs(flown(times, timed=False) - even).max() > 5e-3, "without the times it is not"
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "times", [[0, 1, 2, 3, 4, 6], [0, 1, 2, 9], [0, 1, 2, 3, 3.7, 4.2, 5, 6, 7, 8, 9, 10.7, 11]]
 )
 def test_a_response_with_gaps_is_that_of_regular_steps(times):
@@ -67,7 +68,7 @@ def test_a_response_with_gaps_is_that_of_regular_steps(times):
         flown(t, timed, responsive())[:, -8 * RESPONSE :].reshape(8, RESPONSE)[:, :6]
         for t, timed in ((times, True), (range(times[-1] + 1), False), (times, False))
     ]
-    np.testing.assert_allclose(speeds[0], speeds[1], atol=2e-6)
+    assert_allclose(speeds[0], speeds[1], atol=2e-6)
     assert np.abs(speeds[2] - speeds[1]).max() > 5e-3, "without the times it is not"
 
 
@@ -82,7 +83,7 @@ def test_steps_in_time_are_the_same_bits():
 def test_what_is_older_than_the_throw_is_its_first_step():
     history = torch.tensor([[[4.0], [1.0], [1.0], [1.0]]])
     found = resampled(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)
-    assert found[0, :, 0].tolist() == pytest.approx([6.0, 4.0, 1.0, 1.0])
+    assert found[0, :, 0].tolist() == approx([6.0, 4.0, 1.0, 1.0])
 
 
 def test_a_release_that_was_not_done_is_not_told():
@@ -91,7 +92,7 @@ def test_a_release_that_was_not_done_is_not_told():
     seen(pilot, 0.0, 0.0)
     assert pilot.previous_action[0, 4] == 1.0
     pilot.not_released()
-    assert pilot.previous_action[0].tolist() == pytest.approx([-0.1, 0.3, 0.0, 0.0, before])
+    assert pilot.previous_action[0].tolist() == approx([-0.1, 0.3, 0.0, 0.0, before])
     seen(pilot, PERIOD, PERIOD)
     pilot.not_released()
     assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"

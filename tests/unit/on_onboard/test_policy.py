@@ -7,8 +7,8 @@ import io
 import zipfile
 
 import numpy as np
-import pytest
 import torch
+from pytest import fixture, mark, raises
 from tensordict import TensorDict
 
 from visthrow.common.errors import MismatchError, PolicyError, VisthrowError
@@ -49,16 +49,16 @@ def make_actor(activation: str = "elu", normalized: bool = True):
     return actor.eval(), batch
 
 
-@pytest.fixture
+@fixture
 def policy() -> Policy:
     actor, _ = make_actor()
     return Policy.from_actor_state(actor.state_dict(), "elu", CONTRACT, {"seed": 3})
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "activation", ["elu", "relu", "tanh", "selu", "lrelu", "swish", "gelu", "softplus", "mish"]
 )
-@pytest.mark.parametrize("normalized", [True, False])
+@mark.parametrize("normalized", [True, False])
 def test_equal_to_the_training_network(activation, normalized, tmp_path):
     actor, batch = make_actor(activation, normalized)
     Policy.from_actor_state(actor.state_dict(), activation, CONTRACT).save(tmp_path / "p.npz")
@@ -84,7 +84,7 @@ def test_a_single_action_is_one_row_of_a_batch(policy):
 
 
 def test_observations_of_another_length_are_refused(policy):
-    with pytest.raises(PolicyError, match=r"\(1, 61\).*expects \(E, 35\)"):
+    with raises(PolicyError, match=r"\(1, 61\).*expects \(E, 35\)"):
         policy.act(torch.zeros(1, 61))
 
 
@@ -102,7 +102,7 @@ def test_each_difference_is_named_with_both_values(policy):
     now["noise"] = 1
     del now["release_lag"]
     now["vehicle"] = {"mass": 0.21}
-    with pytest.raises(MismatchError) as caught:
+    with raises(MismatchError) as caught:
         policy.require(now)
     message = str(caught.value)
     assert "camera.mount.position_b[2]: trained with -0.02, here -0.03" in message
@@ -117,7 +117,7 @@ def test_each_difference_is_named_with_both_values(policy):
 def test_a_shorter_list_is_a_difference(policy):
     now = copy.deepcopy(CONTRACT)
     now["action"]["max_rate"] = []
-    with pytest.raises(MismatchError, match=r"max_rate\[0\]: trained with 10.0, here nothing"):
+    with raises(MismatchError, match=r"max_rate\[0\]: trained with 10.0, here nothing"):
         policy.require(now)
 
 
@@ -131,7 +131,7 @@ def rewritten(path, change):
     np.savez(path, **arrays)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "said"),
     [
         (
@@ -158,28 +158,28 @@ def test_incomplete_or_contradictory_files_are_refused(policy, tmp_path, change,
     path = tmp_path / "p.npz"
     policy.save(path)
     rewritten(path, change)
-    with pytest.raises(PolicyError) as caught:
+    with raises(PolicyError) as caught:
         Policy.load(path)
     assert said in str(caught.value)
     assert "p.npz" in str(caught.value)
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.99])
+@mark.parametrize("kept", [0.0, 0.1, 0.5, 0.9, 0.99])
 def test_truncated_files_are_refused(policy, tmp_path, kept):
     path = tmp_path / "p.npz"
     policy.save(path)
     data = path.read_bytes()
     path.write_bytes(data[: int(kept * len(data))])
-    with pytest.raises(PolicyError, match="cut short or damaged"):
+    with raises(PolicyError, match="cut short or damaged"):
         Policy.load(path)
 
 
 def test_other_files_and_missing_files_are_refused(policy, tmp_path):
     policy.save(tmp_path / "there.npz")
     (tmp_path / "text.npz").write_text("mass = 1")
-    with pytest.raises(PolicyError, match="damaged"):
+    with raises(PolicyError, match="damaged"):
         Policy.load(tmp_path / "text.npz")
-    with pytest.raises(PolicyError, match=r"no such file.*there\.npz"):
+    with raises(PolicyError, match=r"no such file.*there\.npz"):
         Policy.load(tmp_path / "gone.npz")
 
 
@@ -189,7 +189,7 @@ def test_policies_are_found_by_shipped_name_or_path(policy, tmp_path, monkeypatc
     policy.save(tmp_path / "mine.npz")
     assert find_policy("vision") == tmp_path / "shipped" / "vision.npz"
     assert find_policy(tmp_path / "mine.npz") == tmp_path / "mine.npz"
-    with pytest.raises(PolicyError, match=r"no policy 'vison'.*did you mean 'vision'"):
+    with raises(PolicyError, match=r"no policy 'vison'.*did you mean 'vision'"):
         find_policy("vison")
 
 
@@ -199,7 +199,7 @@ def test_pickles_are_never_loaded(tmp_path):
     np.save(buffer, np.array([{"a": 1}], dtype=object), allow_pickle=True)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("header.npy", buffer.getvalue())
-    with pytest.raises(PolicyError, match="pickle"):
+    with raises(PolicyError, match="pickle"):
         Policy.load(path)
 
 
@@ -212,18 +212,18 @@ def test_a_full_disk_leaves_the_old_file(policy, tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("visthrow.common.storage.os.fsync", full)
-    with pytest.raises(VisthrowError, match="No space left on device"):
+    with raises(VisthrowError, match="No space left on device"):
         policy.save(path)
     assert path.read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["p.npz"]
 
 
 def test_states_of_other_networks_are_refused():
-    with pytest.raises(
+    with raises(
         PolicyError, match=r"got rnn\.weight_ih_l0; expected the state of an rsl_rl MLPModel"
     ):
         Policy.from_actor_state(
             {"rnn.weight_ih_l0": torch.zeros(1), "mlp.0.weight": torch.zeros(1, 1)}, "elu", {}
         )
-    with pytest.raises(PolicyError, match="no mlp"):
+    with raises(PolicyError, match="no mlp"):
         Policy.from_actor_state({}, "elu", {})

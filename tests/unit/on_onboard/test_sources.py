@@ -3,7 +3,8 @@ camera reports them.
 """
 
 import numpy as np
-import pytest
+from numpy.testing import assert_array_equal
+from pytest import mark
 
 from visthrow.onboard import observations as ob
 from visthrow.onboard.pilot import Pilot
@@ -43,7 +44,7 @@ def changed(name):
     return set(np.flatnonzero((one != two).any(axis=0))), layout
 
 
-@pytest.mark.parametrize("name", ["vision", "vision_betaflight"])
+@mark.parametrize("name", ["vision", "vision_betaflight"])
 def test_nothing_but_keypoints_tells_of_goal_and_payload(name):
     columns, layout = changed(name)
     assert columns == set(layout.columns(*SEEN))
@@ -59,10 +60,10 @@ def test_what_an_estimator_adds_is_found():
 
 def test_validity_bits_are_the_cameras():
     shown, layout, valid = observations("vision", 3)
-    np.testing.assert_array_equal(shown[-1, layout.columns("validity")], valid)
+    assert_array_equal(shown[-1, layout.columns("validity")], valid)
     shown, layout, valid = observations("vision_located", 3)
     bits = shown[-1, layout.columns("validity")]
-    np.testing.assert_array_equal(bits[4:], valid[4:])
+    assert_array_equal(bits[4:], valid[4:])
     assert bits[:4].sum() >= valid[:4].sum()
 
 

@@ -2,7 +2,7 @@
 
 import json
 
-import pytest
+from pytest import approx, importorskip
 
 from visthrow import cli
 from visthrow.cli import compare
@@ -10,7 +10,7 @@ from visthrow.paper.baseline import spline, thrower
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import BATCH
 
-pytest.importorskip("piqp")
+importorskip("piqp")
 
 
 def test_units_are_cut_into_batches_on_reference_plants_alone():
@@ -26,7 +26,7 @@ def test_a_unit_knows_its_plant():
     light = thrower.unit("hybrid", "both", 2.0, 1, overrides=["vehicle.body.mass=0.2"])
     plain = thrower.unit("hybrid", "both", 2.0, 1)
     assert light["conditions"] != plain["conditions"]
-    assert plain["speed"] == pytest.approx(2.935)
+    assert plain["speed"] == approx(2.935)
     assert plain["w_t"] == spline.PlanParams().duration
 
 

@@ -5,7 +5,7 @@ plants, front and command.
 from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, importorskip, mark, raises
 
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError
@@ -25,7 +25,7 @@ from visthrow.task import Experiment, plant_of
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batch_plant, place_in_hover
 
-pytest.importorskip("piqp")
+importorskip("piqp")
 
 OWN_MODEL = 0.05
 """Landing error in the own model from random starts [m] (measured 0.01): the paper's best is 0.027.
@@ -41,12 +41,12 @@ CONDENSED = 1e-4
 """Of the first command against a dense solution of the same programme; the solver stops at 1e-6."""
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def experiment() -> Experiment:
     return config.load(Experiment, config.find("train", "state"))
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def plan(experiment):
     return plan_throw(
         pm.pendulum_of(plant_of(experiment)),
@@ -104,7 +104,7 @@ def test_commands_stay_within_bounds(plan):
     assert np.all(np.abs(command[1:]) <= np.array(params.max_rate) + 1e-6)
 
 
-@pytest.mark.parametrize(("below", "limit"), [(2.0, 3.5), (-2.0, 2.0)])
+@mark.parametrize(("below", "limit"), [(2.0, 3.5), (-2.0, 2.0)])
 def test_thrust_stops_at_its_limit(below, limit):
     model, params = pm.Pendulum(0.212, 0.06, 0.363), MPCParams(min_thrust=2.0, max_thrust=3.5)
     count = params.stages
@@ -112,7 +112,7 @@ def test_thrust_stops_at_its_limit(below, limit):
     start = states[0].copy()
     start[2] -= below
     command = MPC(model, params).step(start, (states, inputs[:count]))
-    assert command[0] == pytest.approx(limit, abs=1e-3)
+    assert command[0] == approx(limit, abs=1e-3)
 
 
 def test_the_sign_of_a_quaternion_does_not_matter(plan):
@@ -137,7 +137,7 @@ def test_own_model_throws_land_near_the_target(plan):
 
 
 def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment):
-    pytest.importorskip("mujoco")
+    importorskip("mujoco")
     flown, _ = _started("reference-realistic", experiment, 2.0, 0, 3, 5, "cpu")
     plant, rng = batch_plant(experiment, "reference-realistic", 2.0, 0, 3, 5)
     place_in_hover(plant, experiment, rng)
@@ -153,10 +153,10 @@ def test_delays_by_name(experiment):
     assert delays_of(experiment, "none") == Delays()
     assert delays_of(experiment, "release") == Delays(release=0.11)
     both = delays_of(experiment)
-    assert both.command == pytest.approx(0.022 + 0.008 + 0.033)
+    assert both.command == approx(0.022 + 0.008 + 0.033)
     instant = replace(experiment.vehicle, motor=replace(experiment.vehicle.motor, kind="instant"))
-    assert delays_of(replace(experiment, vehicle=instant)).command == pytest.approx(0.022 + 0.008)
-    with pytest.raises(ConfigError, match="did you mean 'delay'"):
+    assert delays_of(replace(experiment, vehicle=instant)).command == approx(0.022 + 0.008)
+    with raises(ConfigError, match="did you mean 'delay'"):
         delays_of(experiment, "delays")
 
 
@@ -166,7 +166,7 @@ def test_front_and_hypervolume_by_hand():
     """
     points = np.array([[3.0, 2.0], [1.0, 3.0], [2.0, 1.0], [5.0, 0.1]])
     assert pareto(points).tolist() == [1, 2, 3]
-    assert front.hypervolume(points, (4.0, 4.0)) == pytest.approx(7.0)
+    assert front.hypervolume(points, (4.0, 4.0)) == approx(7.0)
     assert front.hypervolume(np.empty((0, 2))) == 0.0
 
 

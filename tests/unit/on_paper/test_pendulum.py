@@ -1,7 +1,9 @@
 """The baseline's pendulum: conservation, closed forms, constraints, Jacobians."""
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 
 from sim.params import GRAVITY
 from tests.plants import paper_plant
@@ -25,9 +27,9 @@ and less).
 def random_states(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     state = rng.standard_normal((count, pm.STATES))
-    state[:, DIR] /= np.linalg.norm(state[:, DIR], axis=1, keepdims=True)
+    state[:, DIR] /= norm(state[:, DIR], axis=1, keepdims=True)
     state[:, RATE] -= (state[:, RATE] * state[:, DIR]).sum(1, keepdims=True) * state[:, DIR]
-    state[:, QUAT] /= np.linalg.norm(state[:, QUAT], axis=1, keepdims=True)
+    state[:, QUAT] /= norm(state[:, QUAT], axis=1, keepdims=True)
     return state, np.column_stack(
         [rng.uniform(0.5, 8.0, count), rng.uniform(-5.0, 5.0, (count, 3))]
     )
@@ -91,7 +93,7 @@ def test_small_swing_has_the_period_of_two_bodies():
     state[DIR] = [np.sin(angle), 0.0, -np.cos(angle)]
     omega = np.sqrt(9.81 * 0.27 / (0.21 * 0.36))
     half = roll(state, control, np.pi / omega, np.pi / omega / 400)
-    assert half[6] == pytest.approx(-angle, rel=1e-3)
+    assert half[6] == approx(-angle, rel=1e-3)
     assert abs(half[10]) < 1e-3 * angle * omega
 
 
@@ -118,16 +120,14 @@ def test_jacobians_are_those_of_the_step():
         assert np.allclose((ends[0] - ends[1]) / (2 * h), slope, atol=1e-7)
 
 
-@pytest.mark.parametrize(
-    "values", [(0.0, 0.06, 0.36), (0.2, -1.0, 0.36), (0.2, 0.06, float("nan"))]
-)
+@mark.parametrize("values", [(0.0, 0.06, 0.36), (0.2, -1.0, 0.36), (0.2, 0.06, float("nan"))])
 def test_impossible_pendulums_are_refused(values):
-    with pytest.raises(ValueError, match="expected more than 0"):
+    with raises(ValueError, match="expected more than 0"):
         Pendulum(*values)
 
 
 def test_arrays_of_another_width_are_refused():
-    with pytest.raises(ValueError, match="expected"):
+    with raises(ValueError, match="expected"):
         pm.step(MODEL, np.zeros(15), np.zeros(4), 0.02)
 
 
@@ -136,15 +136,15 @@ def test_the_pendulum_of_a_plant_has_half_of_the_rope_at_each_end():
     pendulum = pm.pendulum_of(plant)
     half = 0.5 * plant.rope.rope_mass
     assert half > 0.0
-    assert pendulum.vehicle_mass == pytest.approx(plant.vehicle.body.mass + half)
-    assert pendulum.payload_mass == pytest.approx(plant.rope.payload_mass + half)
-    assert pendulum.weight == pytest.approx(GRAVITY * plant.total_mass)
+    assert pendulum.vehicle_mass == approx(plant.vehicle.body.mass + half)
+    assert pendulum.payload_mass == approx(plant.rope.payload_mass + half)
+    assert pendulum.weight == approx(GRAVITY * plant.total_mass)
 
 
 def test_an_error_as_large_as_its_scale_costs_one():
     params = MPCParams()
     errors = [params.position, params.velocity, params.direction, params.rate, params.attitude]
     costs = params.state_weights * np.repeat(errors, [3, 3, 3, 3, 4]) ** 2
-    np.testing.assert_allclose(costs, 1.0)
+    assert_allclose(costs, 1.0)
     inputs = np.array([params.thrust, *[params.body_rate] * 3])
-    np.testing.assert_allclose(params.input_weights * inputs**2, 1.0)
+    assert_allclose(params.input_weights * inputs**2, 1.0)

@@ -1,7 +1,8 @@
 """The baseline's plan: projectile motion, septic spline, flatness, bounds."""
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from pytest import approx, fixture, mark, raises
 
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import FlightRecorder
@@ -26,7 +27,7 @@ OPEN_LOOP = 2e-3
 """
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def plan():
     return plan_throw(MODEL, 2.0, 1.13, 2.2, PlanParams(), 0.04, lag=0.11)
 
@@ -34,16 +35,16 @@ def plan():
 def test_the_release_lands_on_the_target():
     release = release_for(2.0, 1.13, 2.2, 0.04)
     point, time = landing_point(release.pos_w, release.vel_w, 0.04)
-    assert point == pytest.approx([2.0, 0.0])
-    assert time == pytest.approx(np.sqrt(2.0 * (1.13 - 0.04) / 9.81))
-    assert release.fall_time == pytest.approx(time)
+    assert point == approx([2.0, 0.0])
+    assert time == approx(np.sqrt(2.0 * (1.13 - 0.04) / 9.81))
+    assert release.fall_time == approx(time)
 
 
 def test_landing_by_hand():
     """Upwards at 2 m/s from 1 m to the ground: 4.905 t^2 - 2 t - 1 = 0, t = 0.69925 s."""
     point, time = landing_point(np.array([0.5, 0.1, 1.0]), np.array([3.0, -1.0, 2.0]), 0.0)
-    assert time == pytest.approx((2.0 + np.sqrt(4.0 + 19.62)) / 9.81)
-    assert point == pytest.approx([0.5 + 3.0 * time, 0.1 - time])
+    assert time == approx((2.0 + np.sqrt(4.0 + 19.62)) / 9.81)
+    assert point == approx([0.5 + 3.0 * time, 0.1 - time])
     assert np.isnan(landing_point(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.5]), 1.0)[1])
 
 
@@ -55,20 +56,20 @@ def test_release_is_read_off_a_flight():
             payload_pos_w=np.array([0.0, 0.0, height]),
             payload_vel_w=np.array([speed, 0.0, 0.0]),
         )
-    assert read_release(recorder.log()) == pytest.approx((1.1, 2.5))
-    with pytest.raises(ConfigError, match="let nothing go"):
+    assert read_release(recorder.log()) == approx((1.1, 2.5))
+    with raises(ConfigError, match="let nothing go"):
         read_release(FlightRecorder({"result": {"failure": "the vehicle tilted too far"}}).log())
 
 
 def test_defaults_lie_between_what_was_measured():
     near, middle, far = (default_release(x) for x in (1.5, 1.75, 2.0))
-    assert middle == pytest.approx(np.mean([near, far], axis=0))
+    assert middle == approx(np.mean([near, far], axis=0))
     assert default_release(0.5) == near
 
 
-@pytest.mark.parametrize(("height", "speed"), [(0.04, 2.0), (1.0, 0.0), (1.0, float("nan"))])
+@mark.parametrize(("height", "speed"), [(0.04, 2.0), (1.0, 0.0), (1.0, float("nan"))])
 def test_impossible_releases_are_refused(height, speed):
-    with pytest.raises(ConfigError, match="expected"):
+    with raises(ConfigError, match="expected"):
         release_for(2.0, height, speed, 0.04)
 
 
@@ -99,11 +100,11 @@ def test_plan_ends_in_the_release_on_the_grid_and_within_bounds(plan):
     end = plan.path.sample(np.array([plan.path.duration]))[0]
     assert np.allclose(end[:2], [plan.release.pos_w, plan.release.vel_w], atol=1e-9)
     latch = (plan.path.duration - 0.11) / 0.02
-    assert latch == pytest.approx(round(latch), abs=1e-9)
+    assert latch == approx(round(latch), abs=1e-9)
     path = plan.path.sample(np.arange(0.0, plan.path.duration, 0.005))
     bounds, soft = plan.params, 1.05  # soft bounds: a few per cent past them
-    assert np.linalg.norm(path[:, 1], axis=1).max() < soft * bounds.max_speed
-    assert np.linalg.norm(path[:, 2], axis=1).max() < soft * bounds.max_acceleration
+    assert norm(path[:, 1], axis=1).max() < soft * bounds.max_speed
+    assert norm(path[:, 2], axis=1).max() < soft * bounds.max_acceleration
     assert path[:, 0, 2].min() > bounds.floor
     states, inputs = plan.reference(0.0, 0.005, 150)
     assert np.all(pm.tension(MODEL, states[:-1], inputs) > 0.0)
@@ -121,11 +122,11 @@ def test_flat_inputs_flown_open_loop_stay_on_the_path(plan):
 
 
 def test_bad_plans_are_refused():
-    with pytest.raises(PlanError, match="horizontal"):
+    with raises(PlanError, match="horizontal"):
         sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([0.0, 0.0, 1.0]), PlanParams())
-    with pytest.raises(PlanError, match="beside the plane"):
+    with raises(PlanError, match="beside the plane"):
         sp.optimise(MODEL, np.zeros(3), np.ones(3), np.array([1.0, 0.0, 0.0]), PlanParams())
     falling = np.zeros((1, 6, 3))
     falling[0, 2, 2] = -9.81
-    with pytest.raises(PlanError, match="falls freely"):
+    with raises(PlanError, match="falls freely"):
         sp.flat_reference(MODEL, falling)

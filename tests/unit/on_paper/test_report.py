@@ -4,8 +4,8 @@ missing, and the page.
 
 import re
 
-import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, fixture
 
 from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
@@ -18,12 +18,12 @@ from visthrow.view import page
 from visthrow.view.parts import Grid, Picture, Text
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def full():
     return made_up.everything()
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def written(full, tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     sections = command.sections(full)
@@ -46,7 +46,7 @@ def only(*found) -> result_set.ResultSet:
 
 
 def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     parts = []
     for batch in (0, 1):
         one = made_up.policy(rng, "state", "state", "reference", 2.0, count=4)
@@ -95,7 +95,7 @@ def test_an_empty_book_says_everything_that_is_missing(tmp_path):
 
 
 def test_difference_of_vision_has_the_right_sign():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     near = made_up.policy(rng, "vision", "vision", "hybrid", 2.0, 0.01)
     far = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.05)
     (row,) = grids(throws.vision_section(only(near, far)))[0].rows
@@ -108,7 +108,7 @@ def test_ablation_ratio_bias_and_the_verdict():
     """Twice the spread is twice the error; a shift along the throw is told as overshoot; equal
     spread as no effect.
     """
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
 
     def trained(variant: str, spread: float, offset=(0.0, 0.0)) -> list[Result]:
         return [
@@ -136,7 +136,7 @@ def test_ablation_ratio_bias_and_the_verdict():
     )
     section = ablations.section(found)
     rows = {row[0]: row for row in grids(section)[0].rows}
-    assert float(rows["no motor lag"][5].split(" [")[0]) == pytest.approx(2.0, abs=0.15)
+    assert float(rows["no motor lag"][5].split(" [")[0]) == approx(2.0, abs=0.15)
     assert rows["no motor lag"][6].startswith("2.4 [")
     assert rows["rigid cable"][11] == "overshoots"
     assert rows["rigid cable"][12] == "undershoots"
@@ -146,7 +146,7 @@ def test_ablation_ratio_bias_and_the_verdict():
 
 
 def test_front_tells_honestly_who_beats_whom(full):
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     policy = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.02, duration=1.05)
 
     def told(**setting) -> str:
@@ -162,11 +162,11 @@ def test_front_tells_honestly_who_beats_whom(full):
 
 
 def test_hypervolume_of_one_setting_is_its_rectangle():
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     found = made_up.baseline(rng, "hybrid", "both", 2.0, 0.05, 1.5, speed=2.2)
     volume = trade.hypervolume([found])
     expected = (2.5 - found.of("duration").mean()) * (0.5 - found.of("error").mean())
-    assert volume.value == pytest.approx(expected)
+    assert volume.value == approx(expected)
     assert expected in volume
 
 

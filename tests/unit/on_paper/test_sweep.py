@@ -9,7 +9,7 @@ import sys
 import time
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, importorskip, mark, raises
 
 from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
@@ -47,7 +47,7 @@ allow = ["rope"]
 """
 
 
-@pytest.fixture
+@fixture
 def path(tmp_path):
     found = tmp_path / "list.toml"
     found.write_text(LIST)
@@ -178,7 +178,7 @@ class FakeRun:
         raise AssertionError("was asked to stop and did")
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def fast(monkeypatch):
     monkeypatch.setattr(pool, "POLL", 0.001)
     monkeypatch.setattr(pool, "BUSY_PAUSE", 0.01)
@@ -192,7 +192,7 @@ def run(path, out, minutes=None, **told):
 
 def test_a_task_is_told_how_many_minutes_are_left(path, tmp_path):
     starter, _ = run(path, tmp_path, minutes=9.0)
-    assert starter.minutes == pytest.approx(9.0, abs=0.5)
+    assert starter.minutes == approx(9.0, abs=0.5)
 
 
 def test_everything_is_done_once_and_no_more_at_once_than_there_is_room(path, tmp_path):
@@ -237,7 +237,7 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
     try:
         assert other.stdout.readline() == b"1\n"
         assert held(path)
-        with pytest.raises(BusyError, match=str(other.pid)), locked(path):
+        with raises(BusyError, match=str(other.pid)), locked(path):
             pass
         other.send_signal(signal.SIGKILL)
         other.wait()
@@ -252,7 +252,7 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
 
 
 def test_a_folder_in_which_nothing_is_done_makes_no_record(path, tmp_path):
-    with pytest.raises(
+    with raises(
         StorageError,
         match=r"nothing of the list .* is done there; expected what 'visthrow sweep run",
     ):
@@ -329,7 +329,7 @@ def test_status_and_mistakes_on_the_command_line(path, tmp_path, capsys):
     assert "the number of GPUs" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("outcome", "status"),
     [
         (pool.Outcome(), 0),
@@ -348,7 +348,7 @@ def test_the_status_of_a_sweep_says_how_it_ended(
     assert ("the same command goes on" in said) == outcome.stopped
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "words"),
     [
         ('runs.trained.throws=["onw"]', "did you mean 'own'"),
@@ -359,7 +359,7 @@ def test_the_status_of_a_sweep_says_how_it_ended(
     ],
 )
 def test_wrong_lists_are_refused(path, change, words):
-    with pytest.raises(ConfigError, match=words):
+    with raises(ConfigError, match=words):
         load_list(path, (change,))
 
 
@@ -378,7 +378,7 @@ def test_shipped_lists_name_what_exists():
 
 
 def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
-    utils = pytest.importorskip("submitit.core.utils")
+    utils = importorskip("submitit.core.utils")
     from collections import Counter
 
     from visthrow.paper.sweep import cluster
@@ -410,7 +410,7 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys)
     """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is
     said.
     """
-    pytest.importorskip("submitit")
+    importorskip("submitit")
     from visthrow.paper.sweep.cluster import Cluster
 
     words = [
@@ -443,5 +443,5 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys)
     script = (tmp_path / "script").read_text()
     for wanted in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
         assert wanted in script
-    with pytest.raises(ConfigError, match="partitoin"):
+    with raises(ConfigError, match="partitoin"):
         Cluster(path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partitoin": "gpu"})

@@ -1,9 +1,9 @@
 """What the simulators refuse, and that the message names what came, what was expected and where."""
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from pytest import mark, raises
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.structs import types
@@ -22,7 +22,7 @@ def changed(path: str, value) -> PlantParams:
     for name in names[:-1]:
         owners.append(getattr(owners[-1], name))
     for owner, name in zip(reversed(owners), reversed(names)):
-        value = dataclasses.replace(owner, **{name: value})
+        value = replace(owner, **{name: value})
     return value
 
 
@@ -56,19 +56,19 @@ PLANT = [
 ]
 
 
-@pytest.mark.parametrize(("path", "value", "message"), VEHICLE + PLANT)
+@mark.parametrize(("path", "value", "message"), VEHICLE + PLANT)
 def test_bad_plants_are_refused(path, value, message):
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         HybridSim(changed(path, value), 1)
 
 
-@pytest.mark.parametrize(("path", "value", "message"), VEHICLE)
+@mark.parametrize(("path", "value", "message"), VEHICLE)
 def test_bad_vehicles_are_refused_alone_too(path, value, message):
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         bare_quadrotor(changed(path, value).vehicle, 1)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("options", "message"),
     [
         ({"count": 0}, "0 environments; expected 1 or more"),
@@ -79,21 +79,21 @@ def test_bad_vehicles_are_refused_alone_too(path, value, message):
     ],
 )
 def test_bad_options_of_the_quadrotor(options, message):
-    with pytest.raises(ValueError, match=message):
+    with raises(ValueError, match=message):
         bare_quadrotor(paper_plant().vehicle, **{"count": 1, **options})
 
 
 def test_wrenches_and_engines_that_do_not_fit():
     plant = paper_plant()
-    with pytest.raises(ValueError, match="extension 'push'"):
+    with raises(ValueError, match="extension 'push'"):
         HybridSim(plant, 1).set_wrench(np.zeros((1, 3)), np.zeros((1, 3)))
     exchanged = changed("sim.solver", "exchanged_chain")
-    with pytest.raises(ValueError, match=r"without a rope in sim\.solver 'exchanged_chain'"):
+    with raises(ValueError, match=r"without a rope in sim\.solver 'exchanged_chain'"):
         HybridSim(exchanged, 1, without_rope="rk4")
 
 
 def test_a_batch_of_no_environments():
-    with pytest.raises(ValueError, match="0 environments; expected 1 or more"):
+    with raises(ValueError, match="0 environments; expected 1 or more"):
         HybridSim(paper_plant(), 0)
 
 
@@ -103,26 +103,26 @@ def test_other_kinds_of_blocks_in_one_batch():
     """
     other = changed("vehicle.aero.kind", "none").vehicle
     plant = paper_plant()
-    with pytest.raises(ValueError, match=r"'none'.*expected the same blocks"):
+    with raises(ValueError, match=r"'none'.*expected the same blocks"):
         HybridSim(plant, 2, vehicles=[plant.vehicle, other])
-    with pytest.raises(ValueError, match=r"'none'.*expected the same blocks"):
+    with raises(ValueError, match=r"'none'.*expected the same blocks"):
         bare_quadrotor(plant.vehicle, 2, vehicles=[plant.vehicle, other])
 
 
 def test_ropes_of_different_segments_in_one_batch():
     plant = paper_plant()
-    short = dataclasses.replace(plant.rope, segments=3)
-    with pytest.raises(ValueError, match=r"\[3, 15\] segments in one batch of 15"):
+    short = replace(plant.rope, segments=3)
+    with raises(ValueError, match=r"\[3, 15\] segments in one batch of 15"):
         HybridSim(plant, 2, ropes=[plant.rope, short])
 
 
 def test_no_tethers():
     z = config.load(TaskParams, config.find("task", "state")).start
-    with pytest.raises(ValueError, match="tether_variants 0"):
-        tether_lengths(paper_plant().rope, dataclasses.replace(z, tether_variants=0))
+    with raises(ValueError, match="tether_variants 0"):
+        tether_lengths(paper_plant().rope, replace(z, tether_variants=0))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("arguments", "message"),
     [
         ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\); expected \(3, 3\)"),
@@ -135,14 +135,12 @@ def test_no_tethers():
 )
 def test_shapes_of_poses(arguments, message):
     for sim in (HybridSim(paper_plant(), 3), bare_quadrotor(paper_plant().vehicle, 3)):
-        with pytest.raises(ValueError, match=message):
+        with raises(ValueError, match=message):
             sim.place(**arguments)
 
 
 def test_shape_of_the_cable():
-    with pytest.raises(
-        ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"
-    ):
+    with raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"):
         HybridSim(paper_plant(), 3).place(np.zeros((3, 3)), cable_dir_w=np.zeros((3, 14, 3)))
 
 
@@ -150,19 +148,19 @@ def test_shapes_of_commands():
     """Twelve numbers are no command of three environments just because they fit."""
     sim, quad = HybridSim(paper_plant(), 3), bare_quadrotor(paper_plant().vehicle, 3)
     for target in (sim, quad):
-        with pytest.raises(ValueError, match=r"command of shape \(4, 3\); expected \(3, 4\)"):
+        with raises(ValueError, match=r"command of shape \(4, 3\); expected \(3, 4\)"):
             target.set_command(np.zeros((4, 3)))
-    with pytest.raises(ValueError, match=r"release of shape \(2,\); expected \(3,\)"):
+    with raises(ValueError, match=r"release of shape \(2,\); expected \(3,\)"):
         sim.set_command(np.zeros((3, 4)), np.zeros(2))
-    with pytest.raises(ValueError, match=r"force_w of shape \(3,\); expected \(3, 3\)"):
+    with raises(ValueError, match=r"force_w of shape \(3,\); expected \(3, 3\)"):
         quad.set_wrench(np.zeros(3), np.zeros((3, 3)))
 
 
 def test_unknown_names():
     for sim in (HybridSim(paper_plant(), 1), bare_quadrotor(paper_plant().vehicle, 1)):
-        with pytest.raises(ValueError, match=r"no array 'position'; there are .*pos_w"):
+        with raises(ValueError, match=r"no array 'position'; there are .*pos_w"):
             sim.get("position")
-    with pytest.raises(ValueError, match="expected 'float32' or 'float64'"):
+    with raises(ValueError, match="expected 'float32' or 'float64'"):
         types("double")
 
 

@@ -1,9 +1,9 @@
 """Betaflight's settings as numbers of the rate controller's block."""
 
-import dataclasses
 import math
+from dataclasses import replace
 
-import pytest
+from pytest import approx, raises
 
 from sim.effects.firmware import calibrated_voltage, controller_of, left_out
 from tests.plants import paper_plant
@@ -33,30 +33,28 @@ def test_a_gain_is_the_torque_that_the_motors_make_of_it():
     c = controller_of(vehicle, SETTINGS, 0.66, vehicle.battery.reference_voltage)
     hover, step = math.sqrt(0.66 / 3.5), 0.352319e-3 * 0.945
     rise = 3.5 * ((hover + step) ** 2 - (hover - step) ** 2)
-    assert c.p_gain[0] * math.radians(1.0) == pytest.approx(
-        2.0 * rise * vehicle.rotors.y[0], rel=1e-6
-    )
-    assert c.p_gain[1] == pytest.approx(2.0 * c.p_gain[0], rel=1e-12)
-    assert c.p_gain[2] * math.radians(1.0) == pytest.approx(
+    assert c.p_gain[0] * math.radians(1.0) == approx(2.0 * rise * vehicle.rotors.y[0], rel=1e-6)
+    assert c.p_gain[1] == approx(2.0 * c.p_gain[0], rel=1e-12)
+    assert c.p_gain[2] * math.radians(1.0) == approx(
         2.0 * 45.0 / 11.0 * rise * vehicle.thrust.torque_ratio, rel=1e-6
     )
     # pid_init.c: an I of 1 is 0.244381 of 1000 a degree, about yaw 2.5 times that; P of 1 is
     # 0.032029 a degree a second.
-    assert c.i_gain[0] / c.p_gain[0] == pytest.approx(0.244381 * 20 / (0.032029 * 11))
-    assert c.i_gain[2] / c.p_gain[2] == pytest.approx(2.5 * 0.244381 * 80 / (0.032029 * 45))
-    assert c.gyro_time_constant == pytest.approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
-    assert c.min_thrust == pytest.approx(3.5 * 0.055**2)
-    assert c.gyro_share == pytest.approx([(1 / 250 + 1 / 500) / (1 / 250 + 1 / 500 + 1 / 150)] * 3)
+    assert c.i_gain[0] / c.p_gain[0] == approx(0.244381 * 20 / (0.032029 * 11))
+    assert c.i_gain[2] / c.p_gain[2] == approx(2.5 * 0.244381 * 80 / (0.032029 * 45))
+    assert c.gyro_time_constant == approx((1 / 250 + 1 / 500 + 1 / 150) / (2 * math.pi))
+    assert c.min_thrust == approx(3.5 * 0.055**2)
+    assert c.gyro_share == approx([(1 / 250 + 1 / 500) / (1 / 250 + 1 / 500 + 1 / 150)] * 3)
     c = controller_of(vehicle, SETTINGS | {"yaw_lowpass_hz": "300"}, 0.66, 11.1)
     both = 1 / 250 + 1 / 500 + 1 / 300
-    assert c.gyro_share[2] == pytest.approx(both / (1 / 250 + 1 / 500 + 1 / 150))
+    assert c.gyro_share[2] == approx(both / (1 / 250 + 1 / 500 + 1 / 150))
 
 
 def test_the_voltage_of_a_hover():
     vehicle = paper_plant().vehicle
     voltage = calibrated_voltage(vehicle, SETTINGS, 0.66, 0.36)
     thrust = 3.5 * ((0.055 + 0.945 * 0.36) * voltage / vehicle.battery.reference_voltage) ** 2
-    assert thrust == pytest.approx(0.66)
+    assert thrust == approx(0.66)
 
 
 def test_what_the_block_has_no_number_for_is_told():
@@ -66,7 +64,7 @@ def test_what_the_block_has_no_number_for_is_told():
 
 
 def test_settings_that_are_missing_are_named():
-    with pytest.raises(ValueError, match="iterm_relax_cutoff"):
+    with raises(ValueError, match="iterm_relax_cutoff"):
         controller_of(paper_plant().vehicle, {"rollPID": "1,2,3"}, 0.66, 15.0)
 
 
@@ -80,8 +78,5 @@ def test_the_switch_keeps_the_hover():
     plant = paper_plant()
     switched = SWITCHES["motor mixing"](Setting(plant)).plant.vehicle.controller
     assert switched.p_gain == plant.vehicle.controller.p_gain
-    assert switched.mix_thrust == pytest.approx(plant.total_mass * 9.81 / 4)
-    assert (
-        dataclasses.replace(switched, kind="betaflight").max_thrust
-        == plant.vehicle.controller.max_thrust
-    )
+    assert switched.mix_thrust == approx(plant.total_mass * 9.81 / 4)
+    assert replace(switched, kind="betaflight").max_thrust == plant.vehicle.controller.max_thrust

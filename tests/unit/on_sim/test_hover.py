@@ -5,7 +5,10 @@ swing, recovers.
 import itertools
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.random import default_rng
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, mark, raises
 
 from sim import params
 from visthrow.common.rotations import matrix_of_quat
@@ -75,7 +78,7 @@ class Pendulum:
         acceleration = load - LENGTH * (np.cross(turn, q) + np.cross(w, np.cross(w, q)))
         self.rope_rate_w = w + self.step * turn
         self.rope_w = q + self.step * np.cross(self.rope_rate_w, q)
-        self.rope_w /= np.linalg.norm(self.rope_w, axis=1, keepdims=True)
+        self.rope_w /= norm(self.rope_w, axis=1, keepdims=True)
         return acceleration
 
     @property
@@ -86,7 +89,7 @@ class Pendulum:
 
 def turned(quat: np.ndarray, angle_b: np.ndarray) -> np.ndarray:
     """Turn quaternions (E, 4), xyzw, by rotation vectors (E, 3) [rad] in the body frame."""
-    size = np.linalg.norm(angle_b, axis=1, keepdims=True)
+    size = norm(angle_b, axis=1, keepdims=True)
     v = angle_b * np.sinc(size / (2 * np.pi)) / 2
     w = np.cos(size[:, 0] / 2)
     vector = quat[:, 3:] * v + w[:, None] * quat[:, :3] + np.cross(quat[:, :3], v)
@@ -107,7 +110,7 @@ def fly(
         mass = plant.mass if told_mass is None else told_mass
         command = controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, mass, yaw)
         plant.advance(k * PERIOD, command)
-        distance = np.linalg.norm(plant.pos_w - GOAL, axis=1)
+        distance = norm(plant.pos_w - GOAL, axis=1)
         rows.append((distance, plant.swing.copy(), plant.pos_w[:, 2].copy()))
     return (PERIOD * np.arange(1, len(rows) + 1), *map(np.array, zip(*rows)))
 
@@ -139,7 +142,7 @@ def test_settles_from_half_a_metre_with_the_payload():
     assert swings[-50:].max() < 0.01
 
 
-@pytest.mark.parametrize("delay", [DELAY, DELAY + 0.02])
+@mark.parametrize("delay", [DELAY, DELAY + 0.02])
 def test_swing_is_damped_never_amplified(delay):
     start = 0.35
     times, distances, swings, _ = fly(Pendulum(GOAL, swing=start, delay=delay), 5.0)
@@ -157,7 +160,7 @@ def test_hover_without_the_payload_and_yaw_turns():
     times, distances, _, _ = fly(plant, 6.0, yaw=2.0)
     assert settled(times, distances[:, 0], 0.03) < 3.5
     rot_wb = matrix_of_quat(plant.quat_wb)[0]
-    assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == pytest.approx(2.0, abs=0.02)
+    assert np.arctan2(rot_wb[1, 0], rot_wb[0, 0]) == approx(2.0, abs=0.02)
 
 
 def test_integral_makes_up_for_a_wrong_mass():
@@ -173,7 +176,7 @@ def test_integral_makes_up_for_a_wrong_mass():
     assert without[-1, 0] > 0.05
 
 
-@pytest.mark.parametrize("pitch", [1.3, 2.8, np.pi])
+@mark.parametrize("pitch", [1.3, 2.8, np.pi])
 def test_recovers_after_a_release_at_any_attitude(pitch):
     quat = (0.0, np.sin(pitch / 2), 0.0, np.cos(pitch / 2))
     _, distances, _, heights = fly(
@@ -191,7 +194,7 @@ def test_far_goals_are_approached_at_the_speed_limit():
         plant.advance(
             k * PERIOD, controller.step(plant.pos_w, plant.quat_wb, plant.vel_w, GOAL, plant.mass)
         )
-    assert plant.vel_w[0, 0] == pytest.approx(params.max_speed, rel=0.05)
+    assert plant.vel_w[0, 0] == approx(params.max_speed, rel=0.05)
 
 
 def test_commands_by_hand():
@@ -199,7 +202,7 @@ def test_commands_by_hand():
     level = np.array([[0.0, 0.0, 0.0, 1.0]])
     still = np.zeros((1, 3))
     hover = controller.step(still, level, still, still, 0.27)
-    np.testing.assert_allclose(hover, [[0.27 * GRAVITY, 0, 0, 0]], atol=1e-12)
+    assert_allclose(hover, [[0.27 * GRAVITY, 0, 0, 0]], atol=1e-12)
     # Goal ahead (+x): lean forward, a positive turn about y (left). Goal to the left (+y): a
     # negative turn about x.
     assert controller.step(still, level, still, np.array([1.0, 0, 0]), 0.27)[0, 2] > 0.5
@@ -208,10 +211,10 @@ def test_commands_by_hand():
     # 0.1 m above the goal, integral aside: velocity asked -0.15 m/s, acceleration -0.525 m/s^2.
     low = controller.step(np.array([[0, 0, 0.1]]), level, still, still, 1.0)[0, 0]
     step_of_integral = 3.0 * PERIOD * 0.1
-    assert low == pytest.approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
+    assert low == approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
 
 
-@pytest.mark.parametrize("axis", range(3))
+@mark.parametrize("axis", range(3))
 def test_the_integral_is_limited_alike_both_ways(axis):
     """A vehicle that is held beside its goal for long: mirrored, the same push."""
     level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
@@ -223,12 +226,12 @@ def test_the_integral_is_limited_alike_both_ways(axis):
             command = controller.step(still, level, still, goal, 0.27)[0]
         pushes.append(command - [0.27 * GRAVITY, 0.0, 0.0, 0.0])
     assert np.abs(pushes[0]).max() > 0.05
-    np.testing.assert_allclose(pushes[0], -pushes[1], atol=1e-9)
+    assert_allclose(pushes[0], -pushes[1], atol=1e-9)
 
 
 def test_limits_hold_for_any_state():
     params = HoverParams()
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     count = 1000
     quats = rng.normal(size=(count, 4))
     quats[0] = (1.0, 0.0, 0.0, 0.0)  # upside down exactly
@@ -248,7 +251,7 @@ def test_limits_hold_for_any_state():
 
 
 def test_a_batch_equals_singles_and_reset_is_masked():
-    rng = np.random.default_rng(1)
+    rng = default_rng(1)
     state = rng.normal(size=(4, 3)), rng.normal(size=(4, 4)), rng.normal(size=(4, 3))
     goal = state[0] + 0.1
     batch = HoverController(HoverParams(), PERIOD, 4)
@@ -259,15 +262,15 @@ def test_a_batch_equals_singles_and_reset_is_masked():
             one.step(*(part[i : i + 1] for part in state), goal[i], 0.27)
             for i, one in enumerate(singles)
         ]
-        np.testing.assert_array_equal(together, np.concatenate(alone))
+        assert_array_equal(together, np.concatenate(alone))
     batch.reset(np.array([True, False, False, False]))
     fresh = HoverController(HoverParams(), PERIOD, 4).step(*state, goal, 0.27)
     after = batch.step(*state, goal, 0.27)
-    np.testing.assert_array_equal(after[0], fresh[0])
+    assert_array_equal(after[0], fresh[0])
     assert not np.array_equal(after[1:], fresh[1:])
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "wrong",
     [
         {"position_gain": -1.0},
@@ -277,9 +280,9 @@ def test_a_batch_equals_singles_and_reset_is_masked():
     ],
 )
 def test_nonsense_parameters_are_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with raises(ValueError, match=next(iter(wrong))):
         HoverParams(**wrong)
-    with pytest.raises(ValueError, match="period"):
+    with raises(ValueError, match="period"):
         HoverController(HoverParams(), 0.0)
 
 

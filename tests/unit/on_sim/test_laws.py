@@ -3,8 +3,9 @@ says.
 """
 
 import numpy as np
-import pytest
 import warp as wp
+from numpy.linalg import norm
+from pytest import approx, mark, raises
 
 from sim.kernels import laws
 from sim.kernels.laws import BLOCKS, check_laws, names
@@ -26,10 +27,10 @@ def knots(seed: int = 0) -> dict[str, np.ndarray]:
         "pos_w": rng.normal(size=3),
         "vel_w": rng.normal(size=3),
         "rate_b": rng.normal(size=3),
-        "quat_wb": quat / np.linalg.norm(quat),
+        "quat_wb": quat / norm(quat),
         "payload_vel_w": rng.normal(size=3),
         "payload_pos_w": rng.normal(size=3),
-        "cable_dir_w": cable / np.linalg.norm(cable),
+        "cable_dir_w": cable / norm(cable),
         "tension": 0.7,
         "mount_b": rng.normal(size=3),
     }
@@ -80,7 +81,7 @@ def test_factors_are_the_grammars():
     known = grammar.KnotValues(k)
     assert set(scalars) == set(grammar.SCALARS)
     for name, factor in grammar.SCALARS.items():
-        assert scalars[name] == pytest.approx(factor.read(known)[0], rel=1e-12), name
+        assert scalars[name] == approx(factor.read(known)[0], rel=1e-12), name
     assert set(vectors) == set(BLOCKS) == set(grammar.VECTORS)
     for block, of in grammar.VECTORS.items():
         assert set(vectors[block]) == set(of), block
@@ -103,7 +104,7 @@ def test_laws_are_part_of_the_configuration():
     assert config.loads(Experiment, config.dumps(experiment)) == experiment
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "law",
     [
         LawParams("payload force", ("no_such",), "cable", 1.0),
@@ -112,7 +113,7 @@ def test_laws_are_part_of_the_configuration():
     ],
 )
 def test_laws_that_are_none_are_refused(law):
-    with pytest.raises(ValueError, match="expected a block"):
+    with raises(ValueError, match="expected a block"):
         check_laws((law,))
-    with pytest.raises(ValueError, match="at most"):
+    with raises(ValueError, match="at most"):
         check_laws((SWIRL,) * 5)

@@ -2,11 +2,12 @@
 from the states.
 """
 
-import dataclasses
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import pytest
+from numpy.testing import assert_allclose
+from pytest import mark
 from scipy.stats import kstest
 
 from sim.hybrid import HybridSim, tether_lengths
@@ -30,7 +31,7 @@ def spreads():
 
 @lru_cache
 def started(**changes: float) -> HybridSim:
-    plant, start = paper_plant(), dataclasses.replace(spreads(), **changes)
+    plant, start = paper_plant(), replace(spreads(), **changes)
     sim = HybridSim(plant, COUNT, seed=5, ropes=tether_lengths(plant.rope, start))
     sim.randomize(start)
     return sim
@@ -59,7 +60,7 @@ def test_the_file_holds_the_numbers_of_the_paper():
     assert (z.cable_angle_deg, z.cable_rate_deg, z.goal_radius) == (15.0, 15.0, 2.0)
 
 
-@pytest.mark.parametrize("axis", range(3))
+@mark.parametrize("axis", range(3))
 def test_position_velocity_and_rates(axis):
     sim, z = started(), spreads()
     home = np.array([0.0, 0.0, z.spawn_height])[axis]
@@ -75,7 +76,7 @@ def test_position_velocity_and_rates(axis):
 def test_attitude():
     """Roll, pitch and yaw of the rotation Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z, w = sim_quat = started().get("quat_wb").astype(float).T
-    np.testing.assert_allclose(np.linalg.norm(sim_quat, axis=0), 1.0, atol=1e-6)
+    assert_allclose(np.linalg.norm(sim_quat, axis=0), 1.0, atol=1e-6)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(2 * (w * y - z * x))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -108,7 +109,7 @@ def test_cable_hangs_yawed_then_rolled():
     rebuilt = np.stack(
         (-np.sin(azimuth) * np.sin(tilt), np.cos(azimuth) * np.sin(tilt), -np.cos(tilt)), -1
     )
-    np.testing.assert_allclose(rebuilt, down, atol=1e-6)
+    assert_allclose(rebuilt, down, atol=1e-6)
     assert_uniform(np.degrees(tilt), -bound, bound)
     assert_uniform(np.degrees(azimuth[np.abs(tilt) > 0.01]), -bound, bound)
 
@@ -116,7 +117,7 @@ def test_cable_hangs_yawed_then_rolled():
 def test_a_cable_of_any_yaw_swings_fore_and_aft_as_far_as_sideways():
     down = cable_angles(cable_yaw_deg=180.0)[2]
     fore, side = np.abs(down[:, :2]).mean(0)
-    np.testing.assert_allclose(fore, side, rtol=0.1)
+    assert_allclose(fore, side, rtol=0.1)
     narrow = np.abs(cable_angles()[2][:, :2]).mean(0)
     assert narrow[0] < 0.2 * narrow[1]
 
@@ -181,7 +182,7 @@ def test_every_reset_draws_anew():
 
 def test_without_spreads_the_start_is_exact():
     names = ("position", "velocity", "attitude_deg", "rate_deg")
-    still = dataclasses.replace(
+    still = replace(
         spreads(),
         mass=0.0,
         cable_angle_deg=0.0,
@@ -192,9 +193,9 @@ def test_without_spreads_the_start_is_exact():
     )
     sim = HybridSim(paper_plant(), 2)
     sim.randomize(still)
-    np.testing.assert_allclose(sim.get("pos_w"), [[0.0, 0.0, still.spawn_height]] * 2, atol=1e-7)
-    np.testing.assert_allclose(sim.get("quat_wb"), [[0.0, 0.0, 0.0, 1.0]] * 2, atol=1e-7)
-    np.testing.assert_allclose(sim.get("cable_dir_w")[:, 0], [[0.0, 0.0, -1.0]] * 2, atol=1e-7)
+    assert_allclose(sim.get("pos_w"), [[0.0, 0.0, still.spawn_height]] * 2, atol=1e-7)
+    assert_allclose(sim.get("quat_wb"), [[0.0, 0.0, 0.0, 1.0]] * 2, atol=1e-7)
+    assert_allclose(sim.get("cable_dir_w")[:, 0], [[0.0, 0.0, -1.0]] * 2, atol=1e-7)
     assert not np.any(sim.get("vel_w"))
     assert not np.any(sim.get("cable_vel_w"))
-    np.testing.assert_allclose(sim.goal_w.numpy(), 0.0)
+    assert_allclose(sim.goal_w.numpy(), 0.0)

@@ -2,10 +2,12 @@
 see each other.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
+from numpy.linalg import norm
+from numpy.testing import assert_allclose
+from pytest import fixture, raises
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting, generalised
@@ -24,14 +26,14 @@ def plant():
     both simulators alike.
     """
     base = paper_plant()
-    return dataclasses.replace(base, sim=dataclasses.replace(base.sim, precision="float64"))
+    return replace(base, sim=replace(base.sim, precision="float64"))
 
 
 def one(value):
     return np.array([value])
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flight():
     """A flight of the simulator: start, commands, and states at the ends of the periods."""
     sim = HybridSim(plant(), 1, extensions=EVERYTHING)
@@ -151,11 +153,9 @@ def test_commands_switch_where_they_should(flight):
     """
     late = [0.0, 2e-4, 2e-3]
     plants = [
-        dataclasses.replace(
+        replace(
             plant(),
-            vehicle=dataclasses.replace(
-                plant().vehicle, queue=dataclasses.replace(plant().vehicle.queue, delay=0.022 + x)
-            ),
+            vehicle=replace(plant().vehicle, queue=replace(plant().vehicle.queue, delay=0.022 + x)),
         )
         for x in late
     ]
@@ -171,22 +171,17 @@ def test_release_falls_between_steps(flight):
     before = seen["payload"][:, 0]
     assert len(before) == np.count_nonzero(stamps <= 0.5)
     lags = [0.1037, 0.1038]
-    plants = [
-        dataclasses.replace(plant(), release=dataclasses.replace(plant().release, lag=x))
-        for x in lags
-    ]
+    plants = [replace(plant(), release=replace(plant().release, lag=x)) for x in lags]
     ends = replay(flight, plants, count=2, plant=np.arange(2), keep=np.array([0, 0]))[1].ends
     shift = ends["payload_pos_w"][1] - ends["payload_pos_w"][0]
-    assert 0.0 < np.linalg.norm(shift) < 1e-3
-    half = [
-        dataclasses.replace(plants[0], release=dataclasses.replace(plant().release, lag=0.10375))
-    ]
+    assert 0.0 < norm(shift) < 1e-3
+    half = [replace(plants[0], release=replace(plant().release, lag=0.10375))]
     middle = replay(flight, half, keep=0)[1].ends["payload_pos_w"][0] - ends["payload_pos_w"][0]
-    np.testing.assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
+    assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
 
 
 def test_lanes_do_not_see_each_other(flight):
-    heavy = dataclasses.replace(plant(), rope=dataclasses.replace(plant().rope, payload_mass=0.08))
+    heavy = replace(plant(), rope=replace(plant().rope, payload_mass=0.08))
     rows = np.array([0, 1, 0, 1, 1, 0, 0])
     seen, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
     for i, row in enumerate(rows):
@@ -240,13 +235,13 @@ def test_sensors(flight):
     attitude = Rotation.from_quat(nearest) * Rotation.from_rotvec(ideal["turn"][at[:n], 0])
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
     wanted = 1.01 * frame.apply(ideal["pos"][at[:n], 0] + attitude.apply(x.marker_offset))
-    np.testing.assert_allclose(seen["pos"][:, 0], wanted, atol=1e-9)
+    assert_allclose(seen["pos"][:, 0], wanted, atol=1e-9)
     turn = (true_quat.inv() * frame * attitude * marker).as_rotvec()
-    np.testing.assert_allclose(seen["turn"][:, 0], turn, atol=1e-9)
+    assert_allclose(seen["turn"][:, 0], turn, atol=1e-9)
     m = len(seen["payload"])
     wanted = 1.01 * frame.apply(ideal["payload"][at[n : n + m], 0] + np.array(x.payload_offset))
-    np.testing.assert_allclose(seen["payload"][:, 0], wanted, atol=1e-9)
-    np.testing.assert_allclose(
+    assert_allclose(seen["payload"][:, 0], wanted, atol=1e-9)
+    assert_allclose(
         seen["rate"][:, 0] - ideal["rate"][at[2 * n :], 0], np.tile(x.gyro_bias, (n, 1)), atol=1e-9
     )
 
@@ -267,17 +262,17 @@ def test_rope_that_leaves_falls_with_the_payload(flight):
     """The centre of mass of payload and loose rope is a projectile; the payload, which the rope
     tugs at, is not.
     """
-    tail = dataclasses.replace(plant(), release=dataclasses.replace(plant().release, rope_tail=1.0))
+    tail = replace(plant(), release=replace(plant().release, rope_tail=1.0))
     early, late = (
         replay(flight, [tail], keep=0, stamps=np.array([0.4]), end=end)[1].ends
         for end in (0.56, 0.78)
     )
     fallen = 0.22 * np.array([0.0, 0.0, -9.81])
-    np.testing.assert_allclose(com_velocity(late) - com_velocity(early), fallen, atol=1e-9)
-    assert np.linalg.norm(late["payload_vel_w"][0] - early["payload_vel_w"][0] - fallen) > 1e-4
+    assert_allclose(com_velocity(late) - com_velocity(early), fallen, atol=1e-9)
+    assert norm(late["payload_vel_w"][0] - early["payload_vel_w"][0] - fallen) > 1e-4
 
 
 def test_mixed_segments_are_refused():
-    rigid = dataclasses.replace(plant(), rope=dataclasses.replace(plant().rope, segments=1))
-    with pytest.raises(ValueError, match="one number of segments"):
+    rigid = replace(plant(), rope=replace(plant().rope, segments=1))
+    with raises(ValueError, match="one number of segments"):
         Replay([plant(), rigid], [SensingParams()] * 2)

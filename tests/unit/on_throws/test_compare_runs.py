@@ -5,7 +5,7 @@ throws, wrong folders.
 import json
 
 import numpy as np
-import pytest
+from pytest import approx, raises
 
 from hil.control.recording.run_report import finish
 from tests.hil_runs import record_run, saved_policy
@@ -57,9 +57,9 @@ def test_a_row_a_policy_and_target():
     assert (at_15.target, at_2.target) == (1.5, 2.0)
     found = at_2.summary()
     assert (found["throws"], found["success"]) == (4, 0.75)
-    assert found["error_mean"] == pytest.approx(0.5 / 3)
-    assert found["bias_x"] == pytest.approx(0.1)
-    assert at_15.summary()["bias_y"] == pytest.approx(0.2)
+    assert found["error_mean"] == approx(0.5 / 3)
+    assert found["bias_x"] == approx(0.1)
+    assert at_15.summary()["bias_y"] == approx(0.2)
     assert first.throws[0].summary()["throws"] == 0, "the state policy did not throw at 1.5 m"
 
 
@@ -78,7 +78,7 @@ def test_two_policies_of_one_name_are_told_apart():
 
 
 def test_smoothness_is_that_of_simulated_throws():
-    assert from_runs.smoothness(log()) == pytest.approx(0.1)
+    assert from_runs.smoothness(log()) == approx(0.1)
 
 
 def test_the_command(tmp_path, capsys):
@@ -103,7 +103,7 @@ def test_the_command(tmp_path, capsys):
     }
     rows = json.loads((tmp_path / "t.json").read_text())["rows"]
     flown = next(row for row in rows if row["policy"] == "always")
-    assert flown["error_mean"] == pytest.approx(2.0, abs=0.02)
+    assert flown["error_mean"] == approx(2.0, abs=0.02)
     assert isinstance(
         from_runs.entries([FlightLog.load(folder / "throw-01.npz")])[0].throws[0], Throws
     )
@@ -113,15 +113,13 @@ def test_what_holds_no_throws(tmp_path, capsys):
     assert main(["compare", "--from", str(tmp_path / "none")]) == 2
     assert "no such folder" in capsys.readouterr().err
     (tmp_path / "summary.json").write_text("{}")
-    with pytest.raises(
-        LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"
-    ):
+    with raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
         from_runs.logs_of([tmp_path])
     (tmp_path / "ticks.jsonl").write_text('{"n": 0, "state": "ready"}\n')
-    with pytest.raises(LogError, match="No throw was begun in this run"):
+    with raises(LogError, match="No throw was begun in this run"):
         from_runs.logs_of([tmp_path])
     bare = FlightLog({}, {"policy": "x"})
-    with pytest.raises(LogError, match="holds no throw of a run"):
+    with raises(LogError, match="holds no throw of a run"):
         from_runs.entries([bare])
     assert main(["compare", "vision", "--from", str(tmp_path)]) == 2
     assert "the runs say which policies" in capsys.readouterr().err

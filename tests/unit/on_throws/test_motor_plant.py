@@ -1,7 +1,7 @@
 """The vehicle that a firmware flies: its stand, its rotors, what its sensors show."""
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from visthrow.throws.wire_plant import GRAVITY, make_motors
 
@@ -12,7 +12,7 @@ FULL = 3.5
 """Thrust of a rotor at full command and that voltage [N]."""
 
 
-@pytest.fixture(params=["vision", "vision_betaflight"])
+@fixture(params=["vision", "vision_betaflight"])
 def plant(request):
     """The paper's vehicle: by its own controller's full thrust, and by that of a firmware's at the
     voltage of its calibration.
@@ -35,8 +35,8 @@ def test_it_stands_until_its_rotors_carry_it(plant):
     weight = plant.mass[0] * GRAVITY
     fly(plant, command_for(plant, 0.7 * weight), 1.0)
     assert plant.held
-    assert plant.state["pos_w"] == pytest.approx(start)
-    assert plant.force_b == pytest.approx([0.0, 0.0, GRAVITY])
+    assert plant.state["pos_w"] == approx(start)
+    assert plant.force_b == approx([0.0, 0.0, GRAVITY])
     fly(plant, command_for(plant, 1.1 * weight), 0.5)
     assert not plant.held
     assert plant.state["vel_w"][2] > 0.0
@@ -52,12 +52,12 @@ def test_thrust_goes_with_the_square_of_the_command_and_is_what_the_acceleromete
     fly(plant, 1.5 * command_for(plant, weight), 0.15)
     assert plant.look()["motor_speed"].mean() > slow
     thrust = (plant.look()["motor_speed"] ** 2).sum() * FULL / 4000.0**2
-    assert plant.force_b[2] * plant.mass[0] == pytest.approx(
+    assert plant.force_b[2] * plant.mass[0] == approx(
         thrust, rel=0.12
     )  # inflow and drag take their share
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("more", "axis", "sign"),
     [((1, 0, 1, 0), 0, 1.0), ((0, 0, 1, 1), 1, 1.0), ((1, 0, 0, 1), 2, 1.0)],
     ids=["left rolls right", "rear pitches the nose down", "clockwise rotors yaw left"],
@@ -77,7 +77,7 @@ def test_the_ball_separates_the_mechanisms_lag_after_the_latch(plant):
     asked = plant.time
     for _ in range(60):
         plant.step(np.full(4, hover), True)
-    assert plant.landing["separation_time"] - asked == pytest.approx(0.06, abs=1e-6)
+    assert plant.landing["separation_time"] - asked == approx(0.06, abs=1e-6)
 
 
 def test_it_stands_on_the_ground_it_came_down_to_and_takes_off_again(plant):
@@ -87,8 +87,8 @@ def test_it_stands_on_the_ground_it_came_down_to_and_takes_off_again(plant):
     assert plant.held
     assert plant.touchdown > 1.0
     height = plant.state["pos_w"][2]
-    assert height == pytest.approx(0.08)
+    assert height == approx(0.08)
     assert plant.state["payload_pos_w"][2] >= 0.033
-    assert plant.force_b == pytest.approx([0.0, 0.0, GRAVITY])
+    assert plant.force_b == approx([0.0, 0.0, GRAVITY])
     fly(plant, command_for(plant, 1.2 * plant.weight), 0.5)
     assert plant.state["pos_w"][2] > height + 0.05

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import pytest
+from pytest import approx, mark, raises
 
 from visthrow.common.errors import StorageError
 from visthrow.throws import results
@@ -44,8 +44,8 @@ def test_result_survives_its_file(tmp_path):
     assert again.extra == {"n": 1}
     assert again.good.tolist() == [True, True, False]
     assert np.isnan(again.columns["error"][2])
-    assert again.of("error") == pytest.approx([0.1, 0.1235])
-    assert again.miss == pytest.approx(np.array([[0.1, 0.0], [-0.1, 0.2]]))
+    assert again.of("error") == approx([0.1, 0.1235])
+    assert again.miss == approx(np.array([[0.1, 0.0], [-0.1, 0.2]]))
 
 
 def test_batches_are_joined_in_order_and_moving_goals_count():
@@ -58,8 +58,8 @@ def test_batches_are_joined_in_order_and_moving_goals_count():
     made.append(results.Result({**unit(), "batch": 1, "throws": 2}, columns(9)))
     moving, whole = results.join(made)
     assert whole.unit == {**unit(), "throws": 6}
-    assert whole.columns["error"][[1, 4]] == pytest.approx([0.1234567, 1.1234567])
-    assert moving.miss == pytest.approx(np.array([[0.0, -0.1], [-0.1, 0.0]]))
+    assert whole.columns["error"][[1, 4]] == approx([0.1234567, 1.1234567])
+    assert moving.miss == approx(np.array([[0.0, -0.1], [-0.1, 0.0]]))
 
 
 def test_packed_record_does_not_depend_on_the_order(tmp_path):
@@ -70,11 +70,11 @@ def test_packed_record_does_not_depend_on_the_order(tmp_path):
     assert set(results.load_all([tmp_path / "a"])) == {r.key for r in made}
 
 
-@pytest.mark.parametrize("text", ["", "[1]", '{"results": [{"unit": 1}]}', '{"unit": {}}'])
+@mark.parametrize("text", ["", "[1]", '{"results": [{"unit": 1}]}', '{"unit": {}}'])
 def test_a_file_that_is_no_record_is_named(tmp_path, text):
     path = tmp_path / "x.json"
     path.write_text(text)
-    with pytest.raises(StorageError, match=r"x\.json; expected throws"):
+    with raises(StorageError, match=r"x\.json; expected throws"):
         results.load(path)
 
 
@@ -89,7 +89,7 @@ def test_work_does_only_what_is_missing(tmp_path):
     known = {results.key_of(unit(1)): results.Result(unit(1), columns(1))}
     found = results.work([unit(0), unit(1), unit(2), unit(2)], tmp_path, function, known)
     assert calls == [0, 2]
-    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == pytest.approx(
+    assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == approx(
         [0.1235, 1.1235, 2.1235], abs=1e-4
     )
 

@@ -1,15 +1,17 @@
 """Plants, flights, the protocol on the reference plant, and the commands that fly and compare."""
 
 import csv
-import dataclasses
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pytest
 import torch
+from numpy.linalg import norm
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture, importorskip, mark, raises
 from scipy.integrate import solve_ivp
 
 from sim.params import GRAVITY
@@ -50,14 +52,14 @@ def dropping_policy(name: str = "state", release: float = 1.0, overrides=()) -> 
     return Policy((torch.zeros(5, width),), (bias,), "relu", contract, made_by)
 
 
-@pytest.fixture
+@fixture
 def dropper(tmp_path):
     path = tmp_path / "dropper.npz"
     dropping_policy().save(path)
     return path
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(tmp_path_factory) -> FlightLog:
     path = tmp_path_factory.mktemp("policies") / "dropper.npz"
     dropping_policy().save(path)
@@ -67,7 +69,7 @@ def flown(tmp_path_factory) -> FlightLog:
 def test_loose_rope_keeps_its_links_and_its_energy():
     rng = np.random.default_rng(0)
     links = np.column_stack((rng.normal(0, 0.3, 8), rng.normal(0, 0.3, 8), -np.ones(8)))
-    links *= 0.03 / np.linalg.norm(links, axis=1, keepdims=True)
+    links *= 0.03 / norm(links, axis=1, keepdims=True)
     points = np.vstack((np.zeros(3), np.cumsum(links, axis=0)))
     ball = points[-1] + links[-1]
     turn = np.cross([0.0, 6.0, 2.0], points - ball)  # a rigid turn stretches no link
@@ -76,10 +78,10 @@ def test_loose_rope_keeps_its_links_and_its_energy():
     energy = np.sum(rope.velocity_w**2)
     rope.fly(0.5)
     ends = rope.points_w(np.zeros(3))
-    lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
+    lengths = norm(np.diff(ends, axis=0), axis=1)
     assert np.abs(lengths - 0.03).max() < LINK_ERROR
     assert abs(np.sum(rope.velocity_w**2) / energy - 1.0) < ENERGY_DRIFT
-    assert np.linalg.norm(ends[0] - (points[0] - ball)) > 0.1, "it must have turned"
+    assert norm(ends[0] - (points[0] - ball)) > 0.1, "it must have turned"
 
 
 def test_loose_rope_ends_on_the_ground():
@@ -91,7 +93,7 @@ def test_loose_rope_ends_on_the_ground():
     resting = rope.points_w(np.array([0.0, 0.0, 0.04]))
     assert resting[:-1, 2].min() > 0.0
     assert resting[0, 2] < 0.02
-    assert np.linalg.norm(rope.velocity_w, axis=1).max() < 0.2
+    assert norm(rope.velocity_w, axis=1).max() < 0.2
 
 
 def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
@@ -107,14 +109,14 @@ def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
         expected = before.payload_pos_w + 0.02 * 0.5 * (before.payload_vel_w + now.payload_vel_w)
         airborne = ~plant.landing.landed
         assert np.abs(now.payload_pos_w - expected)[airborne].max() < JOIN
-        gap = np.linalg.norm(now.cable_points_w[:, -1] - now.payload_pos_w, axis=1)
+        gap = norm(now.cable_points_w[:, -1] - now.payload_pos_w, axis=1)
         assert np.abs(gap - experiment.rope.payload_offset).max() < JOIN
         before = now
     landing = plant.landing
     assert landing.landed.tolist() == [True, False]
-    assert landing.separation_time[0] == pytest.approx(experiment.release.lag, abs=1e-6)
-    np.testing.assert_allclose(now.payload_pos_w[0], landing.point_w[0])
-    assert landing.point_w[0, 2] == pytest.approx(experiment.release.landing_height, abs=1e-5)
+    assert landing.separation_time[0] == approx(experiment.release.lag, abs=1e-6)
+    assert_allclose(now.payload_pos_w[0], landing.point_w[0])
+    assert landing.point_w[0, 2] == approx(experiment.release.landing_height, abs=1e-5)
     assert np.isnan(landing.time[1])
     assert now.attached.tolist() == [False, True]
 
@@ -125,39 +127,39 @@ MEASURED_VECTORS = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
 def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
     """A vehicle that is told not to turn turns as fast as its bias says."""
     experiment = config.load(Experiment, config.find("train", "state"))
-    quiet = dataclasses.replace(experiment.task.noise, command_bias=0.0, command_step=0.0)
+    quiet = replace(experiment.task.noise, command_bias=0.0, command_step=0.0)
     weight = GRAVITY * plant_of(experiment).total_mass
-    still = dataclasses.replace(experiment.task.start, rate_deg=(0.0, 0.0, 0.0))
+    still = replace(experiment.task.start, rate_deg=(0.0, 0.0, 0.0))
     spreads = []
     for bias in (0.0, 0.03):
-        noise = dataclasses.replace(quiet, command_bias=bias)
+        noise = replace(quiet, command_bias=bias)
         plant = HybridPlant(experiment, 400, noise=noise, start=still)
         for _ in range(15):
             plant.step(np.tile([weight, 0.0, 0.0, 0.0], (400, 1)))
         spreads.append(plant.state.rate_b[:, 2].std() / experiment.task.action.max_rate[2])
     assert spreads[0] < 0.005
-    assert spreads[1] == pytest.approx(0.03, rel=0.15)
+    assert spreads[1] == approx(0.03, rel=0.15)
 
 
 def test_a_payload_flies_under_drag_side_force_lift_and_wind():
     """Against scipy's integrator: drag against the air, side force to its left, lift up."""
     plant = plant_of(config.load(Experiment, config.find("train", "state")))
     mass = plant.rope.payload_mass
-    rope = dataclasses.replace(plant.rope, payload_drag=0.05, payload_side=0.02, payload_lift=0.03)
+    rope = replace(plant.rope, payload_drag=0.05, payload_side=0.02, payload_lift=0.03)
     wind = np.array([1.0, -2.0, 0.5])
     pos, vel, time = np.array([0.0, 0.0, 2.0]), np.array([3.0, 1.0, 2.0]), 0.7
 
     def derivative(_, state):
         air = state[3:] - wind
         left = np.array([-air[1], air[0], 0.0])
-        upward = np.cross(air, left / np.linalg.norm(left))
-        force = np.linalg.norm(air) * (0.02 * left + 0.03 * upward - 0.05 * air)
+        upward = np.cross(air, left / norm(left))
+        force = norm(air) * (0.02 * left + 0.03 * upward - 0.05 * air)
         return [*state[3:], *(force / mass - [0.0, 0.0, GRAVITY])]
 
     wanted = solve_ivp(derivative, (0.0, time), [*pos, *vel], rtol=1e-9, atol=1e-9).y[:, -1]
-    air = dataclasses.replace(plant.air, wind_w=tuple(wind))
+    air = replace(plant.air, wind_w=tuple(wind))
     place, speed = flown_payload(rope, air, pos[None], vel[None], np.array([time]))
-    np.testing.assert_allclose(np.hstack([place[0], speed[0]]), wanted, atol=1e-5)
+    assert_allclose(np.hstack([place[0], speed[0]]), wanted, atol=1e-5)
 
 
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
@@ -169,15 +171,15 @@ def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
     )  # right after a reset nothing has moved yet, so nothing is late
     for name in MEASURED_VECTORS:
         spread = (getattr(seen, name) - getattr(truth, name)).std()
-        assert spread == pytest.approx(experiment.task.noise.observation_step, rel=0.1)
+        assert spread == approx(experiment.task.noise.observation_step, rel=0.1)
     errors = [(getattr(seen, name) - getattr(truth, name)).ravel() for name in MEASURED_VECTORS]
-    np.testing.assert_allclose(np.corrcoef(errors), np.eye(4), atol=0.15)
-    np.testing.assert_allclose(np.linalg.norm(seen.quat_wb, axis=1), 1.0)
-    angle = 2.0 * np.linalg.norm(seen.quat_wb[:, :3], axis=1)
-    assert angle.mean() == pytest.approx(
+    assert_allclose(np.corrcoef(errors), np.eye(4), atol=0.15)
+    assert_allclose(norm(seen.quat_wb, axis=1), 1.0)
+    angle = 2.0 * norm(seen.quat_wb[:, :3], axis=1)
+    assert angle.mean() == approx(
         1.6 * 0.01, rel=0.1
     )  # mean length of three normal deviates: 1.596
-    with pytest.raises(ConfigError, match="did you mean 'hybrid'"):
+    with raises(ConfigError, match="did you mean 'hybrid'"):
         make_plant("hybird", experiment)
 
 
@@ -190,8 +192,8 @@ def test_measurements_of_the_hybrid_plant_are_late():
     now, seen = plant.state, plant.measured()
     for name in MEASURED_VECTORS:
         middle = 0.5 * (getattr(before, name) + getattr(now, name))
-        np.testing.assert_allclose(getattr(seen, name), middle, atol=1e-12)
-    np.testing.assert_array_equal(
+        assert_allclose(getattr(seen, name), middle, atol=1e-12)
+    assert_array_equal(
         HybridPlant(experiment, 2).measured().pos_w, HybridPlant(experiment, 2).state.pos_w
     )
 
@@ -200,14 +202,12 @@ def test_a_flight_goes_from_hover_to_hover(flown):
     times, result = flown.meta["times"], flown.meta["result"]
     assert result["success"]
     assert result["hovering_again"]
-    assert times["latch"] == pytest.approx(times["policy_start"])
-    assert times["separation"] - times["latch"] == pytest.approx(0.11, abs=1e-6)
-    assert result["error"] == pytest.approx(
-        np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1]))
-    )
+    assert times["latch"] == approx(times["policy_start"])
+    assert times["separation"] - times["latch"] == approx(0.11, abs=1e-6)
+    assert result["error"] == approx(np.hypot(*(np.array(result["landing_w"][:2]) - [0.5, 0.1])))
     fall = np.sqrt(2 * (flown["separation"].values[0, 2] - 0.04) / 9.81)
-    assert result["duration"] == pytest.approx(times["landing"] - times["policy_start"])
-    assert times["landing"] - times["separation"] == pytest.approx(fall, abs=0.05), (
+    assert result["duration"] == approx(times["landing"] - times["policy_start"])
+    assert times["landing"] - times["separation"] == approx(fall, abs=0.05), (
         "it is dropped, nearly at rest"
     )
     of_autopilots = {"flying"}  # what an autopilot says of itself
@@ -227,14 +227,14 @@ def test_a_rope_keeps_its_speed_when_the_ball_lands():
     landing = SimpleNamespace(landed=[True], time=[1.02])
     plant = SimpleNamespace(landing=landing, period=0.02)
     moved = recording._rope(SimpleNamespace(now=now, plant=plant)) - leaning
-    np.testing.assert_allclose(moved[:-1, 0], 0.01 * height[:-1], rtol=0.15)
+    assert_allclose(moved[:-1, 0], 0.01 * height[:-1], rtol=0.15)
 
 
 def test_a_flights_modes_and_commands(flown):
     times = flown.meta["times"]
     mode = flown["mode"]
     flying = (mode.time >= times["policy_start"] - 1e-9) & (mode.time < times["recovery"] - 1e-9)
-    np.testing.assert_array_equal(mode.values == 1, flying)
+    assert_array_equal(mode.values == 1, flying)
     assert len(flown["action"].time) == np.count_nonzero(flying)
     assert flown["command"].time[0] == 0.0
     assert np.abs(flown["pos_w"].values[-1] - [0, 0, 1.333]).max() < 0.1
@@ -323,7 +323,7 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
     assert {row["plant"] for row in rows} == {"hybrid"}
     first = [float(row["landing error [m]"]) for row in rows[:5]]
     summary = json.loads((out / "c.json").read_text())["rows"][0]
-    assert summary["error_mean"] == pytest.approx(np.mean(first), rel=1e-4)
+    assert summary["error_mean"] == approx(np.mean(first), rel=1e-4)
     assert f"{summary['error_mean']:.3f} ± {summary['error_std']:.3f}" in told
     assert (out / "compare-hybrid.png").read_bytes()[:4] == b"\x89PNG"
 
@@ -343,7 +343,7 @@ def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     """A drop from hover lands below the hover point, so far from the target as that is; in parts or
     as a whole.
     """
-    pytest.importorskip("mujoco")
+    importorskip("mujoco")
     monkeypatch.setattr(reference_protocol, "HOVER_TIME", 0.1)
     loaded = load_policy(dropper)
     got = reference_protocol.fly_batch(
@@ -351,7 +351,7 @@ def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     )
     assert got["success"].all()
     assert np.abs(got["landing_w"]).max() < 0.25
-    np.testing.assert_allclose(got["error"], np.linalg.norm(got["landing_w"] - [1.0, 0.0], axis=1))
+    assert_allclose(got["error"], norm(got["landing_w"] - [1.0, 0.0], axis=1))
     assert np.all((got["duration"] > 0.4) & (got["duration"] < 0.7))
     assert np.all(got["clearance"] > 0.2)
     assert np.all(got["smoothness"] < 0.6), (
@@ -388,9 +388,9 @@ def test_failures_name_their_cause():
     payload[2, 0], payload[3] = 3.5, pos[3] + [0, 0, 0.05]
     quat = now.quat_wb.copy()
     quat[4] = [1.0, 0.0, 0.0, 0.0]
-    now = dataclasses.replace(now, pos_w=pos, payload_pos_w=payload, quat_wb=quat)
+    now = replace(now, pos_w=pos, payload_pos_w=payload, quat_wb=quat)
     flight.flown[:] = True
-    latched = dataclasses.replace(now, latched=np.ones(5, bool))
+    latched = replace(now, latched=np.ones(5, bool))
     flight.judge(latched)
     assert flight.failures[4] is None
     flight.judge(now)
@@ -431,7 +431,7 @@ def test_names_are_made_unique(dropper):
     assert unique_names([loaded, loaded]) == ["dropper 1", "dropper 2"]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "message"),
     [
         (["fly", "--policy", "visoin"], "no policy 'visoin'"),
@@ -463,7 +463,7 @@ def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, cap
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("command", ["fly", "compare"])
+@mark.parametrize("command", ["fly", "compare"])
 def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
     command, dropper, tmp_path, capsys, monkeypatch
 ):
@@ -475,17 +475,17 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
 
 
 def test_a_policy_without_its_config_asks_for_one(tmp_path):
-    policy = dataclasses.replace(dropping_policy(), made_by={})
+    policy = replace(dropping_policy(), made_by={})
     policy.save(tmp_path / "bare.npz")
-    with pytest.raises(PolicyError, match="--config"):
+    with raises(PolicyError, match="--config"):
         load_policy(tmp_path / "bare.npz")
     assert load_policy(tmp_path / "bare.npz", "state").experiment.task.observation.layout == "state"
-    with pytest.raises(MismatchError):
+    with raises(MismatchError):
         load_policy(tmp_path / "bare.npz", "state", ["vehicle.body.mass=0.3"])
 
 
 def test_targets_must_differ_from_each_other():
-    with pytest.raises(ConfigError):
+    with raises(ConfigError):
         compare.check([2.0, 2.0], 10)
 
 

@@ -1,6 +1,6 @@
 """The vehicle without a rope."""
 
-import numpy as np
+from numpy.linalg import norm
 
 from visthrow import cli
 from visthrow.logs.flightlog import FlightLog
@@ -14,8 +14,8 @@ def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
         log = FlightLog.load(tmp_path / name / "flight.npz")
         assert "payload_pos_w" not in log
         ends[name] = log["pos_w"].values
-        assert np.linalg.norm(ends[name][-1, :2] - (1.0, 0.5)) < 0.03
-    apart = np.linalg.norm(ends["rk4"] - ends["euler"], axis=1)
+        assert norm(ends[name][-1, :2] - (1.0, 0.5)) < 0.03
+    apart = norm(ends["rk4"] - ends["euler"], axis=1)
     assert 0.0 < apart.max() < 0.02
 
 

@@ -5,9 +5,9 @@ one error at a time, against numbers worked by hand.
 import math
 from dataclasses import replace
 
-import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose, assert_array_equal
+from pytest import approx, fixture
 
 from visthrow import config
 from visthrow.task import Experiment
@@ -20,7 +20,7 @@ OLD = ~FRESH
 LIKE = torch.zeros(COUNT)
 
 
-@pytest.fixture(autouse=True)
+@fixture(autouse=True)
 def seeded():
     torch.manual_seed(3)
 
@@ -40,16 +40,16 @@ def test_jitter_moves_the_age_of_a_pose_both_ways():
     for k in range(6):
         pose = delay.push(sample(k * PERIOD), FRESH if k == 0 else OLD)
     age = 5 * PERIOD - pose[:, 0]
-    assert float(age.mean()) == pytest.approx(0.03, abs=2e-4)
-    assert float(age.min()) == pytest.approx(0.026, abs=1e-4)
-    assert float(age.max()) == pytest.approx(0.034, abs=1e-4)
+    assert float(age.mean()) == approx(0.03, abs=2e-4)
+    assert float(age.min()) == approx(0.026, abs=1e-4)
+    assert float(age.max()) == approx(0.034, abs=1e-4)
 
 
 def test_an_exact_pose_of_the_recent_past_lies_between_two_steps():
     delay = delay_of(latency=(0.0, 0.03))
     for k in range(3):
         delay.push(sample(float(k)), FRESH if k == 0 else OLD)
-    np.testing.assert_allclose(delay.exact(0.25 * PERIOD).numpy(), 1.75, atol=1e-6)
+    assert_allclose(delay.exact(0.25 * PERIOD).numpy(), 1.75, atol=1e-6)
 
 
 def test_goals_move_in_every_direction_at_the_configured_speeds():
@@ -57,10 +57,10 @@ def test_goals_move_in_every_direction_at_the_configured_speeds():
     goals.begin(FRESH)
     speed = goals.velocity.norm(dim=-1)
     heading = torch.atan2(goals.velocity[:, 1], goals.velocity[:, 0])
-    assert float(speed.min()) == pytest.approx(0.2, abs=2e-3)
-    assert float(speed.max()) == pytest.approx(0.6, abs=2e-3)
-    assert float(heading.min()) == pytest.approx(-math.pi, abs=0.02)
-    assert float(heading.max()) == pytest.approx(math.pi, abs=0.02)
+    assert float(speed.min()) == approx(0.2, abs=2e-3)
+    assert float(speed.max()) == approx(0.6, abs=2e-3)
+    assert float(heading.min()) == approx(-math.pi, abs=0.02)
+    assert float(heading.max()) == approx(math.pi, abs=0.02)
 
 
 def view_of(mount: dict | None = None, **noise) -> DetectorView:
@@ -92,14 +92,14 @@ def test_an_error_of_the_focal_length_scales_all_keypoints_of_an_episode():
     exact, _ = look(view_of())
     points, _ = look(view_of(scale_std=0.05))
     ratio = points.norm(dim=-1) / exact.norm(dim=-1)
-    np.testing.assert_allclose(ratio.std(1).numpy(), 0.0, atol=1e-5)
-    assert float(ratio[:, 0].std()) == pytest.approx(0.05, rel=0.05)
+    assert_allclose(ratio.std(1).numpy(), 0.0, atol=1e-5)
+    assert float(ratio[:, 0].std()) == approx(0.05, rel=0.05)
 
 
 def test_mounts_are_off_by_the_configured_angles_and_lengths():
     view = view_of({"rotation_error_std": 0.02, "position_error_std": 0.005})
-    assert float(view.buffers["extrinsic_rotation"].std()) == pytest.approx(0.02, rel=0.05)
-    assert float(view.buffers["extrinsic_offset"].std()) == pytest.approx(0.005, rel=0.05)
+    assert float(view.buffers["extrinsic_rotation"].std()) == approx(0.02, rel=0.05)
+    assert float(view.buffers["extrinsic_offset"].std()) == approx(0.005, rel=0.05)
 
 
 def test_keypoints_beyond_the_radius_that_a_detector_sees_are_invalid():
@@ -108,14 +108,14 @@ def test_keypoints_beyond_the_radius_that_a_detector_sees_are_invalid():
     radius = points.norm(dim=-1)[0]
     middle = float(radius.sort().values[3:5].mean())
     _, valid = look(view_of(seen_radius=middle))
-    np.testing.assert_array_equal(valid[0].numpy(), (radius <= middle).numpy())
+    assert_array_equal(valid[0].numpy(), (radius <= middle).numpy())
 
 
 def test_an_image_is_repeated_but_never_that_of_another_episode():
     view = view_of(held_probability=0.999999)
     first, _ = look(view, 0.5, FRESH)
     repeated, _ = look(view, 0.8)
-    np.testing.assert_array_equal(repeated.numpy(), first.numpy())
+    assert_array_equal(repeated.numpy(), first.numpy())
     new, _ = look(view, 0.8, FRESH)
     assert float((new - first)[:, :4].abs().min(1).values.mean()) > 0.01
 

@@ -5,8 +5,9 @@ reward of a crash worked by hand.
 import math
 
 import numpy as np
-import pytest
 import torch
+from pytest import approx
+from torch.testing import assert_close
 
 from visthrow import config
 from visthrow.onboard import actions as act
@@ -46,9 +47,9 @@ def test_measurements_have_the_configured_noise_and_bias():
         errors.append(env.measured[0] - true_frame(env))
         env.carry(env.previous_action)
     errors = torch.stack(errors)  # (T, E, 20)
-    assert errors.std().item() == pytest.approx(math.hypot(step, bias), rel=SPREAD)
+    assert errors.std().item() == approx(math.hypot(step, bias), rel=SPREAD)
     within = errors.std(dim=0, unbiased=True).square().mean().sqrt()
-    assert within.item() == pytest.approx(step, rel=SPREAD), "the bias must hold over the steps"
+    assert within.item() == approx(step, rel=SPREAD), "the bias must hold over the steps"
     assert errors.mean().abs() < 4.0 * bias / math.sqrt(COUNT * 20)
 
 
@@ -64,7 +65,7 @@ def test_measurements_are_as_old_as_the_latency():
     env.carry(env.previous_action)
     now = true_frame(env)
     assert (now - before).abs().max() > 1e-3
-    torch.testing.assert_close(env.measured[0], before, atol=1e-5, rtol=0.0)
+    assert_close(env.measured[0], before, atol=1e-5, rtol=0.0)
 
 
 def test_flown_commands_have_the_configured_noise_and_bias():
@@ -79,9 +80,9 @@ def test_flown_commands_have_the_configured_noise_and_bias():
         env.carry(action)
         errors.append((env.views.command.clone() - wanted) / scale)
     errors = torch.stack(errors)
-    assert errors.std().item() == pytest.approx(math.hypot(step, bias), rel=SPREAD)
+    assert errors.std().item() == approx(math.hypot(step, bias), rel=SPREAD)
     within = errors.std(dim=0).square().mean().sqrt()
-    assert within.item() == pytest.approx(step, rel=SPREAD), "the bias must hold over the steps"
+    assert within.item() == approx(step, rel=SPREAD), "the bias must hold over the steps"
 
 
 def test_the_exact_critic_is_without_noise_and_the_actor_is_not():
@@ -91,11 +92,9 @@ def test_the_exact_critic_is_without_noise_and_the_actor_is_not():
         'ppo.privileged=["exact","payload_velocity"]',
     )
     groups, truth = env.get_observations(), true_frame(env)
-    torch.testing.assert_close(
-        groups["critic"][:, : ob.VEHICLE], truth[:, : ob.VEHICLE], atol=1e-6, rtol=0.0
-    )
+    assert_close(groups["critic"][:, : ob.VEHICLE], truth[:, : ob.VEHICLE], atol=1e-6, rtol=0.0)
     noise = groups["actor"][:, : ob.VEHICLE] - truth[:, : ob.VEHICLE]
-    assert noise.std().item() == pytest.approx(0.05, rel=SPREAD)
+    assert noise.std().item() == approx(0.05, rel=SPREAD)
 
 
 def test_a_crash_costs_its_penalty_once():
@@ -115,7 +114,7 @@ def test_a_crash_costs_its_penalty_once():
     assert not done[32:].any()
     paid = p.scale * p.termination
     gap = reward[32:].mean() - reward[:32].mean()
-    assert gap.item() == pytest.approx(paid, rel=0.02)
+    assert gap.item() == approx(paid, rel=0.02)
     assert reward[:32].max() < 0.0
 
 

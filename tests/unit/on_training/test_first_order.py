@@ -5,8 +5,9 @@ against the simulator itself.
 import itertools
 from types import SimpleNamespace
 
-import pytest
 import torch
+from pytest import approx, mark
+from torch.testing import assert_close
 
 from sim.params import GRAVITY
 from visthrow import config
@@ -52,7 +53,7 @@ ALIKE = 0.006
 """Between mean landings of the two simulators [m]: they differed by 3 mm over 1,000 throws."""
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = mark.usefixtures("one_thread")
 
 
 def first_order(name="state", *changes):
@@ -219,9 +220,7 @@ def test_weights_get_what_autograd_gives_them():
     parameters = list(fo.network.mlp.parameters())
     expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)
     for parameter, gradient in zip(parameters, expected, strict=True):
-        torch.testing.assert_close(
-            parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item()
-        )
+        assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
     assert by_action.any(), "nothing was differentiated"
 
 
@@ -233,7 +232,7 @@ SLOWER = [
 ]
 
 
-@pytest.mark.parametrize("vehicle", [[], SLOWER], ids=["own", "slower"])
+@mark.parametrize("vehicle", [[], SLOWER], ids=["own", "slower"])
 def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     """Where the payload lands against thrust, roll and pitch commands at earlier steps, by
     differences of the simulator.
@@ -269,7 +268,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
         ).sqrt()
     ) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
-    torch.testing.assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
+    assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
     monkeypatch.setattr(fo.layers, "backpropagate", lambda k, flown: None)
     found = []
     for axis in range(2):
@@ -291,7 +290,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
             pairs.append(torch.stack([found[axis][k, :, channel], slope]))
         surrogate, simulator = torch.cat(pairs, dim=1)
         assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE
-        assert surrogate @ simulator / simulator.square().sum() == pytest.approx(1.0, abs=MOST_BIAS)
+        assert surrogate @ simulator / simulator.square().sum() == approx(1.0, abs=MOST_BIAS)
 
 
 def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
@@ -341,7 +340,7 @@ def small_task():
     )
 
 
-@pytest.mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(5))
 def test_every_seed_learns(seed):
     """Of the last five of 35 iterations nearly all flights release, and land near."""
     trainer = Trainer(small_task(), "cpu", seed)

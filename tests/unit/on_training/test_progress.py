@@ -4,7 +4,7 @@ import csv
 import math
 
 import numpy as np
-import pytest
+from pytest import approx, fixture, mark
 
 from visthrow.task.measurement import Throws
 from visthrow.training import progress
@@ -19,7 +19,7 @@ def throws(error: float = 0.05) -> Throws:
     return Throws(2.0, np.array([True, True, False]), landing, off, blank, blank, blank)
 
 
-@pytest.fixture
+@fixture
 def clock(monkeypatch):
     """Ten seconds an iteration."""
     now = [100.0]
@@ -39,11 +39,11 @@ def test_the_lines_show_errors_landings_and_the_time_left(tmp_path, clock, capsy
     (line,) = capsys.readouterr().out.splitlines()
     assert "1:10 left" in line  # seven iterations of ten seconds
     assert "0.0500 m, 1.000 s, landed 66.7 %" in line
-    assert float(rows_of(tmp_path / "p.csv")[-1]["error_2m"]) == pytest.approx(0.05)
-    assert float(rows_of(tmp_path / "p.csv")[-1]["landed_2m"]) == pytest.approx(2 / 3)
+    assert float(rows_of(tmp_path / "p.csv")[-1]["error_2m"]) == approx(0.05)
+    assert float(rows_of(tmp_path / "p.csv")[-1]["landed_2m"]) == approx(2 / 3)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("seconds", "text"), [(0, "0:00"), (65.2, "1:05"), (3661, "1:01:01"), (math.inf, "-")]
 )
 def test_clock(seconds, text):

@@ -6,8 +6,8 @@ import re
 
 import cv2
 import numpy as np
-import pytest
 import torch
+from pytest import fixture, mark
 
 from camera.calibrate.boards import BoardParams
 from camera.calibrate.files import read
@@ -129,7 +129,7 @@ def pictures(board: BoardParams, lens: Fisheye) -> list[np.ndarray]:
     return found
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def boards(tmp_path_factory):
     """Give the folder of pictures of a kind of board, drawn when asked for."""
     root = tmp_path_factory.mktemp("boards")
@@ -257,12 +257,12 @@ def test_ocam_agrees_with_its_own_inverse_polynomial(tmp_path):
     assert np.hypot(pixels[:, 0] - column, pixels[:, 1] - row).max() < OCAM_PX
 
 
-@pytest.mark.parametrize("kind", [*WRITERS, "ocam"])
+@mark.parametrize("kind", [*WRITERS, "ocam"])
 def test_the_tool_is_told_from_the_text(kind, tmp_path):
     assert kind in read(calibration(kind, tmp_path, None)[0])[0]
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "message"),
     [
         (

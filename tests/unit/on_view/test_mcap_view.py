@@ -6,15 +6,16 @@ import json
 import sys
 
 import numpy as np
-import pytest
+from numpy.testing import assert_array_equal
+from pytest import fixture, importorskip
 
 from visthrow.cli import main
 from visthrow.logs.flightlog import FlightLog
 
-reader = pytest.importorskip("mcap.reader")
+reader = importorskip("mcap.reader")
 
 
-@pytest.fixture(scope="module")
+@fixture(scope="module")
 def flown(tmp_path_factory):
     """Folder of one throw, exported to all formats."""
     folder = tmp_path_factory.mktemp("flown")
@@ -43,17 +44,17 @@ def test_poses_and_commands_read_back_as_they_were_flown(flown):
     moved = messages(flown, "/tf")
     assert {name for name, _, _ in moved} == {"foxglove.FrameTransform"}
     places = [[content["translation"][axis] for axis in "xyz"] for _, _, content in moved]
-    np.testing.assert_array_equal(places, log["pos_w"].values)
+    assert_array_equal(places, log["pos_w"].values)
     np.testing.assert_allclose(
         [1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9
     )
     turned = [[content["rotation"][axis] for axis in "xyzw"] for _, _, content in moved]
-    np.testing.assert_array_equal(turned, log["quat_wb"].values)
+    assert_array_equal(turned, log["quat_wb"].values)
     sent = [
         [c["thrust_n"], c["rate_x"], c["rate_y"], c["rate_z"]]
         for _, _, c in messages(flown, "/command")
     ]
-    np.testing.assert_array_equal(sent, log["command"].values)
+    assert_array_equal(sent, log["command"].values)
 
 
 def test_every_channel_is_there_with_its_unit_and_schema(flown):

@@ -1,6 +1,6 @@
 """The commands from Python: the options of the command line as keywords."""
 
-import pytest
+from pytest import raises
 
 import visthrow
 from visthrow.cli import api
@@ -34,9 +34,9 @@ def test_a_throw_a_comparison_and_a_training(tmp_path, monkeypatch):
 
 
 def test_mistakes_raise():
-    with pytest.raises(VisthrowError, match="not a valid command"):
+    with raises(VisthrowError, match="not a valid command"):
         visthrow.compare("state", no_such_option=1)
-    with pytest.raises(VisthrowError, match="no_such_policy"):
+    with raises(VisthrowError, match="no_such_policy"):
         visthrow.fly("no_such_policy")
-    with pytest.raises(AttributeError, match="no attribute 'throw'"):
+    with raises(AttributeError, match="no attribute 'throw'"):
         _ = visthrow.throw

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated
 
-import pytest
+from pytest import mark, raises
 
 from visthrow import config
 from visthrow.common.errors import ConfigError
@@ -26,7 +26,7 @@ class More(Few):
     weight: Positive = 1.0
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("wrong", "message"),
     [
         ({"lag": -1e-9}, "lag is -1e-09; expected 0 or more"),
@@ -40,7 +40,7 @@ class More(Few):
     ],
 )
 def test_what_lies_outside_is_named_with_its_bound(wrong, message):
-    with pytest.raises(ConfigError) as caught:
+    with raises(ConfigError) as caught:
         More(**wrong)
     assert str(caught.value) == message
 
@@ -51,5 +51,5 @@ def test_ends_that_belong_to_it_and_none_pass():
 
 
 def test_a_file_is_named_with_the_key():
-    with pytest.raises(ConfigError, match=r"mine\.toml.*channel is 0; expected 1 to 12"):
+    with raises(ConfigError, match=r"mine\.toml.*channel is 0; expected 1 to 12"):
         config.loads(More, "channel = 0", name="mine.toml")

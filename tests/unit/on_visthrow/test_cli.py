@@ -9,7 +9,7 @@ import time
 import types
 from pathlib import Path
 
-import pytest
+from pytest import fixture, mark, raises
 
 from visthrow import cli
 from visthrow.common import arguments
@@ -46,7 +46,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess:
     )
 
 
-@pytest.fixture
+@fixture
 def command(monkeypatch):
     """Install a command 'try' whose ``run`` raises or returns what the test wants."""
 
@@ -95,7 +95,7 @@ def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     "does", [["config", "train", "vision"], ["compare", "visoin"], ["fly", "--policy", "visoin"]]
 )
 def test_configurations_and_misspelt_names_import_neither_torch_nor_warp(does):
@@ -131,7 +131,7 @@ def test_no_command_and_unknown_command_list_the_commands():
     assert "compare" in result.stderr
 
 
-@pytest.mark.parametrize("error", [ConfigError("a: b"), ValueError("a: b"), OSError(28, "a: b")])
+@mark.parametrize("error", [ConfigError("a: b"), ValueError("a: b"), OSError(28, "a: b")])
 def test_a_mistake_is_one_message_and_status_2(command, capsys, monkeypatch, error):
     command(error)
     monkeypatch.delenv(cli.TRACEBACK_VARIABLE, raising=False)
@@ -141,13 +141,13 @@ def test_a_mistake_is_one_message_and_status_2(command, capsys, monkeypatch, err
     assert "a: b" in err
     assert err.count("\n") == 1
     monkeypatch.setenv(cli.TRACEBACK_VARIABLE, "1")
-    with pytest.raises(type(error)):
+    with raises(type(error)):
         cli.main(["try"])
 
 
 def test_defects_are_not_hidden(command):
     command(KeyError("a defect"))
-    with pytest.raises(KeyError):
+    with raises(KeyError):
         cli.main(["try"])
 
 
@@ -180,7 +180,7 @@ def test_a_missing_optional_package_names_the_extra(command, capsys):
     assert cli.main(["try"]) == 2
     assert "MuJoCo 3" in capsys.readouterr().err
     command(ModuleNotFoundError("No module named 'visthrow.gone'", name="visthrow.gone"))
-    with pytest.raises(ModuleNotFoundError):
+    with raises(ModuleNotFoundError):
         cli.main(["try"])
 
 
@@ -218,7 +218,7 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
     assert "paper" in capsys.readouterr().out.split()
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("arguments", "said"),
     [
         (["config", "vehicel"], "did you mean 'vehicle'"),
@@ -240,7 +240,7 @@ def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
     assert said in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("words", "said"),
     [
         (
@@ -263,7 +263,7 @@ def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
     ],
 )
 def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, capsys):
-    with pytest.raises(SystemExit, match="2"):
+    with raises(SystemExit, match="2"):
         cli.main(words)
     assert said in capsys.readouterr().err
 
@@ -280,7 +280,7 @@ def test_a_file_of_windows_notepad_is_read(tmp_path):
 def test_devices_that_are_not_there_are_refused():
     assert compute_device.resolve("cpu") == "cpu"
     assert compute_device.resolve("auto") in ("cpu", "cuda:0")
-    with pytest.raises(DeviceError, match=r"'cuda:99' is not there; expected auto or one of cpu"):
+    with raises(DeviceError, match=r"'cuda:99' is not there; expected auto or one of cpu"):
         compute_device.resolve("cuda:99")
 
 
@@ -292,7 +292,7 @@ def test_suggestions():
     assert many.endswith("; 36 more exist")
     assert suggest("xyz", []) == "nothing is known here"
     assert issubclass(ConfigError, VisthrowError)
-    with pytest.raises(ConfigError, match="no kind of config 'nothing'"):
+    with raises(ConfigError, match="no kind of config 'nothing'"):
         kinds.schema_of("nothing")
 
 
@@ -307,9 +307,9 @@ class MixedMujoco:
 def test_a_mixed_mujoco_is_named_by_plants_and_solvers(monkeypatch):
     monkeypatch.delitem(sys.modules, "mujoco.batch", raising=False)
     monkeypatch.setattr(sys, "meta_path", [MixedMujoco(), *sys.meta_path])
-    with pytest.raises(ModuleNotFoundError, match="another MuJoCo") as caught:
+    with raises(ModuleNotFoundError, match="another MuJoCo") as caught:
         runpy.run_module("sim.reference.rope")
     assert caught.value.name == "mujoco.batch"
     solver = runpy.run_module("sim.solvers.mujoco")
-    with pytest.raises(ModuleNotFoundError, match="another MuJoCo"):
+    with raises(ModuleNotFoundError, match="another MuJoCo"):
         solver["_on_cpu"](None, {}, 1, "cpu")

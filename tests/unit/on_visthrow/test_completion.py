@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
+from pytest import mark, skip
 
 BIN = Path(sys.executable).parent
 
@@ -41,11 +41,11 @@ LINES = {
 }
 
 
-@pytest.mark.parametrize("shell", SHELLS)
-@pytest.mark.parametrize("line", LINES)
+@mark.parametrize("shell", SHELLS)
+@mark.parametrize("line", LINES)
 def test_a_shell_completes(shell, line):
     if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed")
+        skip(f"{shell} is not installed")
     environment = os.environ | {"PATH": f"{BIN}:{os.environ['PATH']}"}
     out = subprocess.run(
         [shell, *SHELLS[shell], line, LINES[line]],

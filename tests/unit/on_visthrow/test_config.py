@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import pytest
+from pytest import fixture, mark, raises
 
 from visthrow import config
 from visthrow.common import toml_text
@@ -45,7 +45,7 @@ gain = [1, 2.5]
 """
 
 
-@pytest.fixture
+@fixture
 def write(tmp_path: Path):
     def _write(name: str, text: str) -> Path:
         path = tmp_path / name
@@ -63,7 +63,7 @@ def test_values_arrive_with_their_types(write):
     assert type(loaded.inner.gain[0]) is float
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("change", "said"),
     [
         (("count = 3", "count = 3.0"), ["count", "3.0 (float)", "a whole number"]),
@@ -91,7 +91,7 @@ def test_values_arrive_with_their_types(write):
 )
 def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, said):
     path = write("a.toml", GOOD.replace(*change))
-    with pytest.raises(ConfigError) as caught:
+    with raises(ConfigError) as caught:
         config.load(Outer, path)
     for part in ["a.toml", *said]:
         assert part in str(caught.value)
@@ -99,7 +99,7 @@ def test_mistakes_are_refused_with_file_key_and_what_exists(write, change, said)
 
 def test_missing_file_names_its_neighbours(write):
     path = write("paper.toml", GOOD)
-    with pytest.raises(ConfigError, match=r"papr.toml: no such file; did you mean 'paper.toml'"):
+    with raises(ConfigError, match=r"papr.toml: no such file; did you mean 'paper.toml'"):
         config.load(Outer, path.parent / "papr.toml")
 
 
@@ -112,7 +112,7 @@ def test_a_string_for_a_table_includes_a_file_beside_it(write):
 def test_an_error_inside_an_included_file_names_that_file(write):
     write("parts/inner.toml", 'kind = "b"\ngain = [3, "4"]')
     path = write("a.toml", 'name = "x"\ncount = 1\nmass = 1.5\ninner = "parts/inner.toml"')
-    with pytest.raises(ConfigError, match=r"inner\.toml: inner\.gain\[1\]"):
+    with raises(ConfigError, match=r"inner\.toml: inner\.gain\[1\]"):
         config.load(Outer, path)
 
 
@@ -121,7 +121,7 @@ def test_an_include_falls_back_to_the_configs_folder(write, monkeypatch, tmp_pat
     monkeypatch.setattr(config, "configs_root", lambda: tmp_path / "root")
     path = write("a.toml", 'name = "x"\ncount = 1\nmass = 1\ninner = "inner/x.toml"')
     assert config.load(Outer, path).inner.kind == "b"
-    with pytest.raises(ConfigError, match=r"no file 'inner/y.toml'.*did you mean 'inner/x.toml'"):
+    with raises(ConfigError, match=r"no file 'inner/y.toml'.*did you mean 'inner/x.toml'"):
         config.load(Outer, write("b.toml", path.read_text().replace("x.toml", "y.toml")))
 
 
@@ -164,7 +164,7 @@ def test_a_table_among_like_ones_lies_on_top_of_its_base():
     assert config.loads(Rows, text, ["rows.x.a=7"]).rows["x"].a == 7
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("text", "said"),
     [
         (
@@ -183,7 +183,7 @@ def test_a_table_among_like_ones_lies_on_top_of_its_base():
     ],
 )
 def test_a_wrong_base_of_a_table_is_refused(text, said):
-    with pytest.raises(ConfigError) as caught:
+    with raises(ConfigError) as caught:
         config.loads(Rows, text)
     assert said in str(caught.value)
 
@@ -191,7 +191,7 @@ def test_a_wrong_base_of_a_table_is_refused(text, said):
 def test_circles_are_refused(write):
     write("a.toml", 'base = "b.toml"')
     path = write("b.toml", 'base = "a.toml"')
-    with pytest.raises(ConfigError, match=r"circle: .*b\.toml -> .*a\.toml -> .*b\.toml"):
+    with raises(ConfigError, match=r"circle: .*b\.toml -> .*a\.toml -> .*b\.toml"):
         config.load(Outer, path)
 
 
@@ -216,7 +216,7 @@ def test_overrides_apply_in_order_after_includes(write):
     assert loaded.spare == Inner("a", (0.0, 0.0))
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("override", "said"),
     [
         ("inner.gian=[1,2]", "did you mean 'gain'"),
@@ -230,7 +230,7 @@ def test_overrides_apply_in_order_after_includes(write):
     ],
 )
 def test_bad_overrides_name_themselves_and_what_exists(write, override, said):
-    with pytest.raises(ConfigError) as caught:
+    with raises(ConfigError) as caught:
         config.load(Outer, write("a.toml", GOOD), [override])
     assert f"override '{override}'" in str(caught.value)
     assert said in str(caught.value)
@@ -254,7 +254,7 @@ def test_none_word_overrules_a_default(write):
 
 def test_toml_writer_refuses_what_toml_lacks():
     for value in (float("nan"), None, object()):
-        with pytest.raises(ValueError, match=r"a\.b"):
+        with raises(ValueError, match=r"a\.b"):
             toml_text.dumps({"a": {"b": value}})
 
 
@@ -262,7 +262,7 @@ def test_find_by_name_by_path_and_what_exists():
     assert config.find("vehicle", "paper") == config.configs_root() / "vehicle" / "paper.toml"
     assert config.find("vehicle", "vehicle/paper.toml").samefile(config.find("vehicle", "paper"))
     assert config.find("rope", config.find("vehicle", "paper")) == config.find("vehicle", "paper")
-    with pytest.raises(ConfigError, match=r"no vehicle config 'papre'.*did you mean 'paper'"):
+    with raises(ConfigError, match=r"no vehicle config 'papre'.*did you mean 'paper'"):
         config.find("vehicle", "papre")
-    with pytest.raises(ConfigError, match=r"no kind of config 'vehicel'; did you mean 'vehicle'"):
+    with raises(ConfigError, match=r"no kind of config 'vehicel'; did you mean 'vehicle'"):
         config.find("vehicel", "paper")

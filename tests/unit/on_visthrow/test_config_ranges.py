@@ -2,14 +2,14 @@
 file finds its base.
 """
 
-import pytest
+from pytest import mark, raises
 
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError
 from visthrow.task import Experiment
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "name", "change", "message"),
     [
         ("vehicle", "paper", "body.mass=-1", "body: mass is -1.0; expected above 0"),
@@ -88,7 +88,7 @@ def test_the_command_refuses(kind, name, change, message, capsys):
     assert message in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["vision", "vision_ideal", "state_far"])
+@mark.parametrize("name", ["vision", "vision_ideal", "state_far"])
 def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
     shipped = config.find("train", name)
     copy = tmp_path / "mine.toml"
@@ -98,12 +98,12 @@ def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
 
 def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
     (tmp_path / "mine.toml").write_text('base = "visoin.toml"', encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"did you mean 'train/vision\.toml'") as caught:
+    with raises(ConfigError, match=r"did you mean 'train/vision\.toml'") as caught:
         config.load(Experiment, tmp_path / "mine.toml")
     assert "vehicle/" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("override", "message"),
     [
         ("gate.max_speed=-1", "gate: max_speed is -1.0; expected above 0"),
@@ -114,6 +114,6 @@ def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
 def test_a_range_error_names_the_one_key(override, message):
     from hil.params import HilParams
 
-    with pytest.raises(ConfigError) as caught:
+    with raises(ConfigError) as caught:
         config.load(HilParams, config.find("hil", "vicon"), [override])
     assert str(caught.value).endswith(f"{message} (with {override})")

@@ -3,9 +3,10 @@
 import dataclasses
 import math
 import typing
+from dataclasses import replace
 from functools import cache
 
-import pytest
+from pytest import mark, raises
 
 from camera import field_bounds
 from visthrow import config
@@ -63,7 +64,7 @@ def test_the_configurations_hold_hundreds_of_numbers():
     assert len(numbers()) > 300
 
 
-@pytest.mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -1.0, 0.0])
+@mark.parametrize("wrong", [math.nan, math.inf, -math.inf, -1.0, 0.0])
 def test_a_number_outside_its_bound_is_refused(wrong):
     accepted = []
     for table, name in numbers():
@@ -71,7 +72,7 @@ def test_a_number_outside_its_bound_is_refused(wrong):
         if bound.holds(wrong):
             continue
         try:
-            dataclasses.replace(table, **{name: put(getattr(table, name), wrong)})
+            replace(table, **{name: put(getattr(table, name), wrong)})
             message = "accepted"
         except (VisthrowError, ValueError) as error:
             message = str(error)
@@ -80,7 +81,7 @@ def test_a_number_outside_its_bound_is_refused(wrong):
     assert accepted == []
 
 
-@pytest.mark.parametrize(
+@mark.parametrize(
     ("kind", "name", "override", "message"),
     [
         (
@@ -97,5 +98,5 @@ def test_a_number_outside_its_bound_is_refused(wrong):
     ],
 )
 def test_absurd_quantities_are_refused(kind, name, override, message):
-    with pytest.raises(config.ConfigError, match=message):
+    with raises(config.ConfigError, match=message):
         config.load(kinds.schema_of(kind), config.find(kind, name), [override])

@@ -4,8 +4,9 @@ import ctypes
 import subprocess
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose
+from pytest import mark
 
 from visthrow import cli
 from visthrow.cli.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
@@ -71,7 +72,7 @@ def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
     return obs.numpy(), torch.stack(actions).numpy()
 
 
-@pytest.mark.parametrize("name", POLICIES)
+@mark.parametrize("name", POLICIES)
 def test_onnx_gives_the_policys_actions(name, tmp_path):
     from onnx.reference import ReferenceEvaluator
 
@@ -86,10 +87,10 @@ def test_onnx_gives_the_policys_actions(name, tmp_path):
         inputs = {"obs": row} | ({"memory": memory} if policy.estimator else {})
         outputs = session.run(None, inputs)
         memory = outputs[1] if policy.estimator else memory
-        np.testing.assert_allclose(outputs[0], action, rtol=0.0, atol=TOLERANCE)
+        assert_allclose(outputs[0], action, rtol=0.0, atol=TOLERANCE)
 
 
-@pytest.mark.parametrize("name", ["state", "recurrent"])
+@mark.parametrize("name", ["state", "recurrent"])
 def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
     from visthrow.cli.c_source import write_c
 
@@ -108,7 +109,7 @@ def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
     for t in range(STEPS):
         for e in range(THROWS):
             function(np.ascontiguousarray(obs[t, e], np.float32), memories[e], found[t, e])
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
+    assert_allclose(found, expected, rtol=0.0, atol=TOLERANCE)
 
 
 def test_the_command_writes_by_the_ending_and_refuses_others(tmp_path, capsys):

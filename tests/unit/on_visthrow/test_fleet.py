@@ -2,11 +2,12 @@
 ordinary one for each.
 """
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
+from numpy.testing import assert_allclose
+from pytest import approx, mark, raises
 
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY
@@ -148,14 +149,14 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
     drawn, told = members(env.cfg), env.get_observations()["actor"][:, -4:]
     for e in range(12):
         own = drawn[e % 6 // 2]
-        assert told[e].tolist() == pytest.approx(own.told, rel=1e-6)
+        assert told[e].tolist() == approx(own.told, rel=1e-6)
         assert (
             float(env.delay.age[e]) * own.units.time <= env.cfg.task.observation.latency[1] + 1e-6
         )
     env.carry(torch.ones(12, 5))
     queued = env.views.command[:, 0]
     for e in range(12):
-        assert float(queued[e]) == pytest.approx(
+        assert float(queued[e]) == approx(
             drawn[e % 6 // 2].max_thrust, rel=0.1
         )  # noise of commands
 
@@ -174,24 +175,22 @@ def quiet(base: Experiment) -> Experiment:
         ),
         0.0,
     )
-    mount = dataclasses.replace(base.camera.mount, rotation_error_std=0.0, position_error_std=0.0)
-    camera = dataclasses.replace(
-        base.camera, mount=mount, noise=dataclasses.replace(base.camera.noise, **clear)
-    )
-    noise = dataclasses.replace(
+    mount = replace(base.camera.mount, rotation_error_std=0.0, position_error_std=0.0)
+    camera = replace(base.camera, mount=mount, noise=replace(base.camera.noise, **clear))
+    noise = replace(
         task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
     )
-    start = dataclasses.replace(task.start, mass=0.0, tether_variants=1)
-    observation = dataclasses.replace(task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
-    return dataclasses.replace(
+    start = replace(task.start, mass=0.0, tether_variants=1)
+    observation = replace(task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
+    return replace(
         base,
         camera=camera,
-        task=dataclasses.replace(task, noise=noise, start=start, observation=observation),
+        task=replace(task, noise=noise, start=start, observation=observation),
     )
 
 
-@pytest.mark.parametrize("kind", ["any", "any_vision"])
-@pytest.mark.parametrize("name", NAMED)
+@mark.parametrize("kind", ["any", "any_vision"])
+@mark.parametrize("name", NAMED)
 def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name, kind):
     base = quiet(of(name, kind))
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
@@ -200,8 +199,8 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
         Pilot(own, one.camera if kind == "any_vision" else None, 4),
         members(base)[0].units,
     )
-    assert pilot.period == pytest.approx(0.02 * units.time)
-    assert own.total_mass == pytest.approx(plant_of(base).total_mass)
+    assert pilot.period == approx(0.02 * units.time)
+    assert own.total_mass == approx(plant_of(base).total_mass)
     most, rates = members(base)[0].max_thrust, torch.tensor(base.task.action.max_rate)
     shown = env.get_observations()["actor"]
     for _ in range(15):
@@ -219,14 +218,10 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
             payload,
             goal,
         )
-        np.testing.assert_allclose(out.action, act.clip_action(wanted).numpy(), atol=SAME)
+        assert_allclose(out.action, act.clip_action(wanted).numpy(), atol=SAME)
         command = act.command_from_action(torch.from_numpy(out.action), most, rates)
-        np.testing.assert_allclose(
-            out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME
-        )
-        np.testing.assert_allclose(
-            out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME
-        )
+        assert_allclose(out.command[:, 0], command[:, 0] * units.size((1, 1, -2)), rtol=SAME)
+        assert_allclose(out.command[:, 1:], command[:, 1:] / units.time, rtol=SAME, atol=SAME)
         shown = env.carry(wanted)["actor"]
     assert one.rope.length == plant_of(base).rope.length
 
@@ -236,23 +231,23 @@ def test_one_vehicles_experiment_is_the_same_task_at_its_size():
     size, usual = 0.8 / 0.33, config.load(Experiment, config.find("train", "any"))
     assert one.fleet is None
     assert one.task.observation.setup == "none"
-    assert one.task.bounds.horizontal == pytest.approx(usual.task.bounds.horizontal * size)
-    assert one.release.landing_height == pytest.approx(usual.release.landing_height * size)
-    assert one.release.lag == pytest.approx(usual.release.lag)
-    assert one.sim.control_period == pytest.approx(0.02 * np.sqrt(size))
-    assert one.task.action.max_thrust == pytest.approx(4 * one.vehicle.controller.max_thrust)
+    assert one.task.bounds.horizontal == approx(usual.task.bounds.horizontal * size)
+    assert one.release.landing_height == approx(usual.release.landing_height * size)
+    assert one.release.lag == approx(usual.release.lag)
+    assert one.sim.control_period == approx(0.02 * np.sqrt(size))
+    assert one.task.action.max_thrust == approx(4 * one.vehicle.controller.max_thrust)
     assert config.loads(Experiment, config.dumps(one)) == one
 
 
 def test_a_policy_of_one_vehicle_is_not_specialised():
     base = config.load(Experiment, config.find("train", "state"))
-    with pytest.raises(
+    with raises(
         PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"
     ):
         specialised(random_policy(base), of("x500"))
 
 
-@pytest.mark.parametrize("name", ["crazyflie_brushless", "x500"])
+@mark.parametrize("name", ["crazyflie_brushless", "x500"])
 def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, tmp_path):
     loaded = load_policy(
         "any", overrides=[f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"']
@@ -268,10 +263,10 @@ def test_the_shipped_policy_throws_with_a_named_vehicle_through_the_pilot(name, 
 
 
 def test_ranges_that_nothing_can_be_drawn_from_are_refused():
-    with pytest.raises(
+    with raises(
         config.ConfigError,
         match=r"fleet\.mass is 2\.0 to 0\.03; expected an ascending range above 0",
     ):
         experiment("fleet.mass=[2.0, 0.03]")
-    with pytest.raises(config.ConfigError, match=r"fleet\.count is -1"):
+    with raises(config.ConfigError, match=r"fleet\.count is -1"):
         experiment("fleet.count=-1")

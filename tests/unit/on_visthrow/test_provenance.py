@@ -8,7 +8,7 @@ import tomllib
 import types
 from dataclasses import dataclass
 
-import pytest
+from pytest import raises
 
 from visthrow import config
 from visthrow.common import provenance
@@ -73,7 +73,7 @@ def test_run_folder_holds_config_and_record_and_is_not_overwritten(tmp_path):
     assert tomllib.loads((folder / "config.toml").read_text()) == {"seed": 3, "rate": 1e-3}
     assert json.loads((folder / "provenance.json").read_text()) == written
     assert written["seed"] == 3
-    with pytest.raises(StorageError, match="holds a run already"):
+    with raises(StorageError, match="holds a run already"):
         provenance.write_run_folder(folder, config.dumps(Settings(4, 1.0)))
     provenance.write_run_folder(folder, config.dumps(Settings(4, 1.0)), resume=True)
     assert tomllib.loads((folder / "config.toml").read_text())["seed"] == 3
@@ -82,7 +82,7 @@ def test_run_folder_holds_config_and_record_and_is_not_overwritten(tmp_path):
 
 def test_writing_where_a_file_stands_in_the_way_names_the_place(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(StorageError, match="cannot write"):
+    with raises(StorageError, match="cannot write"):
         atomic_write(tmp_path / "file" / "below", "x")
 
 

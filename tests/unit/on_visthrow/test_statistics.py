@@ -1,7 +1,8 @@
 """Intervals against closed forms and by their coverage on made-up throws."""
 
 import numpy as np
-import pytest
+from numpy.random import default_rng
+from pytest import approx, raises
 from scipy import stats
 
 from visthrow.common import statistics as st
@@ -20,12 +21,12 @@ the sample's skew.
 
 def test_interval_of_a_mean_is_the_closed_form():
     """Of many normal throws: mean +- 1.96 standard errors."""
-    x = np.random.default_rng(1).normal(0.03, 0.01, 400)
+    x = default_rng(1).normal(0.03, 0.01, 400)
     found = st.mean(x, draws=20000)
     half = 1.96 * x.std() / np.sqrt(len(x))
-    assert found.value == pytest.approx(x.mean())
-    assert found.low == pytest.approx(x.mean() - half, abs=CLOSED * half)
-    assert found.high == pytest.approx(x.mean() + half, abs=CLOSED * half)
+    assert found.value == approx(x.mean())
+    assert found.low == approx(x.mean() - half, abs=CLOSED * half)
+    assert found.high == approx(x.mean() + half, abs=CLOSED * half)
     assert found.levels == "throws"
 
 
@@ -34,18 +35,18 @@ def test_two_levels_carry_the_scatter_of_the_runs():
 
     (variance of run means + mean of throw variances / N) / runs, as drawn.
     """
-    rng = np.random.default_rng(2)
+    rng = default_rng(2)
     groups = [rng.normal(m, 0.01, 50) for m in (0.02, 0.03, 0.05, 0.06)]
-    samples = st._resampled(groups, np.random.default_rng(0), 40000)
+    samples = st._resampled(groups, default_rng(0), 40000)
     means = np.array([g.mean() for g in groups])
     expected = (means.var() + np.mean([g.var() for g in groups]) / 50) / 4
-    assert samples.var() == pytest.approx(expected, rel=0.04)
-    assert samples.mean() == pytest.approx(means.mean(), abs=1e-4)
+    assert samples.var() == approx(expected, rel=0.04)
+    assert samples.mean() == approx(means.mean(), abs=1e-4)
     assert st.mean(groups).levels == "runs and throws"
 
 
 def covered(make, truth: float) -> float:
-    rng = np.random.default_rng(3)
+    rng = default_rng(3)
     return np.mean([truth in make(rng) for _ in range(TRIALS)])
 
 
@@ -73,7 +74,7 @@ def test_throws_alone_miss_the_scatter_between_runs():
     """Eight runs whose true means scatter: pooling their throws claims far too much, two levels do
     not.
     """
-    rng = np.random.default_rng(4)
+    rng = default_rng(4)
     pooled = two = 0
     for _ in range(150):
         groups = [rng.normal(m, 0.01, 100) for m in rng.normal(0.03, 0.01, 8)]
@@ -86,37 +87,37 @@ def test_throws_alone_miss_the_scatter_between_runs():
 
 
 def test_pairs_remove_what_both_share():
-    rng = np.random.default_rng(5)
+    rng = default_rng(5)
     shared = rng.normal(0.0, 0.1, 200)
     a, b = shared + rng.normal(0.01, 0.005, 200), shared + rng.normal(0.0, 0.005, 200)
     a[3] = np.nan
     pair, alone = st.paired(a, b), st.difference(a[np.isfinite(a)], b)
     assert 0.01 in pair
     assert (pair.high - pair.low) < 0.2 * (alone.high - alone.low)
-    with pytest.raises(ValueError, match="pairs of 200 and 199"):
+    with raises(ValueError, match="pairs of 200 and 199"):
         st.paired(a, b[1:])
 
 
 def test_correlation_against_fisher():
     """Interval of a correlation of normal pairs: tanh(atanh r +- 1.96 / sqrt(n - 3))."""
-    rng = np.random.default_rng(6)
+    rng = default_rng(6)
     x = rng.normal(size=500)
     y = 0.8 * x + 0.6 * rng.normal(size=500)
     found = st.correlation(x, y)
-    assert found.value == pytest.approx(stats.pearsonr(x, y).statistic)
+    assert found.value == approx(stats.pearsonr(x, y).statistic)
     ends = np.tanh(np.arctanh(found.value) + np.array([-1.96, 1.96]) / np.sqrt(497))
-    assert [found.low, found.high] == pytest.approx(ends, abs=0.008)
-    with pytest.raises(ValueError, match="three or more pairs"):
+    assert [found.low, found.high] == approx(ends, abs=0.008)
+    with raises(ValueError, match="three or more pairs"):
         st.correlation(x[:2], y[:2])
 
 
 def test_bias_splits_the_mean_square():
-    rng = np.random.default_rng(7)
+    rng = default_rng(7)
     miss = rng.normal([-0.05, 0.0], [0.02, 0.01], (300, 2))
     miss[:, 1] -= miss[:, 1].mean()
     found = st.bias(miss)
-    assert found.offset**2 + found.scatter**2 == pytest.approx((miss**2).sum(1).mean())
-    assert found.scatter == pytest.approx(np.sqrt(miss.var(0).sum()))
+    assert found.offset**2 + found.scatter**2 == approx((miss**2).sum(1).mean())
+    assert found.scatter == approx(np.sqrt(miss.var(0).sum()))
     assert -0.05 in found.along
     assert found.direction == "undershoots"
     assert st.bias(miss * [-1.0, 1.0] + [0.0, -0.02]).direction == "overshoots, right"
@@ -124,9 +125,9 @@ def test_bias_splits_the_mean_square():
 
 
 def test_nothing_to_average_is_said():
-    with pytest.raises(ValueError, match="expected finite numbers"):
+    with raises(ValueError, match="expected finite numbers"):
         st.mean([np.zeros(0)])
-    with pytest.raises(ValueError, match="expected finite numbers"):
+    with raises(ValueError, match="expected finite numbers"):
         st.mean(np.array([1.0, np.nan]))
     assert st.mean(np.array([0.02])).low == 0.02
     assert st.Interval(1.0, 0.5, 2.0, "throws").text(1, sign=True) == "+1.0 [+0.5, +2.0]"

@@ -8,7 +8,7 @@ import lzma
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import pytest
+from pytest import importorskip, mark, raises
 from scipy.io import savemat
 
 from visthrow.common import storage
@@ -24,7 +24,7 @@ ZEROS = np.zeros(ROWS)
 
 
 def h5(path):
-    with pytest.importorskip("h5py").File(path, "w") as file:
+    with importorskip("h5py").File(path, "w") as file:
         file.create_dataset("x", data=ZEROS, compression="gzip")
 
 
@@ -39,18 +39,18 @@ WRITERS = {
 READERS = {".mat": read_recording, ".h5": read_recording, ".npz": read}
 
 
-@pytest.mark.parametrize("name", WRITERS)
+@mark.parametrize("name", WRITERS)
 def test_what_unpacks_to_too_much_is_not_read(name, tmp_path, monkeypatch):
     path = tmp_path / name
     WRITERS[name](path)
     reader = READERS.get(path.suffix, read_table)
     monkeypatch.setattr(storage, "MOST_UNPACKED", 1 << 20)
     monkeypatch.setattr(storage, "MOST_TIMES", 1)
-    with pytest.raises(LogError, match=r"MB that unpack to at least [1-5] MB; expected 1 MB at"):
+    with raises(LogError, match=r"MB that unpack to at least [1-5] MB; expected 1 MB at"):
         reader(path)
     monkeypatch.setattr(storage, "MOST_UNPACKED", 1 << 24)
     if name == "x.npz":
-        with pytest.raises(LogError, match="no entry 'header'"):
+        with raises(LogError, match="no entry 'header'"):
             reader(path)
     else:
         assert len(reader(path)["x"]) == ROWS

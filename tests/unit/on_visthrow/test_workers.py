@@ -4,7 +4,7 @@ import math
 import os
 import time
 
-import pytest
+from pytest import mark, raises
 
 from bench.processes import side_by_side
 from visthrow.common.errors import VisthrowError
@@ -41,7 +41,7 @@ def test_one_process_works_here_and_in_order():
     assert set(seen) == {os.getpid()}
 
 
-@pytest.mark.slow
+@mark.slow
 def test_processes_do_each_task_once():
     assert sorted(done(squared, [3.0, 1.0, 2.0, 5.0, 4.0], 2)) == [
         (0, 9.0),
@@ -53,16 +53,14 @@ def test_processes_do_each_task_once():
     assert list(done(math.sqrt, [], 2)) == []
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")]
-)
+@mark.slow
+@mark.parametrize(("function", "message"), [(refused, "^no [12]"), (killed, "ended with status 7")])
 def test_an_error_or_a_dead_process_ends_the_work(function, message):
-    with pytest.raises(VisthrowError, match=message):
+    with raises(VisthrowError, match=message):
         list(done(function, [1, 2], 2))
 
 
-@pytest.mark.slow
+@mark.slow
 def test_leaving_early_ends_the_processes():
     begin = time.monotonic()
     with Workers(endless, [1, 2], 2) as workers:
@@ -85,6 +83,6 @@ def test_threads_hold_one_place_each_and_begin_nothing_after_an_error():
         return 10 * item
 
     assert sorted(side_by_side(work, range(4), ["a", "b"])) == [0, 10, 20, 30]
-    with pytest.raises(VisthrowError, match="no"):
+    with raises(VisthrowError, match="no"):
         list(side_by_side(work, range(4, 20), ["a", "b"]))
     assert max(begun) < 8
