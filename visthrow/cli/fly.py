@@ -14,13 +14,6 @@ FILES = {
     "pixels.png": "frames of the throw with what the detector saw",
 }
 
-EXPORTS = {
-    ".csv": ("csv", ""),
-    ".parquet": ("pyarrow", "view"),
-    ".mcap": ("mcap.writer", "recordings"),
-}
-"""Ending of a file -> the module that writes it, and the extra that brings it."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -120,20 +113,22 @@ def _check(args: argparse.Namespace) -> None:
     """Raise ConfigError for arguments that no flight follows."""
     from visthrow.common.errors import ConfigError
     from visthrow.common.extras import load_extra
+    from visthrow.logs.export import FORMATS
     from visthrow.throws.plants import known_plant
 
     known_plant(args.plant)
+    formats = FORMATS | {".mcap": ("mcap.writer", "recordings")}
     if len(args.target) > 2:
         raise ConfigError(
             f"--target {' '.join(f'{x:g}' for x in args.target)}; expected a distance, or x and y"
         )
     for path in args.export:
         ending = Path(path).suffix
-        if ending not in EXPORTS:
+        if ending not in formats:
             raise ConfigError(
-                f"--export {path}: ending '{ending}'; expected one of {', '.join(EXPORTS)}"
+                f"--export {path}: ending '{ending}'; expected one of {', '.join(formats)}"
             )
-        load_extra(*EXPORTS[ending], f"--export {path}", ConfigError)
+        load_extra(*formats[ending], f"--export {path}", ConfigError)
     if args.no_rope and (args.pixels or args.save or args.export or args.plant != "hybrid"):
         raise ConfigError("--no-rope with --pixels, --save, --export or --plant; expected it alone")
     for override in args.overrides:

@@ -14,7 +14,8 @@ from visthrow.common.errors import LogError
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 
-FORMATS = (".csv", ".parquet")
+FORMATS = {".csv": ("csv", ""), ".parquet": ("pyarrow", "view")}
+"""Ending of a table -> the module that writes it, and the extra that brings it."""
 
 
 def export(log: FlightLog, path: str | Path) -> None:
