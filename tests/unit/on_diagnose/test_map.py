@@ -149,9 +149,21 @@ def test_markers_are_compared_in_a_time_that_grows_with_their_number(monkeypatch
     relate = relations.relate
     monkeypatch.setattr(relations, "relate", lambda *a, **k: compared.append(0) or relate(*a, **k))
     asked = " ".join(propose(columns, "capture").questions)
-    assert "m29_x, m29_y, m29_z a position?" in asked
-    assert "are v_x, v_y, v_z a position?" not in asked
+    assert "m29_x, m29_y, m29_z" in asked
+    assert "v_x" not in asked
     assert len(compared) < 100
+
+
+def test_a_payload_belongs_to_the_path_that_it_hangs_below():
+    """The first of three paths is another vehicle's."""
+    time = np.arange(0.0, 20.0, 0.01)
+    path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 2.0 + 0.2 * np.sin(time)])
+    swing = 0.2 * np.sin(3.0 * time)
+    below = 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
+    columns = {"time": time} | named("pos_a", 0.7 * path[::-1] + 1.0)
+    columns |= named("pos_b", path) | named("pos_c", path + below)
+    made = {entry.name: entry.columns[0] for entry in propose(columns, "a").mapping.channels}
+    assert made == {"pos_w": "pos_b_x", "payload_pos_w": "pos_c_x"}
 
 
 def test_the_imu_of_euroc_is_proposed(tmp_path):

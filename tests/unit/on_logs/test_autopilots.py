@@ -310,6 +310,8 @@ def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware,
     logfiles.write_bin(path, formats, rows)
     log = read(path)[0]
     assert log.meta["vehicle"] == kind
+    refused = any(row.topic == "vehicle" for row in check([log])[0].rows)
+    assert refused == (kind in ("plane", "VTOL"))  # rotors in a plus fly by the same physics
     if kind != "quadrotor":
         assert "motor_output" not in log
         return

@@ -18,6 +18,7 @@ from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import physics, thrust_checks
+from visthrow.logs.check.excitation import excitation
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
@@ -444,6 +445,20 @@ def test_order_of_motors():
 def test_too_short(count):
     columns = {name: values[:count] for name, values in flight().items()}
     assert "at least 20" in faults(log_of(columns))
+
+
+def test_an_autopilot_that_says_once_that_it_flies_is_no_fault():
+    log = log_of(flight(), flying=Channel(np.array([2.0]), np.array([True]), "bool"))
+    assert check([log])[0].verdict == "ok"
+
+
+def test_no_more_seconds_are_flown_than_there_are():
+    """Samples in pairs: the median step is half of the mean one, or twice."""
+    columns = flight(20.0, scale=0.1)
+    for nearer in (0.004, 0.016):
+        columns["time"] = np.arange(2000) // 2 * 0.02 + np.arange(2000) % 2 * nearer
+        figures = excitation(log_of(columns))
+        assert figures["seconds_flown"] == pytest.approx(figures["seconds"], abs=0.1)
 
 
 def test_long_and_constant_logs():

@@ -521,9 +521,9 @@ class _Chooser:
                 for g in smooth
                 if not any(re.search(pattern, g.stem.lower()) for pattern in patterns)
             ]
-            self.found.questions += [
-                f"are {', '.join(g.columns)} a position? Their names do not say" for g in groups
-            ]
+            listed = "; ".join(", ".join(group.columns) for group in groups)
+            if groups:
+                self.found.questions.append(f"are these positions? Names do not say: {listed}")
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
         derived = self._derivatives(moving, groups)
         groups = [group for group, is_rate in zip(groups, derived) if not is_rate]
@@ -544,7 +544,9 @@ class _Chooser:
         }
         paths = [(g, units[g.columns]) for g in groups if units.get(g.columns)]
         pay = self._payload(paths)
-        vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[0]]
+        vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[1]]
+        if pay is not None and not _ESTIMATE.search(getattr(pay[0], "stem", "")):
+            vehicles.sort(key=lambda path: path[0] is not pay[0])  # the payload hangs below it
         for group, unit in vehicles:
             usual = (
                 "est_pos_w"
@@ -577,7 +579,7 @@ class _Chooser:
                 " first is taken"
             )
         if pay is not None:
-            group, unit, why = pay
+            _, group, unit, why = pay
             self._take(
                 "payload_pos_w",
                 group,
@@ -677,8 +679,13 @@ class _Chooser:
                 f" {' or '.join(self.attitudes)}?"
             )
 
-    def _payload(self, paths: list[tuple[Group, str]]) -> tuple[Group, str, str] | None:
-        """The path below another one that keeps its distance from it."""
+    def _payload(
+        self, paths: list[tuple[Group, str]]
+    ) -> tuple[Group | None, Group, str, str] | None:
+        """Find the path below another one that keeps its distance from it.
+
+        Returns that other one, the path, its unit and the reason.
+        """
         candidates = []
         rows = slice(None, None, max(1, len(self.time) // _COMPARED))
         for upper, a in paths:
@@ -693,11 +700,13 @@ class _Chooser:
                     and spread < 0.1 * middle
                     and np.nanmedian(gap[:, 2]) < -0.3 * middle
                 ):
-                    candidates.append((spread / middle, lower, b, middle))
+                    candidates.append((spread / middle, upper, lower, b, middle))
         best = min(candidates, key=lambda candidate: candidate[0], default=None)
-        if best is None and len(paths) == 1 and _NOT_VEHICLE.search(" ".join(paths[0][0].columns)):
-            return (*paths[0], "the only path, and its name speaks of no vehicle")
-        return best and (best[1], best[2], f"keeps {best[3]:.3f} m from another path, below it")
+        if best is not None:
+            return *best[1:4], f"keeps {best[4]:.3f} m from another path, below it"
+        if len(paths) == 1 and _NOT_VEHICLE.search(" ".join(paths[0][0].columns)):
+            return None, *paths[0], "the only path, and its name speaks of no vehicle"
+        return None
 
     def _smooth(self, group: Group) -> bool:
         values = group.values[np.all(np.isfinite(group.values), axis=1)]

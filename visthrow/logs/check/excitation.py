@@ -147,7 +147,6 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
         return -np.inf, np.inf
     _, time, pos = signal
     above = pos[:, 2] - np.percentile(pos[:, 2], 1)
-    period = np.median(np.diff(time))
     up = above > 0.15 * np.max(above) if np.max(above) > 0.3 else np.ones(len(above), bool)
     if "flying" in log and len(log["flying"].time):
         up &= log["flying"].hold(time)
@@ -155,19 +154,20 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
             figures["grounded"] = figures["still"] = 1.0
             figures["seconds_flown"] = 0.0
             return np.inf, -np.inf
-    figures["seconds_flown"] = float(np.sum(up) * period)
+    figures["seconds_flown"] = float(np.mean(up) * np.ptp(time))
     figures["height_range_m"] = float(np.ptp(pos[:, 2]))
-    figures["seconds_low"] = float(np.sum(up & (pos[:, 2] < 0.3)) * period)
+    figures["seconds_low"] = float(np.mean(up & (pos[:, 2] < 0.3)) * np.ptp(time))
     return (float(time[up][0]), float(time[up][-1])) if np.any(up) else (-np.inf, np.inf)
 
 
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
     if signal := _first(log, POSITIONS, 50):
         time, vel = relations.derivative(*signal[1:], 0.1)
-        speed = np.linalg.norm(vel[(time >= flown[0]) & (time <= flown[1])], axis=1)
+        flies = (time >= flown[0]) & (time <= flown[1])
+        speed = np.linalg.norm(vel[flies], axis=1)
         if len(speed):
             figures["speed_p95_m_s"] = float(np.percentile(speed, 95))
-            figures["seconds_hover"] = float(np.sum(speed < 0.15) * np.median(np.diff(time)))
+            figures["seconds_hover"] = float(np.mean(speed < 0.15) * np.ptp(time[flies]))
     if signal := _first(log, ATTITUDES):
         x, y, z, w = signal[2].T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))

@@ -120,7 +120,7 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
         text = (
             f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
         )
-        event = name in ("separation", "landing", "goal_w", "release_command", "attached", "mode")
+        event = name in _SWITCHES + ("separation", "landing", "goal_w")
         return [
             Row("clock", name, "ok" if event else "bad", text, {"samples": count, "seconds": span})
         ]

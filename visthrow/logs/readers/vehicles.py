@@ -66,7 +66,7 @@ class Vehicle:
     @property
     def rotors_alone(self) -> bool:
         """Whether rotors on fixed arms carry it, or the log does not say."""
-        return self.kind in ("", *ROTORS.values())
+        return self.kind in ("", "tricopter") or "rotor" in self.kind
 
 
 def vehicle_of(log: Messages) -> Vehicle:
