@@ -458,7 +458,7 @@ def test_no_more_seconds_are_flown_than_there_are():
     for nearer in (0.004, 0.016):
         columns["time"] = np.arange(2000) // 2 * 0.02 + np.arange(2000) % 2 * nearer
         figures = excitation(log_of(columns))
-        assert figures["seconds_flown"] == pytest.approx(figures["seconds"], abs=0.1)
+        assert figures["seconds_flown"] == approx(figures["seconds"], abs=0.1)
 
 
 def test_long_and_constant_logs():
