@@ -32,7 +32,6 @@ DATA = Path(__file__).resolve().parents[2] / "data"
 REAL = DATA / "real"
 FULL = Path(os.environ.get("VISTHROW_REAL_DATA", REAL))
 SETUPS = {
-    "betaflight_bbl": None,
     "crazypad_faults": "crazypad",
     "jugglebot_throws": "jugglebot",
     "motor_prop_stand": "motor_stand",
@@ -42,8 +41,6 @@ SETUPS = {
     "pendulum_single": "pendulum_encoder",
     "slungload_camera": "slungload_camera",
 }
-
-pytestmark = mark.slow
 
 
 def explained(setup: str, *paths: str | Path):
@@ -66,11 +63,10 @@ def explained(setup: str, *paths: str | Path):
 @mark.parametrize("folder", list(SETUPS))
 def test_every_file_gets_a_verdict(folder):
     root = FULL / folder if (FULL / folder).is_dir() else DATA / folder
-    files = sorted(p for p in root.iterdir() if p.name.endswith((".csv.gz", ".bbl")))
+    files = sorted(p for p in root.iterdir() if p.name.endswith(".csv.gz"))
     assert files
     for path in files:
-        logs = setups.read_logs([path], SETUPS[folder]) if SETUPS[folder] else read_all([path])
-        for checked in check(logs):
+        for checked in check(setups.read_logs([path], SETUPS[folder])):
             assert checked.verdict in ("ok", "warn", "bad")
             assert not [
                 reason
@@ -95,6 +91,7 @@ def test_two_drones_run_on_two_clocks():
     assert row.figures["rms_m"] < 1e-3
 
 
+@mark.slow
 def test_streams_of_nanobench_are_not_aligned_to_half_a_millisecond():
     (checked,) = check(
         setups.read_logs(
@@ -109,6 +106,7 @@ def test_streams_of_nanobench_are_not_aligned_to_half_a_millisecond():
     assert np.ptp(drift[0].figures["delays_s"]) > 5e-3
 
 
+@mark.slow
 def test_pendulum_has_three_frictions():
     diagnosis, named, rms = explained(
         "pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
@@ -120,12 +118,14 @@ def test_pendulum_has_three_frictions():
     assert rms(diagnosis.theta) < 0.1 * rms({})
 
 
+@mark.slow
 def test_ball_has_drag_and_sideways_forces_cannot_be_told_apart():
     diagnosis, named, rms = explained("jugglebot", REAL / "jugglebot_throws" / "session7.csv.gz")
     assert named & {"ball_drag", "linear_drag"}
     assert rms(diagnosis.theta) < 0.5 * rms({})
 
 
+@mark.slow
 def test_a_cut_propeller_is_found_and_tape_is_not():
     folder = REAL / "crazypad_faults"
     diagnosis, named, _ = explained(
@@ -140,6 +140,7 @@ def test_a_cut_propeller_is_found_and_tape_is_not():
     assert not named
 
 
+@mark.slow
 def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
     """Windows of one sample without a state at their start: the motor that is named predicts the
     parts that were left out.
@@ -164,6 +165,7 @@ def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
     assert (tmp_path / "report.html").is_file()
 
 
+@mark.slow
 def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
     flights = [REAL / "payload_cf_single" / f"log{number}.csv.gz" for number in (204, 205, 206)]
     diagnosis, named, rms = explained("cf_payload", *flights)
@@ -178,6 +180,7 @@ def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
     assert rms(diagnosis.theta, 1) < 0.5 * rms({}, 1)
 
 
+@mark.slow
 def test_thrust_map_drag_and_battery_of_nanobench():
     diagnosis, named, rms = explained(
         "nanobench_cf21", REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"
@@ -187,6 +190,7 @@ def test_thrust_map_drag_and_battery_of_nanobench():
     assert rms(diagnosis.theta) < 0.2 * rms({})
 
 
+@mark.slow
 def test_a_motor_idles_and_a_hundred_motors_are_not_one():
     table = REAL / "motor_prop_stand" / "all_tests.csv.gz"
     for pair in ("a1", "c1", "g1"):  # one motor, one propeller, two supplies
@@ -199,6 +203,7 @@ def test_a_motor_idles_and_a_hundred_motors_are_not_one():
     assert "thrust_voltage" not in named
 
 
+@mark.slow
 def test_the_camera_sees_the_load_nearer_the_axis():
     diagnosis, named, rms = explained(
         "slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz"))
@@ -223,9 +228,6 @@ def test_the_camera_sees_the_load_nearer_the_axis():
         ("pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"),
         ("cf_payload", REAL / "payload_cf_single" / "log206.csv.gz"),
         ("motor_stand", REAL / "motor_prop_stand" / "all_tests.csv.gz"),
-        ("slungload_camera", DATA / "slungload_camera" / "rosbag_16.csv.gz"),
-        ("crazypad", REAL / "crazypad_faults" / "tape_on_propeller_M3__E8_log00.csv.gz"),
-        ("jugglebot", REAL / "jugglebot_throws" / "session7.csv.gz"),
     ],
 )
 def test_spoiled_tables_get_a_verdict_or_an_error(setup, path, how, tmp_path, capsys):
