@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from camera.fisheye import Fisheye
+from camera.mount import rotation_from_vector
 
 
 @dataclass(frozen=True)
@@ -27,11 +28,10 @@ class ViewParams:
 
 def view_rotation(view: ViewParams) -> torch.Tensor:
     """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
-    from scipy.spatial.transform import Rotation
-
-    return torch.from_numpy(
-        Rotation.from_euler("YX", [view.yaw_deg, view.pitch_deg], degrees=True).as_matrix()
-    )
+    yaw, pitch = math.radians(view.yaw_deg), math.radians(view.pitch_deg)
+    turns = torch.tensor([[0.0, yaw, 0.0], [pitch, 0.0, 0.0]], dtype=torch.float64)
+    about_y, about_x = rotation_from_vector(turns)
+    return about_y @ about_x
 
 
 def view_focal(view: ViewParams) -> float:

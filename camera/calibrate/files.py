@@ -118,12 +118,12 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     position_b = -rot_cb.T @ place_c
     if key == "T_imu_cam":
         rot_cb, position_b = matrix[:3, :3].T, place_c
-    from scipy.spatial.transform import Rotation
-
-    turn = Rotation.from_matrix(rot_cb.T @ np.array(DOWNWARD_ROT_CB))
-    yaw, pitch, roll = turn.as_euler("ZYX", degrees=True).tolist()
+    turn = (rot_cb.T @ np.array(DOWNWARD_ROT_CB)).tolist()
+    roll = math.atan2(turn[2][1], turn[2][2])
+    pitch = math.asin(max(-1.0, min(1.0, -turn[2][0])))
+    yaw = math.atan2(turn[1][0], turn[0][0])
     x, y, z = position_b.tolist()
-    return MountParams((x, y, z), (roll, pitch, yaw))
+    return MountParams((x, y, z), (math.degrees(roll), math.degrees(pitch), math.degrees(yaw)))
 
 
 def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:

@@ -66,11 +66,9 @@ class CalibrationSolver:
 
 
 def _warm() -> None:
-    import scipy.sparse.linalg
     import torch
 
     torch.set_num_threads(1)
-    _ = scipy.sparse.linalg
 
 
 class Calibrating:

@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from camera.detectors.contours import BallSeen, FrameDetections, GoalSeen, detected_keypoints
 from camera.keypoints import GOAL_KEYPOINTS, KEYPOINTS, KeypointCamera
 from camera.mount import rotation_from_vector
 from hil.poses.pose import Quaternion, Vector
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.observations import rotation_from_quat
 
@@ -98,7 +98,7 @@ class Detections:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than
         these.
         """
-        self._path.append((time, np.array(pos), rotation_of(quat)))
+        self._path.append((time, np.array(pos), np.array(quat)))
 
     def take(self, detection: Detection, quat: Quaternion, aged: float = 0.0) -> None:
         """Take a frame in; the vehicle's attitude says which corner is which, and poses have an age
@@ -132,8 +132,9 @@ class Detections:
         """Return what was seen at a time as the camera of training would see it now: the goal lies,
         the ball goes with the vehicle.
         """
-        _, pos_now, rot_now = self._path[-1]
-        pos, rot = self._pose(when)
+        _, pos_now, quat_now = self._path[-1]
+        pos, quat = self._pose(when)
+        rot_now, rot = matrix_of_quat(quat_now), matrix_of_quat(quat)
         rot_bc, lens = (
             self._camera.rot_cb.double().numpy().T,
             self._camera.position_b.double().numpy(),
@@ -158,17 +159,17 @@ class Detections:
         return rays
 
     def _pose(self, when: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the place and attitude at a time on the path, by straight lines; its ends beyond
-        them.
+        """Return the place and the quaternion, of any length, at a time on the path, by straight
+        lines; its ends beyond them.
         """
         path = list(self._path)
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:
             return path[after][1:]
-        (begin, pos, rot), (end, pos_after, rot_after) = path[after - 1], path[after]
+        (begin, pos, quat), (end, pos_after, quat_after) = path[after - 1], path[after]
         share = (when - begin) / (end - begin)
-        way = Rotation.from_matrix(rot.T @ rot_after).as_rotvec()
-        return pos + share * (pos_after - pos), rot @ Rotation.from_rotvec(share * way).as_matrix()
+        nearest = quat_after if quat @ quat_after > 0.0 else -quat_after
+        return pos + share * (pos_after - pos), quat + share * (nearest - quat)
 
     def keypoints(self, time: float) -> tuple[np.ndarray, np.ndarray]:
         """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape

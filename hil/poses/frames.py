@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
-from visthrow.common.rotations import conjugate, cross_one, multiply, rotate_one
+from visthrow.common.rotations import conjugate, cross_one, multiply, quat_of_matrix, rotate_one
 from visthrow.config.bounds import Bounded
 from visthrow.logs.axes import turn_of
 
@@ -117,9 +116,9 @@ def _quaternion(matrix: np.ndarray) -> Quaternion:
     exactly, so that "x,y,z" changes no bit.
     """
     exact = np.array([0.0, 0.5, math.sqrt(0.5), 1.0])
+    exact = np.concatenate([-exact, exact])
     x, y, z, w = (
-        math.copysign(float(exact[np.argmin(np.abs(exact - abs(v)))]), v)
-        for v in Rotation.from_matrix(matrix).as_quat()
+        float(exact[np.argmin(np.abs(exact - v))]) for v in quat_of_matrix(matrix).tolist()
     )
     sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))
     return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0)

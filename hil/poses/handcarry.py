@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 
 import numpy as np
-from scipy.ndimage import find_objects, label
 
 from hil.errors import RunError
 from hil.links.clock import Clock
@@ -123,10 +122,10 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
     rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
     resting = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
+    turns = np.diff(resting, prepend=False, append=False)
+    edges = np.flatnonzero(turns).reshape(-1, 2)  # of each rest: its first pose, and one past it
     return [
-        s
-        for (s,) in find_objects(label(resting)[0])
-        if times[s.stop - 1] - times[s.start] >= REST_TIME
+        slice(start, stop) for start, stop in edges if times[stop - 1] - times[start] >= REST_TIME
     ]
 
 

@@ -38,7 +38,7 @@ EXTRAS = (  # packages that an installation without extras lacks
     *("cflib", "cyclonedds", "natnet", "motioncapture", "mujoco_warp", "aeroid"),
 )
 ON_THE_GROUND = (  # extras train, view, pictures
-    *("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow", "cv2", "matplotlib"),
+    *("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow", "cv2", "matplotlib", "scipy"),
 )
 BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
 

@@ -71,7 +71,7 @@ TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 _EXTRAS = {
     **dict.fromkeys(("warp", "rsl_rl", "tensordict", "kornia"), "train"),
     **dict.fromkeys(("rerun", "pyarrow"), "view"),
-    **dict.fromkeys(("cv2", "matplotlib"), "pictures"),
+    **dict.fromkeys(("cv2", "matplotlib", "scipy"), "pictures"),
     **{"submitit": "slurm", "mujoco": "reference", "piqp": "paper"},
 }
 """Optional packages by import name, and the extra of visthrow that installs them."""

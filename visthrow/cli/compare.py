@@ -208,11 +208,14 @@ def throw_hybrid(
     policy a `Throws` a target.
     """
     from visthrow.throws.calibrated import calibrated_start
+
+    # A policy that cannot be calibrated is refused before the simulator is imported.
+    starts = [calibrated_start(item.experiment) if calibrate else None for item in loaded]
     from visthrow.training.env import ThrowEnv
     from visthrow.training.protocol import throw
 
     rows: list[list] = []
-    for item in loaded:
+    for item, start in zip(loaded, starts):
         policy = item.policy.to(device)
         row = []
         rows.append(row)
@@ -221,12 +224,9 @@ def throw_hybrid(
                 f"throws in the training simulator: {sum(map(len, rows))} of"
                 f" {len(loaded) * len(targets)} sets"
             )
-            begin = calibrated_start(item.experiment) if calibrate else ThrowEnv.reset
-            row.append(
-                throw(
-                    item.experiment, policy.actor(count), target, count, device, seed, begin=begin
-                )
-            )
+            begin = start or ThrowEnv.reset
+            actor = policy.actor(count)
+            row.append(throw(item.experiment, actor, target, count, device, seed, begin=begin))
     status("")
     return rows
 

@@ -3,8 +3,7 @@
 Onboard-safe.
 
 First arrays over any leading axes; then single quaternions and vectors in plain floats, which NumPy
-would handle ten times slower and which give the same bits for the same input. Conversions that
-neither needs in a loop are scipy's ``Rotation``."""
+would handle ten times slower and which give the same bits for the same input."""
 
 import math
 
@@ -42,6 +41,39 @@ def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
         for j, entry in enumerate(row):
             out[..., i, j] = entry
     return out
+
+
+def quat_of_matrix(rot: np.ndarray) -> np.ndarray:
+    """Return unit quaternions, shape (..., 4), w not negative, of rotation matrices, shape
+    (..., 3, 3): the eigenvectors of the largest eigenvalues of symmetric matrices.
+
+    Source: Bar-Itzhack, "New method for extracting the quaternion from a rotation matrix",
+    J. Guid. Control Dyn. 23(6), 2000."""
+    trace = np.trace(rot, axis1=-2, axis2=-1)[..., None, None]
+    skew = rot - rot.mT
+    form = np.empty((*rot.shape[:-2], 4, 4))
+    form[..., :3, :3] = rot + rot.mT - trace * np.eye(3)
+    form[..., 3, :3] = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    form[..., 3, 3:] = trace[..., 0]
+    quat = np.linalg.eigh(form).eigenvectors[..., -1]  # of the lower triangle
+    return np.where(quat[..., 3:] < 0.0, -quat, quat)
+
+
+def quat_of_vector(vector: np.ndarray) -> np.ndarray:
+    """Return unit quaternions, shape (..., 4), of axes times angles [rad], shape (..., 3)."""
+    half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
+    return np.concatenate([0.5 * vector * np.sinc(half / np.pi), np.cos(half)], axis=-1)
+
+
+def vectors_between(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+    """Return axes times angles, below half a turn [rad], shape (T, 3), from attitudes to others,
+    quaternions of any length, shape (T, 4).
+    """
+    turn = np.stack(multiply(conjugate(first.T), last.T), -1)
+    turn *= np.where(turn[:, 3:] < 0.0, -1.0, 1.0)
+    sine = np.linalg.norm(turn[:, :3], axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, turn[:, 3:])
+    return turn[:, :3] * angle / np.maximum(sine, 1e-300)
 
 
 def rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:

@@ -481,13 +481,13 @@ def calibrate(
     x, c = problem.start()
     for _ in range(ROUNDS):
         try:
-            solve, gradient, misfit = _linearised(problem, x, c)
+            factor, gradient, misfit = _linearised(problem, x, c)
         except RuntimeError as error:  # of a factorisation
             raise CalibrationError(f"{NO_ANSWER}: {error}") from error
-        step = solve(-gradient)
+        step = torch.cholesky_solve(-gradient[:, None], factor)[:, 0]
         width = x.numel()
-        x = x + torch.from_numpy(step[:width]).reshape(x.shape)
-        moved = torch.from_numpy(step[width:])
+        x = x + step[:width].reshape(x.shape)
+        moved = step[width:]
         c = c + moved
         if not bool(torch.isfinite(c).all()):
             raise CalibrationError(NO_ANSWER)
@@ -498,10 +498,8 @@ def calibrate(
             f"calibration did not settle in {ROUNDS} rounds; expected a hover that ends in a sway,"
             " its ball in view"
         )
-    unit = np.zeros((width + len(c), len(c)))
-    unit[width:] = np.eye(len(c))
-    covariance = np.column_stack([solve(column)[width:] for column in unit.T])
-    sigma = problem.split(torch.from_numpy(np.sqrt(np.maximum(np.diag(covariance), 0.0)))[None])
+    covariance = torch.cholesky_inverse(factor[width:, width:])  # the constants stand last
+    sigma = problem.split(covariance.diagonal().sqrt()[None])
     estimates = problem.split(c[None])
     row = lambda table, name: tuple(table[name][0].tolist())  # noqa: E731
     return Calibration(
@@ -530,15 +528,12 @@ def solved(
         return str(error)
 
 
-def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Any, np.ndarray, float]:
-    """Solver of the normal equations about unknowns, the gradient there, and the misfit of the
-    sightings.
+def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tensor, Tensor, float]:
+    """Cholesky factor of the normal equations about unknowns, the gradient there, and the misfit of
+    the sightings.
 
     A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for
     all of them."""
-    from scipy import sparse
-    from scipy.sparse.linalg import splu
-
     (count, width) = x.shape
     h = 1e-5
     j, _ = problem.places(problem.split(c[None])["latency"][0, 0])
@@ -548,10 +543,9 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Any,
         for parity in (0, 1):
             xs[1 + 2 * i + parity, parity::2, i] += h
     cs[1 + 2 * width :] += h * torch.eye(len(c), dtype=c.dtype)
-    parts = []
-    rows = []
-    first = 0
-    residuals = []
+    prior = torch.cat([torch.zeros(count * width, dtype=c.dtype), 1.0 / problem.prior**2])
+    normal = torch.diag(prior + 1e-9)
+    gradient = prior * torch.cat([torch.zeros(count * width, dtype=c.dtype), c])
     for values, step in (
         (problem.steps(xs, cs), torch.arange(count - 1)),
         (problem.sightings(xs, cs, j), j),
@@ -567,24 +561,14 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Any,
             weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
             base = base * weight
             off = off * weight
-        n, m = base.shape
-        row = first + torch.arange(n * m).reshape(n, m)
-        for i in range(width):
-            for parity in (0, 1):
-                sample = step + (step % 2 != parity).long()
-                rows.append((row.flatten(), (sample * width + i)[:, None].expand(n, m).flatten()))
-                parts.append(off[2 * i + parity].flatten())
-        for i in range(len(c)):
-            rows.append((row.flatten(), torch.full((n * m,), count * width + i)))
-            parts.append(off[2 * width + i].flatten())
-        residuals.append(base.flatten())
-        first += n * m
-    index = [torch.cat(side).numpy() for side in zip(*rows)]
-    size = (first, count * width + len(c))
-    jacobian = sparse.csr_matrix((torch.cat(parts).numpy(), index), shape=size)
-    prior = np.concatenate([np.zeros(count * width), 1.0 / problem.prior.numpy() ** 2])
-    normal = (jacobian.T @ jacobian + sparse.diags(prior + 1e-9)).tocsc()
-    gradient = jacobian.T @ torch.cat(residuals).numpy() + prior * np.concatenate(
-        [np.zeros(count * width), c.numpy()]
-    )
-    return splu(normal).solve, gradient, misfit
+        even, odd = off[: 2 * width : 2], off[1 : 2 * width : 2]
+        is_even = (step % 2 == 0)[:, None]
+        at_step, at_next = torch.where(is_even, even, odd), torch.where(is_even, odd, even)
+        slopes = torch.cat([at_step, at_next, off[2 * width :]]).permute(1, 2, 0)
+        first = step[:, None] * width + torch.arange(2 * width)
+        shared = count * width + torch.arange(len(c)).expand(len(step), -1)
+        unknowns = torch.cat([first, shared], 1)
+        blocks = slopes.mT @ slopes
+        normal.index_put_((unknowns[:, :, None], unknowns[:, None]), blocks, accumulate=True)
+        gradient.index_put_((unknowns,), (slopes.mT @ base[..., None])[..., 0], accumulate=True)
+    return torch.linalg.cholesky(normal), gradient, misfit

@@ -7,11 +7,11 @@ motion-capture hall has it."""
 
 from collections.abc import Callable
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
-from tensordict import TensorDict
 
 from camera.keypoints import KEYPOINTS
 from sim.cores import cores
@@ -22,7 +22,11 @@ from visthrow.onboard import observations as ob
 from visthrow.onboard.calibration import HOVER, SWAY, Calibration, Hovered, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
-from visthrow.training.env import ThrowEnv
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+    from visthrow.training.env import ThrowEnv
 
 SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
 TOO_FEW = (
@@ -32,7 +36,7 @@ TOO_FEW = (
 
 def calibrated_start(
     experiment: Experiment, records: list[Calibration | None] | None = None
-) -> Callable[[ThrowEnv], TensorDict]:
+) -> "Callable[[ThrowEnv], TensorDict]":
     """Return the start of :func:`visthrow.training.protocol.throw`; ConfigError for another layout
     than vision, or goals that move.
 
@@ -45,7 +49,7 @@ def calibrated_start(
             " that stand still"
         )
 
-    def begin(env: ThrowEnv) -> TensorDict:
+    def begin(env: "ThrowEnv") -> "TensorDict":
         estimates = _calibrations(experiment, _hovered(env))
         if records is not None:
             records[:] = estimates
@@ -58,7 +62,7 @@ def calibrated_start(
     return begin
 
 
-def _hovered(env: ThrowEnv) -> list[Hovered]:
+def _hovered(env: "ThrowEnv") -> list[Hovered]:
     """Hover, sway and settle; what was measured till the end of the sway, of each vehicle."""
     cfg = env.cfg
     period = env.cfg.sim.control_period
@@ -95,7 +99,7 @@ def _hovered(env: ThrowEnv) -> list[Hovered]:
     ]
 
 
-def _measured(env: ThrowEnv) -> tuple[np.ndarray, ...]:
+def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
     """Position, attitude xyzw, velocity, body rates, keypoints (E, 8, 2) and validity (E, 8) of
     this step.
     """

@@ -32,6 +32,7 @@ from hil.links.roster import Roster
 from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Body, Pose
 from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder, seen_of
 from visthrow.common.errors import LogError, suggest
+from visthrow.common.rotations import quat_of_euler, rotate
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs import read
 from visthrow.logs.flightlog import FlightLog
@@ -281,10 +282,9 @@ def _of_messages(log: Messages, body: LogBody, table: dict[str, PoseMessage]) ->
 def _columns_of(data: Fields, message: PoseMessage, part: str) -> np.ndarray | None:
     """Return the columns of a part of a pose, shape (T, 3 or 4); None where there are none."""
     if part == "quat" and message.angles:
-        from scipy.spatial.transform import Rotation
-
-        angles = _columns(data, message.angles)
-        return Rotation.from_euler("ZYX", angles[:, ::-1], degrees=True).as_quat()[:, [3, 0, 1, 2]]
+        angles = np.radians(_columns(data, message.angles)).tolist()
+        quats = np.array([quat_of_euler(*row) for row in angles]).reshape(-1, 4)
+        return quats[:, [3, 0, 1, 2]]
     names = getattr(message, part)
     return _columns(data, names) if names else None
 
@@ -308,14 +308,13 @@ def _in_world(
     """Return velocities in the world frame; NaN for a body's without an attitude."""
     if vel is None or frame is None:
         return vel
-    from scipy.spatial.transform import Rotation
-
     body_frame = frame == BODY_FRAME
     usable = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
     vel_w = np.where((body_frame & ~usable)[:, None], np.nan, vel)
     rows = body_frame & usable
     if np.any(rows):
-        vel_w[rows] = Rotation.from_quat(quat[rows][:, [1, 2, 3, 0]]).apply(vel[rows])
+        turns = quat[rows][:, [1, 2, 3, 0]]
+        vel_w[rows] = rotate(turns / np.linalg.norm(turns, axis=1, keepdims=True), vel[rows])
     return vel_w
 
 

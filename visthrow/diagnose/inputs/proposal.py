@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
+from visthrow.common.rotations import rotate_back
 from visthrow.diagnose.inputs import unit_evidence
 from visthrow.logs.axes import turn_of
 from visthrow.logs.check import physics, relations, thrust_checks
@@ -810,7 +811,7 @@ class _Chooser:
         stamps, derived = relations.derivative(time, columns, 0.1)
         if len(stamps) < 100:
             return False
-        turned = relations.attitude_at(*attitude.samples(), stamps).inv().apply(derived)
+        turned = rotate_back(relations.attitude_at(*attitude.samples(), stamps), derived)
         best = max((correlation for correlation, *_ in world), default=0.0)
         for group in self._open(3):
             good = np.all(np.isfinite(group.values), axis=1)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel
@@ -65,7 +66,7 @@ def by_lean(
         time_q, quat = attitude.samples()
         if min(len(stamps), len(time_q)) < 50:
             continue
-        up = relations.attitude_at(time_q, quat, stamps).apply([0.0, 0.0, 1.0])
+        up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
         lean = relations.mean_over(
             stamps, GRAVITY * up[:, :2] / np.maximum(up[:, 2:], 0.2), stamps, _SPAN
         )
@@ -99,7 +100,7 @@ def lean_misfit(time: np.ndarray, path: np.ndarray, attitude: Channel) -> tuple[
     stamps, acc = physics.accelerations(*rising(time, path), "m", _SPAN)
     if min(len(stamps), len(time_q)) < 50:
         return np.inf, 0.0
-    up = relations.attitude_at(time_q, quat, stamps).apply([0.0, 0.0, 1.0])
+    up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
     sideways = np.cross(up, acc + [0.0, 0.0, GRAVITY])
     floor = 1e-4  # noise of a still path [m^2/s^4]
     return float(np.mean(np.sum(sideways**2, axis=1))) + floor, 0.5 * float(np.ptp(stamps)) / _SPAN

@@ -9,6 +9,7 @@ from scipy.signal import lfilter
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.diagnose.models.flyer_params import MOST_LATE, FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -177,7 +178,7 @@ def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
     """Rotations at the half steps, shape (half steps, 3, 3)."""
     time, quat = channel.samples()
     span = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
-    return attitude_at(time[span], quat[span], times).as_matrix()
+    return matrix_of_quat(attitude_at(time[span], quat[span], times))
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:

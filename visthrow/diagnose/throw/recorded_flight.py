@@ -213,7 +213,7 @@ def _paired(
         )
     time = pos.time[close]
     return ChannelSamples(time, pos.values[close], pos.sigma), ChannelSamples(
-        time, attitude_at(quat.time, quat.values, time).as_quat(), quat.sigma
+        time, attitude_at(quat.time, quat.values, time), quat.sigma
     )
 
 

@@ -6,9 +6,9 @@ Onboard-safe.
 from collections.abc import Iterator
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from visthrow.common.free_fall import GRAVITY
+from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back
 from visthrow.logs.axes import EXCHANGES, MATRICES, OURS, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
@@ -67,7 +67,7 @@ def usable(time: np.ndarray, values: np.ndarray, threshold: float) -> bool:
 
 def median_tilt(attitude: Channel) -> float:
     """Middle of an attitude's angle from upright [deg]."""
-    up = Rotation.from_quat(attitude.samples()[1]).apply([0.0, 0.0, 1.0])[:, 2]
+    up = matrix_of_quat(attitude.samples()[1])[:, 2, 2]
     return float(np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0)))))
 
 
@@ -270,7 +270,7 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     if len(time_q) < 50 or len(time_a) < 50:
         return []
     nearest = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
-    mean_w = np.mean(Rotation.from_quat(q).apply(acc[nearest]), axis=0)
+    mean_w = np.mean(matrix_of_quat(q) @ acc[nearest][..., None], axis=0)[:, 0]
     extra = np.zeros(3)
     if pos in log and len(log[pos].time) > 50:
         time_p, p = log[pos].samples()
@@ -323,11 +323,11 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         time_a, force_b = log["acc_b"].samples()
         if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
             return []
-        pushed = relations.attitude_at(time_q, q, time_a).apply(force_b) - [0.0, 0.0, GRAVITY]
+        pushed = rotate(relations.attitude_at(time_q, q, time_a), force_b) - [0.0, 0.0, GRAVITY]
         pushed = relations.mean_over(time_a, pushed, time, _SPAN)
         name = "acc_b"
     else:
-        up = turn.apply([0.0, 0.0, 1.0])
+        up = matrix_of_quat(turn)[:, :, 2]
         pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * [1.0, 1.0, 0.0]
         acc = acc * [1.0, 1.0, 0.0]
         name = "thrust along z"
@@ -339,7 +339,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     wrong = _exchanged(time, acc, pushed, turn, relation.axes_delay, channels, force_b is not None)
     if wrong is None and force_b is not None:
         wrong = _exchanged_body(
-            time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY]), time_a, force_b, channels
+            time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY]), time_a, force_b, channels
         )
     return (
         [wrong]
@@ -448,7 +448,7 @@ def _exchanged(
     time: np.ndarray,
     acc: np.ndarray,
     pushed: np.ndarray,
-    turn: Rotation,
+    turn: np.ndarray,
     delay: float,
     channels: str,
     sensed: bool,
@@ -463,8 +463,8 @@ def _exchanged(
     tried = {"path": np.einsum("kij,nj->kni", MATRICES, acc) - pushed}
     if sensed:
         gravity = np.array([0.0, 0.0, GRAVITY])
-        force_b = turn.inv().apply(pushed + gravity)
-        turned = np.einsum("nij,kjm,nm->kni", turn.as_matrix(), MATRICES, force_b)
+        force_b = rotate_back(turn, pushed + gravity)
+        turned = np.einsum("nij,kjm,nm->kni", matrix_of_quat(turn), MATRICES, force_b)
         tried["acc_b"] = acc - (turned - gravity)
     errors = {
         (what, EXCHANGES[k]): float(np.mean(e**2))

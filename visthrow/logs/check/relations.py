@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from visthrow.common.rotations import continuous
+from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
 
 REACH = 0.4  # largest delay looked for [s]
@@ -313,8 +312,7 @@ def rates_of(
     first, last, middle, width = _pairs(time, span)
     if not len(middle):
         return middle, np.empty((0, 3))
-    turn = (Rotation.from_quat(quat[first]).inv() * Rotation.from_quat(quat[last])).as_rotvec()
-    return middle, turn / width[:, None]
+    return middle, vectors_between(quat[first], quat[last]) / width[:, None]
 
 
 def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -339,6 +337,7 @@ def mean_over(time: np.ndarray, values: np.ndarray, times: np.ndarray, span: flo
     ) / span
 
 
-def attitude_at(time: np.ndarray, quat: np.ndarray, times: np.ndarray) -> Rotation:
-    """Attitudes xyzw between samples, straight through the quaternions."""
-    return Rotation.from_quat(on_grid(time, continuous(quat), times))
+def attitude_at(time: np.ndarray, quat: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Attitudes between samples, unit quaternions, straight through those of the samples."""
+    between = on_grid(time, continuous(quat), times)
+    return between / np.linalg.norm(between, axis=1, keepdims=True)

@@ -4,6 +4,7 @@ and rotor against rotor.
 
 import numpy as np
 
+from visthrow.common.rotations import rotate_back
 from visthrow.logs.check import relations
 from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
@@ -187,7 +188,7 @@ def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
     if len(time) < 50 or len(log["quat_wb"].samples()[0]) < 50:
         return None
     turn = relations.attitude_at(*log["quat_wb"].samples(), time)
-    return time, turn.inv().apply(acc + [0.0, 0.0, GRAVITY])[:, 2:3]
+    return time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3]
 
 
 def _correlations(

@@ -18,6 +18,13 @@ from typing import Any
 import numpy as np
 
 from visthrow.common.errors import LogError, suggest
+from visthrow.common.rotations import (
+    conjugate,
+    multiply,
+    quat_of_euler,
+    quat_of_matrix,
+    quat_of_vector,
+)
 from visthrow.common.storage import require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
@@ -382,28 +389,22 @@ def _converted(values: np.ndarray, entry: ChannelMap, factor: float) -> np.ndarr
         if entry.axes and values.shape[1] == 3:
             return values @ turn_of(entry.axes).T
         return values
-    from scipy.spatial.transform import Rotation
-
     if entry.kind == "matrix":
         good = np.abs(np.linalg.norm(values, axis=1) - np.sqrt(3.0)) < 0.1
         whole = np.where(good[:, None], values, np.eye(3).ravel())
         matrices = whole.reshape(-1, 3, 3).transpose(0, 2, 1)  # column after column
-        quat = Rotation.from_matrix(matrices).as_quat() * good[:, None]
+        quat = quat_of_matrix(matrices) * good[:, None]
     elif entry.kind == "rotvec":
-        quat = Rotation.from_rotvec(values).as_quat()
+        quat = quat_of_vector(values)
     elif entry.kind == "euler":
-        quat = Rotation.from_euler("ZYX", values[:, ::-1]).as_quat()
+        quat = np.array([quat_of_euler(*row) for row in values.tolist()]).reshape(-1, 4)
     else:
         quat = values[:, [1, 2, 3, 0]] if entry.order == "wxyz" else values
     if not entry.axes and not entry.body_axes:
         return quat
-    length = np.linalg.norm(quat, axis=1)
-    turned = Rotation.from_matrix(turn_of(entry.axes or OURS)) * Rotation.from_quat(
-        np.where(length[:, None] > 0, quat, [0, 0, 0, 1])
-    )
-    return (
-        turned * Rotation.from_matrix(turn_of(entry.body_axes or OURS)).inv()
-    ).as_quat() * length[:, None]
+    world = quat_of_matrix(turn_of(entry.axes or OURS))
+    body = conjugate(quat_of_matrix(turn_of(entry.body_axes or OURS)))
+    return np.stack(multiply(multiply(world, quat.T), body), -1)
 
 
 def is_export(table: Table) -> bool:
