@@ -103,8 +103,7 @@ def advance(fo, true, k, x, response, commands):
     rots = ob.rotation_from_quat(true.quat)
     rot = rots[k + 1] @ turned.detach().mT @ turned
     z = 0.5 * (x["rot"][..., 2] + rot[..., 2])
-    axes = x["rot"].detach()
-    drag = (axes * force[1:]) @ axes.mT @ x["vel"][..., None]
+    drag = (x["rot"] * force[1:]) @ x["rot"].mT @ x["vel"][..., None]
     f = force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
     arms = true.load_pos - true.pos - (rots @ pl.mount[..., None])[..., 0]
     arm = (
@@ -184,7 +183,7 @@ def reference(fo, by):
 
 def backward(fo, by):
     """The same by the kernel."""
-    for name, tensor in fo.adjoint.items():
+    for name, tensor in fo.flights.adjoint.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
     fo.layers.by_action.zero_()
     fo.layers.prepare(fo.flights.last)

@@ -1,9 +1,9 @@
 """Backward pass of flights: through the surrogate a kernel a step, a thread a flight, and between
 two of them through the network.
 
-Derivatives are written by hand; a rotation's is that by a turn about the body axes, R exp(turn).
-What a derivative by a state is worth is known once all later steps are done: so the network's own
-are products with one vector a step, those by its weights products over all steps at the end."""
+Warp differentiates the surrogate's step. What a derivative by a state is worth is known once all
+later steps are done: so the network's own are products with one vector a step, those by its weights
+are products over all steps at the end."""
 
 import torch
 import warp as wp
@@ -42,141 +42,139 @@ class BackwardParams:
     decay: float  # of derivatives, per step
 
 
-@wp.func
-def turned(quat: wp.quat, arm_b: wp.vec3, grad_w: wp.vec3):
-    """Return the derivative by the turn of what has the derivative ``grad_w`` by the world vector
-    ``R arm_b``.
-    """
-    return wp.cross(arm_b, wp.quat_rotate_inv(quat, grad_w))
+def _at(kind: type) -> wp.Function:
+    """Return the function that gives a value the derivatives of another."""
+
+    @wp.func
+    def at(value: kind, slope: kind):
+        return value
+
+    @wp.func_grad(at)
+    def adj_at(value: kind, slope: kind, adj_ret: kind):
+        wp.adjoint[slope] += adj_ret
+
+    return at
+
+
+number_at, vector_at, response_at, turn_at = map(_at, (float, wp.vec3, wp.vec4, wp.quat))
 
 
 @wp.func
-def step_back(p: BackwardParams, x: Course, adj: Course, k: int, e: int):
-    """Add to the derivatives by state k, k - 1 and by the commands up to k what those by state k +
-    1 make of them.
-    """
-    dt, half, up = p.period, 0.5 * p.period, wp.vec3(0.0, 0.0, 1.0)
-    mass, load_mass, mount, rot, rot_next = (
-        p.mass[e],
-        p.load_mass[e],
-        p.mount[e],
-        x.quat[k, e],
-        x.quat[k + 1, e],
+def command(p: BackwardParams, action: wp.array3d(dtype=float), k: int, e: int):
+    """Return thrust and rates that an action commands, as its derivatives have it."""
+    throttle = 0.5 * (wp.clamp(action[k, e, 0], -1.0, 1.0) + 1.0)
+    slack = SLACK_THROTTLE * (2.0 * throttle - SLACK_THROTTLE)
+    return wp.vec4(
+        p.max_thrust * wp.where(throttle > SLACK_THROTTLE, throttle * throttle, slack),
+        p.max_rate[0] * wp.clamp(action[k, e, 1], -1.0, 1.0),
+        p.max_rate[1] * wp.clamp(action[k, e, 2], -1.0, 1.0),
+        p.max_rate[2] * wp.clamp(action[k, e, 3], -1.0, 1.0),
     )
-    g_pos, g_load = p.decay * adj.pos[k + 1, e], p.decay * adj.load_pos[k + 1, e]
-    g_vel, g_load_vel = (
-        p.decay * adj.vel[k + 1, e] + half * g_pos,
-        p.decay * adj.load_vel[k + 1, e] + half * g_load,
-    )
-    g_turn, g_response = p.decay * adj.turn[k + 1, e], p.decay * adj.response[k + 1, e]
-    z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
-    rates = x.response[k, e] + x.response[k + 1, e]
-    thrust, drag = 0.5 * p.force[0] * rates[0], wp.vec3(p.force[1], p.force[2], p.force[3])
-    f = thrust * z - wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, x.vel[k, e])))
-    arm = 0.5 * (x.load_pos[k, e] - x.pos[k, e] + x.load_pos[k + 1, e] - x.pos[k + 1, e])
-    arm = arm - 0.5 * (wp.quat_rotate(rot, mount) + wp.quat_rotate(rot_next, mount))
-    length, n = wp.length(arm), wp.normalize(arm)
-    u = 0.5 * (x.load_vel[k, e] - x.vel[k, e] + x.load_vel[k + 1, e] - x.vel[k + 1, e])
-    perpendicular = u - wp.dot(n, u) * n
-    pull = -load_mass * wp.dot(n, (x.load_vel[k + 1, e] - x.load_vel[k, e]) / dt + GRAVITY * up)
-
-    g_f = dt / mass * g_vel
-    g_u, g_arm = wp.vec3(), wp.vec3()
-    if pull > TAUT * GRAVITY * load_mass:
-        combined = g_f - dt / load_mass * g_load_vel
-        g_pull = wp.dot(n, combined) * mass * load_mass / (mass + load_mass)
-        swing = g_pull * p.tension[1] / length
-        g_n = pull * combined - g_pull * p.tension[0] / mass * f - 2.0 * swing * wp.dot(n, u) * u
-        g_u = 2.0 * swing * perpendicular
-        g_f = g_f - g_pull * p.tension[0] / mass * n
-        g_arm = (
-            g_n - wp.dot(n, g_n) * n - swing * wp.dot(perpendicular, perpendicular) * n
-        ) / length
-
-    g_z = 0.5 * thrust * g_f
-    g_turn += turned(rot_next, up, g_z)
-    phi = half * wp.vec3(rates[1], rates[2], rates[3])
-    g_rate = half * (
-        g_turn + 0.5 * wp.cross(phi, g_turn) + wp.cross(phi, wp.cross(phi, g_turn)) / 6.0
-    )
-    g_mean = wp.vec4(0.5 * p.force[0] * wp.dot(z, g_f), g_rate[0], g_rate[1], g_rate[2])
-    g_response += g_mean
-    adj.response[k, e] += g_mean + wp.cw_mul(p.response[0], g_response)
-    if k > 0:
-        adj.response[k - 1, e] += wp.cw_mul(p.response[1], g_response)
-    for j in range(wp.min(p.response.shape[0] - 2, k + 1)):
-        adj.command[k - j, e] += wp.cw_mul(p.response[2 + j], g_response)
-    adj.pos[k, e] += g_pos - g_arm
-    adj.load_pos[k, e] += g_load + g_arm
-    g_drag = wp.quat_rotate(rot, wp.cw_mul(drag, wp.quat_rotate_inv(rot, g_f)))
-    adj.vel[k, e] += g_vel + half * (g_pos - g_arm) - g_u - g_drag
-    adj.load_vel[k, e] += g_load_vel + half * (g_load + g_arm) + g_u
-    before = wp.quat_rotate_inv(rot, wp.quat_rotate(rot_next, g_turn))
-    adj.turn[k, e] += before + turned(rot, up, g_z) - turned(rot, mount, g_arm)
 
 
 @wp.func
-def three(by_seen: wp.array2d(dtype=float), e: int, i: int):
-    """Return the derivative by three columns of an observation."""
-    return wp.vec3(by_seen[e, i], by_seen[e, i + 1], by_seen[e, i + 2])
+def arm_of(p: BackwardParams, x: Course, k: int, e: int):
+    """Return the rope's vector in state k."""
+    return x.load_pos[k, e] - x.pos[k, e] - wp.quat_rotate(x.quat[k, e], p.mount[e])
 
 
 @wp.func
-def seen_back(
-    p: BackwardParams,
-    x: Course,
-    adj: Course,
-    by_seen: wp.array2d(dtype=float),
-    i: int,
-    e: int,
-    share: float,
+def advance(
+    p: BackwardParams, x: Course, made: Course, action: wp.array3d(dtype=float), k: int, e: int
 ):
-    """Add an observation's derivatives to state i, of which ``share`` is in it, and to the payload
-    as it was up to ``history`` steps before.
+    """Make state k + 1 of state k and the commands up to k."""
+    dt = p.period
+    up = wp.vec3(0.0, 0.0, 1.0)
+    mass = p.mass[e]
+    load_mass = p.load_mass[e]
+    rot = x.quat[k, e]
+    vel = x.vel[k, e]
+    load_vel = x.load_vel[k, e]
+    y = wp.cw_mul(p.response[0], x.response[k, e])
+    if k > 0:
+        y += wp.cw_mul(p.response[1], x.response[k - 1, e])
+    for j in range(wp.min(p.response.shape[0] - 2, k + 1)):
+        y += wp.cw_mul(p.response[2 + j], command(p, action, k - j, e))
+    y = response_at(x.response[k + 1, e], y)
+    mean = 0.5 * (x.response[k, e] + y)
+    half_turn = 0.5 * dt * wp.vec3(mean[1], mean[2], mean[3])
+    square = wp.dot(half_turn, half_turn)
+    turn = wp.quat(half_turn * (1.0 - square / 6.0), 1.0 - 0.5 * square)
+    rot_next = turn_at(x.quat[k + 1, e], rot * turn)
+    z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
+    drag_b = wp.cw_mul(
+        wp.vec3(p.force[1], p.force[2], p.force[3]), wp.quat_rotate_inv(rot, vel)
+    )
+    f = p.force[0] * mean[0] * z - wp.quat_rotate(rot, drag_b)
+
+    slip = load_vel - vel
+    arm = vector_at(0.5 * (arm_of(p, x, k, e) + arm_of(p, x, k + 1, e)), arm_of(p, x, k, e) + 0.5 * dt * slip)
+    u = vector_at(0.5 * (slip + x.load_vel[k + 1, e] - x.vel[k + 1, e]), slip)
+    n = wp.normalize(arm)
+    along = wp.dot(n, u)
+    swing = (wp.dot(u, u) - along * along) / wp.length(arm)
+    reduced = mass * load_mass / (mass + load_mass)
+    rod = reduced * (p.tension[1] * swing - p.tension[0] / mass * wp.dot(n, f))
+    load_gain = (x.load_vel[k + 1, e] - load_vel) / dt + GRAVITY * up
+    pull = number_at(-load_mass * wp.dot(n, load_gain), rod)
+    tension = wp.where(pull > TAUT * GRAVITY * load_mass, pull, 0.0) * n
+    vel_next = vel + dt / mass * (f + tension)
+    load_vel_next = load_vel - dt / load_mass * tension
+    made.pos[k + 1, e] = p.decay * (x.pos[k, e] + 0.5 * dt * (vel + vel_next))
+    made.vel[k + 1, e] = p.decay * vel_next
+    made.quat[k + 1, e] = p.decay * rot_next
+    made.load_pos[k + 1, e] = p.decay * (x.load_pos[k, e] + 0.5 * dt * (load_vel + load_vel_next))
+    made.load_vel[k + 1, e] = p.decay * load_vel_next
+    made.response[k + 1, e] = p.decay * y
+
+
+@wp.func
+def show(
+    p: BackwardParams, x: Course, seen: wp.array2d(dtype=float), k: int, e: int, share: float
+):
+    """Add the share of an observation that state k has, with the payload as it was up to
+    ``history`` steps before.
     """
-    adj.pos[i, e] += share * three(by_seen, e, 0)
-    adj.vel[i, e] += share * three(by_seen, e, 3)
-    adj.response[i, e] += share * wp.vec4(0.0, by_seen[e, 6], by_seen[e, 7], by_seen[e, 8])
-    for axis in range(2):
-        unit = wp.vec3(1.0 - float(axis), float(axis), 0.0)
-        adj.turn[i, e] += share * turned(x.quat[i, e], unit, three(by_seen, e, 9 + 3 * axis))
-    adj.load_pos[i, e] -= share * wp.vec3(by_seen[e, GOAL_AT], by_seen[e, GOAL_AT + 1], 0.0)
+    rot = x.quat[k, e]
+    forward = wp.quat_rotate(rot, wp.vec3(1.0, 0.0, 0.0))
+    left = wp.quat_rotate(rot, wp.vec3(0.0, 1.0, 0.0))
+    for i in range(3):
+        seen[e, i] += share * x.pos[k, e][i]
+        seen[e, 3 + i] += share * x.vel[k, e][i]
+        seen[e, 6 + i] += share * x.response[k, e][1 + i]
+        seen[e, 9 + i] += share * forward[i]
+        seen[e, 12 + i] += share * left[i]
+    for i in range(2):
+        seen[e, GOAL_AT + i] -= share * x.load_pos[k, e][i]
     for age in range(p.history + 1):
-        offset = share * three(by_seen, e, LOAD_AT + 3 * age)
-        adj.load_pos[wp.max(i - age, 0), e] += offset
-        adj.pos[wp.max(i - age, 0), e] -= offset
+        before = wp.max(k - age, 0)
+        offset = x.load_pos[before, e] - x.pos[before, e]
+        for i in range(3):
+            seen[e, LOAD_AT + 3 * age + i] += share * offset[i]
 
 
-@wp.kernel(module="unique", enable_backward=False)
-def backward(
+@wp.kernel(module="unique", enable_backward=True)
+def step(
     # Params:
     p: BackwardParams,
     k: int,
     # State in:
-    adj: Course,
-    # In:
     x: Course,
+    # In:
     steps: wp.array(dtype=wp.int32),
     action: wp.array3d(dtype=float),
-    by_seen: wp.array2d(dtype=float),  # by observation k + 1
     # Out:
-    by_action: wp.array3d(dtype=float),
+    made: Course,  # of no use but for the derivatives, which it shares with x
+    seen: wp.array2d(dtype=float),  # observation k + 1
 ):
     e = wp.tid()
     if k < steps[e]:
-        seen_back(p, x, adj, by_seen, k + 1, e, 1.0 - p.age[e] / p.period)
-        seen_back(p, x, adj, by_seen, k, e, p.age[e] / p.period)
-        step_back(p, x, adj, k, e)
-        throttle = wp.clamp(0.5 * (action[k, e, 0] + 1.0), SLACK_THROTTLE, 1.0)
-        command = wp.cw_mul(
-            wp.vec4(p.max_thrust * throttle, p.max_rate[0], p.max_rate[1], p.max_rate[2]),
-            adj.command[k, e],
-        )
+        advance(p, x, made, action, k, e)
+        late = p.age[e] / p.period
+        show(p, x, seen, k + 1, e, 1.0 - late)
+        show(p, x, seen, k, e, late)
         for j in range(5):
-            if wp.abs(action[k, e, j]) <= 1.0:
-                by_action[k, e, j] += by_seen[e, PREVIOUS_AT + j]
-                if j < 4:
-                    by_action[k, e, j] += command[j]
+            seen[e, PREVIOUS_AT + j] += wp.clamp(action[k, e, j], -1.0, 1.0)
 
 
 class Layers:

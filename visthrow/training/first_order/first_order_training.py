@@ -19,8 +19,8 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment
 from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
-from visthrow.training.first_order.backward import BackwardParams, Layers, backward
-from visthrow.training.first_order.surrogate import Course, FlightBatch, course, fit
+from visthrow.training.first_order.backward import BackwardParams, Layers, step
+from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit
 from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
@@ -100,12 +100,9 @@ class FirstOrder:
             last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
-        self.flights, (self.adjoint, adjoint) = (
-            FlightBatch(env, self.p.horizon),
-            course(self.p.horizon, env.num_envs, device),
-        )
+        self.flights = FlightBatch(env, self.p.horizon)
         self.layers = Layers(self.network, self.flights.obs)
-        self._launches = self._recorded(adjoint)
+        self._launches = self._recorded()
         self._adapting = False
         self._schedule(0.0)
         rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
@@ -197,6 +194,7 @@ class FirstOrder:
         rate = x.response[1:, :, 1:]
         height = x.pos[1:, :, 2]
         load = x.load_pos[1:, :, 2]
+        upright = ob.rotation_from_quat(x.quat[1:])[..., 2, 2]
         action = act.clip_action(x.action)
         action, before = (
             a.flatten(0, 1)
@@ -211,7 +209,7 @@ class FirstOrder:
             height - load - ABOVE,
             load - self.cfg.release.landing_height - GROUND,
             bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
-            x.tilt[1:, :, 2] - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
+            upright - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
         ]
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
@@ -265,32 +263,25 @@ class FirstOrder:
         """Write the derivatives of the last rollout's cost by the actions into the layers; return
         figures.
         """
-        f = self.flights.x
-        T = self.flights.last
-        states = ("pos", "vel", "load_pos", "load_vel", "response")
-        tilt = ob.rotation_from_quat(f["quat"][: T + 1])[..., 2, :]  # world z in the body frame
-        leaves = {name: f[name][: T + 1].clone() for name in states} | {
-            "tilt": tilt,
-            "action": self.layers.action[:T].clone(),
-        }
+        flights = self.flights
+        T = flights.last
+        leaves = {name: flights.x[name][: T + 1].clone().requires_grad_() for name in STATES}
+        leaves["action"] = self.layers.action[:T].clone().requires_grad_()
         with torch.enable_grad():
-            cost, figures = self._cost(
-                SimpleNamespace(**{name: leaf.requires_grad_() for name, leaf in leaves.items()})
-            )
-        gradients = dict(zip(leaves, torch.autograd.grad(cost, list(leaves.values()))))
-        for name in states:
-            self.adjoint[name][: T + 1] = gradients[name]
-        self.adjoint["turn"][: T + 1] = torch.linalg.cross(gradients["tilt"], tilt)
-        self.adjoint["command"].zero_()
-        self.layers.by_action[:T] = gradients["action"]
+            cost, figures = self._cost(SimpleNamespace(**leaves))
+        *by_states, by_action = torch.autograd.grad(cost, list(leaves.values()))
+        for name, gradient in zip(STATES, by_states):
+            flights.adjoint[name][: T + 1] = gradient
+        self.layers.by_action[:T] = by_action
         self.layers.prepare(T)
         self.backward()
         return {name: figure.detach() for name, figure in (figures | {"cost": cost}).items()}
 
-    def _recorded(self, adjoint: Course) -> list[wp.Launch]:
-        """Return the launches of the backward kernel, a step each."""
+    def _recorded(self) -> list[wp.Launch]:
+        """Return the launches of the surrogate's way back, a step each."""
         env = self.env
         flights = self.flights
+        layers = self.layers
         action = self.cfg.task.action
         p = BackwardParams()
         p.max_thrust = action.max_thrust
@@ -306,18 +297,24 @@ class FirstOrder:
         }
         for name, tensor in (self.surrogate | plants).items():
             setattr(p, name, wp.from_torch(tensor, dtype=BackwardParams.vars[name].type.dtype))
-        remainder = map(
-            wp.from_torch,
-            (flights.steps, self.layers.action, self.layers.by_seen, self.layers.by_action),
+        arguments = (
+            flights.course,
+            wp.from_torch(flights.steps),
+            wp.from_torch(layers.action, grad=layers.by_action),
+            flights.made,
+            wp.from_torch(torch.zeros_like(layers.by_seen), grad=layers.by_seen),
         )
-        arguments = (adjoint, flights.course, *remainder)
-        how = {
-            "device": env.device,
-            "block_dim": 64,
-            "record_cmd": True,
-        }
         return [
-            wp.launch(backward, env.num_envs, [p, k, *arguments], **how)
+            wp.launch(
+                step,
+                env.num_envs,
+                [p, k, *arguments],
+                adj_inputs=[BackwardParams(), None, Course(), None, None, Course(), None],
+                device=env.device,
+                block_dim=64,
+                record_cmd=True,
+                adjoint=True,
+            )
             for k in range(self.p.horizon)
         ]
 

@@ -26,6 +26,7 @@ from torch import Tensor
 from sim.kernels.quadrotor.queue import queue_depth
 from sim.params import GRAVITY
 from sim.torch_bridge import on_torch_stream
+from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
 from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
@@ -45,38 +46,27 @@ FITTED = 8000  # steps of flight that the fit rests on
 TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
 
 
+STATES = ("pos", "vel", "quat", "load_pos", "load_vel", "response")
+
+
 @wp.struct
 class Course:
-    """Course of flights, or derivatives of a cost by it: (T + 1, E)."""
+    """Course of flights, (T + 1, E), with derivatives of a cost by it as gradients."""
 
     pos: wp.array2d(dtype=wp.vec3)
     vel: wp.array2d(dtype=wp.vec3)
-    turn: wp.array2d(dtype=wp.vec3)  # derivatives alone
+    quat: wp.array2d(dtype=wp.quat)
     load_pos: wp.array2d(dtype=wp.vec3)
     load_vel: wp.array2d(dtype=wp.vec3)
     response: wp.array2d(dtype=wp.vec4)  # thrust, body rates
-    command: wp.array2d(dtype=wp.vec4)
-    quat: wp.array2d(dtype=wp.quat)  # flights alone
-
-
-def course(steps: int, count: int, device: str) -> tuple[dict[str, Tensor], Course]:
-    """Tensors of shape (T + 1, E, 3 or 4) by the names of :class:`Course`, and the same memory for
-    kernels.
-    """
-    x = {}
-    arrays = Course()
-    for name, field in Course.vars.items():
-        x[name] = torch.zeros(steps + 1, count, field.type.dtype._length_, device=device)
-        setattr(arrays, name, wp.from_torch(x[name], dtype=field.type.dtype))
-    return x, arrays
 
 
 class FlightBatch:
     """A batch of flights without release and the plants that make them.
 
     Attributes:
-        x, course: states and commands; see :func:`course`. obs: what the actor observes, shape (T,
-            E, D).
+        x: states by :data:`STATES` and commands, shape (T + 1, E, 3 or 4). adjoint: derivatives by
+            the states. course: both for kernels; made: the derivatives with room for states. obs: what the actor observes, shape (T, E, D).
         landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s],
             shape (T + 1, E).
         mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of
@@ -88,7 +78,19 @@ class FlightBatch:
     def __init__(self, env: ThrowEnv, steps: int):
         E = env.num_envs
         make = {"device": env.device}
-        self.env, (self.x, self.course), self.last = env, course(steps, E, env.device), steps
+        self.env = env
+        self.last = steps
+        self.course, self.made = Course(), Course()
+        self.adjoint = {}
+        self.x = {"command": torch.zeros(steps + 1, E, actions.COMMANDS, **make)}
+        for name in STATES:
+            dtype = Course.vars[name].type.dtype
+            x, adjoint = torch.zeros(2, steps + 1, E, dtype._length_, **make)
+            self.x[name], self.adjoint[name] = x, adjoint
+            grad = wp.from_torch(adjoint, dtype=dtype)
+            setattr(self.course, name, wp.from_torch(x, dtype=dtype, grad=grad))
+            unused = wp.from_torch(torch.zeros_like(x), dtype=dtype, grad=grad)
+            setattr(self.made, name, unused)
         self.obs = torch.zeros(steps, E, env.layout.dimension, **make)
         self.landing = torch.zeros(steps + 1, E, 2, **make)
         self.time = torch.zeros(steps + 1, E, **make)
