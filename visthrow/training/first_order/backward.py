@@ -102,13 +102,13 @@ def advance(
     turn = wp.quat(half_turn * (1.0 - square / 6.0), 1.0 - 0.5 * square)
     rot_next = turn_at(x.quat[k + 1, e], rot * turn)
     z = 0.5 * (wp.quat_rotate(rot, up) + wp.quat_rotate(rot_next, up))
-    drag_b = wp.cw_mul(
-        wp.vec3(p.force[1], p.force[2], p.force[3]), wp.quat_rotate_inv(rot, vel)
-    )
+    drag_b = wp.cw_mul(wp.vec3(p.force[1], p.force[2], p.force[3]), wp.quat_rotate_inv(rot, vel))
     f = p.force[0] * mean[0] * z - wp.quat_rotate(rot, drag_b)
 
     slip = load_vel - vel
-    arm = vector_at(0.5 * (arm_of(p, x, k, e) + arm_of(p, x, k + 1, e)), arm_of(p, x, k, e) + 0.5 * dt * slip)
+    arm = vector_at(
+        0.5 * (arm_of(p, x, k, e) + arm_of(p, x, k + 1, e)), arm_of(p, x, k, e) + 0.5 * dt * slip
+    )
     u = vector_at(0.5 * (slip + x.load_vel[k + 1, e] - x.vel[k + 1, e]), slip)
     n = wp.normalize(arm)
     along = wp.dot(n, u)
@@ -129,9 +129,7 @@ def advance(
 
 
 @wp.func
-def show(
-    p: BackwardParams, x: Course, seen: wp.array2d(dtype=float), k: int, e: int, share: float
-):
+def show(p: BackwardParams, x: Course, seen: wp.array2d(dtype=float), k: int, e: int, share: float):
     """Add the share of an observation that state k has, with the payload as it was up to
     ``history`` steps before.
     """

@@ -66,7 +66,8 @@ class FlightBatch:
 
     Attributes:
         x: states by :data:`STATES` and commands, shape (T + 1, E, 3 or 4). adjoint: derivatives by
-            the states. course: both for kernels; made: the derivatives with room for states. obs: what the actor observes, shape (T, E, D).
+            the states. course: both for kernels; made: the derivatives with room for states.
+        obs: what the actor observes, shape (T, E, D).
         landing, time: of a payload that separates at a state, [m], shape (T + 1, E, 2), and [s],
             shape (T + 1, E).
         mass, load_mass: of vehicles with their ropes and of payloads [kg], shape (E,). mount: of
