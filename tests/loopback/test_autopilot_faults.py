@@ -14,6 +14,7 @@ from pytest import approx, mark, param
 
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput
+from tests.fakes.fake_px4 import HOLD
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import cut, peers
@@ -118,6 +119,26 @@ def test_the_pilot_takes_over(kind):
     assert when(told, "abort") <= START + BEAT["betaflight"] + 3 * TICK
     assert (len(commands), len(modes)) == (1, 1), "silent: the pilot has it"
     assert fake.taken
+
+
+@mark.parametrize("before", [0.0, 0.02, 0.06])
+def test_a_pilots_hold_at_the_end_of_a_throw_stands(before):
+    """The runner wants Hold itself a moment later, before a heartbeat has told of the pilot's: it
+    does not take the mode for its own, and asks for no Land.
+    """
+    taken = []
+
+    def watch(now, runner, fake):
+        separation = runner.latch.at and runner.latch.at + runner.latch.lag
+        if separation and now >= separation - before - 1e-3 and not taken:
+            taken.append(now)
+            fake.enter(HOLD)
+
+    fake, _, told = run("px4", START + 2.0, loaded=AT_ONCE, watch=watch)
+    assert told[-1][0] == "done"
+    assert reason(told, "abort").startswith(GONE)
+    modes = [text for time, text in fake.events if time >= taken[0] and text.startswith("mode")]
+    assert modes == ["mode 4.3"]
 
 
 @mark.parametrize("kind", KINDS)

@@ -6,6 +6,7 @@ from time import perf_counter
 
 import numpy as np
 
+from hil.control.dead_reckoning import DeadReckoning
 from hil.control.safety import Guard, box_violation
 from hil.control.state_machine import FLYING, Inputs, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
@@ -24,8 +25,8 @@ HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
 poses [m/s, rad].
 """
 
-# an aborted run without poses levels the vehicle for this long and then falls silent: the
-# autopilot's failsafes act [s]
+# a vehicle without poses is levelled for this long; then the autopilot has it, or nothing is sent
+# and its failsafes act [s]
 LEVEL_TIME = 0.5
 
 # calls of the policy before it flies: the first one compiles, the others warm the caches
@@ -34,11 +35,15 @@ WARM_CALLS = 3
 Command = tuple[float, ...]  # thrust [N] and body rates [rad/s]
 
 
+def is_level(vehicle: BodyState) -> bool:
+    """Return whether a vehicle is level enough for the autopilot's own hold."""
+    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
+    return 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
+
+
 def can_hand_over(vehicle: BodyState) -> bool:
     """Return whether a vehicle is slow and level enough for the autopilot's own hold."""
-    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
-    level = 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
-    return level and math.hypot(*vehicle.vel) < HAND_OVER_SPEED
+    return is_level(vehicle) and math.hypot(*vehicle.vel) < HAND_OVER_SPEED
 
 
 class Commander:
@@ -58,6 +63,8 @@ class Commander:
         self.calibration: Calibration | str | None = None
         self._state: str = State.IDLE
         self._release_end = math.inf  # after which no release of this throw is sent [s]
+        self._reckoning = DeadReckoning()
+        self._last_command = (parts.mass * GRAVITY, 0.0, 0.0, 0.0)
 
     def enter(self, estimate: Estimate, state: str) -> None:
         """Do what a change of state requires."""
@@ -75,7 +82,7 @@ class Commander:
         """
         parts, state = self.parts, record.state
         record.ready = THROW if parts.machine.ready_to_throw else NOTHING
-        command = self._wanted_command(estimate, record)
+        command = self._wanted_command(estimate, status, record)
         if parts.calibrating is not None:
             command = self._add_sway(estimate, status, command, record)
         hovers = state in (State.READY, State.ARMED) and status.mode == FOLLOW
@@ -90,12 +97,13 @@ class Commander:
         if record.command is not None:
             ready = perf_counter()
             parts.backend.send(record.command, record.time)
+            self._last_command = record.command
             parts.spent["send"] = perf_counter() - ready
             parts.spent["total"] = perf_counter() - begin
         self._note_hover(estimate, record.command if hovers else None, status.rates)
         if record.release:
             parts.backend.release(parts.latch.trip(record.time, estimate.goal_w))
-        if state == State.ABORT and parts.machine.flown:
+        if state == State.ABORT and parts.machine.flown and not self._must_level(estimate):
             end = parts.backend.surrender if parts.machine.handed_back else parts.backend.abort
             end(record.time)
 
@@ -128,17 +136,22 @@ class Commander:
         if state in (State.LAND, State.ABORT) and estimate.vehicle is not None:
             parts.hovering.hold(estimate.vehicle.pos)
 
-    def _wanted_command(self, estimate: Estimate, record: TickRecord) -> Command | None:
+    def _wanted_command(
+        self, estimate: Estimate, status: Status, record: TickRecord
+    ) -> Command | None:
         """Return the command of a state, before the guard; None for none."""
         parts, state = self.parts, record.state
         if state not in FLYING and state != State.ABORT:
             return None
         mass = parts.mass if parts.carries_payload(estimate) else parts.vehicle_mass
+        self._reckoning.update(estimate, status.rates, self._last_command, mass)
         if not estimate.is_flyable:
             if state == State.ABORT and record.time - parts.machine.since > LEVEL_TIME:
                 return None
             record.note = "level: no fresh pose"
-            return (mass * GRAVITY, 0.0, 0.0, 0.0)
+            if self._reckoning.state is None:
+                return (mass * GRAVITY, 0.0, 0.0, 0.0)
+            return parts.hovering.command(self._reckoning.state, mass)
         if state == State.THROW:
             return self._throw(estimate, record)
         if state in (State.LAND, State.ABORT):
@@ -226,12 +239,21 @@ class Commander:
             if status.mode != FOLLOW:
                 parts.hovering.reset()
         elif state == State.RECOVER and backend.holds:
-            vehicle = estimate.vehicle
-            lost = vehicle is None or estimate.vehicle_level >= HOLD
-            if lost or can_hand_over(vehicle) or status.mode == HOLDING:
+            lost = estimate.vehicle is None or estimate.vehicle_level >= HOLD
+            ready = not self._must_level(estimate) if lost else can_hand_over(estimate.vehicle)
+            if ready or status.mode == HOLDING:
                 backend.ask(HOLDING, time)
         elif state == State.LAND and backend.holds:
             backend.ask(LAND, time)
+
+    def _must_level(self, estimate: Estimate) -> bool:
+        """Return whether the autopilot has to wait for a vehicle without poses that is still
+        tilted, which would sink in its hands.
+        """
+        vehicle = self._reckoning.state
+        if estimate.is_flyable or vehicle is None or self._reckoning.duration > LEVEL_TIME:
+            return False
+        return not is_level(vehicle)
 
     def _is_ours(self, state: str, status: Status) -> bool:
         """Return whether commands are sent: not to a vehicle that was handed or taken over, that

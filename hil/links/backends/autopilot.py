@@ -19,6 +19,10 @@ from hil.links.roster import MavlinkId, Party
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
+# before another mode is requested, a new heartbeat must show that the pilot has not taken over; so
+# long it is waited for [s]
+CONFIRMATION_TIME = 0.1
+MOST_TEXTS = 1000  # that are kept
 
 STREAM = (
     (mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW, 5_000),
@@ -90,6 +94,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         self._heartbeat: Any = None
         self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
+        self._next: str | None = None  # mode that waits for a heartbeat before it is requested
+        self._wished_at = -1e9
         self._may: set[str | None] = set()  # the last role that was ours, and those asked for since
         self._reached = False
         self._taken_over = False
@@ -159,54 +165,17 @@ class MavlinkAutopilot(Autopilot, ABC):
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
-        p, kind = self.params, message.get_type()
+        p, handle = self.params, _HANDLERS.get(message.get_type())
         if message.get_srcSystem() != p.system or message.get_srcComponent() != p.component:
             return
-        if kind == "HEARTBEAT":
-            self._heartbeat, self._heard = message, arrival
-            self._judge_mode()
-        elif kind == "COMMAND_ACK":
-            self._acknowledged(message)
-        elif kind == "STATUSTEXT" and len(self.texts) < 1000:
-            self.texts.append(str(message.text))
-        elif kind == "SERVO_OUTPUT_RAW" and p.servo_output:
-            value = getattr(message, self._servo, 0)
-            if value:
-                self.release_record.output(abs(value - p.servo_open_us) <= SERVO_NEAR)
-        elif kind == "PARAM_VALUE":
-            self._kinds[message.param_id] = message.param_type
-            self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
-        elif kind == "PARAM_ERROR":
-            self.audit.refuse(message.param_id, message.error)
-        elif kind == "ATTITUDE":
-            rates = (message.rollspeed, -message.pitchspeed, -message.yawspeed)
-            self.rates = rates if all(map(math.isfinite, rates)) else None
-        elif kind == "ATTITUDE_TARGET":
-            self.share, self._exact = message.thrust, True
-        elif kind == "VFR_HUD" and not self._exact:  # in whole percent
-            self.share = 0.01 * message.throttle
-        elif kind == "SYS_STATUS":
-            if 0 < message.voltage_battery < 65535:
-                self.voltage = 1e-3 * message.voltage_battery
-            checks = mav.MAV_SYS_STATUS_PREARM_CHECK
-            failed = (
-                message.onboard_control_sensors_present & ~message.onboard_control_sensors_health
-            )
-            self._may_arm = not failed & checks
+        if handle is not None:
+            handle(self, message, arrival)
 
-    def _judge_mode(self) -> None:
-        """Judge whether the mode is still one of ours."""
-        role = self._role(self._heartbeat.custom_mode)
-        if self._wanted is None:
-            return
-        self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
-        if role == self._wanted:
-            self._reached, self._taken_over, self._may = True, False, {role}
-            self._ours |= role == FOLLOW
-        elif self._reached or role not in self._may:
-            self._taken_over = True
+    def _hear_heartbeat(self, message: Any, arrival: float) -> None:
+        self._heartbeat, self._heard = message, arrival
+        self._judge_mode()
 
-    def _acknowledged(self, message: Any) -> None:
+    def _hear_acknowledgement(self, message: Any, arrival: float) -> None:
         result = message.result
         if message.command == self._release_command()[0]:
             if result == mav.MAV_RESULT_ACCEPTED:
@@ -220,6 +189,51 @@ class MavlinkAutopilot(Autopilot, ABC):
             and result != mav.MAV_RESULT_ACCEPTED
         ):
             self._arm_refused = f"arming refused with result {result}: {self._last_text()}"
+
+    def _hear_text(self, message: Any, arrival: float) -> None:
+        if len(self.texts) < MOST_TEXTS:
+            self.texts.append(str(message.text))
+
+    def _hear_outputs(self, message: Any, arrival: float) -> None:
+        value = getattr(message, self._servo, 0) if self.params.servo_output else 0
+        if value:
+            self.release_record.output(abs(value - self.params.servo_open_us) <= SERVO_NEAR)
+
+    def _hear_parameter(self, message: Any, arrival: float) -> None:
+        self._kinds[message.param_id] = message.param_type
+        self.audit.feed(message.param_id, self._stored(message.param_value, message.param_type))
+
+    def _hear_parameter_error(self, message: Any, arrival: float) -> None:
+        self.audit.refuse(message.param_id, message.error)
+
+    def _hear_attitude(self, message: Any, arrival: float) -> None:
+        rates = (message.rollspeed, -message.pitchspeed, -message.yawspeed)
+        self.rates = rates if all(map(math.isfinite, rates)) else None
+
+    def _hear_target(self, message: Any, arrival: float) -> None:
+        self.share, self._exact = message.thrust, True
+
+    def _hear_hud(self, message: Any, arrival: float) -> None:
+        if not self._exact:  # in whole percent
+            self.share = 0.01 * message.throttle
+
+    def _hear_system(self, message: Any, arrival: float) -> None:
+        if 0 < message.voltage_battery < 65535:
+            self.voltage = 1e-3 * message.voltage_battery
+        failed = message.onboard_control_sensors_present & ~message.onboard_control_sensors_health
+        self._may_arm = not failed & mav.MAV_SYS_STATUS_PREARM_CHECK
+
+    def _judge_mode(self) -> None:
+        """Judge whether the mode is still one of ours."""
+        role = self._role(self._heartbeat.custom_mode)
+        if self._wanted is None:
+            return
+        self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
+        if role == self._wanted:
+            self._reached, self._taken_over, self._may = True, False, {role}
+            self._ours |= role == FOLLOW
+        elif self._reached or role not in self._may:
+            self._taken_over = True
 
     def _last_text(self) -> str:
         return self.texts[-1] if self.texts else "no text"
@@ -286,6 +300,8 @@ class MavlinkAutopilot(Autopilot, ABC):
     def ask(self, mode: str, host_time: float) -> None:
         """Ask until the heartbeat shows the mode."""
         if mode != self._wanted:
+            if not self._confirms(mode, host_time):
+                return
             first = self._wanted is None and self._heartbeat is not None
             if first:  # the mode before it was the pilot's
                 self._may.add(self._role(self._heartbeat.custom_mode))
@@ -299,10 +315,23 @@ class MavlinkAutopilot(Autopilot, ABC):
         if beat is None or self._role(beat.custom_mode) != mode:
             self._asked_at = host_time
             self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
-            self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
+            self._request_heartbeat()
         elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
             self._asked_at = host_time
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
+
+    def _confirms(self, mode: str, host_time: float) -> bool:
+        """Return whether another mode may be requested: a heartbeat that came after the wish for it
+        has been judged by the mode before, so that a pilot who took over is not overruled.
+        """
+        if mode != self._next:
+            self._next, self._wished_at = mode, host_time
+            self._request_heartbeat()
+        late = host_time - self._wished_at >= CONFIRMATION_TIME
+        return late or self._wanted is None or self._heard > self._wished_at
+
+    def _request_heartbeat(self) -> None:
+        self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
 
     def service(self, host_time: float) -> None:
         if host_time - self._beat_at >= 1.0:
@@ -343,3 +372,18 @@ class MavlinkAutopilot(Autopilot, ABC):
                 p.system, p.component, name.encode(), self._field(value, kind), kind
             )
         )
+
+
+_HANDLERS = {
+    "HEARTBEAT": MavlinkAutopilot._hear_heartbeat,
+    "COMMAND_ACK": MavlinkAutopilot._hear_acknowledgement,
+    "STATUSTEXT": MavlinkAutopilot._hear_text,
+    "SERVO_OUTPUT_RAW": MavlinkAutopilot._hear_outputs,
+    "PARAM_VALUE": MavlinkAutopilot._hear_parameter,
+    "PARAM_ERROR": MavlinkAutopilot._hear_parameter_error,
+    "ATTITUDE": MavlinkAutopilot._hear_attitude,
+    "ATTITUDE_TARGET": MavlinkAutopilot._hear_target,
+    "VFR_HUD": MavlinkAutopilot._hear_hud,
+    "SYS_STATUS": MavlinkAutopilot._hear_system,
+}
+"""Message -> the method that takes it; others are passed over."""

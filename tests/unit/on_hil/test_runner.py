@@ -472,8 +472,51 @@ def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
     assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
     assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
     levelled = [d for d in decisions if d.note.startswith("level")]
-    assert levelled[0].command[1:] == (0.0, 0.0, 0.0)
+    assert levelled[0].command[1:] == pytest.approx((0.0, 0.0, 0.0), abs=0.2)
     assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
+
+
+class HoldingSpy(Spy):
+    """An autopilot that holds and lands by itself, and keeps when it was asked to."""
+
+    holds = True
+
+    def __init__(self):
+        super().__init__()
+        self.asked = []
+
+    def ask(self, mode, now):
+        if mode != "follow":
+            self.asked.append(now)
+
+    def abort(self, now):
+        self.asked.append(now)
+
+
+@pytest.mark.parametrize("reported", [False, True])
+def test_a_tilted_vehicle_without_poses_is_levelled_before_it_is_handed_over(reported):
+    """By dead reckoning, with the rates that the autopilot reports and without."""
+    tilting = (HOVER, 0.0, 0.5, 0.0, -1.0)
+    pilot = Runner(params(), simple_policy(tilting), HoldingSpy())
+    tilts, gone = {}, []
+
+    def stopped(time, poses):
+        x, y, _, _ = poses[0].quat
+        tilts[round(time, 2)] = math.acos(1.0 - 2.0 * (x * x + y * y))
+        if gone or tilts[round(time, 2)] > math.radians(60.0):
+            gone.append(time)
+            return []
+        return poses
+
+    def status(time):
+        rates = pilot.commander._last_command[1:] if reported else None
+        return Status(True, rates=rates)
+
+    fly(pilot, 4.0, poses=stopped, status=status)
+    handed = round(pilot.backend.asked[0], 2)
+    assert math.degrees(max(tilts.values())) > 80.0, "the policy goes on for a while"
+    assert math.degrees(tilts[handed]) < 25.0
+    assert handed - gone[0] < 0.4
 
 
 def test_payload_lost_but_not_the_vehicle():

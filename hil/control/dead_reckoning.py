@@ -1,0 +1,65 @@
+"""The state of a vehicle whose poses have stopped, until it is level."""
+
+import math
+
+from hil.control.tick.body_estimate import Estimate
+from hil.poses.body_track import BodyState, turned
+from visthrow.common.rotations import rotate_one
+from visthrow.onboard.hover import GRAVITY
+
+RESPONSE = 0.05  # time constant with which body rates follow their command [s]
+ROUNDING = 1e-6  # tolerance of differences of times [s]
+
+Command = tuple[float, ...]  # thrust [N] and body rates [rad/s]
+
+
+class DeadReckoning:
+    """Carries the last pose on by thrust and body rates.
+
+    Attributes:
+        state: of the vehicle at the last tick; None before the first pose with an attitude.
+        duration: for which it has been carried on [s].
+    """
+
+    def __init__(self) -> None:
+        """Wait for the first pose."""
+        self.state: BodyState | None = None
+        self.duration = 0.0
+        self._arrival = self._time = 0.0  # of the last pose; that the state stands for [s]
+        self._reported: tuple[float, ...] | None = None
+
+    def update(
+        self, estimate: Estimate, rates: tuple[float, ...] | None, command: Command, mass: float
+    ) -> None:
+        """Take a tick: body rates that the autopilot last reported [rad/s], the last command, and
+        the mass that flies [kg].
+        """
+        time, vehicle = estimate.time, estimate.vehicle
+        reported, self._reported = self._reported, rates
+        if vehicle is None or vehicle.quat is None:
+            self.state = None
+        elif self.state is None or time - vehicle.age > self._arrival + ROUNDING:
+            self.state, self.duration = vehicle, 0.0
+            self._arrival, self._time = time - vehicle.age, time - estimate.shown_age
+        else:
+            step = time - self._time
+            self._time, self.duration = time, self.duration + step
+            self.state = _advanced(
+                self.state, step, rates if rates != reported else None, command, mass
+            )
+
+
+def _advanced(
+    state: BodyState, step: float, rates: tuple[float, ...] | None, command: Command, mass: float
+) -> BodyState:
+    """Return a state after a step [s]; without new rates, they follow the command."""
+    thrust, *commanded = command
+    if rates is None:
+        share = 1.0 - math.exp(-step / RESPONSE)
+        rates = tuple(rate + share * (new - rate) for rate, new in zip(state.rate, commanded))
+    quat = turned(state.quat, rates, step)
+    force_w = rotate_one(quat, (0.0, 0.0, thrust / mass))
+    acceleration_w = (force_w[0], force_w[1], force_w[2] - GRAVITY)
+    vel = tuple(v + step * a for v, a in zip(state.vel, acceleration_w))
+    pos = tuple(x + step * v for x, v in zip(state.pos, vel))
+    return BodyState(pos, quat, vel, rates, state.age + step)
