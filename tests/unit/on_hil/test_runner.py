@@ -472,7 +472,7 @@ def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
     assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
     assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
     levelled = [d for d in decisions if d.note.startswith("level")]
-    assert levelled[0].command[1:] == pytest.approx((0.0, 0.0, 0.0), abs=0.2)
+    assert levelled[0].command[1:] == approx((0.0, 0.0, 0.0), abs=0.2)
     assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
 
 
@@ -493,7 +493,7 @@ class HoldingSpy(Spy):
         self.asked.append(now)
 
 
-@pytest.mark.parametrize("reported", [False, True])
+@mark.parametrize("reported", [False, True])
 def test_a_tilted_vehicle_without_poses_is_levelled_before_it_is_handed_over(reported):
     """By dead reckoning, with the rates that the autopilot reports and without."""
     tilting = (HOVER, 0.0, 0.5, 0.0, -1.0)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError
+from visthrow.common.rotations import rotate
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.messages import (
@@ -157,6 +158,32 @@ DATAFLASH = (
     _t("ESC", _motors("RPM[*]"), "motor_speed", "rpm"),
     _t("CTUN", "ThO", "throttle", "1"),
 )
+
+POSE_PARTS = ("pos_w", "quat_wb", "vel_w", "rate_b")
+EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
+BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
+POSE_TAPS = {
+    "bin": (
+        _t("POS", "N E D", "pos_w", "m"),
+        *(
+            _t(core, "Roll Pitch Yaw", "quat_wb", "deg", "euler")
+            for core in ("XKF1", "NKF1", "EKF1")
+        ),
+    ),
+    "ulg": tuple(
+        _t(f"vehicle_{kind}", fields, channel, unit)
+        for kind in ("odometry", "visual_odometry", "mocap_odometry")
+        for fields, channel, unit in (
+            (_vector("velocity"), "vel_w", "m/s"),
+            ("vx vy vz", "vel_w", "m/s"),
+            (_vector("angular_velocity"), "rate_b", "rad/s"),
+            ("rollspeed pitchspeed yawspeed", "rate_b", "rad/s"),
+        )
+    ),
+}
+"""Kind of log -> fields of poses that :func:`log_of_poses` alone reads: places on the globe become
+N, E, D, and a velocity may be of the body.
+"""
 
 LOCAL = ("frame_id", 1.0, 1.0)  # MAV_FRAME_LOCAL_NED
 FRD, FLU = ("frame_id", 20.0, 20.0), ("frame_id", 21.0, 21.0)  # about a yaw of the sender's
@@ -308,13 +335,103 @@ def _channel(
     return channel, notes
 
 
-def validity(kind: str, message: str, fields: Fields) -> np.ndarray:
-    """Return which rows of a message of poses its source calls valid, bool, shape (T,), in a log
-    of kind "ulog" or "dataflash".
+def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -> FlightLog:
+    """Read the poses of one message of a log of kind "bin" or "ulg", whatever its ending.
+
+    The axes stay the autopilot's: world north, east, down (PX4 optionally forward, right, down),
+    body forward, right, down. The channels are pos_w, quat_wb (xyzw), vel_w, rate_b, as far as they
+    are known, ``arrival`` [s] and ``resets``. A position without an attitude goes with the
+    vehicle's own attitude and rates. ``together`` of the metadata names the channels that share
+    the position's stamps. Without such an instance no channel is there.
+
+    Raises LogError: it cannot be read, the message is not in it, or there is no attitude.
     """
-    taps = ULOG if kind == "ulog" else DATAFLASH
-    conditions = (tap.good for tap in taps if tap.message == message)
-    return in_range(fields, next(conditions, ()))
+    taps = _pose_taps(kind)
+    log = READERS[f".{kind}"][0](path, {tap.message for tap in taps} | {"ORGN"})
+    if message not in log.names:
+        available = ", ".join(name for name in pose_messages(kind) if name in log.names)
+        raise LogError(
+            f"{log.path}: no {message} in this log; of the messages with poses it has:"
+            f" {available or 'none'}"
+        )
+    data = log.fields.get((message, instance))
+    if data is None:
+        return FlightLog({})
+    if message == "POS":
+        data = data | _from_globe(data, log.first("ORGN"))
+    sources: dict[str, tuple[Tap, Fields]] = {}
+    for tap in taps:
+        if tap.message == message and all(column in data for column in tap.entry.columns):
+            sources.setdefault(_pose_part(tap), (tap, data))
+    together = [*sources]
+    if "quat_wb" not in sources:
+        for tap in taps:
+            fields = log.first(tap.message)
+            if tap.entry.name in ("quat_wb", "rate_b") and fields is not None:
+                sources.setdefault(tap.entry.name, (tap, fields))
+        if "quat_wb" not in sources:
+            raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
+    channels = {name: _of_pose(name, *source, str(path)) for name, source in sources.items()}
+    counters = [data[name] for name in (*RESETS, "heading_reset_counter") if name in data]
+    arrival = ChannelMap("arrival", ("arrival",), "s"), data["arrival"]
+    resets = ChannelMap("resets", ("resets",), "1"), np.sum([0.0 * data["time"], *counters], axis=0)
+    for entry, values in (arrival, resets):
+        channels[entry.name] = make_channel(data["time"], values[:, None], entry, str(path))[0]
+    return FlightLog(channels, {"source": str(path), "together": together})
+
+
+def pose_messages(kind: str) -> list[str]:
+    """Return the messages of a log of kind "bin" or "ulg" that hold poses."""
+    return sorted({tap.message for tap in _pose_taps(kind) if _pose_part(tap) == "pos_w"})
+
+
+def _pose_taps(kind: str) -> list[Tap]:
+    taps = (*READERS[f".{kind}"][1], *POSE_TAPS[kind])
+    return [tap for tap in taps if _pose_part(tap) in POSE_PARTS]
+
+
+def _pose_part(tap: Tap) -> str:
+    """Return the part of a pose that a tap holds, whoever measured or estimated it."""
+    return tap.entry.name.removeprefix("mocap_").removeprefix("est_")
+
+
+def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
+    """Return a part of a pose about the autopilot's axes, without the samples that are not known;
+    a position keeps those that are not valid.
+    """
+    values = np.column_stack([fields[column] for column in tap.entry.columns]).astype(float)
+    if part == "vel_w" and "velocity_frame" in fields:
+        values = _in_world(values, fields)
+    entry = replace(tap.entry, name=part, axes="", body_axes="")
+    channel, _ = make_channel(fields["time"], values, entry, source, ~in_range(fields, tap.good))
+    return channel if part == "pos_w" else channel.only(np.asarray(channel.valid))
+
+
+def _in_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
+    """Return velocities in the world frame; NaN for a body's without an attitude."""
+    quat = np.column_stack([odometry[f"q[{i}]"] for i in (1, 2, 3, 0)]).astype(float)
+    body_frame = odometry["velocity_frame"] == BODY_FRAME
+    known = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
+    vel_w = np.where((body_frame & ~known)[:, None], np.nan, vel)
+    rows = body_frame & known
+    if np.any(rows):
+        turns = quat[rows] / np.linalg.norm(quat[rows], axis=1, keepdims=True)
+        vel_w[rows] = rotate(turns, vel[rows])
+    return vel_w
+
+
+def _from_globe(data: Fields, origins: Fields | None) -> Fields:
+    """Return north, east and down [m] from the estimator's origin, else from the first position."""
+    lat, lng = data["Lat"][0], data["Lng"][0]
+    if origins is not None and "Type" in origins:
+        index = np.flatnonzero(origins["Type"] == 0.0)
+        if len(index):
+            lat, lng = origins["Lat"][index[-1]], origins["Lng"][index[-1]]
+    return {
+        "N": np.radians(data["Lat"] - lat) * EARTH_RADIUS,
+        "E": np.radians(data["Lng"] - lng) * EARTH_RADIUS * math.cos(math.radians(lat)),
+        "D": -(data["RelOriginAlt"] if "RelOriginAlt" in data else data["RelHomeAlt"]),
+    }
 
 
 def in_range(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
