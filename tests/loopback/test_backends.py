@@ -160,6 +160,8 @@ def test_an_abort_right_after_the_hold_was_asked_for_still_lands(kind):
     """The heartbeat shows the hold when landing is wanted already: that is no pilot."""
     desk = Desk(kind).follow()
     desk.backend.ask(HOLD, desk.now)
+    desk.turn(0.02)
+    desk.backend.ask(HOLD, desk.now)
     desk.backend.abort(desk.now)
     hold = 17 if kind == "ardupilot" else custom(4, 3)
     desk.fake.enter(hold)

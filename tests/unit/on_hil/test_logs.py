@@ -103,9 +103,7 @@ def test_an_estimate_is_that_of_one_core(tmp_path):
         read_bin(path, (LogBody("vehicle", "XKF1", instance=2),))
     with raises(SourceError, match="no VISP in this log; of the messages with poses it has: XKF1"):
         read_bin(path, VEHICLE)
-    with raises(
-        SourceError, match="'ATT' of the vehicle carries no pose; known: EKF1, NKF1, POS"
-    ):
+    with raises(SourceError, match="'ATT' of the vehicle carries no pose; known: EKF1, NKF1, POS"):
         read_bin(path, (LogBody("vehicle", "ATT"),))
 
 
