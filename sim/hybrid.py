@@ -22,9 +22,8 @@ from sim.kernels.structs import (
     extensions_of,
     kinds_of,
     pack,
-    pack_air,
-    pack_rope,
-    pack_vehicle,
+    pack_plants,
+    plants_on,
     ropes_on,
     types,
 )
@@ -221,32 +220,13 @@ class HybridSim:
         kernels = _kernels(params, direct, motors, self.extensions, without_rope)
         self.types, self._step, self._reset = kernels
         ropes = ropes_on(vehicles, ropes)
-        self._pack(ropes, airs, releases)
+        laws = [params.laws] * len(airs)
+        kinds = kinds_of(params.vehicle)
+        rows = pack_plants(self.types, vehicles, ropes, airs, releases, laws, kinds)
+        self._plants = plants_on(self.types, rows, params.sim, gravity, device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
         self._exchange = self._exchanged(ropes)
         self.place(pos_w=np.zeros((count, 3)))
-
-    def _pack(
-        self, ropes: list[RopeParams], airs: list[AirParams], releases: list[ReleaseParams]
-    ) -> None:
-        """Copy the parameters to the device."""
-        t = self.types
-        laws = [self.params.laws] * len(airs)
-        rows = {
-            "vehicles": (t.Vehicle, pack_vehicle(t, self.vehicles, kinds_of(self.params.vehicle))),
-            "ropes": (t.Rope, pack_rope(t, ropes)),
-            "airs": (t.Air, pack_air(t, airs, laws)),
-            "releases": (t.Release, pack(t.Release, *releases)),
-        }
-        self._plants = t.Plants()
-        for name, (struct, packed) in rows.items():
-            setattr(self._plants, name, wp.array(packed, dtype=struct, device=self.device))
-        s = self.params.sim
-        self._plants.period = s.control_period
-        self._plants.substep = s.substep
-        self._plants.gamma = s.gamma
-        self._plants.max_turn = s.max_turn
-        self._plants.gravity = self.gravity
 
     def _exchanged(self, ropes: list[RopeParams]) -> solvers.Exchange | None:
         """Return the solver of the plant's bodies with what it exchanges; None for the fused

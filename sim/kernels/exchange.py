@@ -153,8 +153,8 @@ def build_exchange(
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
-        whole, switch = split_delay(p, plants.period)
-        active, _until = held(state.queue, env, whole, switch, time + half, plants.period)
+        whole, switch = split_delay(p, plants.control_period)
+        active, _until = held(state.queue, env, whole, switch, time + half, plants.control_period)
         s = load(state, env)
         law_factors = laws.on(
             p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]
@@ -278,7 +278,9 @@ def build_exchange(
         if mask[env] == 0:
             return
         if state.release_timer[env] >= real(0.0):
-            state.release_timer[env] = wp.max(state.release_timer[env] - plants.period, real(0.0))
+            state.release_timer[env] = wp.max(
+                state.release_timer[env] - plants.control_period, real(0.0)
+            )
         if state.attached[env] != 0:
             s = load(state, env)
             n = wp.zeros(shape=(L,), dtype=vec3)

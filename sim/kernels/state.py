@@ -26,11 +26,15 @@ QUAD_FIELDS = {
     name: (kind, False) for name, kind in QUAD_STATE.items()
 }  # name: (type, also by row)
 
-STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
-    "mass_scale": ("real", False),
+ROPE_FIELDS = {
     "cable_dir_w": ("vec3", True),
     "cable_vel_w": ("vec3", True),
     "stiffness": ("real", True),
+}
+
+STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
+    "mass_scale": ("real", False),
+    **ROPE_FIELDS,
     "queue": ("vec4", True),  # (D, E) commands, newest first
     "release_timer": ("real", False),  # time to separation [s]; negative: not latched
     "attached": ("int", False),
@@ -174,3 +178,27 @@ def build_access(t: Types, State: type):
         state.voltage[env] = s.voltage
 
     return load, store
+
+
+def build_rope_access(t: Types, segments: int):
+    """Return Warp functions ``load_rope(state, env, n, u, stiffness)`` and ``store_rope``: they copy
+    between a struct of arrays that has :data:`ROPE_FIELDS` and local arrays.
+    """
+    Vectors = t.Vectors
+    Reals = t.Reals
+
+    @wp.func
+    def load_rope(state: Any, env: int, n: Vectors, u: Vectors, stiffness: Reals):
+        for i in range(segments):
+            n[i] = state.cable_dir_w[i, env]
+            u[i] = state.cable_vel_w[i, env]
+            stiffness[i] = state.stiffness[i, env]
+
+    @wp.func
+    def store_rope(state: Any, env: int, n: Vectors, u: Vectors, stiffness: Reals):
+        for i in range(segments):
+            state.cable_dir_w[i, env] = n[i]
+            state.cable_vel_w[i, env] = u[i]
+            state.stiffness[i, env] = stiffness[i]
+
+    return load_rope, store_rope

@@ -46,13 +46,12 @@ def build_parts(
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
-    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``rope_size``, ``hazards``;
-    ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an environment;
-    ``depart``, which writes what follows when the payload separates with a stated velocity."""
+    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and
+    ``hazards``; ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an
+    environment; ``depart``, which writes what follows when the payload separates with a stated velocity."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
     Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
@@ -77,6 +76,7 @@ def build_parts(
     ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
     leaving = rel.build_letting_go(t, extensions)
     load, store = st.build_access(t, State)
+    load_rope, store_rope = st.build_rope_access(t, L)
 
     @wp.func
     def rope_size(u: Vectors, n: Vectors):
@@ -85,19 +85,6 @@ def build_parts(
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
         return total
-
-    @wp.func
-    def load_rope(
-        state: State,
-        env: int,
-        n: Vectors,
-        u: Vectors,
-        stiffness: Reals,
-    ):
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            stiffness[i] = state.stiffness[i, env]
 
     @wp.func
     def vehicle_of(plants: Plants, state: State, env: int):
@@ -183,6 +170,7 @@ def build_parts(
         load=load,
         store=store,
         load_rope=load_rope,
+        store_rope=store_rope,
         rope_size=rope_size,
         vehicle_of=vehicle_of,
         rope_of=rope_of,
@@ -235,6 +223,7 @@ def build_step(
     load = parts.load
     store = parts.store
     load_rope = parts.load_rope
+    store_rope = parts.store_rope
     rope_size = parts.rope_size
     vehicle_of = parts.vehicle_of
     rope_of = parts.rope_of
@@ -290,7 +279,7 @@ def build_step(
         natural = rope_of(plants, env)
         r = release_of(plants, env)
         air = air_of(plants, state, env)
-        period = plants.period
+        period = plants.control_period
         gravity = plants.gravity
         g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
@@ -358,10 +347,7 @@ def build_step(
         state.attached[env] = attached
         if sane(s, u, n):
             store(state, env, s)
-            for i in range(L):
-                state.cable_dir_w[i, env] = n[i]
-                state.cable_vel_w[i, env] = u[i]
-                state.stiffness[i, env] = stiffness[i]
+            store_rope(state, env, n, u, stiffness)
         else:
             status = status | nonfinite
             s = load(state, env)

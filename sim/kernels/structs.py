@@ -46,9 +46,8 @@ ROPE_NUMBERS = (
 """Scalars of the device's rope, beside its mount."""
 
 
-PLANT_ROWS = ("vehicles", "ropes", "releases", "airs")
-PLANT_NUMBERS = ("period", "substep", "gamma", "max_turn", "gravity")
-"""Arrays and numbers of a batch's parameters."""
+NUMERICS = ("control_period", "substep", "gamma", "max_turn")
+"""Numbers of :class:`sim.params.SimParams` that kernels read."""
 
 QUAD_STATE = {
     "pos_w": "vec3",
@@ -91,7 +90,7 @@ class Types:
             during a step: ``push_w`` [N] on the vehicle, ``twist_b`` [N m] about its centre of
                 mass, ``payload_push_w`` [N].
         Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
-            an entry for one environment or all, and the numerics.
+            an entry for one environment or all, and the numerics. rows: types of these arrays.
         Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.
         QuadState, QuadRate: state of the quadrotor alone and its time derivative.
     """
@@ -114,9 +113,14 @@ class Types:
         }
         self.Air = self.from_dataclass(P.AirParams, pushes)
         self.Rope = make_struct("Rope", {"mount": self.vec3, **dict.fromkeys(ROPE_NUMBERS, real)})
-        rows = (self.Vehicle, self.Rope, self.Release, self.Air)
-        arrays = {name: wp.array(dtype=row) for name, row in zip(PLANT_ROWS, rows, strict=True)}
-        self.Plants = make_struct("Plants", arrays | dict.fromkeys(PLANT_NUMBERS, real))
+        self.rows = {
+            "vehicles": self.Vehicle,
+            "ropes": self.Rope,
+            "releases": self.Release,
+            "airs": self.Air,
+        }
+        arrays = {name: wp.array(dtype=row) for name, row in self.rows.items()}
+        self.Plants = make_struct("Plants", arrays | dict.fromkeys((*NUMERICS, "gravity"), real))
         self.Vectors = wp.array(dtype=self.vec3)
         self.Reals = wp.array(dtype=real)
         self.QuadState, self.QuadRate, self.Flow = (
@@ -332,3 +336,34 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
         row["total_mass"] = rope.hanging_mass
     return rows
+
+
+def pack_plants(
+    t: Types,
+    vehicles: list[P.VehicleParams],
+    ropes: list[P.RopeParams],
+    airs: list[P.AirParams],
+    releases: list[P.ReleaseParams],
+    laws: list[tuple[P.LawParams, ...]],
+    kinds: tuple[str, str, str, str],
+) -> dict[str, np.ndarray]:
+    """Structured arrays for :func:`plants_on`; arguments as of the other ``pack`` functions."""
+    return {
+        "vehicles": pack_vehicle(t, vehicles, kinds),
+        "ropes": pack_rope(t, ropes),
+        "airs": pack_air(t, airs, laws),
+        "releases": pack(t.Release, *releases),
+    }
+
+
+def plants_on(
+    t: Types, rows: dict[str, np.ndarray], sim: P.SimParams, gravity: float, device: str
+) -> typing.Any:
+    """Struct ``t.Plants`` on a device with these rows and numerics; gravity [m/s^2]."""
+    plants = t.Plants()
+    for name, packed in rows.items():
+        setattr(plants, name, wp.array(packed, dtype=t.rows[name], device=device))
+    for name in NUMERICS:
+        setattr(plants, name, getattr(sim, name))
+    plants.gravity = gravity
+    return plants

@@ -16,10 +16,9 @@ from sim.kernels.quadrotor.thrust import rotor_thrust
 from sim.kernels.replay.sampling import build_sampling
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
-from sim.kernels.rope.loose import build_loose_step
-from sim.kernels.rope.payload import build_flight, build_payload
-from sim.kernels.rope.release import build_letting_go, build_step_in_flight
-from sim.kernels.structs import EXTENSIONS, Types, make_struct
+from sim.kernels.rope.loose import build_loose
+from sim.kernels.rope.payload import build_payload
+from sim.kernels.structs import EXTENSIONS, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
 EVERYTHING = frozenset(
@@ -29,9 +28,7 @@ EVERYTHING = frozenset(
 ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2  # how the payload starts: on the rope, flying, or not there
 
 STATE_FIELDS = st.QUAD_FIELDS | {
-    "cable_dir_w": ("vec3", True),
-    "cable_vel_w": ("vec3", True),
-    "stiffness": ("real", True),
+    **st.ROPE_FIELDS,
     "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
     "payload_vel_w": ("vec3", False),
     "slack_first": ("real", False),  # at the end alone: when the rope first went slack [s]
@@ -121,6 +118,7 @@ class ReplayKernel:
     Data: type
     Sensing: type
     Moment: type
+    Ropes: type  # of the moments, fields of state.ROPE_FIELDS
     Pointers: type
 
 
@@ -133,11 +131,12 @@ def build_replay(
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
+    Reals = t.Reals
     Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
     Air = t.Air
-    QuadState = t.QuadState
+    Plants = t.Plants
     L = segments
     State = st.array_struct(t, "ReplayState", STATE_FIELDS)
     Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
@@ -150,41 +149,18 @@ def build_replay(
     payload = build_payload(t, EVERYTHING)
     coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
     extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
-    flight_acceleration = build_flight(t, payload, extra)
-    loose_step = build_loose_step(t, chain, payload)
-    leaving = build_letting_go(t, EVERYTHING)
-    fly_ball = build_step_in_flight(t, flight_acceleration)
-    sampling = build_sampling(t, Sensing, Windows, Data)
+    Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
+    load_quad, store_quad = st.build_access(t, State)
+    load_rope, store_rope = st.build_rope_access(t, L)
+    loose = build_loose(t, chain, payload, extra, coupled.mount_velocity)
+    Ball = loose.Ball
+    sampling = build_sampling(t, Sensing, Windows, Data, Ball)
     Steps = sampling.Steps
     Pointers = sampling.Pointers
-    sample = sampling.sample
-    copy_samples = sampling.copy_samples
-    load_quad, store_quad = st.build_access(t, State)
-    Ball = make_struct(
-        "Ball",
-        {"pos": vec3, "vel": vec3, "root": vec3, "root_vel": vec3, "tail": vec3, "tail_vel": vec3},
-    )
-    Moment = make_struct(
-        "Moment",
-        {
-            "time": real,
-            "quad": QuadState,
-            "rope": Rope,
-            "ball": Ball,
-            "total": vec3,
-            "before": vec3,
-            "pay": vec3,
-            "pay_vel": vec3,
-            "separation": real,
-            "mode": wp.int32,
-            "latched": wp.int32,
-            "knot": wp.int32,
-            "slack": wp.int32,
-            "at": Pointers,
-        },
-    )
+    Moment = sampling.Moment
     attached_code = ATTACHED
     loose_code = LOOSE
+    tiny = real(1.0e-9)
 
     @wp.func
     def push_at(air: Air, axis: int, size: real, share: real):
@@ -202,58 +178,117 @@ def build_replay(
         return out
 
     @wp.func
-    def payload_now(r: Release, ball: Ball):
-        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (
-            ball.tail_vel - ball.vel
-        )
-
-    @wp.func
-    def let_go(r: Release, rope: Rope, s: QuadState, n: Vectors, u: Vectors):
-        """The payload and the loose rope at the separation."""
-        ball = Ball()
-        ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
-        ball.root_vel = coupled.mount_velocity(rope, s)
-        pos, vel = chain.payload(rope, ball.root, ball.root_vel, n, u)
-        ball.pos = pos
-        ball.vel = leaving.kick(r, vel, n[L - 1])
-        ball.root_vel = ball.root_vel + (ball.vel - vel)
-        ball.tail = pos
-        ball.tail_vel = ball.vel
-        return ball
-
-    @wp.func
-    def knot_of(
-        knots: Knots,
-        row: int,
+    def begin(
         p: Vehicle,
-        rope: Rope,
-        s: QuadState,
-        pos: vec3,
-        vel: vec3,
-        pull: real,
+        natural: Rope,
+        r: Release,
+        windows: Windows,
+        w: int,
+        starts: State,
+        start: int,
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
     ):
-        knots.pos_w[row] = s.pos_w
-        knots.vel_w[row] = s.vel_w
-        knots.quat_wb[row] = s.quat_wb
-        knots.rate_b[row] = s.rate_b
-        f = rotor_thrust(p, s.motor_speed, s.voltage)
+        """A lane at its window's start; n, u and stiffness are filled in."""
+        m = Moment()
+        m.time = windows.start[w]
+        m.quad = load_quad(starts, start)
+        load_rope(starts, start, n, u, stiffness)
+        m.mode = windows.payload[w]
+        m.separation = windows.end[w] + real(1.0)
+        if m.mode == attached_code:
+            m.rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+            pos, vel = coupled.payload(m.rope, m.quad, n, u)
+            m.pay = pos
+            m.pay_vel = vel
+            if windows.latch[w] <= m.time:  # the pull at the latch lies before this window
+                m.separation = wp.max(windows.latch[w] + r.lag, m.time)
+                m.latched = 1
+        else:
+            m.rope = natural
+            m.pay = starts.payload_pos_w[start]
+            m.pay_vel = starts.payload_vel_w[start]
+            m.ball = loose.hang_below(natural, m.pay, m.pay_vel, n, u)
+            m.latched = 1
+        m.total = coupled.momentum(p, m.rope, m.quad, u)
+        m.before = m.quad.rate_b
+        m.slack_first = m.time - real(1.0)
+        m.slack_last = m.slack_first
+        m.at.due = m.time
+        return m
+
+    @wp.func
+    def latch_or_separate(
+        m: Moment,
+        natural: Rope,
+        r: Release,
+        latch: real,
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
+        gravity: real,
+    ):
+        """A lane after what is due of its release: the latch trips, or the payload separates."""
+        out = m
+        if m.mode == attached_code:
+            if latch <= m.time + tiny and m.latched == 0:
+                pull = chain.pull(m.rope, stiffness, u)
+                out.separation = latch + loose.lag(r, m.rope, pull, gravity)
+                out.latched = 1
+            if out.separation <= m.time + tiny:
+                out.ball = loose.let_go(r, m.rope, m.quad, n, u)
+                out.mode = int(loose_code)
+                out.rope = natural
+                out.pay = out.ball.pos
+                out.pay_vel = out.ball.vel
+        return out
+
+    @wp.func
+    def next_event(m: Moment, windows: Windows, w: int, data: Data, command: int, delay: real):
+        """Time at which the next command acts, the latch trips or the payload separates, or of the
+        window's end.
+        """
+        until = windows.end[w]
+        if command + 1 < windows.command_last[w]:
+            until = wp.min(until, data.command_time[command + 1] + delay)
+        if m.mode == attached_code:
+            if windows.latch[w] > m.time + tiny:
+                until = wp.min(until, windows.latch[w])
+            until = wp.min(until, m.separation)
+        return until
+
+    @wp.func
+    def note_slack(m: Moment, pull: real, weight: real, begins: real, t0: real, t1: real):
+        """A lane that knows whether its rope is slack after a step, and since when."""
+        out = m
+        if pull < real(SLACK) * weight:
+            out.slack = 1
+            if m.slack_first < begins:
+                out.slack_first = t0
+        elif m.slack != 0:
+            out.slack = 0
+            out.slack_last = t1
+        return out
+
+    @wp.func
+    def write_knot(knots: Knots, row: int, p: Vehicle, m: Moment, pull: real):
+        knots.pos_w[row] = m.quad.pos_w
+        knots.vel_w[row] = m.quad.vel_w
+        knots.quat_wb[row] = m.quad.quat_wb
+        knots.rate_b[row] = m.quad.rate_b
+        f = rotor_thrust(p, m.quad.motor_speed, m.quad.voltage)
         knots.thrust[row] = f[0] + f[1] + f[2] + f[3]
-        knots.payload_pos_w[row] = pos
-        knots.payload_vel_w[row] = vel
+        knots.payload_pos_w[row] = m.pay
+        knots.payload_vel_w[row] = m.pay_vel
         knots.tension[row] = pull
 
     @wp.kernel(module="unique", enable_backward=False)
     def replay_kernel(
         # Params:
-        vehicles: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        releases: wp.array(dtype=Release),
-        airs: wp.array(dtype=Air),
+        plants: Plants,
         sensings: wp.array(dtype=Sensing),
         knot_spacing: real,
-        gamma: real,
-        max_turn: real,
-        gravity: real,
         # State in:
         starts: State,
         # In:
@@ -267,291 +302,140 @@ def build_replay(
         knots: Knots,
         marks: wp.array(dtype=Pointers),
         moments: wp.array(dtype=Moment),
-        moment_dirs: wp.array2d(dtype=vec3),
-        moment_vels: wp.array2d(dtype=vec3),
-        moment_stiffness: wp.array2d(dtype=real),
+        moment_ropes: Ropes,
         # Out:
         out: wp.array2d(dtype=vec3),
     ):
         lane = order[wp.tid() + first_lane]
         w = lanes.window[lane]
         row = lanes.plant[lane]
-        p = vehicles[row]
-        natural = ropes[row]
-        r = releases[row]
-        air = airs[row]
+        p = plants.vehicles[row]
+        natural = plants.ropes[row]
+        r = plants.releases[row]
+        air = plants.airs[row]
         x = sensings[row]
+        gravity = plants.gravity
         g = vec3(real(0.0), real(0.0), -gravity)
-        start = lanes.state[lane]
-        s = load_quad(starts, start)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        for i in range(L):
-            n[i] = starts.cable_dir_w[i, start]
-            u[i] = starts.cable_vel_w[i, start]
-            stiffness[i] = starts.stiffness[i, start]
-        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
-        mode = windows.payload[w]
-        ball = Ball()
-        if mode != attached_code:
-            rope = natural
-            ball.pos = starts.payload_pos_w[start]
-            ball.vel = starts.payload_vel_w[start]
-            arm, arm_vel = chain.payload(rope, vec3(), vec3(), n, u)
-            ball.root = ball.pos - arm
-            ball.root_vel = ball.vel - arm_vel
-            ball.tail = ball.pos
-            ball.tail_vel = ball.vel
-
-        tiny = real(1.0e-9)
-        time = windows.start[w]
-        end = windows.end[w]
-        command = windows.command_first[w]
-        delay = p.queue.delay
-        while (
-            command + 1 < windows.command_last[w]
-            and data.command_time[command + 1] + delay <= time + tiny
-        ):
-            command = command + 1
-        latch = windows.latch[w]
-        separation = end + real(1.0)
-        latched = mode != attached_code
-        if mode == attached_code and latch <= time:
-            separation = wp.max(
-                latch + r.lag, time
-            )  # the pull at the latch lies before this window
-            latched = True
-        knot = int(0)
-        slack = bool(False)
-        slack_first = time - real(1.0)
-        slack_last = time - real(1.0)
-        pointers = Pointers()
-        pointers.due = time
+        m = begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
         for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
-            marks[e] = pointers
-        total = coupled.momentum(p, rope, s, u)
-        before = s.rate_b
-        pay = ball.pos
-        pay_vel = ball.vel
-        if mode == attached_code:
-            pos0, vel0 = coupled.payload(rope, s, n, u)
-            pay = pos0
-            pay_vel = vel0
+            marks[e] = m.at
         resume = lanes.resume[lane]
         if resume >= 0:
             m = moments[resume]
-            time = m.time
-            s = m.quad
-            rope = m.rope
-            ball = m.ball
-            total = m.total
-            before = m.before
-            pay = m.pay
-            pay_vel = m.pay_vel
-            separation = m.separation
-            mode = m.mode
-            latched = m.latched != 0
-            slack = m.slack != 0
-            knot = m.knot
-            pointers = m.at
-            for i in range(L):
-                n[i] = moment_dirs[resume, i]
-                u[i] = moment_vels[resume, i]
-                stiffness[i] = moment_stiffness[resume, i]
-            copy_samples(windows, w, pointers, lanes.parent[lane], lane, out)
-        while time < end - tiny:
-            until = end
+            load_rope(moment_ropes, resume, n, u, stiffness)
+            sampling.copy_samples(windows, w, m.at, lanes.parent[lane], lane, out)
+        end = windows.end[w]
+        command = windows.command_first[w]
+        delay = p.queue.delay
+        while m.time < end - tiny:
             while (
                 command + 1 < windows.command_last[w]
-                and data.command_time[command + 1] + delay <= time + tiny
+                and data.command_time[command + 1] + delay <= m.time + tiny
             ):
                 command = command + 1
-            if command + 1 < windows.command_last[w]:
-                until = wp.min(until, data.command_time[command + 1] + delay)
-            if mode == attached_code and latch > time + tiny:
-                until = wp.min(until, latch)
-            if mode == attached_code and latch <= time + tiny and not latched:
-                separation = latch + leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
-                latched = True
-            if mode == attached_code and separation <= time + tiny:
-                ball = let_go(r, rope, s, n, u)
-                mode = int(loose_code)
-                rope = natural
-                pay = ball.pos
-                pay_vel = ball.vel
-            if mode == attached_code:
-                until = wp.min(until, separation)
-            knot_time = windows.first_knot[w] + real(float(knot)) * knot_spacing
-            if knot < windows.knots[w]:
-                if knot_time <= time + tiny:
+            m = latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
+            until = next_event(m, windows, w, data, command, delay)
+            if m.knot < windows.knots[w]:
+                knot_time = windows.first_knot[w] + real(float(m.knot)) * knot_spacing
+                if knot_time <= m.time + tiny:
                     if lanes.keep[lane] >= 0:
-                        knot_index = lanes.keep[lane] + knot
-                        knot_of(
-                            knots,
-                            knot_index,
-                            p,
-                            rope,
-                            s,
-                            pay,
-                            pay_vel,
-                            chain.pull(rope, stiffness, u),
-                        )
-                        if knot_index < moments.shape[0]:
-                            moment = Moment()
-                            moment.time = time
-                            moment.quad = s
-                            moment.rope = rope
-                            moment.ball = ball
-                            moment.total = total
-                            moment.before = before
-                            moment.pay = pay
-                            moment.pay_vel = pay_vel
-                            moment.separation = separation
-                            moment.mode = mode
-                            moment.latched = int(latched)
-                            moment.slack = int(slack)
-                            moment.knot = knot
-                            moment.at = pointers
-                            moments[knot_index] = moment
-                            for i in range(L):
-                                moment_dirs[knot_index, i] = n[i]
-                                moment_vels[knot_index, i] = u[i]
-                                moment_stiffness[knot_index, i] = stiffness[i]
-                    knot = knot + 1
+                        kept = lanes.keep[lane] + m.knot
+                        write_knot(knots, kept, p, m, chain.pull(m.rope, stiffness, u))
+                        if kept < moments.shape[0]:
+                            moments[kept] = m
+                            store_rope(moment_ropes, kept, n, u, stiffness)
+                    m.knot = m.knot + 1
                     knot_time = knot_time + knot_spacing
-                until = wp.min(until, wp.max(knot_time, time + tiny))
-            count = wp.max(int(wp.ceil((until - time) / lanes.substep[lane] - real(1.0e-3))), 1)
-            h = (until - time) / real(float(count))
+                until = wp.min(until, wp.max(knot_time, m.time + tiny))
+            count = wp.max(int(wp.ceil((until - m.time) / lanes.substep[lane] - real(1.0e-3))), 1)
+            h = (until - m.time) / real(float(count))
             active = data.command[command]
             peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
             for j in range(count):
-                t0 = time + real(float(j)) * h
-                distance = wp.abs(t0 + real(0.5) * h - peak) / knot_spacing
-                hanging = int(0)
-                if mode == attached_code:
-                    hanging = 1
-                    rope = chain.stretched(natural, rope, stiffness, u, h)
-                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
-                pushed = extra.on(p, rope, pushed, s, n, u, stiffness, active, hanging)
-                old = s
-                old_pay = pay
-                old_pay_vel = pay_vel
-                if mode == attached_code:
-                    s, total, fell_back = coupled.step(
-                        p, rope, pushed, s, total, active, n, u, stiffness, g, gamma, max_turn, h
-                    )
-                    pos1, vel1 = coupled.payload(rope, s, n, u)
-                    pay = pos1
-                    pay_vel = vel1
-                    if chain.pull(rope, stiffness, u) < real(SLACK) * rope.payload_mass * gravity:
-                        slack = True
-                        if slack_first < windows.start[w]:
-                            slack_first = t0
-                    elif slack:
-                        slack = False
-                        slack_last = t0 + h
-                else:
-                    s = coupled.step_alone(p, pushed, s, active, g, h)
-                    if mode == loose_code:
-                        flown_pos, flown_vel = fly_ball(rope, pushed, ball.pos, ball.vel, g, h)
-                        ball.pos = flown_pos
-                        ball.vel = flown_vel
-                        if r.rope_tail > real(0.0):
-                            root, root_vel = loose_step(
-                                rope,
-                                pushed,
-                                ball.root,
-                                ball.root_vel,
-                                n,
-                                u,
-                                stiffness,
-                                g,
-                                gamma,
-                                max_turn,
-                                h,
-                            )
-                            tail_pos, tail_vel = chain.payload(rope, root, root_vel, n, u)
-                            ball.root = root
-                            ball.root_vel = root_vel
-                            ball.tail = tail_pos
-                            ball.tail_vel = tail_vel
-                        pos2, vel2 = payload_now(r, ball)
-                        pay = pos2
-                        pay_vel = vel2
                 k = Steps()
-                k.t0 = t0
-                k.t1 = t0 + h
+                k.t0 = m.time + real(float(j)) * h
+                k.t1 = k.t0 + h
                 k.h = h
-                last = j == count - 1 and until >= end - tiny
-                if (
-                    last or pointers.due <= k.t1
-                ):  # most steps show nothing, and to ask costs as much as a tenth of a step
-                    pointers = sample(
+                k.quad = m.quad
+                k.pay = m.pay
+                k.pay_vel = m.pay_vel
+                distance = wp.abs(k.t0 + real(0.5) * h - peak) / knot_spacing
+                hanging = int(0)
+                if m.mode == attached_code:
+                    hanging = 1
+                    m.rope = chain.stretched(natural, m.rope, stiffness, u, h)
+                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
+                pushed = extra.on(p, m.rope, pushed, k.quad, n, u, stiffness, active, hanging)
+                if hanging != 0:
+                    quad, total, _fell_back = coupled.step(
                         p,
-                        x,
-                        data,
-                        windows,
-                        w,
-                        old,
-                        s,
-                        before,
-                        old_pay,
-                        old_pay_vel,
-                        pay,
-                        pay_vel,
-                        k,
-                        last,
-                        pointers,
-                        out,
-                        lane,
+                        m.rope,
+                        pushed,
+                        k.quad,
+                        m.total,
+                        active,
+                        n,
+                        u,
+                        stiffness,
+                        g,
+                        plants.gamma,
+                        plants.max_turn,
+                        h,
                     )
+                    m.quad = quad
+                    m.total = total
+                    pos, vel = coupled.payload(m.rope, quad, n, u)
+                    m.pay = pos
+                    m.pay_vel = vel
+                    pull = chain.pull(m.rope, stiffness, u)
+                    weight = m.rope.payload_mass * gravity
+                    m = note_slack(m, pull, weight, windows.start[w], k.t0, k.t1)
+                else:
+                    m.quad = coupled.step_alone(p, pushed, k.quad, active, g, h)
+                    if m.mode == loose_code:
+                        m.ball = loose.fly(
+                            m.ball,
+                            m.rope,
+                            r,
+                            pushed,
+                            n,
+                            u,
+                            stiffness,
+                            g,
+                            plants.gamma,
+                            plants.max_turn,
+                            h,
+                        )
+                        pos1, vel1 = loose.payload(r, m.ball)
+                        m.pay = pos1
+                        m.pay_vel = vel1
+                last = j == count - 1 and until >= end - tiny
+                # most steps show nothing, and to ask costs as much as a tenth of a step
+                if last or m.at.due <= k.t1:
+                    m.at = sampling.sample(p, x, data, windows, w, k, m, last, m.at, out, lane)
                 for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
                     if last or marks[e].due <= k.t1:
-                        marks[e] = sample(
-                            p,
-                            sensings[lanes.plant[e]],
-                            data,
-                            windows,
-                            w,
-                            old,
-                            s,
-                            before,
-                            old_pay,
-                            old_pay_vel,
-                            pay,
-                            pay_vel,
-                            k,
-                            last,
-                            marks[e],
-                            out,
-                            e,
+                        seen = sensings[lanes.plant[e]]
+                        marks[e] = sampling.sample(
+                            p, seen, data, windows, w, k, m, last, marks[e], out, e
                         )
-                before = old.rate_b
-            time = until
+                m.before = k.quad.rate_b
+            m.time = until
 
         if lanes.keep[lane] >= 0:
-            if knot < windows.knots[w]:
-                knot_of(
-                    knots,
-                    lanes.keep[lane] + knot,
-                    p,
-                    rope,
-                    s,
-                    pay,
-                    pay_vel,
-                    chain.pull(rope, stiffness, u),
-                )
-            store_quad(ends, lane, s)
-            ends.payload_pos_w[lane] = pay
-            ends.payload_vel_w[lane] = pay_vel
-            ends.slack_first[lane] = slack_first
-            ends.slack_last[lane] = slack_last
-            for i in range(L):
-                ends.cable_dir_w[i, lane] = n[i]
-                ends.cable_vel_w[i, lane] = u[i]
-                ends.stiffness[i, lane] = stiffness[i]
+            if m.knot < windows.knots[w]:
+                kept = lanes.keep[lane] + m.knot
+                write_knot(knots, kept, p, m, chain.pull(m.rope, stiffness, u))
+            store_quad(ends, lane, m.quad)
+            ends.payload_pos_w[lane] = m.pay
+            ends.payload_vel_w[lane] = m.pay_vel
+            ends.slack_first[lane] = m.slack_first
+            ends.slack_last[lane] = m.slack_last
+            store_rope(ends, lane, n, u, stiffness)
 
     return ReplayKernel(
-        replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Pointers
+        replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Ropes, Pointers
     )

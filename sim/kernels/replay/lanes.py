@@ -14,16 +14,7 @@ from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.laws import check_laws, structure
 from sim.kernels.replay import kernel as rk
-from sim.kernels.structs import (
-    Types,
-    kinds_of,
-    pack,
-    pack_air,
-    pack_rope,
-    pack_vehicle,
-    ropes_on,
-    types,
-)
+from sim.kernels.structs import Types, kinds_of, pack, pack_plants, plants_on, ropes_on, types
 from sim.params import GRAVITY, PlantParams, SensingParams
 
 
@@ -66,15 +57,9 @@ class Recording:
     def on(self, kernel: rk.ReplayKernel, t: Types, device: str) -> tuple:
         """Return windows and recorded data as a kernel's structs on a device."""
         if (kernel, device) not in self._there:
-            structs = (
-                (kernel.Windows, rk.WINDOW_FIELDS, self.windows),
-                (
-                    kernel.Data,
-                    rk.DATA_FIELDS,
-                    self.data,
-                ),
-            )
-            self._there[kernel, device] = tuple(_struct(t, *group, device) for group in structs)
+            windows = _struct(t, kernel.Windows, rk.WINDOW_FIELDS, self.windows, device)
+            data = _struct(t, kernel.Data, rk.DATA_FIELDS, self.data, device)
+            self._there[kernel, device] = (windows, data)
         return self._there[kernel, device]
 
 
@@ -128,21 +113,24 @@ class Replay:
             _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
         self.kernel = _BUILDS[key]
         vehicles = [p.vehicle for p in plants]
-        self._rows = {
-            t.Vehicle: pack_vehicle(t, vehicles, kinds),
-            t.Rope: pack_rope(t, ropes_on(vehicles, [p.rope for p in plants])),
-            t.Release: pack(t.Release, *[p.release for p in plants]),
-            t.Air: pack_air(t, [p.air for p in plants], [p.laws for p in plants]),
-            self.kernel.Sensing: pack(self.kernel.Sensing, *sensings),
-        }
-        self._plants: dict[str, list[wp.array]] = {}
+        self._rows = pack_plants(
+            t,
+            vehicles,
+            ropes_on(vehicles, [p.rope for p in plants]),
+            [p.air for p in plants],
+            [p.release for p in plants],
+            [p.laws for p in plants],
+            kinds,
+        )
+        self._sensings = pack(self.kernel.Sensing, *sensings)
+        self._plants: dict[str, list] = {}
 
-    def _plants_on(self, device: str) -> list[wp.array]:
-        """Return the plants' arrays on a device, copied once."""
+    def _plants_on(self, device: str) -> list:
+        """Return plants and sensings on a device, copied once."""
         if device not in self._plants:
-            self._plants[device] = [
-                wp.array(value, dtype=struct, device=device) for struct, value in self._rows.items()
-            ]
+            plants = plants_on(self.types, self._rows, self._sim, GRAVITY, device)
+            sensings = wp.array(self._sensings, dtype=self.kernel.Sensing, device=device)
+            self._plants[device] = [plants, sensings]
         return self._plants[device]
 
     def run(
@@ -170,7 +158,7 @@ class Replay:
             lanes = {**lanes, "resume": np.full(count, -1)}
         w = np.asarray(lanes["window"])
         height = max(int(np.max(recording.rows[w])), 1)
-        segments = dict.fromkeys(("cable_dir_w", "cable_vel_w", "stiffness"), self.segments)
+        segments = dict.fromkeys(st.ROPE_FIELDS, self.segments)
         keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
         if keeps:
             ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
@@ -181,9 +169,10 @@ class Replay:
         out = wp.empty((height, count), dtype=t.vec3, device=device)
         resumed = np.asarray(lanes["resume"]) >= 0
         moments = knots if np.any(resumed) else 0
-        size = (moments, self.segments)
-        ropes = [wp.empty(size, dtype=kind, device=device) for kind in (t.vec3, t.vec3, t.real)]
-        left_at = [wp.empty(moments, dtype=k.Moment, device=device), *ropes]
+        left_at = [
+            wp.empty(moments, dtype=k.Moment, device=device),
+            st.allocate(t, k.Ropes, st.ROPE_FIELDS, moments, segments, device),
+        ]
         marks = wp.empty(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
         launches = [
@@ -191,11 +180,10 @@ class Replay:
             for rows in _in_order(np.asarray(lanes["shared"]), resumed)
         ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
-        numerics = [knot_spacing, self._sim.gamma, self._sim.max_turn, GRAVITY]
         begin = _struct(t, k.State, rk.STATE_FIELDS, starts, device)
         flown = _struct(t, k.Lanes, rk.LANE_FIELDS, lanes, device)
         windows, data = recording.on(k, t, device)
-        before = [*self._plants_on(device), *numerics, begin, windows, flown, data, order]
+        before = [*self._plants_on(device), knot_spacing, begin, windows, flown, data, order]
         after = [ends, knot_states, marks, *left_at, out]
         first = 0
         for rows in launches:
@@ -203,7 +191,7 @@ class Replay:
             first += len(rows)
         if not keeps:
             return Replayed(self._download(out), {}, {})
-        read = self._read(ends, rk.STATE_FIELDS), self._read(knot_states, rk.KNOT_FIELDS)
+        read = _read(ends, rk.STATE_FIELDS), _read(knot_states, rk.KNOT_FIELDS)
         return Replayed(self._download(out), *read)
 
     def _launch(
@@ -222,25 +210,16 @@ class Replay:
         """
         if not len(costs):
             return
+        inputs = [*before, begin, *after]
+        kernel = self.kernel.replay
         if device != "cpu":
-            wp.launch(
-                self.kernel.replay,
-                len(costs),
-                [*before, begin, *after],
-                device=device,
-                block_dim=64,
-            )
+            wp.launch(kernel, len(costs), inputs, device=device, block_dim=64)
             wp.synchronize_device(device)
             return
-        whole = wp.launch(
-            self.kernel.replay, len(costs), [*before, begin, *after], device="cpu", record_cmd=True
-        )
+        whole = wp.launch(kernel, len(costs), inputs, device="cpu", record_cmd=True)
 
-        def launch(
-            first: int, last: int
-        ) -> (
-            None
-        ):  # packed once: that of each piece took longer than a lane's flight, with Python held
+        def launch(first: int, last: int) -> None:
+            # packed once: that of each piece took longer than a lane's flight, with Python held
             piece = copy.copy(whole)
             piece.params = list(whole.params)
             piece.set_dim(last - first)
@@ -249,16 +228,10 @@ class Replay:
 
         in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 
-    @staticmethod
-    def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
-        return {
-            name: (
-                np.swapaxes(getattr(struct, name).numpy(), 0, 1)
-                if by_row
-                else getattr(struct, name).numpy()
-            )
-            for name, (_, by_row) in fields.items()
-        }
+
+def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
+    """Arrays of a struct on the host, lane first."""
+    return {name: st.fetched(getattr(struct, name), by_row) for name, (_, by_row) in fields.items()}
 
 
 def _struct(t: Types, struct: type, fields: Mapping, values: Mapping[str, np.ndarray], device: str):

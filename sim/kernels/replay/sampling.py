@@ -79,29 +79,34 @@ class Sampling:
 
     sample: wp.Function
     copy_samples: wp.Function
-    Steps: type  # a step's two ends and its length [s]
+    Moment: type  # a lane in flight
+    Steps: type  # a step's two ends and its length [s], and the lane's state before it
     # how many stamps of each sensor were sampled, and the time of the state that the next one shows
     # [s]
     Pointers: type
 
 
-def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampling:
+def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: type) -> Sampling:
     """Build what a lane does at the end of each step.
 
     Args:
         t: types of the wanted precision.
-        Sensing, Windows, Data: structs of the replay.
+        Sensing, Windows, Data, Ball: structs of the replay.
     """
     real = t.real
     vec3 = t.vec3
     quat = t.quat
     Vehicle = t.Vehicle
-    QuadState = t.QuadState
     see_pose, see_point, see_rate = build_sensing(t, Sensing)
-    Steps = make_struct("Steps", {"t0": real, "t1": real, "h": real})
     Pointers = make_struct(
         "Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real}
     )
+    body = {"quad": t.QuadState, "pay": vec3, "pay_vel": vec3}
+    Steps = make_struct("Steps", body | dict.fromkeys(("t0", "t1", "h"), real))
+    release = {"rope": t.Rope, "ball": Ball, "total": vec3, "before": vec3, "at": Pointers}
+    times = dict.fromkeys(("time", "separation", "slack_first", "slack_last"), real)
+    flags = dict.fromkeys(("mode", "latched", "knot", "slack"), wp.int32)
+    Moment = make_struct("Moment", body | release | times | flags)
 
     @wp.func
     def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
@@ -129,14 +134,8 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         data: Data,
         windows: Windows,
         w: int,
-        a: QuadState,
-        b: QuadState,
-        before: vec3,
-        pa: vec3,
-        va: vec3,
-        pb: vec3,
-        vb: vec3,
         k: Steps,
+        m: Moment,
         last: bool,
         pointers: Pointers,
         out: wp.array2d(dtype=vec3),
@@ -157,12 +156,12 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
-            pos = blend_vec(a.pos_w, a.vel_w, b.pos_w, b.vel_w, s, span)
+            pos = blend_vec(k.quad.pos_w, k.quad.vel_w, m.quad.pos_w, m.quad.vel_w, s, span)
             q = blend_quat(
-                a.quat_wb,
-                quat_rate(a.quat_wb, a.rate_b),
-                b.quat_wb,
-                quat_rate(b.quat_wb, b.rate_b),
+                k.quad.quat_wb,
+                quat_rate(k.quad.quat_wb, k.quad.rate_b),
+                m.quad.quat_wb,
+                quat_rate(m.quad.quat_wb, m.quad.rate_b),
                 s,
                 span,
             )
@@ -183,7 +182,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 break
             s = (time - k.t0) / span
             out[2 * vehicles + pointers_after.payload, lane] = see_point(
-                x, a.quat_wb, blend_vec(pa, va, pb, vb, s, span)
+                x, k.quad.quat_wb, blend_vec(k.pay, k.pay_vel, m.pay, m.pay_vel, s, span)
             )
             pointers_after.payload = pointers_after.payload + 1
         while pointers_after.gyro < windows.gyro_count[w]:
@@ -198,10 +197,10 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
                 pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
-            bend = (
-                b.rate_b - a.rate_b - (a.rate_b - before)
-            )  # a parabola through three ends of steps
-            turning = a.rate_b + s * (b.rate_b - a.rate_b) - real(0.5) * s * (real(1.0) - s) * bend
+            old = k.quad.rate_b
+            change = m.quad.rate_b - old
+            bend = change - (old - m.before)  # a parabola through three ends of steps
+            turning = old + s * change - real(0.5) * s * (real(1.0) - s) * bend
             out[2 * vehicles + payloads + pointers_after.gyro, lane] = see_rate(x, turning)
             pointers_after.gyro = pointers_after.gyro + 1
         return pointers_after
@@ -225,4 +224,4 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type) -> Sampli
         for i in range(first, first + pointers.gyro):
             out[i, lane] = out[i, parent]
 
-    return Sampling(sample, copy_samples, Steps, Pointers)
+    return Sampling(sample, copy_samples, Moment, Steps, Pointers)

@@ -2,9 +2,13 @@
 without a vehicle.
 """
 
+from types import SimpleNamespace
+
 import warp as wp
 
-from sim.kernels.structs import Types
+from sim.kernels.rope.payload import build_flight
+from sim.kernels.rope.release import build_letting_go, build_step_in_flight
+from sim.kernels.structs import EXTENSIONS, Types, make_struct
 
 
 def build_loose_step(t: Types, chain, payload):
@@ -88,3 +92,102 @@ def build_loose_step(t: Types, chain, payload):
         return pos_w + (half * h) * (vel_w + vel), vel
 
     return step
+
+
+def build_loose(
+    t: Types,
+    chain: SimpleNamespace,
+    payload: SimpleNamespace,
+    laws: SimpleNamespace,
+    mount_velocity,
+) -> SimpleNamespace:
+    """Build the flight of a payload and of a rope that may leave with it, all extensions built in.
+
+    Returns a namespace of the struct ``Ball``, of the Warp functions ``lag`` of
+    :func:`sim.kernels.rope.release.build_letting_go`, ``let_go(r, rope, quad, n, u)`` -> ball at
+    the separation, ``hang_below(rope, pos, vel, n, u)`` -> ball with a rope in line,
+    ``fly(ball, rope, r, air, n, u, stiffness, gravity, gamma, max_turn, h)`` -> ball after h
+    seconds, and ``payload(r, ball)`` -> its position and velocity, with the rope's share."""
+    vec3 = t.vec3
+    real = t.real
+    Vectors = t.Vectors
+    Reals = t.Reals
+    Rope = t.Rope
+    Air = t.Air
+    Release = t.Release
+    QuadState = t.QuadState
+    last = chain.segments - 1
+    names = ("pos", "vel", "root", "root_vel", "tail", "tail_vel")
+    Ball = make_struct("Ball", dict.fromkeys(names, vec3))
+    leaving = build_letting_go(t, frozenset(EXTENSIONS))
+    step = build_loose_step(t, chain, payload)
+    fly_ball = build_step_in_flight(t, build_flight(t, payload, laws))
+
+    @wp.func
+    def let_go(r: Release, rope: Rope, s: QuadState, n: Vectors, u: Vectors):
+        ball = Ball()
+        ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+        ball.root_vel = mount_velocity(rope, s)
+        pos, vel = chain.payload(rope, ball.root, ball.root_vel, n, u)
+        ball.pos = pos
+        ball.vel = leaving.kick(r, vel, n[last])
+        ball.root_vel = ball.root_vel + (ball.vel - vel)
+        ball.tail = pos
+        ball.tail_vel = ball.vel
+        return ball
+
+    @wp.func
+    def hang_below(rope: Rope, pos: vec3, vel: vec3, n: Vectors, u: Vectors):
+        ball = Ball()
+        ball.pos = pos
+        ball.vel = vel
+        arm, arm_vel = chain.payload(rope, vec3(), vec3(), n, u)
+        ball.root = pos - arm
+        ball.root_vel = vel - arm_vel
+        ball.tail = pos
+        ball.tail_vel = vel
+        return ball
+
+    @wp.func
+    def fly(
+        ball: Ball,
+        rope: Rope,
+        r: Release,
+        air: Air,
+        n: Vectors,
+        u: Vectors,
+        stiffness: Reals,
+        gravity: vec3,
+        gamma: real,
+        max_turn: real,
+        h: real,
+    ):
+        out = ball
+        pos, vel = fly_ball(rope, air, ball.pos, ball.vel, gravity, h)
+        out.pos = pos
+        out.vel = vel
+        if r.rope_tail > real(0.0):
+            root, root_vel = step(
+                rope, air, ball.root, ball.root_vel, n, u, stiffness, gravity, gamma, max_turn, h
+            )
+            tail, tail_vel = chain.payload(rope, root, root_vel, n, u)
+            out.root = root
+            out.root_vel = root_vel
+            out.tail = tail
+            out.tail_vel = tail_vel
+        return out
+
+    @wp.func
+    def payload_state(r: Release, ball: Ball):
+        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (
+            ball.tail_vel - ball.vel
+        )
+
+    return SimpleNamespace(
+        Ball=Ball,
+        lag=leaving.lag,
+        let_go=let_go,
+        hang_below=hang_below,
+        fly=fly,
+        payload=payload_state,
+    )
