@@ -12,227 +12,243 @@ does the same to a straight rope of the length l in direction n, (-M x n) / l on
 opposite at the mount. Momentum is conserved."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
-from sim.kernels.structs import Types, make_struct, types
+from sim.kernels.structs import Types, make_struct
 from sim.params import LOWEST, SLOWEST, LawParams
 
 MOST_LAWS = 4
-BLOCKS = ("vehicle force", "vehicle torque", "payload force", "rope joint")
+
+AROUND = {
+    "pos_w": "vec3",
+    "vel_w": "vec3",
+    "rate_b": "vec3",
+    "quat_wb": "quat",
+    "payload_pos_w": "vec3",
+    "payload_vel_w": "vec3",
+    "cable_dir_w": "vec3",
+    "mount_b": "vec3",
+    "thrust": "real",
+    "thrust_rate": "real",
+    "tension": "real",
+}
+"""What factors are made of: name -> type."""
 
 
-def _factors(t: Types, Around: type) -> tuple[dict, dict]:
-    """Warp functions of the scalars, and of the vectors by block; forces in the world frame,
-    torques in the body's.
-    """
-    vec3 = t.vec3
-    real = t.real
-
-    def axis(x: float, y: float, z: float):
-        @wp.func
-        def unit(a: Around):
-            return vec3(real(x), real(y), real(z))
-
-        return unit
-
-    def turned(vector):
-        @wp.func
-        def world(a: Around):
-            return wp.quat_rotate(a.quat_wb, vector(a))
-
-        return world
-
-    def turned_back(vector):
-        @wp.func
-        def body(a: Around):
-            return wp.quat_rotate_inv(a.quat_wb, vector(a))
-
-        return body
-
-    def crossed(first, second):
-        @wp.func
-        def cross(a: Around):
-            return wp.cross(first(a), second(a))
-
-        return cross
-
-    def size(vector):
-        @wp.func
-        def length(a: Around):
-            return wp.length(vector(a))
-
-        return length
-
+def _axis(x: float, y: float, z: float):
     @wp.func
-    def vel(a: Around):
-        return a.vel_w
+    def unit(a: Any):
+        return type(a.vel_w)(type(a.thrust)(x), type(a.thrust)(y), type(a.thrust)(z))
 
+    return unit
+
+
+def _turned(vector):
     @wp.func
-    def rate(a: Around):
-        return a.rate_b
+    def world(a: Any):
+        return wp.quat_rotate(a.quat_wb, vector(a))
 
+    return world
+
+
+def _turned_back(vector):
     @wp.func
-    def cable(a: Around):
-        return a.cable_dir_w
+    def body(a: Any):
+        return wp.quat_rotate_inv(a.quat_wb, vector(a))
 
+    return body
+
+
+def _crossed(first, second):
     @wp.func
-    def payload_vel(a: Around):
-        return a.payload_vel_w
+    def cross(a: Any):
+        return wp.cross(first(a), second(a))
 
+    return cross
+
+
+def _size(vector):
     @wp.func
-    def thrust(a: Around):
-        return a.thrust
+    def length(a: Any):
+        return wp.length(vector(a))
 
-    @wp.func
-    def thrust_rate(a: Around):
-        return a.thrust_rate
-
-    @wp.func
-    def tension(a: Around):
-        return a.tension
-
-    body_x = axis(1.0, 0.0, 0.0)
-    body_y = axis(0.0, 1.0, 0.0)
-    vertical = axis(0.0, 0.0, 1.0)
-    up = turned(vertical)
-
-    @wp.func
-    def along(a: Around):
-        return wp.dot(a.vel_w, up(a))
-
-    @wp.func
-    def across(a: Around):
-        return a.vel_w - along(a) * up(a)
-
-    @wp.func
-    def swing(a: Around):
-        relative = a.payload_vel_w - a.vel_w
-        return relative - wp.dot(relative, a.cable_dir_w) * a.cable_dir_w
-
-    @wp.func
-    def under(a: Around):
-        return -wp.dot(a.cable_dir_w, up(a))
-
-    @wp.func
-    def aside(a: Around):
-        return a.cable_dir_w + under(a) * up(a)
-
-    @wp.func
-    def abs_thrust_rate(a: Around):
-        return wp.abs(a.thrust_rate)
-
-    @wp.func
-    def speed_across_squared(a: Around):
-        return wp.dot(across(a), across(a))
-
-    @wp.func
-    def rate_yaw(a: Around):
-        return a.rate_b[2]
-
-    @wp.func
-    def inverse_height(a: Around):
-        return real(1.0) / wp.max(a.pos_w[2], real(LOWEST))
-
-    @wp.func
-    def joint_rate(a: Around):
-        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
-        mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
-        rope_rate = wp.cross(reach, a.payload_vel_w - mount_vel) / wp.dot(reach, reach)
-        return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
-
-    @wp.func
-    def friction(a: Around):
-        return joint_rate(a) / wp.sqrt(
-            wp.dot(joint_rate(a), joint_rate(a)) + real(SLOWEST * SLOWEST)
-        )
-
-    vel_body = turned_back(vel)
-    cable_body = turned_back(cable)
-    swing_body = turned_back(swing)
-    scalars = {
-        "thrust": thrust,
-        "thrust_rate": thrust_rate,
-        "abs_thrust_rate": abs_thrust_rate,
-        "speed": size(vel),
-        "speed_across": size(across),
-        "speed_across_squared": speed_across_squared,
-        "speed_along": along,
-        "rate": size(rate),
-        "rate_yaw": rate_yaw,
-        "inverse_height": inverse_height,
-        "tension": tension,
-        "payload_speed": size(payload_vel),
-        "swing_speed": size(swing),
-        "cable_under_rotors": under,
-        "joint_rate": size(joint_rate),
-    }
-    vectors = {
-        "vehicle force": {
-            "body_z": up,
-            "body_x": turned(body_x),
-            "body_y": turned(body_y),
-            "world_z": vertical,
-            "vel": vel,
-            "vel_across": across,
-            "axis_cross_vel": crossed(up, vel),
-            "rate_cross_vel": crossed(turned(rate), vel),
-            "cable": cable,
-            "swing_vel": swing,
-        },
-        "vehicle torque": {
-            "body_x": body_x,
-            "body_y": body_y,
-            "body_z": vertical,
-            "rate": rate,
-            "axis_cross_rate": crossed(vertical, rate),
-            "vel": vel_body,
-            "axis_cross_vel": crossed(vertical, vel_body),
-            "axis_cross_cable": crossed(vertical, cable_body),
-            "axis_cross_swing": crossed(vertical, swing_body),
-        },
-        "payload force": {
-            "payload_vel": payload_vel,
-            "vertical_cross_vel": crossed(vertical, payload_vel),
-            "world_z": vertical,
-            "body_z": up,
-            "cable": cable,
-            "swing_vel": swing,
-            "cable_cross_swing": crossed(cable, swing),
-            "vel": vel,
-            "sideways": aside,
-        },
-        "rope joint": {
-            "joint_rate": joint_rate,
-            "friction": friction,
-            "axis_cross_cable": crossed(vertical, cable_body),
-        },
-    }
-    return scalars, vectors
+    return length
 
 
-def names() -> tuple[tuple[str, ...], dict[str, tuple[str, ...]]]:
-    """Scalars, and vectors by block, that a law may name."""
-    t = types("float64")
-    scalars, vectors = _factors(t, make_struct("Around", _around(t)))
-    return tuple(scalars), {block: tuple(wanted_laws) for block, wanted_laws in vectors.items()}
+@wp.func
+def vel(a: Any):
+    return a.vel_w
 
 
-def _around(t: Types) -> dict[str, type]:
-    return {
-        "pos_w": t.vec3,
-        "vel_w": t.vec3,
-        "rate_b": t.vec3,
-        "quat_wb": t.quat,
-        "payload_pos_w": t.vec3,
-        "payload_vel_w": t.vec3,
-        "cable_dir_w": t.vec3,
-        "mount_b": t.vec3,
-        "thrust": t.real,
-        "thrust_rate": t.real,
-        "tension": t.real,
-    }
+@wp.func
+def rate(a: Any):
+    return a.rate_b
+
+
+@wp.func
+def cable(a: Any):
+    return a.cable_dir_w
+
+
+@wp.func
+def payload_vel(a: Any):
+    return a.payload_vel_w
+
+
+@wp.func
+def thrust(a: Any):
+    return a.thrust
+
+
+@wp.func
+def thrust_rate(a: Any):
+    return a.thrust_rate
+
+
+@wp.func
+def tension(a: Any):
+    return a.tension
+
+
+vertical = _axis(0.0, 0.0, 1.0)
+up = _turned(vertical)
+
+
+@wp.func
+def along(a: Any):
+    return wp.dot(a.vel_w, up(a))
+
+
+@wp.func
+def across(a: Any):
+    return a.vel_w - along(a) * up(a)
+
+
+@wp.func
+def swing(a: Any):
+    relative = a.payload_vel_w - a.vel_w
+    return relative - wp.dot(relative, a.cable_dir_w) * a.cable_dir_w
+
+
+@wp.func
+def under(a: Any):
+    return -wp.dot(a.cable_dir_w, up(a))
+
+
+@wp.func
+def aside(a: Any):
+    return a.cable_dir_w + under(a) * up(a)
+
+
+@wp.func
+def abs_thrust_rate(a: Any):
+    return wp.abs(a.thrust_rate)
+
+
+@wp.func
+def speed_across_squared(a: Any):
+    return wp.dot(across(a), across(a))
+
+
+@wp.func
+def rate_yaw(a: Any):
+    return a.rate_b[2]
+
+
+@wp.func
+def inverse_height(a: Any):
+    return type(a.thrust)(1.0) / wp.max(a.pos_w[2], type(a.thrust)(LOWEST))
+
+
+@wp.func
+def reach(a: Any):
+    """Vector from the mount to the payload [m], world frame."""
+    return a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
+
+
+@wp.func
+def joint_rate(a: Any):
+    arm = reach(a)
+    mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
+    rope_rate = wp.cross(arm, a.payload_vel_w - mount_vel) / wp.dot(arm, arm)
+    return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
+
+
+@wp.func
+def friction(a: Any):
+    turn = joint_rate(a)
+    return turn / wp.sqrt(wp.dot(turn, turn) + type(a.thrust)(SLOWEST * SLOWEST))
+
+
+SCALARS = {
+    "thrust": thrust,
+    "thrust_rate": thrust_rate,
+    "abs_thrust_rate": abs_thrust_rate,
+    "speed": _size(vel),
+    "speed_across": _size(across),
+    "speed_across_squared": speed_across_squared,
+    "speed_along": along,
+    "rate": _size(rate),
+    "rate_yaw": rate_yaw,
+    "inverse_height": inverse_height,
+    "tension": tension,
+    "payload_speed": _size(payload_vel),
+    "swing_speed": _size(swing),
+    "cable_under_rotors": under,
+    "joint_rate": _size(joint_rate),
+}
+"""Scalars that a law may name."""
+
+_vel_body = _turned_back(vel)
+_cable_body = _turned_back(cable)
+_axis_cross_cable = _crossed(vertical, _cable_body)
+VECTORS = {
+    "vehicle force": {
+        "body_z": up,
+        "body_x": _turned(_axis(1.0, 0.0, 0.0)),
+        "body_y": _turned(_axis(0.0, 1.0, 0.0)),
+        "world_z": vertical,
+        "vel": vel,
+        "vel_across": across,
+        "axis_cross_vel": _crossed(up, vel),
+        "rate_cross_vel": _crossed(_turned(rate), vel),
+        "cable": cable,
+        "swing_vel": swing,
+    },
+    "vehicle torque": {
+        "body_x": _axis(1.0, 0.0, 0.0),
+        "body_y": _axis(0.0, 1.0, 0.0),
+        "body_z": vertical,
+        "rate": rate,
+        "axis_cross_rate": _crossed(vertical, rate),
+        "vel": _vel_body,
+        "axis_cross_vel": _crossed(vertical, _vel_body),
+        "axis_cross_cable": _axis_cross_cable,
+        "axis_cross_swing": _crossed(vertical, _turned_back(swing)),
+    },
+    "payload force": {
+        "payload_vel": payload_vel,
+        "vertical_cross_vel": _crossed(vertical, payload_vel),
+        "world_z": vertical,
+        "body_z": up,
+        "cable": cable,
+        "swing_vel": swing,
+        "cable_cross_swing": _crossed(cable, swing),
+        "vel": vel,
+        "sideways": aside,
+    },
+    "rope joint": {
+        "joint_rate": joint_rate,
+        "friction": friction,
+        "axis_cross_cable": _axis_cross_cable,
+    },
+}
+"""Vectors that a law of each block may name; forces in the world frame, torques in the body's."""
+
+BLOCKS = tuple(VECTORS)
 
 
 def structure(laws: tuple[LawParams, ...]) -> tuple:
@@ -242,20 +258,15 @@ def structure(laws: tuple[LawParams, ...]) -> tuple:
 
 def check_laws(laws: tuple[LawParams, ...]) -> None:
     """Raise ValueError for a law that no block can be made of."""
-    scalars, vectors = names() if laws else ((), {})
     if len(laws) > MOST_LAWS:
         raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
     for law in laws:
-        unknown = [name for name in law.factors if name not in scalars]
-        if (
-            law.block not in BLOCKS
-            or unknown
-            or law.vector not in vectors[law.block]
-            or len(law.factors) > 2
-        ):
+        vectors = VECTORS.get(law.block, {})
+        fits = law.vector in vectors and set(law.factors) <= set(SCALARS) and len(law.factors) <= 2
+        if not fits:
             raise ValueError(
-                f"law {law}; expected a block of {BLOCKS}, up to two factors of {scalars}, and a"
-                f" vector of {vectors.get(law.block, BLOCKS)}"
+                f"law {law}; expected a block of {BLOCKS}, up to two factors of {tuple(SCALARS)},"
+                f" and a vector of {tuple(vectors) or BLOCKS}"
             )
 
 
@@ -276,7 +287,7 @@ def build_laws(
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    if not laws:  # their factors take a seventh of the time in which a kernel is composed
+    if not laws:
 
         @wp.func
         def nothing(
@@ -297,8 +308,7 @@ def build_laws(
             return vec3()
 
         return SimpleNamespace(on=nothing, in_flight=no_force)
-    Around = make_struct("Around", _around(t))
-    scalars, vectors = _factors(t, Around)
+    Around = make_struct("Around", {name: getattr(t, kind) for name, kind in AROUND.items()})
 
     @wp.func
     def one(a: Around):
@@ -309,8 +319,8 @@ def build_laws(
         return vec3()
 
     def plus(before, law: LawParams, i: int):
-        first, second = (*[scalars[name] for name in law.factors], one, one)[:2]
-        vector = vectors[law.block][law.vector]
+        first, second = (*[SCALARS[name] for name in law.factors], one, one)[:2]
+        vector = VECTORS[law.block][law.vector]
 
         @wp.func
         def term(a: Around, c: vec4):
@@ -329,8 +339,8 @@ def build_laws(
         """The air whose pushes hold the torque in the rope's joint and its reactions besides."""
         out = air
         on_vehicle = joint(a, air.laws)
-        reach = a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
-        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), reach) / wp.dot(reach, reach)
+        arm = reach(a)
+        pair = -wp.cross(wp.quat_rotate(a.quat_wb, on_vehicle), arm) / wp.dot(arm, arm)
         out.payload_push_w = air.payload_push_w + pair
         out.push_w = air.push_w - pair
         out.twist_b = (

@@ -181,8 +181,8 @@ def build_access(t: Types, State: type):
 
 
 def build_rope_access(t: Types, segments: int):
-    """Return Warp functions ``load_rope(state, env, n, u, stiffness)`` and ``store_rope``: they copy
-    between a struct of arrays that has :data:`ROPE_FIELDS` and local arrays.
+    """Return Warp functions ``load_rope(state, env, n, u, stiffness)`` and ``store_rope``, between
+    arrays of :data:`ROPE_FIELDS` in a struct and local ones.
     """
     Vectors = t.Vectors
     Reals = t.Reals

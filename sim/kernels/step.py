@@ -48,7 +48,8 @@ def build_parts(
     ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
     ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and
     ``hazards``; ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an
-    environment; ``depart``, which writes what follows when the payload separates with a stated velocity."""
+    environment; ``depart``, which writes what follows when the payload separates with a stated
+    velocity."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
