@@ -6,8 +6,10 @@ a plant in other units is flown by the same equations with the same gravity. Vol
 
 import dataclasses
 import math
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 from sim.params import PlantParams
@@ -16,80 +18,24 @@ Value = TypeVar("Value")
 Dimension = tuple[int, int, int]
 """Exponents of length, mass and time."""
 
-NONE = (0, 0, 0)
-LENGTH = (1, 0, 0)
-MASS = (0, 1, 0)
-TIME = (0, 0, 1)
-RATE = (0, 0, -1)
-SPEED = (1, 0, -1)
-FORCE = (1, 1, -2)
-TORQUE = (2, 1, -2)
-INERTIA = (2, 1, 0)
-POWER = (2, 1, -3)
-ANGULAR_DAMPING = (2, 1, -1)
-DAMPING = (0, 1, -1)
-AREA_DRAG = (-1, 1, 0)
-PER_SPEED = (-1, 0, 1)
-
-PLANT: dict[str, dict[Dimension, str]] = {
-    "BodyParams": {MASS: "mass", INERTIA: "inertia", LENGTH: "com"},
-    "RotorParams": {LENGTH: "x y z radius", NONE: "spin", INERTIA: "inertia"},
-    "QueueParams": {TIME: "delay"},
-    "ControllerParams": {
-        NONE: "kind voltage_compensation calibration_voltage gyro_share",
-        ANGULAR_DAMPING: "p_gain",
-        TORQUE: "i_gain integral_limit",
-        INERTIA: "d_gain feedforward_gain",
-        TIME: "setpoint_time_constant gyro_time_constant",
-        FORCE: "min_thrust max_thrust mix_thrust",
-        RATE: "geometric_gain relax_threshold",
-    },
-    "MotorParams": {NONE: "kind", TIME: "time_constant time_constant_down"},
-    "BatteryParams": {
-        NONE: "kind ocv efficiency reference_voltage",
-        (2, 1, -2): "capacity",
-        (-2, -1, 3): "resistance",
-        TIME: "time_constant",
-        POWER: "idle_power",
-    },
-    "ThrustParams": {
-        (1, 1, 0): "k_f",
-        (1, 1, -1): "k_1",
-        NONE: "voltage_coefficient gain torque_gain",
-        LENGTH: "torque_ratio",
-    },
-    "AeroParams": {
-        NONE: "kind",
-        DAMPING: "drag_x drag_y drag_z",
-        AREA_DRAG: "parasitic",
-        PER_SPEED: "inflow torque_inflow",
-        (-2, 0, 2): "translational_lift",
-        TIME: "flapping",
-    },
-    "VehicleParams": {LENGTH: "collision_radius"},
-    "RopeParams": {
-        NONE: "segments downwash",
-        LENGTH: "length payload_offset payload_radius mount payload_sides cables_apart",
-        MASS: "rope_mass payload_mass gripper_mass",
-        INERTIA: "payload_inertia",
-        ANGULAR_DAMPING: "joint_damping mount_damping",
-        DAMPING: "swing_damping",
-        AREA_DRAG: "payload_drag payload_side payload_lift",
-        (0, -1, 2): "compliance",
-    },
-    "ReleaseParams": {
-        NONE: "threshold clearance_samples rope_tail",
-        TIME: "lag",
-        LENGTH: "landing_height clearance_margin",
-        (-1, -1, 3): "lag_tension",
-        SPEED: "kick_w kick_along",
-    },
-    "SimParams": {TIME: "control_period substep", NONE: "gamma max_turn precision solver"},
-    "AirParams": {SPEED: "wind_w", NONE: "ground_effect"},
-    "PlantParams": {},
+_FILE = tomllib.loads(Path(__file__).with_name("dimensions.toml").read_text(encoding="utf-8"))
+_EXPONENTS: dict[str, Dimension] = {
+    name: tuple(exponents) for name, exponents in _FILE.pop("dimensions").items()
 }
-"""Dimensions of all fields of a plant that are no table themselves, a table of `sim.params` each.
-"""
+
+
+def dimensions_of(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Dimension]]:
+    """Dimension of each field of each table, of tables as ``dimensions.toml`` holds them."""
+    return {
+        table: {
+            field: _EXPONENTS[name] for name, fields in kinds.items() for field in fields.split()
+        }
+        for table, kinds in tables.items()
+    }
+
+
+PLANT = dimensions_of(_FILE)
+"""Dimensions of a plant's fields by its tables."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +62,7 @@ class Units:
 
 
 def in_units(
-    value: Value, units: Units, dimensions: Mapping[str, Mapping[Dimension, str]] = PLANT
+    value: Value, units: Units, dimensions: Mapping[str, Mapping[str, Dimension]] = PLANT
 ) -> Value:
     """Dataclass of SI values with its numbers stated in other units, tables in it too.
 
@@ -127,8 +73,7 @@ def in_units(
             f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients"
             " have no dimension"
         )
-    kinds = dimensions.get(type(value).__name__, {})
-    dimension_of = {name: dimension for dimension, names in kinds.items() for name in names.split()}
+    dimension_of = dimensions.get(type(value).__name__, {})
 
     def stated(name: str, item: Any) -> Any:
         if dataclasses.is_dataclass(item) and not isinstance(item, type):
@@ -140,7 +85,7 @@ def in_units(
                 f"{type(value).__name__}.{name}: no dimension told; there are"
                 f" {sorted(dimension_of)}"
             )
-        if dimension_of[name] == NONE:
+        if not any(dimension_of[name]):
             return item
         size = units.size(dimension_of[name])
         return tuple(x / size for x in item) if isinstance(item, tuple) else item / size

@@ -15,12 +15,14 @@ sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody knows 
 bound, and what the critic is given."""
 
 import math
+import tomllib
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 
 from sim.params import GRAVITY, PlantParams
-from sim.units import FORCE, LENGTH, NONE, PLANT, RATE, TIME, Dimension, Units, in_units
+from sim.units import PLANT, Units, dimensions_of, in_units
 from sim.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
@@ -29,35 +31,9 @@ from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of, plant_of
 
-TASK: dict[str, dict[Dimension, str]] = PLANT | {
-    "TaskParams": {},
-    "ActionParams": {FORCE: "max_thrust", RATE: "max_rate"},
-    "ObservationParams": {
-        NONE: "layout history validity goal_velocity located response setup",
-        TIME: "latency latency_jitter",
-    },
-    # One number stands for lengths, speeds and rates alike: it is taken for a length's.
-    "NoiseParams": {LENGTH: "observation_step observation_bias", NONE: "command_step command_bias"},
-    "RandomizationParams": {
-        LENGTH: "spawn_height position goal_radius",
-        (1, 0, -1): "velocity",
-        RATE: "rate_deg cable_rate_deg",
-        NONE: (
-            "attitude_deg mass cable_angle_deg cable_yaw_deg tether_variants tether_spread"
-            " battery_used payload_variants payload_spread drag_spread"
-        ),
-    },
-    "BoundsParams": {LENGTH: "altitude horizontal", NONE: "tilt_deg", TIME: "time_limit"},
-    "RewardParams": {
-        NONE: "scale smoothness rate_command command_change l1_mix landing termination",
-        (-2, 0, 2): "velocity relative_velocity",
-        (0, 0, 2): "angular_velocity",
-        RATE: "carry_time time_of_flight",
-        (-1, 0, 0): "landing_decay proximity",
-    },
-    "TargetParams": {(1, 0, -1): "speed"},
-}
-"""Dimensions of a task's fields."""
+_FILE = Path(__file__).with_name("dimensions.toml")
+TASK = PLANT | dimensions_of(tomllib.loads(_FILE.read_text(encoding="utf-8")))
+"""Dimensions of the fields of plant and task."""
 
 HIDDEN = (
     "motor.time_constant",
