@@ -7,7 +7,7 @@ them without a plug-in. Log time counts from the first sample of the flight."""
 import base64
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,50 +24,7 @@ from visthrow.logs.flightlog import FlightLog
 
 IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
 
-_NUMBER = {"type": "number"}
-_TEXT = {"type": "string"}
-
-
-def _object(**properties: Any) -> dict[str, Any]:
-    return {"type": "object", "properties": properties}
-
-
-_STAMP = _object(sec={"type": "integer"}, nsec={"type": "integer"})
-_XYZ = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_POSE = _object(position=_XYZ, orientation=_object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER))
-_ENTITY = _object(
-    timestamp=_STAMP,
-    frame_id=_TEXT,
-    id=_TEXT,
-    lines={"type": "array"},
-    spheres={"type": "array"},
-    cubes={"type": "array"},
-)
-
-SCHEMAS = {
-    "foxglove.FrameTransform": _object(
-        timestamp=_STAMP,
-        parent_frame_id=_TEXT,
-        child_frame_id=_TEXT,
-        translation=_XYZ,
-        rotation=_POSE["properties"]["orientation"],
-    ),
-    "foxglove.PoseInFrame": _object(timestamp=_STAMP, frame_id=_TEXT, pose=_POSE),
-    "foxglove.SceneUpdate": _object(
-        deletions={"type": "array"}, entities={"type": "array", "items": _ENTITY}
-    ),
-    "foxglove.CompressedImage": _object(
-        timestamp=_STAMP,
-        frame_id=_TEXT,
-        data={"type": "string", "contentEncoding": "base64"},
-        format=_TEXT,
-    ),
-    "foxglove.Log": _object(timestamp=_STAMP, level={"type": "integer"}, message=_TEXT, name=_TEXT),
-    "visthrow.Command": _object(thrust_n=_NUMBER, rate_x=_NUMBER, rate_y=_NUMBER, rate_z=_NUMBER),
-    "visthrow.Signal": _object(
-        values={"type": "array", "items": _NUMBER}, valid={"type": "boolean"}
-    ),
-}
+_SCHEMAS = Path(__file__).with_name("mcap_schemas.json")
 """Name -> JSON schema, of Foxglove's and of ours.
 
 Rates are in rad/s; a signal's unit and frame are its channel's metadata.
@@ -92,7 +49,7 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     writer.start(library="visthrow")
     schemas = {
         name: writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
-        for name, schema in SCHEMAS.items()
+        for name, schema in json.loads(_SCHEMAS.read_text(encoding="utf-8")).items()
     }
     channels: dict[str, int] = {}
     for time, topic, schema, content in sorted(
@@ -113,54 +70,32 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
 
 def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     """Messages of a whole flight, topic after topic."""
-
-    def placed(time: float, topic: str, pose: dict[str, Any]) -> Message:
-        return (
-            time,
-            topic,
-            "foxglove.PoseInFrame",
-            {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose},
-        )
-
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
         for time, place, turn in zip(log["pos_w"].time, log["pos_w"].values, turns, strict=True):
             moved = {
+                "timestamp": _stamp(time - begin),
                 "parent_frame_id": "world",
                 "child_frame_id": "vehicle",
-                "translation": _xyz(place),
-                "rotation": _xyzw(turn),
+                "translation": _named("xyz", place),
+                "rotation": _named("xyzw", turn),
             }
-            yield (
-                time,
-                "/tf",
-                "foxglove.FrameTransform",
-                {"timestamp": _stamp(time - begin), **moved},
-            )
-            yield placed(time, "/vehicle", _pose(place, turn))
+            yield time, "/tf", "foxglove.FrameTransform", moved
+            yield _placed(time, begin, "/vehicle", _pose(place, turn))
     for name, topic in (("payload_pos_w", "/payload"), ("goal_w", "/goal")):
         for time, place in _rows(log, name):
-            yield placed(time, topic, _pose(place))
+            yield _placed(time, begin, topic, _pose(place))
     for time, row in _rows(log, "command"):
-        yield (
-            time,
-            "/command",
-            "visthrow.Command",
-            dict(zip(("thrust_n", "rate_x", "rate_y", "rate_z"), map(float, row), strict=True)),
-        )
+        command = _named(("thrust_n", "rate_x", "rate_y", "rate_z"), row)
+        yield time, "/command", "visthrow.Command", command
     yield from _scene(log, experiment, begin)
     yield from _pictures(log, experiment, begin)
     for name, channel in log.channels.items():
-        for time, row, valid in zip(
-            channel.time, channel.values, np.asarray(channel.valid), strict=True
-        ):
+        samples = zip(channel.time, channel.values, np.asarray(channel.valid), strict=True)
+        for time, row, valid in samples:
             values = [float(x) if np.isfinite(x) else None for x in np.ravel(row)]
-            yield (
-                time,
-                f"/signals/{name}",
-                "visthrow.Signal",
-                {"values": values, "valid": bool(valid)},
-            )
+            signal = {"values": values, "valid": bool(valid)}
+            yield time, f"/signals/{name}", "visthrow.Signal", signal
     for time, state, reason in log.meta.get("events", ()):
         message = {
             "timestamp": _stamp(time - begin),
@@ -171,66 +106,50 @@ def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
         yield max(time, begin), "/events", "foxglove.Log", message
 
 
+def _placed(time: float, begin: float, topic: str, pose: dict[str, Any]) -> Message:
+    content = {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose}
+    return time, topic, "foxglove.PoseInFrame", content
+
+
 def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
     """Rope, ball and goal as things of the 3D panel."""
+
+    def thing(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
+        entity = {
+            "timestamp": _stamp(time - begin),
+            "frame_id": "world",
+            "id": name,
+            "frame_locked": False,
+            kind: [shape],
+        }
+        return time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entity]}
+
+    for time, row in _rows(log, "cable_points_w"):
+        line = {
+            "type": 0,
+            "pose": _pose((0.0, 0.0, 0.0)),
+            "thickness": 0.006,
+            "scale_invariant": False,
+            "points": [_named("xyz", point) for point in row],
+            "color": _named("rgba", (0.35, 0.3, 0.25, 1.0)),
+            "colors": [],
+            "indices": [],
+        }
+        yield thing(time, "rope", "lines", line)
     width = 2.0 * experiment.rope.payload_radius
     side = experiment.camera.goal_side
-    things: list[tuple[str, str, Any]] = [
-        (
-            "cable_points_w",
-            "rope",
-            lambda row: {
-                "lines": [
-                    {
-                        "type": 0,
-                        "pose": _pose((0.0, 0.0, 0.0)),
-                        "thickness": 0.006,
-                        "scale_invariant": False,
-                        "points": [_xyz(p) for p in row],
-                        "color": _rgba(0.35, 0.3, 0.25),
-                        "colors": [],
-                        "indices": [],
-                    }
-                ]
-            },
-        ),
-        (
-            "payload_pos_w",
-            "ball",
-            lambda row: {
-                "spheres": [
-                    {
-                        "pose": _pose(row),
-                        "size": _xyz([width] * 3),
-                        "color": _rgba(0.8, 0.85, 0.1),
-                    }
-                ]
-            },
-        ),
-        (
-            "goal_w",
-            "goal",
-            lambda row: {
-                "cubes": [
-                    {
-                        "pose": _pose(row),
-                        "size": _xyz([side, side, 0.004]),
-                        "color": _rgba(0.2, 0.7, 0.3),
-                    }
-                ]
-            },
-        ),
-    ]
-    for name, entity, shape in things:
-        for time, row in _rows(log, name):
-            entities = {
-                "timestamp": _stamp(time - begin),
-                "frame_id": "world",
-                "id": entity,
-                "frame_locked": False,
-                **shape(row),
+    solids = (
+        ("payload_pos_w", "ball", "spheres", (width, width, width), (0.8, 0.85, 0.1, 1.0)),
+        ("goal_w", "goal", "cubes", (side, side, 0.004), (0.2, 0.7, 0.3, 1.0)),
+    )
+    for channel, name, kind, size, colour in solids:
+        for time, row in _rows(log, channel):
+            solid = {
+                "pose": _pose(row),
+                "size": _named("xyz", size),
+                "color": _named("rgba", colour),
             }
-            yield time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entities]}
+            yield thing(time, name, kind, solid)
 
 
 def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
@@ -239,10 +158,9 @@ def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
         return
     camera = KeypointCamera(experiment.camera)
     last = -np.inf
-    visible = log["keypoints_valid"].hold(log["keypoints"].time)
-    for time, points, valid in zip(
-        log["keypoints"].time, log["keypoints"].values, visible, strict=True
-    ):
+    points_of = log["keypoints"]
+    visible = log["keypoints_valid"].hold(points_of.time)
+    for time, points, valid in zip(points_of.time, points_of.values, visible, strict=True):
         if time - last < IMAGE_PERIOD - 1e-6:
             continue
         last = time
@@ -273,17 +191,9 @@ def _stamp(seconds: float) -> dict[str, int]:
     return {"sec": nanoseconds // 10**9, "nsec": nanoseconds % 10**9}
 
 
-def _xyz(values: Any) -> dict[str, float]:
-    return dict(zip("xyz", map(float, values), strict=True))
-
-
-def _xyzw(values: Any) -> dict[str, float]:
-    return dict(zip("xyzw", map(float, values), strict=True))
+def _named(names: Iterable[str], values: Any) -> dict[str, float]:
+    return dict(zip(names, map(float, values), strict=True))
 
 
 def _pose(place: Any, turn: Any = (0.0, 0.0, 0.0, 1.0)) -> dict[str, Any]:
-    return {"position": _xyz(place), "orientation": _xyzw(turn)}
-
-
-def _rgba(red: float, green: float, blue: float) -> dict[str, float]:
-    return {"r": red, "g": green, "b": blue, "a": 1.0}
+    return {"position": _named("xyz", place), "orientation": _named("xyzw", turn)}

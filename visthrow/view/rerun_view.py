@@ -25,7 +25,6 @@ from visthrow.logs.flightlog import FlightLog
 
 TIMELINE = "throw_time"
 ROTOR_NAMES = ("front left", "front right", "rear left", "rear right")
-AXES = ("x", "y", "z")
 BODIES = ("vehicle", "payload", "goal")
 FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
@@ -73,8 +72,10 @@ def recording(
     atomic_write(path, content)
 
 
-def _times(log: FlightLog, name: str) -> rr.TimeColumn:
-    return rr.TimeColumn(TIMELINE, duration=log[name].time - log.meta["times"]["policy_start"])
+def _send(stream: rr.RecordingStream, entity: str, log: FlightLog, name: str, columns: Any) -> None:
+    """Send columns that have a row for each sample of a channel."""
+    time = log[name].time - log.meta["times"]["policy_start"]
+    stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time)], columns)
 
 
 def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
@@ -94,42 +95,45 @@ def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
     at ``goal_w`` [m], shape (3,).
     """
     goal = np.asarray(goal_w, dtype=float)
-    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    middle = 0.5 * goal[:2]
+    scene = _scene(goal, experiment) | _vehicle(experiment.vehicle.rotors)
+    for entity, shapes in (scene | _plane(experiment.camera)).items():
+        stream.log(entity, *shapes, static=True)
+
+
+Shapes = dict[str, tuple[Any, ...]]
+"""Entity -> what is drawn there for good."""
+
+
+def _scene(goal: np.ndarray, experiment: Any) -> Shapes:
+    """Ground, goal, ball, rope and trails."""
     reach = 0.5 * np.abs(goal[:2]) + FIELD
     floor = rr.Boxes3D(
-        centers=[[*middle, -0.011]],
+        centers=[[*(0.5 * goal[:2]), -0.011]],
         half_sizes=[[*reach, 0.01]],
         colors=[[232, 230, 224]],
         fill_mode="solid",
     )
-    stream.log("world/ground", floor, static=True)
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    square = rr.LineStrips3D(
-        [corners + [0, 0, 0.003]], radii=0.006, colors=[colour_code(style.GOAL)]
-    )
-    stream.log("world/goal", square, rr.Transform3D(translation=goal), static=True)
-    centre = rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=[colour_code(style.GOAL)])
-    stream.log("world/goal/centre", centre, static=True)
-    _vehicle(stream, experiment)
-    radius = experiment.rope.payload_radius
-    ball = rr.Ellipsoids3D(
-        half_sizes=[[radius] * 3], colors=[colour_code(style.PAYLOAD)], fill_mode="solid"
-    )
-    stream.log("world/ball", ball, static=True)
-    stream.log(
-        "world/rope",
-        rr.LineStrips3D.from_fields(radii=0.003, colors=[colour_code(style.ROPE)]),
-        static=True,
-    )
-    for _, entity, colour in TRAILS:
-        stream.log(
-            entity,
-            rr.LineStrips3D.from_fields(radii=0.004, colors=[colour_code(colour, 170)]),
-            static=True,
-        )
-    _plane(stream, experiment.camera)
+    green = [colour_code(style.GOAL)]
+    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=green)
+    sizes = [[experiment.rope.payload_radius] * 3]
+    yellow = [colour_code(style.PAYLOAD)]
+    ball = rr.Ellipsoids3D(half_sizes=sizes, colors=yellow, fill_mode="solid")
+    strip = rr.LineStrips3D.from_fields
+    trails = {
+        entity: (strip(radii=0.004, colors=[colour_code(colour, 170)]),)
+        for _, entity, colour in TRAILS
+    }
+    return {
+        "world": (rr.ViewCoordinates.RIGHT_HAND_Z_UP,),
+        "world/ground": (floor,),
+        "world/goal": (square, rr.Transform3D(translation=goal)),
+        "world/goal/centre": (rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=green),),
+        "world/ball": (ball,),
+        "world/rope": (strip(radii=0.003, colors=[colour_code(style.ROPE)]),),
+        **trails,
+    }
 
 
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
@@ -137,20 +141,16 @@ def send(stream: rr.RecordingStream, log: FlightLog) -> None:
     rest.
     """
     if "pos_w" in log and "quat_wb" in log:
-        pose = rr.Transform3D.columns(
-            translation=log["pos_w"].values, quaternion=log["quat_wb"].hold(log["pos_w"].time)
-        )
-        stream.send_columns("world/vehicle", [_times(log, "pos_w")], pose)
+        turns = log["quat_wb"].hold(log["pos_w"].time)
+        pose = rr.Transform3D.columns(translation=log["pos_w"].values, quaternion=turns)
+        _send(stream, "world/vehicle", log, "pos_w", pose)
     if "cable_points_w" in log:
-        columns = rr.LineStrips3D.columns(
-            strips=list(log["cable_points_w"].values.astype(np.float32))
-        )
-        stream.send_columns("world/rope", [_times(log, "cable_points_w")], columns)
+        strips = list(log["cable_points_w"].values.astype(np.float32))
+        _send(stream, "world/rope", log, "cable_points_w", rr.LineStrips3D.columns(strips=strips))
     for name, entity in (("payload_pos_w", "world/ball"), ("goal_w", "world/goal")):
         if name in log:
-            stream.send_columns(
-                entity, [_times(log, name)], rr.Transform3D.columns(translation=log[name].values)
-            )
+            places = rr.Transform3D.columns(translation=log[name].values)
+            _send(stream, entity, log, name, places)
     if "keypoints" in log:
         _image(stream, log)
     _signals(stream, log)
@@ -166,26 +166,26 @@ def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
     mark = rr.Points3D.from_fields(radii=0.015, colors=[colour_code(style.INK)], labels=[label])
     stream.log("world/landing", mark, static=True)
     where = rr.Points3D.columns(positions=log["landing"].values.astype(np.float32))
-    stream.send_columns("world/landing", [_times(log, "landing")], where)
+    _send(stream, "world/landing", log, "landing", where)
 
 
-def _vehicle(stream: rr.RecordingStream, experiment: Any) -> None:
-    rotors = experiment.vehicle.rotors
+def _vehicle(rotors: Any) -> Shapes:
     hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
     arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
     dark = [colour_code(style.VEHICLE)]
-    stream.log("world/vehicle/arms", rr.LineStrips3D(arms, radii=0.005, colors=dark), static=True)
-    body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
-    stream.log("world/vehicle/body", body, static=True)
     discs = rr.Ellipsoids3D(
         centers=hubs + [0, 0, 0.008],
         half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4,
         fill_mode="solid",
-        colors=[
-            colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs
-        ],  # the front ones stand out
+        # the front ones stand out
+        colors=[colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],
     )
-    stream.log("world/vehicle/rotors", discs, static=True)
+    body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
+    return {
+        "world/vehicle/arms": (rr.LineStrips3D(arms, radii=0.005, colors=dark),),
+        "world/vehicle/body": (body,),
+        "world/vehicle/rotors": (discs,),
+    }
 
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
@@ -211,52 +211,43 @@ def trail(stream: rr.RecordingStream, name: str, time: float, points: np.ndarray
     stream.log(entity, rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
 
 
-def _plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
+def _plane(camera: CameraParams) -> Shapes:
     """Field of view and body axes, in normalised image coordinates times 100, so that the viewer's
     strokes fit.
     """
-    lens = Fisheye(camera.fisheye)
-    angle = np.linspace(0.0, 2.0 * np.pi, 121)
-    circle = np.column_stack((np.cos(angle), np.sin(angle)))
     import torch
 
+    lens = Fisheye(camera.fisheye)
+    angle = np.linspace(0.0, 2.0 * np.pi, 121)
+    circle = 100 * np.column_stack((np.cos(angle), np.sin(angle)))
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
     rings = rr.LineStrips2D(
-        [100 * circle, 100 * right * circle],
+        [circle, right * circle],
         colors=[[150, 150, 150], [80, 80, 80]],
         radii=[0.7, 0.4],
         show_labels=False,
     )
-    stream.log("camera/field_of_view", rings, static=True)
-    places = [
-        [0.0, 95.0],
-        [0.0, 100.0 * right - 4.0],
-    ]  # a strip's own label would stand in the middle, on the ball
+    # a strip's own label would stand in the middle, on the ball
+    places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
-    stream.log(
-        "camera/angles",
-        rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]),
-        static=True,
-    )
-    axes = (
-        22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]
-    )  # rows: the body's x and y as directions in the image
-    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=[200, 200, 200], show_labels=False)
-    stream.log("camera/body_axes", arrows, static=True)
-    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=[200, 200, 200])
-    stream.log("camera/body_axes/names", labels, static=True)
+    # rows: the body's x and y as directions in the image
+    axes = 22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]
+    grey = [200, 200, 200]
+    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=grey, show_labels=False)
+    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=grey)
+    point = rr.Points2D.from_fields
+    shapes: Shapes = {
+        "camera/field_of_view": (rings,),
+        "camera/angles": (rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]),),
+        "camera/body_axes": (arrows,),
+        "camera/body_axes/names": (labels,),
+        "camera/invalid": (point(radii=1.2, colors=[[170, 170, 170]]),),
+    }
     for name, colour in GROUPS.items():
-        stream.log(
-            f"camera/{name}", rr.Points2D.from_fields(radii=1.8, colors=[colour]), static=True
-        )
-        stream.log(
-            f"camera/{name}/outline",
-            rr.LineStrips2D.from_fields(radii=0.5, colors=[colour]),
-            static=True,
-        )
-    stream.log(
-        "camera/invalid", rr.Points2D.from_fields(radii=1.2, colors=[[170, 170, 170]]), static=True
-    )
+        outline = rr.LineStrips2D.from_fields(radii=0.5, colors=[colour])
+        shapes[f"camera/{name}"] = (point(radii=1.8, colors=[colour]),)
+        shapes[f"camera/{name}/outline"] = (outline,)
+    return shapes
 
 
 GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}  # keypoints and their colours
@@ -268,76 +259,57 @@ def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
     """
     points = 100.0 * log["keypoints"].values
     valid = log["keypoints_valid"].values.astype(bool)
-    for name, part in (
-        ("goal", slice(0, GOAL_KEYPOINTS)),
-        ("payload", slice(GOAL_KEYPOINTS, None)),
+    for name, part in zip(
+        GROUPS, (slice(GOAL_KEYPOINTS), slice(GOAL_KEYPOINTS, None)), strict=True
     ):
         _points(stream, log, f"camera/{name}", points[:, part], valid[:, part])
-        _outline(
-            stream,
-            log,
-            f"camera/{name}/outline",
-            points[:, part],
-            valid[:, part],
-            box=name == "payload",
-        )
+        _outline(stream, log, name, points[:, part], valid[:, part].all(axis=1))
     _points(stream, log, "camera/invalid", points, ~valid)
 
 
 def _points(stream, log: FlightLog, entity: str, points: np.ndarray, visible: np.ndarray) -> None:
-    columns = rr.Points2D.columns(positions=points[visible].astype(np.float32)).partition(
-        visible.sum(axis=1)
-    )
-    stream.send_columns(entity, [_times(log, "keypoints")], columns)
+    columns = rr.Points2D.columns(positions=points[visible].astype(np.float32))
+    _send(stream, entity, log, "keypoints", columns.partition(visible.sum(axis=1)))
 
 
-def _outline(
-    stream, log: FlightLog, entity: str, points: np.ndarray, valid: np.ndarray, box: bool
-) -> None:
+def _outline(stream, log: FlightLog, name: str, points: np.ndarray, whole: np.ndarray) -> None:
     """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a
     box's edges.
     """
-    whole = valid.all(axis=1)
     if not whole.any():
         return
     corners = points[whole]
-    if box:
+    if name == "payload":
         x = corners[:, [0, 2, 2, 0], 0]
         y = corners[:, [1, 1, 3, 3], 1]
         corners = np.stack((x, y), axis=-1)
     closed = np.concatenate((corners, corners[:, :1]), axis=1).astype(np.float32)
     columns = rr.LineStrips2D.columns(strips=list(closed)).partition(whole.astype(int))
-    stream.send_columns(entity, [_times(log, "keypoints")], columns)
+    _send(stream, f"camera/{name}/outline", log, "keypoints", columns)
 
 
 def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
     """Entity, channel, component, label and colour of each curve that the log has samples for."""
     c = style.COLOURS
+    states = ", ".join(log.meta.get("states", ()))
     curves: list[tuple[str, str, int | None, str, str]] = [
-        ("thrust", "command", 0, "collective thrust [N]", c[0])
-    ]
-    for i, axis in enumerate(AXES):
-        curves.append((f"rate_command/{axis}", "command", 1 + i, f"{axis} commanded [rad/s]", c[i]))
-        curves.append((f"rate/{axis}", "rate_b", i, f"{axis} flown [rad/s]", _paler(c[i])))
-    curves += [
-        (f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i])
-        for i, name in enumerate(ROTOR_NAMES)
-    ]
-    curves += [
+        ("thrust", "command", 0, "collective thrust [N]", c[0]),
         ("battery", "battery_voltage", None, "battery [V]", c[2]),
         ("phase/mode", "mode", None, "0 hover controller, 1 policy", c[0]),
         ("phase/attached", "attached", None, "payload attached", c[1]),
         ("phase/release", "release_command", None, "release command", c[3]),
-        ("phase/state", "state", None, "state: " + ", ".join(log.meta.get("states", ())), c[2]),
+        ("phase/state", "state", None, f"state: {states}", c[2]),
     ]
-    curves += [
-        (f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i])
-        for i, body in enumerate(BODIES)
-    ]
-    names = [name for name in log.channels if name.startswith("tick_")]
-    curves += [
-        (f"tick/{n[5:]}", n, None, f"{n[5:]} [ms]", c[i % len(c)]) for i, n in enumerate(names)
-    ]
+    for i, axis in enumerate("xyz"):
+        curves.append((f"rate_command/{axis}", "command", 1 + i, f"{axis} commanded [rad/s]", c[i]))
+        curves.append((f"rate/{axis}", "rate_b", i, f"{axis} flown [rad/s]", _paler(c[i])))
+    for i, name in enumerate(ROTOR_NAMES):
+        curves.append((f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i]))
+    for i, body in enumerate(BODIES):
+        curves.append((f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i]))
+    ticks = [name.removeprefix("tick_") for name in log.channels if name.startswith("tick_")]
+    for i, name in enumerate(ticks):
+        curves.append((f"tick/{name}", f"tick_{name}", None, f"{name} [ms]", c[i % len(c)]))
     return [curve for curve in curves if curve[1] in log]
 
 
@@ -348,13 +320,10 @@ def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
     for entity, name, component, label, colour in _curves(log):
         values = log[name].values if component is None else log[name].values[:, component]
         scale = 1e3 if entity.split("/")[0] in MILLISECONDS else 1.0
-        stream.log(
-            f"signals/{entity}",
-            rr.SeriesLines(names=[label], colors=[colour_code(colour)]),
-            static=True,
-        )
+        series = rr.SeriesLines(names=[label], colors=[colour_code(colour)])
+        stream.log(f"signals/{entity}", series, static=True)
         column = rr.Scalars.columns(scalars=scale * values.astype(float))
-        stream.send_columns(f"signals/{entity}", [_times(log, name)], column)
+        _send(stream, f"signals/{entity}", log, name, column)
 
 
 def _paler(colour: str) -> str:
