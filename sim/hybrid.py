@@ -204,7 +204,7 @@ class HybridSim:
         if without_rope is not None:
             params = dataclasses.replace(params, rope=dataclasses.replace(params.rope, segments=1))
             extensions, ropes = extensions | {"push"}, None
-        vehicles = vehicles or [params.vehicle]
+        self.vehicles = vehicles = vehicles or [params.vehicle]
         ropes = ropes or [params.rope]
         airs = airs or [params.air]
         releases = releases or [params.release]
@@ -213,17 +213,14 @@ class HybridSim:
         self.count = count
         self.device = device
         self.seed = seed
-        self.vehicles = vehicles
         self.gravity = gravity
         self.threads = threads or cores()
         self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
         kernels = _kernels(params, direct, motors, self.extensions, without_rope)
         self.types, self._step, self._reset = kernels
         ropes = ropes_on(vehicles, ropes)
-        laws = [params.laws] * len(airs)
-        kinds = kinds_of(params.vehicle)
-        rows = pack_plants(self.types, vehicles, ropes, airs, releases, laws, kinds)
-        self._plants = plants_on(self.types, rows, params.sim, gravity, device)
+        plants = pack_plants(self.types, params, vehicles, ropes, airs, releases)
+        self._plants = plants_on(self.types, plants, params.sim, gravity, device)
         self._allocate(max(queue_depth(v.queue.delay, params.sim.control_period) for v in vehicles))
         self._exchange = self._exchanged(ropes)
         self.place(pos_w=np.zeros((count, 3)))
@@ -268,17 +265,10 @@ class HybridSim:
         count = self.count
         device = self.device
         segments = self.params.rope.segments
-        rows = {
-            "cable_dir_w": segments,
-            "cable_vel_w": segments,
-            "stiffness": segments,
-            "queue": depth,
-        }
-        self.state = st.allocate(t, self._step.State, st.STATE_FIELDS, count, rows, device)
-        outputs = {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()}
-        self.out, self.foreseen = (
-            st.allocate(t, self._step.Output, outputs, count, {}, device) for _ in range(2)
-        )
+        rows = {**dict.fromkeys(st.ROPE_FIELDS, segments), "queue": depth}
+        self.state = st.allocate(self._step.State, count, device, rows)
+        self.out = st.allocate(self._step.Output, count, device)
+        self.foreseen = st.allocate(self._step.Output, count, device)
         self.command = wp.zeros(count, dtype=t.vec4, device=device)
         self.release, self.episode = (
             wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2)
@@ -434,9 +424,9 @@ class HybridSim:
         ...).
         """
         if name in st.STATE_FIELDS:
-            return st.fetched(getattr(self.state, name), st.STATE_FIELDS[name][1])
+            return st.fetched(getattr(self.state, name))
         if name in st.OUTPUT_FIELDS:
-            return st.fetched(getattr(self.out, name), False)
+            return st.fetched(getattr(self.out, name))
         raise ValueError(
             f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}"
         )

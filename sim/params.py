@@ -352,6 +352,22 @@ class RopeParams(BoundedFields):
         """Mass of each segment [kg]."""
         return self.rope_mass / self.segments
 
+    def rod(self, loaded: bool) -> tuple[float, float, float]:
+        """Return a segment's mass [kg], its centre of mass below the upper end [m] and its
+        transverse inertia about that [kg m^2]; the payload is part of a ``loaded`` one.
+        """
+        mass = self.segment_mass
+        length = self.segment_length
+        inertia = mass * length**2 / 12.0
+        if not loaded:
+            return mass, length / 2, inertia
+        ball = self.payload_mass
+        reach = length + self.payload_offset
+        centre = (mass * length / 2 + ball * reach) / (mass + ball)
+        inertia += self.payload_inertia
+        inertia += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
+        return mass + ball, centre, inertia
+
     @property
     def hanging_mass(self) -> float:
         """Mass of rope, gripper and payload [kg]; two cables have none."""

@@ -30,14 +30,14 @@ about its centre of mass, body frame, without gravity; force of the air on the p
 the rope did to the vehicle in the last substep, by which the next middle is predicted."""
 
 BODY_FIELDS = {
-    "pos_w": ("vec3", False),
-    "quat_wb": ("quat", False),
-    "vel_w": ("vec3", False),
-    "rate_b": ("vec3", False),
-    "cable_dir_w": ("vec3", True),
-    "cable_vel_w": ("vec3", True),
-    "payload_pos_w": ("vec3", False),
-    "payload_vel_w": ("vec3", False),
+    "pos_w": "vec3",
+    "quat_wb": "quat",
+    "vel_w": "vec3",
+    "rate_b": "vec3",
+    "cable_dir_w": "vec3[]",
+    "cable_vel_w": "vec3[]",
+    "payload_pos_w": "vec3",
+    "payload_vel_w": "vec3",
 }
 """What a solver shows of its bodies: the root, the rope's segments, the payload's centre."""
 
@@ -89,7 +89,7 @@ def build_exchange(
     limit = real(st.SPEED_LIMIT)
     Ints = wp.array(dtype=wp.int32)
     Plants = t.Plants
-    Wrench = st.array_struct(t, "Wrench", {k: (v, False) for k, v in WRENCH_FIELDS.items()})
+    Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     tiny = real(1.0e-6)
 

@@ -36,6 +36,14 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     attached = int(hangs)
 
     @wp.func
+    def drawn(size: vec3, rng: wp.uint32):
+        """Uniform numbers of at most these sizes, and the generator after them."""
+        x = size[0] * real(wp.randf(rng, -1.0, 1.0))
+        y = size[1] * real(wp.randf(rng, -1.0, 1.0))
+        z = size[2] * real(wp.randf(rng, -1.0, 1.0))
+        return vec3(x, y, z), rng
+
+    @wp.func
     def rest(plants: Plants, state: State, env: int, used: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
         p = plants.vehicles[env % plants.vehicles.shape[0]]
@@ -94,34 +102,22 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             episode[env] = episode[env] + 1
             degree = real(0.017453292519943295)
             home = vec3(real(0.0), real(0.0), z.spawn_height)
-            offset = vec3(
-                z.position[0] * real(wp.randf(rng, -1.0, 1.0)),
-                z.position[1] * real(wp.randf(rng, -1.0, 1.0)),
-                z.position[2] * real(wp.randf(rng, -1.0, 1.0)),
-            )
+            offset, rng = drawn(z.position, rng)
             state.pos_w[env] = home + offset
-            state.vel_w[env] = vec3(
-                z.velocity[0] * real(wp.randf(rng, -1.0, 1.0)),
-                z.velocity[1] * real(wp.randf(rng, -1.0, 1.0)),
-                z.velocity[2] * real(wp.randf(rng, -1.0, 1.0)),
-            )
-            roll = z.attitude_deg[0] * real(wp.randf(rng, -1.0, 1.0)) * degree
-            pitch = z.attitude_deg[1] * real(wp.randf(rng, -1.0, 1.0)) * degree
-            yaw = z.attitude_deg[2] * real(wp.randf(rng, -1.0, 1.0)) * degree
+            vel, rng = drawn(z.velocity, rng)
+            state.vel_w[env] = vel
+            angles, rng = drawn(z.attitude_deg, rng)
             x_axis = vec3(real(1.0), real(0.0), real(0.0))
             y_axis = vec3(real(0.0), real(1.0), real(0.0))
             z_axis = vec3(real(0.0), real(0.0), real(1.0))
+            roll = angles[0] * degree
+            pitch = angles[1] * degree
+            yaw = angles[2] * degree
             q = quat(wp.quat_from_axis_angle(z_axis, yaw)) * wp.quat_from_axis_angle(y_axis, pitch)
             q = q * wp.quat_from_axis_angle(x_axis, roll)
             state.quat_wb[env] = q
-            rate = (
-                vec3(
-                    z.rate_deg[0] * real(wp.randf(rng, -1.0, 1.0)),
-                    z.rate_deg[1] * real(wp.randf(rng, -1.0, 1.0)),
-                    z.rate_deg[2] * real(wp.randf(rng, -1.0, 1.0)),
-                )
-                * degree
-            )
+            rates, rng = drawn(z.rate_deg, rng)
+            rate = rates * degree
             state.rate_b[env] = rate
             state.mass_scale[env] = real(1.0) + z.mass * real(wp.randf(rng, -1.0, 1.0))
             azimuth = z.cable_yaw_deg * real(wp.randf(rng, -1.0, 1.0)) * degree

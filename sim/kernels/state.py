@@ -4,6 +4,7 @@ Shapes use E environments and L rope segments. Rope arrays stand segment first, 
 neighbouring threads read neighbouring memory."""
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,25 +23,22 @@ FALLBACK = 2
 COLLISION = 4  # status bit: the payload came closer to the vehicle than both radii
 ROPE_IN_ROTOR = 8  # status bit: a joint of the rope passed through a propeller disc
 
-QUAD_FIELDS = {
-    name: (kind, False) for name, kind in QUAD_STATE.items()
-}  # name: (type, also by row)
-
 ROPE_FIELDS = {
-    "cable_dir_w": ("vec3", True),
-    "cable_vel_w": ("vec3", True),
-    "stiffness": ("real", True),
+    "cable_dir_w": "vec3[]",
+    "cable_vel_w": "vec3[]",
+    "stiffness": "real[]",
 }
 
-STATE_FIELDS = QUAD_FIELDS | {  # those by row have a row a segment, the queue a row a slot
-    "mass_scale": ("real", False),
+STATE_FIELDS = {  # those with [] have a row a segment, the queue a row a slot
+    **QUAD_STATE,
+    "mass_scale": "real",
     **ROPE_FIELDS,
-    "queue": ("vec4", True),  # (D, E) commands, newest first
-    "release_timer": ("real", False),  # time to separation [s]; negative: not latched
-    "attached": ("int", False),
-    "status": ("int", False),
-    "force_w": ("vec3", False),  # from outside [N], where the extension "push" is built in
-    "torque_b": ("vec3", False),  # likewise [N m], about the centre of mass
+    "queue": "vec4[]",  # (D, E) commands, newest first
+    "release_timer": "real",  # time to separation [s]; negative: not latched
+    "attached": "int",
+    "status": "int",
+    "force_w": "vec3",  # from outside [N], where the extension "push" is built in
+    "torque_b": "vec3",  # likewise [N m], about the centre of mass
 }
 
 OUTPUT_FIELDS = {
@@ -55,32 +53,21 @@ OUTPUT_FIELDS = {
 }
 
 
-def array_struct(t: Types, name: str, fields: dict[str, tuple[str, bool]]) -> type:
-    """Warp struct that holds one array per field."""
-    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-    return make_struct(
-        name,
-        {
-            k: wp.array(dtype=scalar[kind], ndim=2 if rows else 1)
-            for k, (kind, rows) in fields.items()
-        },
-    )
+def array_struct(t: Types, name: str, fields: dict[str, str]) -> type:
+    """Warp struct of an array for each field, of a type of :class:`Types`; with ``[]``, by row."""
+    arrays = {}
+    for field, kind in fields.items():
+        dtype = wp.int32 if kind == "int" else getattr(t, kind.removesuffix("[]"))
+        arrays[field] = wp.array(dtype=dtype, ndim=2 if kind.endswith("[]") else 1)
+    return make_struct(name, arrays)
 
 
-def allocate(
-    t: Types,
-    struct: type,
-    fields: dict[str, tuple[str, bool]],
-    count: int,
-    rows: dict[str, int],
-    device: str,
-):
+def allocate(struct: Any, count: int, device: str, rows: Mapping[str, int] = MappingProxyType({})):
     """Zeroed arrays of shape (E,), or (rows[name], E), in an instance of ``struct``."""
-    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
     out = struct()
-    for name, (kind, by_row) in fields.items():
-        shape = (rows[name], count) if by_row else count
-        setattr(out, name, wp.zeros(shape, dtype=scalar[kind], device=device))
+    for name, field in struct.vars.items():
+        shape = (rows[name], count) if field.type.ndim == 2 else count
+        setattr(out, name, wp.zeros(shape, dtype=field.type.dtype, device=device))
     return out
 
 
@@ -115,10 +102,10 @@ def put(
         )
 
 
-def fetched(array: wp.array, rows: bool) -> np.ndarray:
-    """Copy of a device array, environment first; ``rows``: it stands row first on the device."""
+def fetched(array: wp.array) -> np.ndarray:
+    """Copy of a device array, environment first."""
     value = array.numpy()  # on the CPU a view of the simulator's memory
-    return np.array(np.swapaxes(value, 0, 1) if rows else value)
+    return np.array(np.swapaxes(value, 0, 1) if array.ndim == 2 else value)
 
 
 SPEED_LIMIT = 1000.0  # of `size` [m/s], [rad/s]: beyond it a state is broken, not fast

@@ -61,7 +61,7 @@ def build_parts(
     QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
-    Output = st.array_struct(t, "Output", {k: (v, False) for k, v in st.OUTPUT_FIELDS.items()})
+    Output = st.array_struct(t, "Output", st.OUTPUT_FIELDS)
     flow, rate, motor_advance = build_flow(t, params.vehicle, extensions, motors)
     if direct:
         flow = build_direct_flow(t)
@@ -235,11 +235,6 @@ def build_step(
     limit = real(st.SPEED_LIMIT)
 
     @wp.func
-    def sane(s: QuadState, u: Vectors, n: Vectors):
-        """Finite and below the speed limit; a comparison with NaN is false."""
-        return st.size(s) + rope_size(u, n) < limit
-
-    @wp.func
     def separate(
         rope: Rope,
         r: Release,
@@ -346,7 +341,7 @@ def build_step(
             timer = wp.max(timer - period, real(0.0))
         state.release_timer[env] = timer
         state.attached[env] = attached
-        if sane(s, u, n):
+        if st.size(s) + rope_size(u, n) < limit:  # false for NaN
             store(state, env, s)
             store_rope(state, env, n, u, stiffness)
         else:

@@ -340,18 +340,20 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
 
 def pack_plants(
     t: Types,
+    like: P.PlantParams,
     vehicles: list[P.VehicleParams],
     ropes: list[P.RopeParams],
     airs: list[P.AirParams],
     releases: list[P.ReleaseParams],
-    laws: list[tuple[P.LawParams, ...]],
-    kinds: tuple[str, str, str, str],
+    laws: list[tuple[P.LawParams, ...]] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Structured arrays for :func:`plants_on`; arguments as of the other ``pack`` functions."""
+    """Structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``; ``laws``: of
+    the airs' plants, those of ``like`` without.
+    """
     return {
-        "vehicles": pack_vehicle(t, vehicles, kinds),
+        "vehicles": pack_vehicle(t, vehicles, kinds_of(like.vehicle)),
         "ropes": pack_rope(t, ropes),
-        "airs": pack_air(t, airs, laws),
+        "airs": pack_air(t, airs, laws or [like.laws] * len(airs)),
         "releases": pack(t.Release, *releases),
     }
 

@@ -36,25 +36,6 @@ def _set_inertial(
     body.explicitinertial = True
 
 
-def _rod_inertial(
-    rope: RopeParams, loaded: bool
-) -> tuple[float, float, tuple[float, float, float]]:
-    """Mass, height of the centre of mass in the rod's frame and inertia about it, payload included
-    on the loaded one.
-    """
-    mass = rope.segment_mass
-    length = rope.segment_length
-    about_centre = mass * length**2 / 12.0
-    if not loaded:
-        return mass, -length / 2, (about_centre, about_centre, AXIAL_INERTIA)
-    reach = length + rope.payload_offset
-    total = mass + rope.payload_mass
-    centre = (mass * length / 2 + rope.payload_mass * reach) / total
-    transverse = about_centre + rope.payload_inertia
-    transverse += mass * (centre - length / 2) ** 2 + rope.payload_mass * (reach - centre) ** 2
-    return total, -centre, (transverse, transverse, AXIAL_INERTIA)
-
-
 def _add_joints(
     body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float
 ) -> None:
@@ -152,14 +133,11 @@ def add_chain(
     """
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
-        mass, centre, inertia = _rod_inertial(
-            rope, i == rope.segments - 1 and load and stretch is None
-        )
-        if joints == "ball":
-            # Without twist in the joints the axial inertia enters nothing; this one keeps the mass
-            # matrix well scaled.
-            inertia = (inertia[0], inertia[1], inertia[0])
-        _set_inertial(rod, mass, centre, inertia)
+        mass, centre, transverse = rope.rod(i == rope.segments - 1 and load and stretch is None)
+        # Without twist in ball joints the axial inertia enters nothing; theirs keeps the mass
+        # matrix well scaled.
+        axial = transverse if joints == "ball" else AXIAL_INERTIA
+        _set_inertial(rod, mass, -centre, (transverse, transverse, axial))
         if i == 0 and free_root:
             rod.add_freejoint(name="root")
         else:

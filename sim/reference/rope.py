@@ -10,14 +10,8 @@ across its axis."""
 
 import numpy as np
 
-try:
-    from mujoco.batch import Batch
-except AttributeError as error:  # MuJoCo 3 was installed over parts of mujoco-core 4
-    raise ModuleNotFoundError(
-        f"mujoco.batch is of another MuJoCo than 'mujoco' here: {error}", name="mujoco.batch"
-    ) from error
-
 from sim.params import BodyParams, RopeParams
+from sim.reference.batch import Batch
 from sim.reference.model import build_attached, build_free
 from sim.reference.rotation_arrays import (
     cross,

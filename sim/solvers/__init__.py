@@ -13,7 +13,7 @@ import numpy as np
 import warp as wp
 
 from sim.kernels import state as st
-from sim.kernels.exchange import BODY_FIELDS, WRENCH_FIELDS, ExchangeKernels
+from sim.kernels.exchange import ExchangeKernels
 from sim.kernels.structs import Types
 from sim.params import PlantParams, RopeParams, VehicleParams
 
@@ -106,14 +106,15 @@ class Exchange:
         self, kernels: ExchangeKernels, world: dict[str, Any], build: Callable[[World], Solver]
     ) -> None:
         """Build the solver; ``world``: what :class:`World` is made of but the shared arrays."""
-        t, params, count, device = (world[k] for k in ("types", "params", "count", "device"))
-        rows = dict.fromkeys(("cable_dir_w", "cable_vel_w"), params.rope.segments)
-        wrench = {k: (v, False) for k, v in WRENCH_FIELDS.items()}
+        count = world["count"]
+        device = world["device"]
+        segments = world["params"].rope.segments
+        rows = dict.fromkeys(("cable_dir_w", "cable_vel_w"), segments)
         self.world = World(
             **world,
             kernels=kernels,
-            wrench=st.allocate(t, kernels.Wrench, wrench, count, {}, device),
-            bodies=st.allocate(t, kernels.Bodies, BODY_FIELDS, count, rows, device),
+            wrench=st.allocate(kernels.Wrench, count, device),
+            bodies=st.allocate(kernels.Bodies, count, device, rows),
         )
         self.solver = build(self.world)
         self.kernels = kernels

@@ -104,12 +104,7 @@ def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
     """Batch of MuJoCo's C library: arrays of coordinates, controls and masses, functions that step
     and that take over what was placed where a mask is not 0.
     """
-    try:
-        from mujoco.batch import Batch
-    except AttributeError as error:  # MuJoCo 3 was installed over parts of mujoco-core 4
-        raise ModuleNotFoundError(
-            f"mujoco.batch is of another MuJoCo than 'mujoco' here: {error}", name="mujoco.batch"
-        ) from error
+    from sim.reference.batch import Batch
 
     model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)  # a NaN is to be seen
     batch = Batch(model, count, nthread=1)

@@ -16,7 +16,7 @@ from sim.kernels.rope.payload import LOADS
 from sim.kernels.structs import extensions_of
 from sim.params import RopeParams, VehicleParams
 from sim.solvers import World
-from sim.solvers.rods import AXIAL_INERTIA, Ints, build_place, rod_inertial, vec3
+from sim.solvers.rods import AXIAL_INERTIA, Ints, build_place, vec3
 
 LOCKED, FREE = ("transX", "transY", "transZ", "rotZ"), ("rotX", "rotY")
 SCENE = """#usda 1.0
@@ -75,8 +75,8 @@ def environment(env: str, vehicle: VehicleParams, rope: RopeParams) -> str:
     joint_apis = [f'"PhysicsLimitAPI:{axis}"' for axis in LOCKED]
     joint_apis += [f'"PhysicsDriveAPI:{axis}"' for axis in FREE]
     for i in range(rope.segments):
-        mass, centre, transverse = rod_inertial(rope, i == rope.segments - 1)
-        place = {"z": mount[2] - i * length, "mass": mass, "centre": centre}
+        mass, centre, transverse = rope.rod(i == rope.segments - 1)
+        place = {"z": mount[2] - i * length, "mass": mass, "centre": -centre}
         inertia = (transverse, transverse, AXIAL_INERTIA)
         parts.append(LINK.format(name=f"rod{i}", apis="", more="", inertia=inertia, **place))
         damping = rope.joint_damping + (rope.mount_damping if i == 0 else 0.0)

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from sim.params import RopeParams
 from sim.solvers import World
 
 vec3, quat = wp.vec3f, wp.quatf
@@ -11,23 +10,6 @@ Ints, Table = wp.array(dtype=wp.int32), wp.array2d(dtype=float)
 AXIAL_INERTIA = 1e-8
 """Of a rod about its axis [kg m^2]. Its joints pass the vehicle's yaw on, a cord does not: it must
 not load the vehicle; 1e-9 and 1e-10 move nothing more."""
-
-
-def rod_inertial(rope: RopeParams, last: bool) -> tuple[float, float, float]:
-    """Mass [kg], height of the centre of mass above the upper end [m] and transverse inertia about
-    it [kg m^2] of a rod; the last one carries the ball.
-    """
-    mass = rope.segment_mass
-    length = rope.segment_length
-    about_centre = mass * length**2 / 12.0
-    if not last:
-        return mass, -length / 2, about_centre
-    ball = rope.payload_mass
-    reach = length + rope.payload_offset
-    centre = (mass * length / 2 + ball * reach) / (mass + ball)
-    inertia = about_centre + rope.payload_inertia
-    inertia += mass * (centre - length / 2) ** 2 + ball * (reach - centre) ** 2
-    return mass + ball, -centre, inertia
 
 
 def build_place(world: World, hinges: bool) -> wp.Kernel:

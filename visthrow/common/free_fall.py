@@ -20,8 +20,10 @@ def fall_time(height: Any, climb: Any, floor: float = 0.0) -> Any:
     return (climb + root) / GRAVITY
 
 
-def free_flight(pos_w: np.ndarray, vel_w: np.ndarray, time: Any) -> np.ndarray:
-    """Return the position [m] of bodies, shape (..., 3), after a time [s] that broadcasts with
-    it.
+def free_flight(pos_w: Any, vel_w: Any, time: Any) -> Any:
+    """Return the position [m] of bodies, shape (..., 3), after a time [s], a number or of shape
+    (..., 1).
     """
-    return pos_w + time * vel_w + 0.5 * time**2 * np.array([0.0, 0.0, -GRAVITY])
+    path = pos_w + time * vel_w
+    path[..., 2:] -= 0.5 * GRAVITY * time**2
+    return path

@@ -17,6 +17,7 @@ from camera.keypoint_noise import StepDraw, apply_noise
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
+from visthrow.common.free_fall import free_flight
 from visthrow.cooperative.team import TeamExperiment, between, layout_of, members
 from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
@@ -89,7 +90,6 @@ class TeamEnv(VecEnv):
         hover = act.hover_action(GRAVITY * plant.total_mass, task.action.max_thrust)
         self._start_action = torch.tensor(hover, **make)
         self._max_rate = torch.tensor(task.action.max_rate, **make)
-        self._half_gravity = torch.tensor([0.0, 0.0, -0.5 * GRAVITY], **make)
         samples = experiment.release.clearance_samples
         self._fractions = torch.linspace(0.0, 1.0, samples, **make)
         self._rate_weights = torch.tensor(task.reward.rate_command, **make)
@@ -250,8 +250,7 @@ class TeamEnv(VecEnv):
     def _clearance(self, flight: Tensor) -> Tensor:
         """Least distance of the load's flight to any vehicle [m], shape (W,); vehicles stand."""
         time = (flight[:, None] * self._fractions)[:, :, None]
-        path = self.load_w[:, None] + self.load_vel_w[:, None] * time
-        path = path + self._half_gravity * time.square()
+        path = free_flight(self.load_w[:, None], self.load_vel_w[:, None], time)
         offsets = path[:, :, None] - self._worlds(self.views.state["pos_w"])[:, None]
         return offsets.norm(dim=-1).flatten(1).amin(1)
 

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from sim.params import GRAVITY
 from visthrow.common import style
+from visthrow.common.free_fall import free_flight
 from visthrow.common.storage import savez
 from visthrow.cooperative.team import TeamExperiment
 from visthrow.cooperative.team_env import TeamEnv
@@ -60,13 +60,12 @@ def record_throw(
     time = experiment.sim.control_period * np.arange(len(rows) + 1)
     end = max(float(values["duration"][0]), time[-1])
     flight = np.linspace(0.0, end - time[-1], 30)[:, None]
-    fall = np.array([0.0, 0.0, -0.5 * GRAVITY]) * flight**2
     released = bool(values["released"][0])
     return ThrowTrack(
         time[:-1],
         *(np.stack(column) for column in zip(*rows, strict=True)),
         flight_time=time[-1] + flight[:, 0],
-        flight_w=values["load_w"][0] + flight * values["load_vel_w"][0] + fall,
+        flight_w=free_flight(values["load_w"][0], values["load_vel_w"][0], flight),
         goal_w=np.array([options.get("target", 2.0), 0.0, 0.0]),
         landing_error=float(values["landing_error"][0]) if released else np.nan,
         released=released,

@@ -10,11 +10,52 @@ drift. The accelerations are solved twice, the second time with the velocities o
 ``h / 2 D + h^2 / 4 K`` joins a rod's inertia, with its damping D and its stiffness K under the
 pull of the last step, so that a snatch of the cable stays stable."""
 
+from typing import Any
+
 import warp as wp
 
 from sim.kernels.quadrotor.rigid_body import angular_acceleration, quat_rate
 from sim.kernels.rope.chain import tangent_basis, viscous
 from sim.solvers import World
+
+
+@wp.func
+def diagonal(like: Any, x: Any):
+    return wp.diag(type(like)(x, x, x))
+
+
+@wp.func
+def mobility(p: Any, rope: Any, rot: Any):
+    """Acceleration of the mount for a force there, world frame [1/kg]."""
+    one = type(p.body.mass)(1.0)
+    arm = rot * wp.skew(rope.mount)
+    inverse = wp.cw_div(type(rope.mount)(one, one, one), p.body.inertia)
+    turning = arm * wp.diag(inverse) * wp.transpose(arm)
+    return diagonal(rope.mount, one / p.body.mass) + turning
+
+
+@wp.func
+def free(p: Any, rope: Any, rot: Any, w: Any, force_b: Any, torque_b: Any, g: Any):
+    """Acceleration of the mount without a cable, world frame."""
+    turn = angular_acceleration(p, w, torque_b)
+    spin = wp.cross(turn, rope.mount) + wp.cross(w, wp.cross(w, rope.mount))
+    return rot * (force_b / p.body.mass + spin) + g
+
+
+@wp.func
+def damped(c: Any, n: Any, u: Any, rod: int, above: bool, below: bool):
+    """Damping c of the joints to the neighbours that a rod has, as a force on its ``n'``, and its
+    rate.
+    """
+    out = u[rod] - u[rod]
+    rate = c - c
+    if above:
+        out += c * (viscous(n[rod], n[rod - 1], u[rod - 1]) - u[rod])
+        rate += c
+    if below:
+        out += c * (viscous(n[rod], n[rod + 1], u[rod + 1]) - u[rod])
+        rate += c
+    return out, rate
 
 
 class TreeSolver:
@@ -52,10 +93,17 @@ class TreeSolver:
 
 def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
     """Kernels that place and advance the bodies; a thread a world."""
-    t, L, V = world.types, world.params.rope.segments, team
+    t = world.types
+    L = world.params.rope.segments
+    V = team
     N = V * L
-    real, vec3, mat33, Vehicle, Rope = t.real, t.vec3, t.mat33, t.Vehicle, t.Rope
-    State, Wrench, Bodies = world.kernels.State, world.kernels.Wrench, world.kernels.Bodies
+    real = t.real
+    vec3 = t.vec3
+    Vehicle = t.Vehicle
+    Rope = t.Rope
+    State = world.kernels.State
+    Wrench = world.kernels.Wrench
+    Bodies = world.kernels.Bodies
 
     @wp.kernel(module="unique", enable_backward=False)
     def place(
@@ -75,38 +123,16 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 load_vel[world] = bodies.payload_vel_w[row]
 
     @wp.func
-    def diagonal(x: real):
-        return wp.diag(vec3(x, x, x))
+    def vehicle_of(vehicles: wp.array(dtype=Vehicle), state: State, row: int):
+        p = vehicles[row % vehicles.shape[0]]
+        p.body.mass = p.body.mass * state.mass_scale[row]
+        return p
 
     @wp.func
-    def mobility(p: Vehicle, rope: Rope, rot: mat33):
-        """Acceleration of the mount for a force there, world frame [1/kg]."""
-        arm = rot * wp.skew(rope.mount)
-        one = vec3(real(1.0), real(1.0), real(1.0))
-        turning = arm * wp.diag(wp.cw_div(one, p.body.inertia)) * wp.transpose(arm)
-        return diagonal(real(1.0) / p.body.mass) + turning
-
-    @wp.func
-    def free(p: Vehicle, rope: Rope, rot: mat33, w: vec3, force_b: vec3, torque_b: vec3, g: vec3):
-        """Acceleration of the mount without a cable, world frame."""
-        turn = angular_acceleration(p, w, torque_b)
-        spin = wp.cross(turn, rope.mount) + wp.cross(w, wp.cross(w, rope.mount))
-        return rot * (force_b / p.body.mass + spin) + g
-
-    @wp.func
-    def damped(rope: Rope, n: wp.array(dtype=vec3), u: wp.array(dtype=vec3), first: int, i: int):
-        """Damping of the joints between rods as a force on ``n'`` of rod i, and its rate."""
-        c = rope.joint_damping
-        out = vec3()
-        rate = real(0.0)
-        rod = first + i
-        if i > 0:
-            out += c * (viscous(n[rod], n[rod - 1], u[rod - 1]) - u[rod])
-            rate += c
-        if i < L - 1:
-            out += c * (viscous(n[rod], n[rod + 1], u[rod + 1]) - u[rod])
-            rate += c
-        return out, rate
+    def rotation_after(bodies: Bodies, row: int, time: real):
+        """Rotation of a vehicle after a time [s], by its rate now."""
+        q = bodies.quat_wb[row]
+        return wp.quat_to_matrix(wp.normalize(q + quat_rate(q, bodies.rate_b[row]) * time))
 
     # unrolled it takes ten times as long to compile
     @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
@@ -148,21 +174,18 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
 
         acc = vec3()
         for _ in range(2):
-            A_all = diagonal(load_mass)
+            A_all = diagonal(g, load_mass)
             b_all = -load_mass * g
             for k in range(V):
                 row = first + k
                 if state.attached[row] == 0:
                     continue
-                p = vehicles[row % vehicles.shape[0]]
-                p.body.mass = p.body.mass * state.mass_scale[row]
+                p = vehicle_of(vehicles, state, row)
                 rope = ropes[row % ropes.shape[0]]
                 m = rope.segment_mass
                 length = rope.segment_length
-                w = bodies.rate_b[row]
-                q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
-                w += half * turn[k]
-                rot = wp.quat_to_matrix(q)
+                w = bodies.rate_b[row] + half * turn[k]
+                rot = rotation_after(bodies, row, half)
                 A = wp.inverse(mobility(p, rope, rot))
                 b = -(A * free(p, rope, rot, w, wrench.force_b[row], wrench.torque_b[row], g))
                 for i in range(L):
@@ -174,7 +197,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                     a1 = A * e1
                     a2 = A * e2
                     c = real(0.5) * length
-                    damping, friction = damped(rope, n, u, k * L, i)
+                    damping, friction = damped(rope.joint_damping, n, u, rod, i > 0, i < L - 1)
                     tension = wp.max(wp.dot(wrench.pull_w[row], n[rod]), real(0.0))
                     J = (
                         m * length * length / real(3.0)
@@ -202,7 +225,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                         + h1[rod] * b1
                         + h2[rod] * b2
                     )
-                    A = A + diagonal(m) - wp.outer(b1, c1[rod]) - wp.outer(b2, c2[rod])
+                    A = A + diagonal(g, m) - wp.outer(b1, c1[rod]) - wp.outer(b2, c2[rod])
                 A_all += A
                 b_all += b
             acc = -(wp.inverse(A_all) * b_all)
@@ -211,8 +234,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 row = first + k
                 if state.attached[row] == 0:
                     continue
-                p = vehicles[row % vehicles.shape[0]]
-                p.body.mass = p.body.mass * state.mass_scale[row]
+                p = vehicle_of(vehicles, state, row)
                 rope = ropes[row % ropes.shape[0]]
                 a = acc
                 for j in range(L):
@@ -224,10 +246,8 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                     outward = beta - wp.dot(rate, rate) * d
                     swing[rod] = -outward
                     a += rope.segment_length * outward
-                w = bodies.rate_b[row]
-                q = wp.normalize(bodies.quat_wb[row] + quat_rate(bodies.quat_wb[row], w) * half)
-                w += half * turn[k]
-                rot = wp.quat_to_matrix(q)
+                w = bodies.rate_b[row] + half * turn[k]
+                rot = rotation_after(bodies, row, half)
                 torque = wrench.torque_b[row]
                 lack = a - free(p, rope, rot, w, wrench.force_b[row], torque, g)
                 pull = wp.inverse(mobility(p, rope, rot)) * lack

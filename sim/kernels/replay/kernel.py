@@ -18,7 +18,7 @@ from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
 from sim.kernels.rope.payload import build_payload
-from sim.kernels.structs import EXTENSIONS, Types
+from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
 EVERYTHING = frozenset(
@@ -27,15 +27,15 @@ EVERYTHING = frozenset(
 
 ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2  # how the payload starts: on the rope, flying, or not there
 
-STATE_FIELDS = st.QUAD_FIELDS | {
+STATE_FIELDS = {
+    **QUAD_STATE,
     **st.ROPE_FIELDS,
-    "payload_pos_w": ("vec3", False),  # where it starts loose, and where it is at the end
-    "payload_vel_w": ("vec3", False),
-    "slack_first": ("real", False),  # at the end alone: when the rope first went slack [s]
-    "slack_last": (
-        "real",
-        False,
-    ),  # and when it last came taut again; before the window's start if it did not
+    "payload_pos_w": "vec3",  # where it starts loose, and where it is at the end
+    "payload_vel_w": "vec3",
+    # at the end alone: when the rope first went slack [s], and when it last came taut again;
+    # before the window's start if it did not
+    "slack_first": "real",
+    "slack_last": "real",
 }
 
 # share of the payload's weight below which the rope counts as slack: its shape is then anyone's
@@ -43,66 +43,57 @@ STATE_FIELDS = st.QUAD_FIELDS | {
 SLACK = 0.15
 
 WINDOW_FIELDS = {
-    "start": ("real", False),  # [s], clock of the flight
-    "end": ("real", False),
-    "first_knot": ("real", False),  # of the latent forces
-    "knots": ("int", False),
-    "payload": ("int", False),  # ATTACHED, LOOSE or NO_PAYLOAD
-    "latch": ("real", False),  # of the release, any time after the end if none
-    "clock_zero": ("real", False),  # start of the flight
-    "command_first": ("int", False),  # range of the flight's commands
-    "command_last": ("int", False),
-    "vehicle_first": ("int", False),  # ranges of the measured stamps of this window
-    "vehicle_count": ("int", False),
-    "payload_first": ("int", False),
-    "payload_count": ("int", False),
-    "gyro_first": ("int", False),
-    "gyro_count": ("int", False),
+    "start": "real",  # [s], clock of the flight
+    "end": "real",
+    "first_knot": "real",  # of the latent forces
+    "knots": "int",
+    "payload": "int",  # ATTACHED, LOOSE or NO_PAYLOAD
+    "latch": "real",  # of the release, any time after the end if none
+    "clock_zero": "real",  # start of the flight
+    "command_first": "int",  # range of the flight's commands
+    "command_last": "int",
+    "vehicle_first": "int",  # ranges of the measured stamps of this window
+    "vehicle_count": "int",
+    "payload_first": "int",
+    "payload_count": "int",
+    "gyro_first": "int",
+    "gyro_count": "int",
 }
 
 LANE_FIELDS = {
-    "window": ("int", False),
-    "plant": ("int", False),  # row of the parameters
-    "state": ("int", False),  # row of the initial states
-    "axis": (
-        "int",
-        False,
-    ),  # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
-    "knot": ("int", False),
-    "size": ("real", False),  # of the latent force at its knot [N], [N m]
-    "substep": ("real", False),  # largest step [s]
-    "keep": ("int", False),  # first row of its knots' states in the knot arrays, or -1
-    "resume": (
-        "int",
-        False,
-    ),  # row of the knot arrays at which it leaves the lane that kept it, or -1
-    "parent": ("int", False),  # that lane, flown before, of the same window, plant and state
-    "shared": (
-        "int",
-        False,
-        # of a lane from a start: so many after it share its flight and differ in what sensors show
-        # of it
-    ),
+    "window": "int",
+    "plant": "int",  # row of the parameters
+    "state": "int",  # row of the initial states
+    # of its latent force: 0-2 vehicle force, 3-5 vehicle torque, 6-8 payload force, or -1
+    "axis": "int",
+    "knot": "int",
+    "size": "real",  # of the latent force at its knot [N], [N m]
+    "substep": "real",  # largest step [s]
+    "keep": "int",  # first row of its knots' states in the knot arrays, or -1
+    "resume": "int",  # row of the knot arrays at which it leaves the lane that kept it, or -1
+    "parent": "int",  # that lane, flown before, of the same window, plant and state
+    # of a lane from a start: so many after it share its flight and differ in what sensors show
+    "shared": "int",
 }
 
 KNOT_FIELDS = {
-    "pos_w": ("vec3", False),
-    "vel_w": ("vec3", False),
-    "quat_wb": ("quat", False),
-    "rate_b": ("vec3", False),
-    "thrust": ("real", False),
-    "payload_pos_w": ("vec3", False),
-    "payload_vel_w": ("vec3", False),
-    "tension": ("real", False),
+    "pos_w": "vec3",
+    "vel_w": "vec3",
+    "quat_wb": "quat",
+    "rate_b": "vec3",
+    "thrust": "real",
+    "payload_pos_w": "vec3",
+    "payload_vel_w": "vec3",
+    "tension": "real",
 }
 
 DATA_FIELDS = {
-    "command_time": ("real", False),
-    "command": ("vec4", False),
-    "vehicle_time": ("real", False),
-    "vehicle_quat": ("quat", False),  # measured; attitudes are told against them
-    "payload_time": ("real", False),
-    "gyro_time": ("real", False),
+    "command_time": "real",
+    "command": "vec4",
+    "vehicle_time": "real",
+    "vehicle_quat": "quat",  # measured; attitudes are told against them
+    "payload_time": "real",
+    "gyro_time": "real",
 }
 
 

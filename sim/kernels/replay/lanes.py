@@ -5,6 +5,7 @@ cores of a CPU.
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import warp as wp
@@ -14,7 +15,7 @@ from sim.kernels import runtime  # noqa: F401  starts Warp
 from sim.kernels import state as st
 from sim.kernels.laws import check_laws, structure
 from sim.kernels.replay import kernel as rk
-from sim.kernels.structs import Types, kinds_of, pack, pack_plants, plants_on, ropes_on, types
+from sim.kernels.structs import kinds_of, pack, pack_plants, plants_on, ropes_on, types
 from sim.params import GRAVITY, PlantParams, SensingParams
 
 
@@ -54,12 +55,11 @@ class Recording:
         self.seconds = windows["end"] - windows["start"]
         self._there: dict[tuple[rk.ReplayKernel, str], tuple] = {}
 
-    def on(self, kernel: rk.ReplayKernel, t: Types, device: str) -> tuple:
+    def on(self, kernel: rk.ReplayKernel, device: str) -> tuple:
         """Return windows and recorded data as a kernel's structs on a device."""
         if (kernel, device) not in self._there:
-            windows = _struct(t, kernel.Windows, rk.WINDOW_FIELDS, self.windows, device)
-            data = _struct(t, kernel.Data, rk.DATA_FIELDS, self.data, device)
-            self._there[kernel, device] = (windows, data)
+            windows = _struct(kernel.Windows, self.windows, device)
+            self._there[kernel, device] = windows, _struct(kernel.Data, self.data, device)
         return self._there[kernel, device]
 
 
@@ -106,21 +106,20 @@ class Replay:
         self._sim = first.sim
         self._download = download
         self.types = t = types("float64")  # in which differences of lanes do not drown in rounding
-        kinds = kinds_of(first.vehicle)
         check_laws(first.laws)
-        key = (kinds, self.segments, structure(first.laws))
+        key = (kinds_of(first.vehicle), self.segments, structure(first.laws))
         if key not in _BUILDS:
             _BUILDS[key] = rk.build_replay(t, first.vehicle, self.segments, first.laws)
         self.kernel = _BUILDS[key]
         vehicles = [p.vehicle for p in plants]
         self._rows = pack_plants(
             t,
+            first,
             vehicles,
             ropes_on(vehicles, [p.rope for p in plants]),
             [p.air for p in plants],
             [p.release for p in plants],
             [p.laws for p in plants],
-            kinds,
         )
         self._sensings = pack(self.kernel.Sensing, *sensings)
         self._plants: dict[str, list] = {}
@@ -161,8 +160,8 @@ class Replay:
         segments = dict.fromkeys(st.ROPE_FIELDS, self.segments)
         keeps = bool(np.any(np.asarray(lanes["keep"]) >= 0))
         if keeps:
-            ends = st.allocate(t, k.State, rk.STATE_FIELDS, count, segments, device)
-            knot_states = st.allocate(t, k.Knots, rk.KNOT_FIELDS, knots, {}, device)
+            ends = st.allocate(k.State, count, device, segments)
+            knot_states = st.allocate(k.Knots, knots, device)
         else:
             ends = k.State()
             knot_states = k.Knots()
@@ -171,7 +170,7 @@ class Replay:
         moments = knots if np.any(resumed) else 0
         left_at = [
             wp.empty(moments, dtype=k.Moment, device=device),
-            st.allocate(t, k.Ropes, st.ROPE_FIELDS, moments, segments, device),
+            st.allocate(k.Ropes, moments, device, segments),
         ]
         marks = wp.empty(count, dtype=k.Pointers, device=device)
         costs = recording.seconds[w] / np.asarray(lanes["substep"])
@@ -180,9 +179,9 @@ class Replay:
             for rows in _in_order(np.asarray(lanes["shared"]), resumed)
         ]
         order = wp.array(np.concatenate(launches), dtype=wp.int32, device=device)
-        begin = _struct(t, k.State, rk.STATE_FIELDS, starts, device)
-        flown = _struct(t, k.Lanes, rk.LANE_FIELDS, lanes, device)
-        windows, data = recording.on(k, t, device)
+        begin = _struct(k.State, starts, device)
+        flown = _struct(k.Lanes, lanes, device)
+        windows, data = recording.on(k, device)
         before = [*self._plants_on(device), knot_spacing, begin, windows, flown, data, order]
         after = [ends, knot_states, marks, *left_at, out]
         first = 0
@@ -191,8 +190,7 @@ class Replay:
             first += len(rows)
         if not keeps:
             return Replayed(self._download(out), {}, {})
-        read = _read(ends, rk.STATE_FIELDS), _read(knot_states, rk.KNOT_FIELDS)
-        return Replayed(self._download(out), *read)
+        return Replayed(self._download(out), _read(ends, k.State), _read(knot_states, k.Knots))
 
     def _launch(
         self, device: str, begin: int, costs: np.ndarray, before: list, after: list
@@ -229,20 +227,19 @@ class Replay:
         in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 
 
-def _read(struct, fields: Mapping) -> dict[str, np.ndarray]:
+def _read(struct: Any, kind: Any) -> dict[str, np.ndarray]:
     """Arrays of a struct on the host, lane first."""
-    return {name: st.fetched(getattr(struct, name), by_row) for name, (_, by_row) in fields.items()}
+    return {name: st.fetched(getattr(struct, name)) for name in kind.vars}
 
 
-def _struct(t: Types, struct: type, fields: Mapping, values: Mapping[str, np.ndarray], device: str):
-    """Arrays of the fields in an instance of a struct."""
-    scalar = {"real": t.real, "int": wp.int32, "vec3": t.vec3, "vec4": t.vec4, "quat": t.quat}
-    real = np.float32 if t.real is wp.float32 else np.float64
+def _struct(struct: Any, values: Mapping[str, np.ndarray], device: str) -> Any:
+    """Arrays of the values, float64 or int32, in an instance of a struct."""
     out = struct()
-    for name, (kind, by_row) in fields.items():
-        value = np.asarray(values[name], dtype=np.int32 if kind == "int" else real)
-        value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if by_row else value)
-        setattr(out, name, wp.array(value, dtype=scalar[kind], device=device, copy=device != "cpu"))
+    for name, field in struct.vars.items():
+        kind = field.type
+        value = np.asarray(values[name], dtype=np.int32 if kind.dtype is wp.int32 else np.float64)
+        value = np.ascontiguousarray(np.swapaxes(value, 0, 1) if kind.ndim == 2 else value)
+        setattr(out, name, wp.array(value, dtype=kind.dtype, device=device, copy=device != "cpu"))
     return out
 
 

@@ -305,7 +305,8 @@ class MixedMujoco:
 
 
 def test_a_mixed_mujoco_is_named_by_plants_and_solvers(monkeypatch):
-    monkeypatch.delitem(sys.modules, "mujoco.batch", raising=False)
+    for name in ("mujoco.batch", "sim.reference.batch"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
     monkeypatch.setattr(sys, "meta_path", [MixedMujoco(), *sys.meta_path])
     with raises(ModuleNotFoundError, match="another MuJoCo") as caught:
         runpy.run_module("sim.reference.rope")

@@ -299,7 +299,8 @@ def hover_state(flight: RecordedFlight, plant: PlantParams, payload: int) -> Sta
     )
     down = np.array([0.0, 0.0, -1.0])
     state = {
-        name: np.zeros((1, L, 3) if rows else (1, 3)) for name, (_, rows) in STATE_FIELDS.items()
+        name: np.zeros((1, L, 3) if kind.endswith("[]") else (1, 3))
+        for name, kind in STATE_FIELDS.items()
     }
     state |= {"slack_first": np.zeros(1), "slack_last": np.zeros(1)}
     below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L

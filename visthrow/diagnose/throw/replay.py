@@ -171,7 +171,7 @@ class ReplayedFlights:
             for name in self.windows:
                 self.windows[name][w] = arrays[name]
         self.windows = {
-            k: v.astype(int) if WINDOW_FIELDS[k][0] == "int" else v for k, v in self.windows.items()
+            k: v.astype(int) if WINDOW_FIELDS[k] == "int" else v for k, v in self.windows.items()
         }
         self.samples = parts
         data = {
