@@ -35,6 +35,7 @@ from sim.params import (
     ReleaseParams,
     RopeParams,
     VehicleParams,
+    changed,
 )
 
 PIECES = 8
@@ -202,7 +203,7 @@ class HybridSim:
             gravity: of free fall, along -z [m/s^2]. threads: at most, of a CPU; default all cores.
         """
         if without_rope is not None:
-            params = dataclasses.replace(params, rope=dataclasses.replace(params.rope, segments=1))
+            params = changed(params, {"rope.segments": 1})
             extensions, ropes = extensions | {"push"}, None
         self.vehicles = vehicles = vehicles or [params.vehicle]
         ropes = ropes or [params.rope]

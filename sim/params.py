@@ -7,8 +7,9 @@ value below is documented as ``[unit]``; vectors are in the body frame (x forwar
 with the origin at the vehicle's centre of mass unless said otherwise."""
 
 import math
-from dataclasses import dataclass
-from typing import Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, TypeVar
 
 from camera.field_bounds import (
     Arm,
@@ -24,6 +25,24 @@ from camera.field_bounds import (
 
 GRAVITY = 9.81
 """Standard acceleration of free fall used by every plant of the project [m/s^2]."""
+
+Owner = TypeVar("Owner")
+
+
+def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
+    """Return a dataclass with other values at dotted paths, such as ``vehicle.queue.delay``."""
+    fields: dict[str, Any] = {}
+    tables: dict[str, dict[str, Any]] = {}
+    for path, value in values.items():
+        name, _, inner = path.partition(".")
+        if inner:
+            tables.setdefault(name, {})[inner] = value
+        else:
+            fields[name] = value
+    for name, inside in tables.items():
+        fields[name] = changed(getattr(owner, name), inside)
+    return replace(owner, **fields)  # type: ignore[type-var]
+
 
 LEAST_GYRATION = 0.01  # radius of gyration of a vehicle over the reach of its rotors [-]
 

@@ -8,11 +8,13 @@ multiplies what that gives. What does not follow size, links and sensors, stays 
 
 import math
 from dataclasses import dataclass, fields, replace
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 
 from camera.field_bounds import BoundedFields, Positive
-from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams
+from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, changed
 from sim.units import Units, in_units
 
 Range = tuple[float, float]
@@ -133,7 +135,7 @@ def _calm(v: VehicleParams, share: float) -> VehicleParams:
     share = min(share, 1.0)
     names = ("p_gain", "i_gain", "feedforward_gain")
     gains = {name: (*getattr(c, name)[:2], share * getattr(c, name)[2]) for name in names}
-    return replace(v, controller=replace(c, **gains))
+    return changed(v, {f"controller.{name}": gain for name, gain in gains.items()})
 
 
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
@@ -148,51 +150,38 @@ def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
         return tuple((np.array(gains) * turn * factor).tolist())
 
     c = v.controller
-    aero = v.aero
     fast = x["p_gain"] / lag  # a rate loop is tuned to what its motors follow
-    controller = replace(
-        c,
-        p_gain=scaled(c.p_gain, fast),
-        i_gain=scaled(c.i_gain, fast * x["i_gain"]),
-        d_gain=scaled(c.d_gain, x["d_gain"]),
-        feedforward_gain=scaled(c.feedforward_gain, x["feedforward"]),
-        integral_limit=scaled(c.integral_limit, 1.0),
-        setpoint_time_constant=c.setpoint_time_constant * x["filters"],
-        gyro_time_constant=c.gyro_time_constant * x["filters"],
-        min_thrust=c.min_thrust * x["thrust"],
-        max_thrust=c.max_thrust * x["thrust"],
-        voltage_compensation=x["compensation"],
-    )
-    return replace(
-        v,
-        body=replace(v.body, inertia=scaled(v.body.inertia, 1.0)),
-        rotors=replace(
-            v.rotors,
-            x=tuple(arm * a for a in v.rotors.x),
-            y=tuple(arm * a for a in v.rotors.y),
-            z=arm * v.rotors.z,
-            radius=blade * v.rotors.radius,
-            inertia=blade**2 * x["rotor_inertia"] * v.rotors.inertia,
-        ),
-        queue=replace(v.queue, delay=x["delay"]),
-        controller=controller,
-        motor=replace(
-            v.motor,
-            time_constant=lag * v.motor.time_constant,
-            time_constant_down=lag * v.motor.time_constant_down,
-        ),
-        battery=replace(v.battery, resistance=x["resistance"] * v.battery.resistance),
-        thrust=replace(
-            v.thrust,
-            k_f=x["thrust"] * v.thrust.k_f,
-            torque_ratio=blade * x["torque_ratio"] * v.thrust.torque_ratio,
-        ),
-        aero=replace(
-            aero,
-            **{f.name: getattr(aero, f.name) * x["drag"] for f in fields(aero) if f.name != "kind"},
-        ),
-        collision_radius=arm * v.collision_radius,
-    )
+    values: dict[str, Any] = {
+        "body.inertia": scaled(v.body.inertia, 1.0),
+        "queue.delay": x["delay"],
+        "controller.p_gain": scaled(c.p_gain, fast),
+        "controller.i_gain": scaled(c.i_gain, fast * x["i_gain"]),
+        "controller.d_gain": scaled(c.d_gain, x["d_gain"]),
+        "controller.feedforward_gain": scaled(c.feedforward_gain, x["feedforward"]),
+        "controller.integral_limit": scaled(c.integral_limit, 1.0),
+        "controller.voltage_compensation": x["compensation"],
+    }
+    factors = {
+        "rotors.z": arm,
+        "rotors.radius": blade,
+        "rotors.inertia": blade**2 * x["rotor_inertia"],
+        "controller.setpoint_time_constant": x["filters"],
+        "controller.gyro_time_constant": x["filters"],
+        "controller.min_thrust": x["thrust"],
+        "controller.max_thrust": x["thrust"],
+        "motor.time_constant": lag,
+        "motor.time_constant_down": lag,
+        "battery.resistance": x["resistance"],
+        "thrust.k_f": x["thrust"],
+        "thrust.torque_ratio": blade * x["torque_ratio"],
+        "collision_radius": arm,
+        **{f"aero.{f.name}": x["drag"] for f in fields(v.aero) if f.name != "kind"},
+    }
+    for path, factor in factors.items():
+        values[path] = factor * attrgetter(path)(v)
+    for name in ("x", "y"):
+        values[f"rotors.{name}"] = tuple(arm * a for a in getattr(v.rotors, name))
+    return changed(v, values)
 
 
 def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:

@@ -2,13 +2,12 @@
 has, and it with another block.
 """
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
 
 from sim.effects.setting import AERODYNAMICS, Setting
-from sim.params import GRAVITY
+from sim.params import GRAVITY, changed
 
 SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
 RELAX = 1.0 / (
@@ -19,24 +18,14 @@ RELAX = 1.0 / (
 LONGEST_OFFSET = 0.12
 
 
-def _vehicle(setting: Setting, **parts: dict[str, Any]) -> Setting:
-    vehicle = setting.plant.vehicle
-    changed = {
-        name: dataclasses.replace(getattr(vehicle, name), **values)
-        for name, values in parts.items()
-    }
-    plant = dataclasses.replace(setting.plant, vehicle=dataclasses.replace(vehicle, **changed))
-    return dataclasses.replace(setting, plant=plant)
-
-
-def _segments(setting: Setting, count: int) -> Setting:
-    rope = dataclasses.replace(setting.plant.rope, segments=count)
-    return dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, rope=rope))
+def _with(setting: Setting, values: dict[str, Any]) -> Setting:
+    """Return a setting with other values of its vehicle."""
+    return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
 
 
 def _lagging(setting: Setting) -> Setting:
     tau = setting.plant.vehicle.motor.time_constant
-    return _vehicle(setting, motor={"kind": "asymmetric", "time_constant_down": tau})
+    return _with(setting, {"motor.kind": "asymmetric", "motor.time_constant_down": tau})
 
 
 def _pid(setting: Setting) -> bool:
@@ -52,16 +41,14 @@ def _motor_mixing(setting: Setting) -> Setting:
     set-point's filter, the feed-forward off.
     """
     plant = setting.plant
-    return _vehicle(
-        setting,
-        controller={
-            "kind": "motor_mixing",
-            "mix_thrust": 0.25 * plant.total_mass * GRAVITY,
-            "setpoint_time_constant": RELAX,
-            "feedforward_gain": (0.0, 0.0, 0.0),
-            "calibration_voltage": plant.vehicle.battery.reference_voltage,
-        },
-    )
+    controller = {
+        "kind": "motor_mixing",
+        "mix_thrust": 0.25 * plant.total_mass * GRAVITY,
+        "setpoint_time_constant": RELAX,
+        "feedforward_gain": (0.0, 0.0, 0.0),
+        "calibration_voltage": plant.vehicle.battery.reference_voltage,
+    }
+    return _with(setting, {f"controller.{name}": value for name, value in controller.items()})
 
 
 CONDITIONS: dict[str, Callable[[Setting], bool]] = {
@@ -90,12 +77,12 @@ CONDITIONS: dict[str, Callable[[Setting], bool]] = {
 """Name -> whether a setting has what an effect changes."""
 
 SWITCHES: dict[str, Callable[[Setting], Setting]] = {
-    "PID controller": lambda s: _vehicle(s, controller={"kind": "betaflight"}),
+    "PID controller": lambda s: _with(s, {"controller.kind": "betaflight"}),
     "motor mixing": _motor_mixing,
-    "proportional controller": lambda s: _vehicle(s, controller={"kind": "geometric"}),
+    "proportional controller": lambda s: _with(s, {"controller.kind": "geometric"}),
     "motor lag": _lagging,
-    "no motor lag": lambda s: _vehicle(s, motor={"kind": "instant"}),
-    "flexible rope": lambda s: _segments(s, SEGMENTS),
-    "rigid rope": lambda s: _segments(s, 1),
+    "no motor lag": lambda s: _with(s, {"motor.kind": "instant"}),
+    "flexible rope": lambda s: changed(s, {"plant.rope.segments": SEGMENTS}),
+    "rigid rope": lambda s: changed(s, {"plant.rope.segments": 1}),
 }
 """Name -> the setting with another kind of block."""

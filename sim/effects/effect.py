@@ -13,6 +13,7 @@ from typing import Any
 from camera.field_bounds import BoundedFields, Positive
 from sim.effects.blocks import CONDITIONS, SWITCHES
 from sim.effects.setting import Setting
+from sim.params import changed
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Change(BoundedFields):
             new: Any = tuple(self._new(v, theta) if i in picked else v for i, v in enumerate(value))
         else:
             new = self._new(value, theta)
-        return _replaced(setting, self.path.split("."), new)
+        return changed(setting, {self.path: new})
 
     def _new(self, value: float, theta: float) -> float:
         return value * (1.0 + self.factor * theta) if self.scale else value + self.factor * theta
@@ -67,14 +68,6 @@ def _read(setting: Any, path: str) -> Any:
     for name in path.split("."):
         setting = getattr(setting, name)
     return setting
-
-
-def _replaced(owner: Any, names: list[str], new: Any) -> Any:
-    if len(names) == 1:
-        return dataclasses.replace(owner, **{names[0]: new})
-    return dataclasses.replace(
-        owner, **{names[0]: _replaced(getattr(owner, names[0]), names[1:], new)}
-    )
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-from sim.params import PlantParams, SensingParams, VehicleParams
+from sim.params import PlantParams, SensingParams, changed
 
 AERODYNAMICS = (
     "drag_x",
@@ -41,34 +41,27 @@ def generalised(setting: Setting) -> Setting:
     A plant without aerodynamics becomes one with zero coefficients, a first-order motor one of two
     equal lags."""
     vehicle = setting.plant.vehicle
+    values: dict[str, Any] = {}
     if vehicle.aero.kind == "none":
-        frozen = dataclasses.replace(
-            vehicle.aero, kind="rotor_drag", **dict.fromkeys(AERODYNAMICS, 0.0)
-        )
-        vehicle = dataclasses.replace(vehicle, aero=frozen)
+        values["aero.kind"] = "rotor_drag"
+        values |= {f"aero.{name}": 0.0 for name in AERODYNAMICS}
     if vehicle.motor.kind == "first_order":
-        even = dataclasses.replace(
-            vehicle.motor, kind="asymmetric", time_constant_down=vehicle.motor.time_constant
-        )
-        vehicle = dataclasses.replace(vehicle, motor=even)
-    return dataclasses.replace(setting, plant=dataclasses.replace(setting.plant, vehicle=vehicle))
+        values["motor.kind"] = "asymmetric"
+        values["motor.time_constant_down"] = vehicle.motor.time_constant
+    return changed(setting, {f"plant.vehicle.{path}": value for path, value in values.items()})
 
 
 def specialised(plant: PlantParams, before: PlantParams) -> PlantParams:
     """Return the plant with the kinds that it had before it was generalised, wherever they still
     say the same.
     """
-    vehicle: VehicleParams = plant.vehicle
-    motor = vehicle.motor
-    aero = vehicle.aero
-    if (
-        before.vehicle.motor.kind != "asymmetric"
-        and motor.time_constant == motor.time_constant_down
-    ):
+    motor = plant.vehicle.motor
+    aero = plant.vehicle.aero
+    values: dict[str, Any] = {}
+    even = motor.time_constant == motor.time_constant_down
+    if before.vehicle.motor.kind != "asymmetric" and even:
         kind = "first_order" if motor.kind == "asymmetric" else motor.kind
-        vehicle = dataclasses.replace(
-            vehicle, motor=dataclasses.replace(motor, kind=kind, time_constant_down=0.0)
-        )
+        values |= {"vehicle.motor.kind": kind, "vehicle.motor.time_constant_down": 0.0}
     if before.vehicle.aero.kind == "none" and not any(getattr(aero, name) for name in AERODYNAMICS):
-        vehicle = dataclasses.replace(vehicle, aero=before.vehicle.aero)
-    return dataclasses.replace(plant, vehicle=vehicle)
+        values["vehicle.aero"] = before.vehicle.aero
+    return changed(plant, values)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from sim.hybrid import rope_variants
-from sim.params import VehicleParams
+from sim.params import VehicleParams, changed
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
@@ -109,7 +109,7 @@ def between(interval: tuple[float, float], part: Any) -> Any:
 def _weakened(vehicle: VehicleParams, gain: float) -> VehicleParams:
     """The vehicle with a gain of all its rotors."""
     gains = tuple(gain * one for one in vehicle.thrust.gain)
-    return dataclasses.replace(vehicle, thrust=dataclasses.replace(vehicle.thrust, gain=gains))
+    return changed(vehicle, {"thrust.gain": gains})
 
 
 FAULTS: dict[str, dict[str, Any]] = {
@@ -123,16 +123,12 @@ FAULTS: dict[str, dict[str, Any]] = {
 
 def as_flown(experiment: TeamExperiment, fault: str) -> TeamExperiment:
     """The experiment from hover across the throw, in every world with one of :data:`FAULTS`."""
-    start = dataclasses.replace(
-        pilots_hover(),
-        tether_variants=experiment.task.start.tether_variants,
-        tether_spread=experiment.task.start.tether_spread,
-    )
+    start = experiment.task.start
     hover = {"tilt_deg": (33.0, 37.0), "across_deg": 5.0, "faulty": 1.0}
     hover |= {"weak": (1.0, 1.0), "late": (0.0, 0.0), "age": (experiment.team.age[0],) * 2}
-    team = dataclasses.replace(experiment.team, **(hover | FAULTS[fault]))
-    task = dataclasses.replace(experiment.task, start=start)
-    return dataclasses.replace(experiment, task=task, team=team)
+    values = {f"team.{name}": value for name, value in (hover | FAULTS[fault]).items()}
+    variants = {name: getattr(start, name) for name in ("tether_variants", "tether_spread")}
+    return changed(experiment, values | {"task.start": changed(pilots_hover(), variants)})
 
 
 def team_contract(experiment: TeamExperiment) -> dict[str, Any]:

@@ -16,12 +16,12 @@ bound, and what the critic is given."""
 
 import math
 import tomllib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 
-from sim.params import GRAVITY, PlantParams
+from sim.params import GRAVITY, PlantParams, changed
 from sim.units import PLANT, Units, dimensions_of, in_units
 from sim.vehicle_class import draw
 from visthrow import config
@@ -126,12 +126,10 @@ def members(experiment: Experiment) -> list[Member]:
         units = fleet.units_of(plant)
         stated = in_units(plant, units)
         task = {
-            name: getattr(experiment.release, name)
+            f"release.{name}": getattr(experiment.release, name)
             for name in ("landing_height", "clearance_margin")
         }
-        return Member(
-            replace(stated, release=replace(stated.release, **task), sim=experiment.sim), units
-        )
+        return Member(changed(stated, {**task, "sim": experiment.sim}), units)
 
     return [member(plant) for plant in vehicles]
 
@@ -143,24 +141,25 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     chosen = members(experiment)[number]
     inverse_units = chosen.units.inverse
     plant = in_units(chosen.plant, inverse_units)
-    task = in_units(experiment.task, inverse_units, TASK)
-    action = replace(task.action, max_thrust=4.0 * plant.vehicle.controller.max_thrust)
-    task = replace(task, action=action, observation=replace(task.observation, setup="none"))
-    size = chosen.units.length
     camera = experiment.camera
-    mount = replace(camera.mount, position_b=tuple(size * x for x in camera.mount.position_b))
-    camera = replace(
-        camera,
-        mount=mount,
-        payload_radius=plant.rope.payload_radius,
-        goal_side=size * camera.goal_side,
-    )
-    parts = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
-    sensors = {
-        name: getattr(experiment.task.observation, name) for name in ("latency", "latency_jitter")
-    }  # do not know of ropes
-    task = replace(task, observation=replace(task.observation, **sensors))
-    return replace(experiment, **parts, task=task, camera=camera, fleet=None, flown=())
+    size = chosen.units.length
+    sensors = experiment.task.observation  # do not know of ropes
+    values = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
+    values |= {
+        "task": in_units(experiment.task, inverse_units, TASK),
+        "camera.mount.position_b": tuple(size * x for x in camera.mount.position_b),
+        "camera.payload_radius": plant.rope.payload_radius,
+        "camera.goal_side": size * camera.goal_side,
+        "fleet": None,
+        "flown": (),
+    }
+    observation = {
+        "task.action.max_thrust": 4.0 * plant.vehicle.controller.max_thrust,
+        "task.observation.setup": "none",
+        "task.observation.latency": sensors.latency,
+        "task.observation.latency_jitter": sensors.latency_jitter,
+    }
+    return changed(changed(experiment, values), observation)
 
 
 def specialised(

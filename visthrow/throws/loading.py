@@ -2,10 +2,11 @@
 
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
+from sim.params import changed
 from visthrow import config
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
@@ -76,9 +77,7 @@ def load_policy(
             f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
         ) from None
     if experiment.fleet is not None:  # one vehicle is flown, that of the config
-        policy, experiment = specialised(
-            policy, replace(experiment, fleet=replace(experiment.fleet, count=0))
-        )
+        policy, experiment = specialised(policy, changed(experiment, {"fleet.count": 0}))
     return Loaded(
         path.stem if path.stem != "policy" else path.resolve().parent.name,
         policy,

@@ -5,10 +5,10 @@ its plant from outside.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
+from sim.params import changed
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import rotate_back
 from visthrow.task import Experiment, plant_of
@@ -54,10 +54,9 @@ class HybridWirePlant:
 
     def _fine(self, experiment: Experiment) -> Experiment:
         """Return the experiment with this plant's period, nothing measured late."""
-        observation = replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
-        sim = replace(experiment.sim, control_period=self.period)
-        task = replace(experiment.task, observation=observation)
-        return replace(experiment, sim=sim, task=task)
+        observation = "task.observation"
+        values = {f"{observation}.latency": (0.0, 0.0), f"{observation}.latency_jitter": 0.0}
+        return changed(experiment, values | {"sim.control_period": self.period})
 
     def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
@@ -154,14 +153,9 @@ class HybridMotorPlant(HybridWirePlant):
         self.rate_b = self._now["rate_b"]
 
     def _built(self, experiment: Experiment) -> HybridPlant:
-        queue = replace(
-            experiment.vehicle.queue, delay=0.0
-        )  # the firmware's own path comes in its place
-        vehicle = replace(experiment.vehicle, queue=queue)
-        release = replace(experiment.release, lag=MECHANISM)
-        return HybridPlant(
-            self._fine(replace(experiment, vehicle=vehicle, release=release)), motors=True
-        )
+        # the firmware's own path comes in the delay's place
+        values = {"vehicle.queue.delay": 0.0, "release.lag": MECHANISM}
+        return HybridPlant(self._fine(changed(experiment, values)), motors=True)
 
     @property
     def held(self) -> bool:
