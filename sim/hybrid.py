@@ -204,7 +204,8 @@ class HybridSim:
         """
         if without_rope is not None:
             params = changed(params, {"rope.segments": 1})
-            extensions, ropes = extensions | {"push"}, None
+            extensions = extensions | {"push"}
+            ropes = None
         self.vehicles = vehicles = vehicles or [params.vehicle]
         ropes = ropes or [params.rope]
         airs = airs or [params.air]

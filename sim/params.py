@@ -265,7 +265,8 @@ class VehicleParams(BoundedFields):
     def __post_init__(self) -> None:
         """Raise ValueError for a vehicle that the equations do not describe."""
         super().__post_init__()
-        c, rotors = self.controller, self.rotors
+        c = self.controller
+        rotors = self.rotors
         if self.motor.kind == "asymmetric" and not self.motor.time_constant_down:
             raise ValueError("motor.time_constant_down is 0.0; expected above 0")
         if 4.0 * c.max_thrust <= self.body.mass * GRAVITY:

@@ -11,7 +11,11 @@ from collections.abc import Mapping
 
 from sim.params import ControllerParams, VehicleParams
 
-P_SCALE, I_SCALE, D_SCALE, F_SCALE, MIXER_SCALE = 0.032029, 0.244381, 0.000529, 0.013754, 1000.0
+P_SCALE = 0.032029
+I_SCALE = 0.244381
+D_SCALE = 0.000529
+F_SCALE = 0.013754
+MIXER_SCALE = 1000.0
 """Output of a gain of 1 for an error of 1 deg/s, 1 deg, 1 deg/s^2, feedforward of 1 deg/s^2; output
 that is all of a motor's command.
 """

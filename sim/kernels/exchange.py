@@ -7,6 +7,7 @@ interpolated between its ends. A wrench is that of the substep's middle, which i
 second order. After the release the vehicle flies on by itself, without the solver."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import warp as wp
 
@@ -42,6 +43,44 @@ BODY_FIELDS = {
 """What a solver shows of its bodies: the root, the rope's segments, the payload's centre."""
 
 
+def build_body_access(t: Types, segments: int):
+    """Return Warp functions ``load_bodies(bodies, env, s, n, u) -> s`` and
+    ``store_bodies(bodies, env, s, n, u, payload_pos, payload_vel)``, between a struct of
+    :data:`BODY_FIELDS` and a vehicle's state with local arrays of its rope.
+    """
+    QuadState = t.QuadState
+    vec3 = t.vec3
+    Vectors = t.Vectors
+
+    @wp.func
+    def load_bodies(bodies: Any, env: int, s: QuadState, n: Vectors, u: Vectors):
+        out = s
+        out.pos_w = bodies.pos_w[env]
+        out.quat_wb = bodies.quat_wb[env]
+        out.vel_w = bodies.vel_w[env]
+        out.rate_b = bodies.rate_b[env]
+        for i in range(segments):
+            n[i] = bodies.cable_dir_w[i, env]
+            u[i] = bodies.cable_vel_w[i, env]
+        return out
+
+    @wp.func
+    def store_bodies(
+        bodies: Any, env: int, s: QuadState, n: Vectors, u: Vectors, pos: vec3, vel: vec3
+    ):
+        bodies.pos_w[env] = s.pos_w
+        bodies.quat_wb[env] = s.quat_wb
+        bodies.vel_w[env] = s.vel_w
+        bodies.rate_b[env] = s.rate_b
+        for i in range(segments):
+            bodies.cable_dir_w[i, env] = n[i]
+            bodies.cable_vel_w[i, env] = u[i]
+        bodies.payload_pos_w[env] = pos
+        bodies.payload_vel_w[env] = vel
+
+    return load_bodies, store_bodies
+
+
 @dataclass(frozen=True)
 class ExchangeKernels:
     """Kernels of one build and the structs that they take."""
@@ -72,6 +111,7 @@ def build_exchange(
     load = parts.load
     store = parts.store
     load_rope = parts.load_rope
+    load_bodies, store_bodies = build_body_access(t, L)
     flow = parts.flow
     rate = parts.rate
     motor_advance = parts.motor_advance
@@ -207,18 +247,11 @@ def build_exchange(
         env = wp.tid() + first
         if moves[env] == 0 or state.attached[env] == 0:
             return
-        s = load(state, env)
-        s.pos_w = bodies.pos_w[env]
-        s.quat_wb = bodies.quat_wb[env]
-        s.vel_w = bodies.vel_w[env]
-        s.rate_b = bodies.rate_b[env]
         pos = bodies.payload_pos_w[env]
         vel = bodies.payload_vel_w[env]
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
-        for i in range(L):
-            n[i] = bodies.cable_dir_w[i, env]
-            u[i] = bodies.cable_vel_w[i, env]
+        s = load_bodies(bodies, env, load(state, env), n, u)
         size = st.size(s) + rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite
@@ -306,21 +339,11 @@ def build_exchange(
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        s = load(state, env)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
-        for i in range(L):
-            n[i] = state.cable_dir_w[i, env]
-            u[i] = state.cable_vel_w[i, env]
-            bodies.cable_dir_w[i, env] = n[i]
-            bodies.cable_vel_w[i, env] = u[i]
-        bodies.pos_w[env] = s.pos_w
-        bodies.quat_wb[env] = s.quat_wb
-        bodies.vel_w[env] = s.vel_w
-        bodies.rate_b[env] = s.rate_b
+        s = load_bodies(state, env, load(state, env), n, u)
         pos, vel = coupled.payload(rope_of(plants, env), s, n, u)
-        bodies.payload_pos_w[env] = pos
-        bodies.payload_vel_w[env] = vel
+        store_bodies(bodies, env, s, n, u, pos, vel)
         wrench.pull_w[env] = vec3()
         wrench.twist_b[env] = vec3()
 

@@ -255,10 +255,8 @@ def pack_vehicle(
         x = np.asarray(rotors.x)
         y = np.asarray(rotors.y)
         spin = np.asarray(rotors.spin)
-        row["mixer"]["roll"], row["mixer"]["pitch"] = (
-            y / (4 * np.mean(y**2)),
-            -x / (4 * np.mean(x**2)),
-        )
+        row["mixer"]["roll"] = y / (4 * np.mean(y**2))
+        row["mixer"]["pitch"] = -x / (4 * np.mean(x**2))
         row["mixer"]["yaw"] = spin / (4 * thrust.torque_ratio)
         # Arms about the centre of mass, and the drag torque as the rotors have it, not as the
         # controller knows it.
@@ -320,19 +318,15 @@ def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
         mass = rope.segment_mass
         ball = length + rope.payload_offset
         last_mass = mass + rope.payload_mass
-        row["segment_length"], row["segment_mass"], row["segment_inertia"] = (
-            length,
-            mass,
-            mass * length**2 / 3,
+        row["segment_length"] = length
+        row["segment_mass"] = mass
+        row["segment_inertia"] = mass * length**2 / 3
+        row["last_mass"] = last_mass
+        row["last_center"] = (mass * length / 2 + rope.payload_mass * ball) / last_mass
+        row["last_inertia"] = (
+            mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2
         )
-        row["last_mass"], row["last_center"] = (
-            last_mass,
-            (mass * length / 2 + rope.payload_mass * ball) / last_mass,
-        )
-        row["last_inertia"], row["payload_arm"] = (
-            mass * length**2 / 3 + rope.payload_inertia + rope.payload_mass * ball**2,
-            ball,
-        )
+        row["payload_arm"] = ball
         row["stretched_share"] = (mass / 2 + rope.payload_mass) / last_mass
         row["total_mass"] = rope.hanging_mass
     return rows

@@ -14,6 +14,12 @@ from sim.reference import vehicle_blocks
 from sim.reference.quadrotor import (
     BLOCKS,
     BODY,
+    MOTORS,
+    POS,
+    QUAT,
+    RATE,
+    VEL,
+    VOLTAGE,
     VehicleErrors,
     initial_blocks,
     rigid_body_rates,
@@ -25,10 +31,23 @@ from sim.reference.rotation_arrays import cross, quat_dot, rotation_from_quat, t
 from sim.reference.snapshot import PayloadLandings, Snapshot
 from sim.reference.stepping import crossing, halving_rk4, segments_of_period
 
+OWN = slice(BODY, BODY + BLOCKS)  # columns of the blocks
+FREE = slice(BODY + BLOCKS, BODY + BLOCKS + 6)  # and of a loose rope's upper end
 LARGEST_DECAY = 2.2
 """Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis.
 """
 
+
+SAMPLED = (
+    "pos_w",
+    "quat_wb",
+    "vel_w",
+    "rate_b",
+    "payload_pos_w",
+    "payload_vel_w",
+    "cable_points_w",
+)
+"""What a sample of the motion capture keeps of a state."""
 
 KNOWN_EXTENSIONS = {
     "body.com",
@@ -102,14 +121,9 @@ class ReferencePlant:
         self.step_size = step
         self._rng = np.random.default_rng(seed)
         self._ropes = None
-        height = 1.5
-        pos_w = np.tile([0.0, 0.0, height], (count, 1))
-        self.reset(
-            pos_w,
-            np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
-            np.zeros((count, 3)),
-            np.zeros((count, 3)),
-        )
+        zero = np.zeros((count, 3))
+        level = np.tile([0.0, 0.0, 0.0, 1.0], (count, 1))
+        self.reset(zero + [0.0, 0.0, 1.5], level, zero, zero)
 
     def reset(
         self,
@@ -135,30 +149,28 @@ class ReferencePlant:
             cable_vel_w: their time derivatives [1/s], shape (E, L, 3); None for zero.
         """
         count = self.count
-        segments = self.params.rope.segments
-        hanging = np.tile([0.0, 0.0, -1.0], (count, segments, 1))
+        hanging = np.tile([0.0, 0.0, -1.0], (count, self.params.rope.segments, 1))
+        still = np.zeros_like(hanging)
         inputs = {
             "pos_w": (pos_w, (count, 3)),
             "quat_wb": (quat_wb, (count, 4)),
             "vel_w": (vel_w, (count, 3)),
             "rate_b": (rate_b, (count, 3)),
-            "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, (count, segments, 3)),
-            "cable_vel_w": (
-                np.zeros_like(hanging) if cable_vel_w is None else cable_vel_w,
-                (count, segments, 3),
-            ),
+            "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, hanging.shape),
+            "cable_vel_w": (still if cable_vel_w is None else cable_vel_w, hanging.shape),
         }
         values = {name: _array(name, value, shape) for name, (value, shape) in inputs.items()}
         self._draw()
         rotation = rotation_from_quat(values["quat_wb"])
-        offset_w = turned(rotation, self._errors.com_offset)
-        offset_vel = turned(rotation, cross(values["rate_b"], self._errors.com_offset))
-        pos = values["pos_w"] + offset_w
-        vel = values["vel_w"] + offset_vel
+        offset = self._errors.com_offset
+        pos = values["pos_w"] + turned(rotation, offset)
+        vel = values["vel_w"] + turned(rotation, cross(values["rate_b"], offset))
         weight = (self.params.vehicle.body.mass + self._rope_mass) * GRAVITY
         block = initial_blocks(self.params.vehicle, values["rate_b"], weight, self._used)
-        n = values["cable_dir_w"] / np.linalg.norm(values["cable_dir_w"], axis=-1, keepdims=True)
-        n_dot = values["cable_vel_w"] - np.sum(values["cable_vel_w"] * n, -1, keepdims=True) * n
+        n = values["cable_dir_w"]
+        n = n / np.linalg.norm(n, axis=-1, keepdims=True)
+        n_dot = values["cable_vel_w"]
+        n_dot = n_dot - np.sum(n_dot * n, -1, keepdims=True) * n
         body = pos, values["quat_wb"], vel, values["rate_b"], block, np.zeros((count, 6))
         ropes = n.reshape(count, -1), n_dot.reshape(count, -1), np.zeros((count, 2))
         self._state = np.hstack((*body, *ropes))
@@ -188,26 +200,17 @@ class ReferencePlant:
         rope = self.params.rope
         vehicle = self.params.vehicle
         count = self.count
-        rng = self._rng
-        gain = (
-            1.0
-            + extras.thrust_gain_error
-            + extras.thrust_gain_sigma * rng.standard_normal((count, 1))
-        )
-        gain = gain + extras.motor_gain_sigma * rng.standard_normal((count, 4))
-        com = np.add(vehicle.body.com, extras.com_offset) + np.array(
-            extras.com_offset_sigma
-        ) * rng.standard_normal((count, 3))
+        normal = self._rng.standard_normal
+        gain = 1.0 + extras.thrust_gain_error + extras.thrust_gain_sigma * normal((count, 1))
+        gain = gain + extras.motor_gain_sigma * normal((count, 4))
+        com = np.add(vehicle.body.com, extras.com_offset)
+        com = com + np.array(extras.com_offset_sigma) * normal((count, 3))
         self._errors = VehicleErrors(gain, com)
-        self._payload_mass = rope.payload_mass * (
-            1.0 + extras.payload_mass_sigma * rng.standard_normal(count)
-        )
-        length = rope.length * (1.0 + extras.rope_length_sigma * rng.standard_normal(count))
-        self._used = rng.uniform(0.0, 1.0, count) * extras.battery_start_used
+        self._payload_mass = rope.payload_mass * (1.0 + extras.payload_mass_sigma * normal(count))
+        length = rope.length * (1.0 + extras.rope_length_sigma * normal(count))
+        self._used = self._rng.uniform(0.0, 1.0, count) * extras.battery_start_used
         self._rope_mass = self._payload_mass + rope.rope_mass
-        self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * rng.standard_normal(
-            (count, 3)
-        )
+        self._wind = self._mean_wind + np.array(extras.wind_sigma_w) * normal((count, 3))
         self._next_wind = self._wind
         # Compiling a model takes milliseconds; without these draws the ropes of the last episode
         # serve on.
@@ -242,15 +245,12 @@ class ReferencePlant:
         self._ropes = RopeDynamics(vehicle.body, ropes, stretch, rope.mount_damping)
         # The bending modes of light segments die out faster than RK4 bears, at rates up to 48 d /
         # (m l^2).
-        fastest = (
-            48.0
-            * (damping + rope.mount_damping)
-            / (rope.segment_mass * float(np.min(length) / rope.segments) ** 2)
-        )
+        shortest = float(np.min(length) / rope.segments)
+        inertia = rope.segment_mass * shortest**2
+        fastest = 48.0 * (damping + rope.mount_damping) / inertia
+        self._step = self.step_size
         if fastest > 0.0:
             self._step = min(self.step_size, LARGEST_DECAY / fastest)
-        else:
-            self._step = self.step_size
 
     @property
     def _mean_wind(self) -> np.ndarray:
@@ -263,9 +263,8 @@ class ReferencePlant:
 
     @property
     def _rope_columns(self) -> tuple[slice, slice]:
-        start = BODY + BLOCKS + 6
-        size = 3 * self._ropes.segments
-        return slice(start, start + size), slice(start + size, start + 2 * size)
+        middle = FREE.stop + 3 * self._ropes.segments
+        return slice(FREE.stop, middle), slice(middle, 2 * middle - FREE.stop)
 
     def _upper_end(
         self, state: np.ndarray, rotation: np.ndarray | None = None
@@ -273,14 +272,13 @@ class ReferencePlant:
         """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of
         the vehicles, where it is known.
         """
-        rotation = rotation_from_quat(state[:, 3:7]) if rotation is None else rotation
+        rotation = rotation_from_quat(state[:, QUAT]) if rotation is None else rotation
         arm = turned(rotation, self._ropes.mount)
-        arm_dot = turned(rotation, cross(state[:, 10:13], self._ropes.mount))
+        arm_dot = turned(rotation, cross(state[:, RATE], self._ropes.mount))
         on = self._attached[:, None]
-        free = state[:, BODY + BLOCKS : BODY + BLOCKS + 6]
-        return np.where(on, state[:, 0:3] + arm, free[:, :3]), np.where(
-            on, state[:, 7:10] + arm_dot, free[:, 3:]
-        )
+        free = state[:, FREE]
+        pos = np.where(on, state[:, POS] + arm, free[:, :3])
+        return pos, np.where(on, state[:, VEL] + arm_dot, free[:, 3:])
 
     def _rates(
         self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray
@@ -290,17 +288,17 @@ class ReferencePlant:
         """
         vehicle = self.params.vehicle
         rates = np.zeros_like(state)
-        rotation = rotation_from_quat(state[:, 3:7])
+        rotation = rotation_from_quat(state[:, QUAT])
         body = state[:, :BODY]
-        rate_b = state[:, 10:13]
-        air_b = turned_back(rotation, body[:, 7:10] - wind_w)
+        rate_b = state[:, RATE]
+        air_b = turned_back(rotation, body[:, VEL] - wind_w)
         near_ground = vehicle_blocks.near_ground(
             self.params.air.ground_effect, vehicle.rotors.radius, state[:, 2]
         )
-        force_b, torque_b, rates[:, BODY : BODY + BLOCKS], thrust = vehicle_rates(
+        force_b, torque_b, rates[:, OWN], thrust = vehicle_rates(
             vehicle,
             self._errors,
-            state[:, BODY : BODY + BLOCKS],
+            state[:, OWN],
             command,
             air_b,
             rate_b,
@@ -351,17 +349,16 @@ class ReferencePlant:
         if len(ids):
             picked = tuple(part[ids] for part in rope)
             pulled = (wrench[0][ids], wrench[1][ids])
-            rates[ids, 7:10], rates[ids, 10:13], second[ids], stretch_dot[ids] = (
-                self._ropes.attached(ids, body[ids], rotation[ids], pulled, picked, drag_w[ids])
+            rates[ids, VEL], rates[ids, RATE], second[ids], stretch_dot[ids] = self._ropes.attached(
+                ids, body[ids], rotation[ids], pulled, picked, drag_w[ids]
             )
         flying = np.flatnonzero(~self._attached & ~self._landed & moving)
-        free = slice(BODY + BLOCKS, BODY + BLOCKS + 6)
         if len(flying):
             picked = tuple(part[flying] for part in rope)
             acceleration, second[flying], stretch_dot[flying] = self._ropes.free(
                 flying, (root[0][flying], root[1][flying]), picked, drag_w[flying]
             )
-            rates[flying, free] = np.hstack((root[1][flying], acceleration))
+            rates[flying, FREE] = np.hstack((root[1][flying], acceleration))
         return second, stretch_dot
 
     def _pull(self) -> np.ndarray:
@@ -374,7 +371,7 @@ class ReferencePlant:
             np.full(self.count, self.time),
         )
         with_rope, without = (
-            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, 7:10]
+            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, VEL]
             for moving in (True, False)
         )
         force_w = self.params.vehicle.body.mass * (with_rope - without)
@@ -393,13 +390,11 @@ class ReferencePlant:
         period = self.params.sim.control_period
         start = self.time
         end = self.time + period
-        delay = self.params.vehicle.queue.delay + extras.delay_jitter * rng.uniform(
-            -1.0, 1.0, self.count
-        )
-        self._queue_times.append(np.maximum(start + np.maximum(delay, 0.0), self._queue_times[-1]))
-        self._queue_commands.append(
-            np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4)).copy()
-        )
+        jitter = extras.delay_jitter * rng.uniform(-1.0, 1.0, self.count)
+        acts = start + np.maximum(self.params.vehicle.queue.delay + jitter, 0.0)
+        self._queue_times.append(np.maximum(acts, self._queue_times[-1]))
+        commands = np.broadcast_to(np.asarray(command, dtype=np.float64), (self.count, 4))
+        self._queue_commands.append(commands.copy())
         lag = self.params.release.lag
         if self.params.release.lag_tension:
             lag = vehicle_blocks.release_lag(self.params.release, self._pull(), self._payload_mass)
@@ -409,12 +404,9 @@ class ReferencePlant:
         self._latched = self._latched | tripped
         decay = np.exp(-period / extras.wind_time_constant)
         mean = self._mean_wind
-        sigma = np.array(extras.wind_sigma_w)
-        self._next_wind = (
-            mean
-            + decay * (self._wind - mean)
-            + np.sqrt(1 - decay**2) * sigma * rng.standard_normal((self.count, 3))
-        )
+        sigma = np.sqrt(1 - decay**2) * np.array(extras.wind_sigma_w)
+        gust = sigma * rng.standard_normal((self.count, 3))
+        self._next_wind = mean + decay * (self._wind - mean) + gust
         self._advance(start, end)
         self._wind = self._next_wind
         self.time = end
@@ -425,14 +417,10 @@ class ReferencePlant:
         sample = end - self.extras.mocap_latency % (end - start)
         times = np.array(self._queue_times)
         commands = np.array(self._queue_commands)
-        edges = [
-            [
-                start,
-                *[t for t in (*times[1:, e], self._separation[e], sample) if start < t < end],
-                end,
-            ]
-            for e in range(self.count)
-        ]
+        edges = []
+        for e in range(self.count):
+            events = (*times[1:, e], self._separation[e], sample)
+            edges.append([start, *(t for t in events if start < t < end), end])
         steps = segments_of_period(edges, self._step)
         clock = np.full(self.count, start)
         for column in steps.T:
@@ -464,14 +452,13 @@ class ReferencePlant:
         due = self._attached & (self._separation <= clock + vehicle_blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
-            vel = vel + vehicle_blocks.release_kick(
-                self.params.release, self._rope_of(self._state)[0][:, -1]
-            )
-            self._state[due, BODY + BLOCKS : BODY + BLOCKS + 6] = np.hstack((pos, vel))[due]
+            along = self._rope_of(self._state)[0][:, -1]
+            vel = vel + vehicle_blocks.release_kick(self.params.release, along)
+            self._state[due, FREE] = np.hstack((pos, vel))[due]
             self._attached = self._attached & ~due
 
     def _normalise(self) -> None:
-        self._state[:, 3:7] /= np.linalg.norm(self._state[:, 3:7], axis=1, keepdims=True)
+        self._state[:, QUAT] /= np.linalg.norm(self._state[:, QUAT], axis=1, keepdims=True)
         n, n_dot, _, _ = self._rope_of(self._state)
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
         n_dot -= np.sum(n * n_dot, -1, keepdims=True) * n
@@ -486,10 +473,9 @@ class ReferencePlant:
             self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:]
             for state in (before, self._state)
         ]
-        for e in np.flatnonzero(flying & (ends[1][0][:, 2] <= height)):
-            share, point = crossing(
-                ends[0][0][e], ends[0][1][e], ends[1][0][e], ends[1][1][e], step[e], height
-            )
+        (pos_0, vel_0), (pos_1, vel_1) = ends
+        for e in np.flatnonzero(flying & (pos_1[:, 2] <= height)):
+            share, point = crossing(pos_0[e], vel_0[e], pos_1[e], vel_1[e], step[e], height)
             self._landed[e] = True
             self._landing_time[e] = clock[e] + share * step[e]
             self._landing_point[e] = point
@@ -502,49 +488,39 @@ class ReferencePlant:
         if self._samples[-1][0] == time:
             older = self._samples.pop()[1]
             keep = {}
-            for name in (
-                "pos_w",
-                "quat_wb",
-                "vel_w",
-                "rate_b",
-                "payload_pos_w",
-                "payload_vel_w",
-                "cable_points_w",
-            ):
+            for name in SAMPLED:
                 new = getattr(state, name)
-                old = getattr(older, name)
-                keep[name] = np.where(reached.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+                rows = reached.reshape(-1, *[1] * (new.ndim - 1))
+                keep[name] = np.where(rows, new, getattr(older, name))
             state = replace(older, **keep)
         self._samples.append((time, replace(state, time=time)))
 
     def _prune(self, time: float) -> None:
         while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= time):
             del self._queue_times[0], self._queue_commands[0]
-        while (
-            len(self._samples) > 1
-            and self._samples[1][0]
-            <= time - self.extras.mocap_latency + vehicle_blocks.TIME_TOLERANCE
-        ):
+        latest = time - self.extras.mocap_latency + vehicle_blocks.TIME_TOLERANCE
+        while len(self._samples) > 1 and self._samples[1][0] <= latest:
             del self._samples[0]
 
     @property
     def state(self) -> Snapshot:
         """The true state now."""
         state = self._state
-        rotation = rotation_from_quat(state[:, 3:7])
+        rotation = rotation_from_quat(state[:, QUAT])
+        blocks = state[:, OWN]
         offset = self._errors.com_offset
         points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
         return Snapshot(
             time=self.time,
-            pos_w=state[:, 0:3] - turned(rotation, offset),
-            quat_wb=state[:, 3:7].copy(),
-            vel_w=state[:, 7:10] - turned(rotation, cross(state[:, 10:13], offset)),
-            rate_b=state[:, 10:13].copy(),
+            pos_w=state[:, POS] - turned(rotation, offset),
+            quat_wb=state[:, QUAT].copy(),
+            vel_w=state[:, VEL] - turned(rotation, cross(state[:, RATE], offset)),
+            rate_b=state[:, RATE].copy(),
             payload_pos_w=np.where(self._landed[:, None], self._landing_point, ball),
             payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel),
             cable_points_w=points,
-            motor_speed=state[:, BODY + 9 : BODY + 13].copy(),
-            battery_voltage=state[:, BODY + 14].copy(),
+            motor_speed=blocks[:, MOTORS].copy(),
+            battery_voltage=blocks[:, VOLTAGE].copy(),
             attached=self._attached.copy(),
             latched=self._latched.copy(),
         )
@@ -573,15 +549,16 @@ class ReferencePlant:
         time, sample = self._samples[0]
         rotation_noise = 0.5 * extras.mocap_angle_sigma * rng.standard_normal((self.count, 3))
         quat = sample.quat_wb + quat_dot(sample.quat_wb, 2.0 * rotation_noise)
+        sigmas = {
+            "pos_w": extras.mocap_position_sigma,
+            "payload_pos_w": extras.mocap_position_sigma,
+            "vel_w": extras.mocap_velocity_sigma,
+            "payload_vel_w": extras.mocap_velocity_sigma,
+            "rate_b": extras.gyro_sigma,
+        }
         noisy = {
             name: getattr(sample, name) + sigma * rng.standard_normal((self.count, 3))
-            for name, sigma in (
-                ("pos_w", extras.mocap_position_sigma),
-                ("payload_pos_w", extras.mocap_position_sigma),
-                ("vel_w", extras.mocap_velocity_sigma),
-                ("payload_vel_w", extras.mocap_velocity_sigma),
-                ("rate_b", extras.gyro_sigma),
-            )
+            for name, sigma in sigmas.items()
         }
         return replace(
             sample,

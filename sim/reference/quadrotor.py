@@ -10,11 +10,19 @@ from sim.params import GRAVITY, VehicleParams
 from sim.reference import vehicle_blocks
 from sim.reference.rotation_arrays import cross, quat_dot
 
-# columns of a body: position 0:3, quaternion xyzw 3:7, velocity 7:10 (world, centre of mass), rate
-# 10:13 (body)
+# columns of a body: position, quaternion xyzw, velocity (world, centre of mass), rate (body)
+POS = slice(0, 3)
+QUAT = slice(3, 7)
+VEL = slice(7, 10)
+RATE = slice(10, 13)
 BODY = 13
-# columns of the blocks: set-point 0:3, gyro 3:6, integral 6:9, motor speed 9:13, used fraction 13,
-# voltage 14
+# columns of the blocks: set-point, gyro, integral, motor speed, used fraction, voltage
+SETPOINT = slice(0, 3)
+GYRO = slice(3, 6)
+INTEGRAL = slice(6, 9)
+MOTORS = slice(9, 13)
+USED = 13
+VOLTAGE = 14
 BLOCKS = 15
 
 
@@ -55,13 +63,12 @@ def initial_blocks(
     cell = vehicle.battery
     thrust = vehicle.thrust
     state = np.zeros((count, BLOCKS))
-    state[:, 0:3] = rate_b
-    state[:, 3:6] = rate_b
+    state[:, SETPOINT] = rate_b
+    state[:, GYRO] = rate_b
     voltage = np.full(count, cell.reference_voltage)
     for _ in range(50):
-        lift = (
-            weight / 4.0 / (1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage))
-        )
+        factor = 1.0 + thrust.voltage_coefficient * (voltage - cell.reference_voltage)
+        lift = weight / 4.0 / factor
         speed = 2.0 * lift / (thrust.k_1 + np.sqrt(thrust.k_1**2 + 4.0 * thrust.k_f * lift))
         if cell.kind == "ideal":
             break
@@ -69,10 +76,10 @@ def initial_blocks(
         power = vehicle_blocks.electrical_power(cell, np.repeat(speed[:, None], 4, 1), torque)
         source = vehicle_blocks.open_circuit_voltage(cell, used)
         voltage = (source + np.sqrt(source**2 - 4.0 * cell.resistance * power)) / 2.0
-    state[:, 9:13] = speed[:, None]
+    state[:, MOTORS] = speed[:, None]
     if cell.kind != "ideal":
-        state[:, 13] = used
-    state[:, 14] = voltage
+        state[:, USED] = used
+    state[:, VOLTAGE] = voltage
     return state
 
 
@@ -100,33 +107,35 @@ def vehicle_rates(
         Force [N] and torque [N m] about the centre of mass, body frame, shapes (E, 3), the state's
         time derivative, and the rotors' thrust [N], shape (E, 4).
     """
-    used = state[:, 13]
-    voltage = state[:, 14]
+    voltage = state[:, VOLTAGE]
     rates = np.zeros_like(state)
-    if vehicle.controller.kind == "geometric":
+    kind = vehicle.controller.kind
+    if kind == "geometric":
         setpoint = vehicle_blocks.geometric(vehicle, command, rate_b)
-    elif vehicle.controller.kind == "motor_mixing":
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = vehicle_blocks.motor_mixing(
-            vehicle, state[:, 0:9], command, rate_b, voltage
-        )
     else:
-        setpoint, rates[:, 0:3], rates[:, 3:6], rates[:, 6:9] = vehicle_blocks.betaflight(
-            vehicle, state[:, 0:3], state[:, 3:6], state[:, 6:9], command, rate_b, voltage
-        )
-    speed = setpoint if vehicle.motor.kind == "instant" else state[:, 9:13]
-    rates[:, 9:13] = vehicle_blocks.motor(vehicle.motor, speed, setpoint)
+        control = {
+            "betaflight": vehicle_blocks.betaflight,
+            "motor_mixing": vehicle_blocks.motor_mixing,
+        }[kind]
+        filters = (state[:, part] for part in (SETPOINT, GYRO, INTEGRAL))
+        setpoint, *slopes = control(vehicle, *filters, command, rate_b, voltage)
+        rates[:, SETPOINT], rates[:, GYRO], rates[:, INTEGRAL] = slopes
+    speed = setpoint if vehicle.motor.kind == "instant" else state[:, MOTORS]
+    rates[:, MOTORS] = vehicle_blocks.motor(vehicle.motor, speed, setpoint)
     thrust, torque = vehicle_blocks.thrust_map(
         vehicle.thrust, vehicle.battery.reference_voltage, speed, voltage, errors.thrust_gain
     )
-    thrust, torque = (np.reshape(near_ground, (-1, 1)) * part for part in (thrust, torque))
-    rates[:, 13], rates[:, 14] = vehicle_blocks.battery(
-        vehicle.battery, used, voltage, speed, torque
+    factor = np.reshape(near_ground, (-1, 1))
+    thrust = factor * thrust
+    torque = factor * torque
+    rates[:, USED], rates[:, VOLTAGE] = vehicle_blocks.battery(
+        vehicle.battery, state[:, USED], voltage, speed, torque
     )
     arms = rotor_arms(vehicle, errors)
     ratio = vehicle_blocks.drag_torque_ratio(vehicle.thrust)
     aero = vehicle_blocks.aerodynamics(vehicle.aero, arms, ratio, thrust, air_velocity_b, rate_b)
     force_b, torque_b = vehicle_blocks.composer(
-        vehicle.rotors, arms, thrust, torque, speed, rates[:, 9:13], rate_b, aero
+        vehicle.rotors, arms, thrust, torque, speed, rates[:, MOTORS], rate_b, aero
     )
     return force_b, torque_b, rates, thrust
 
@@ -138,10 +147,10 @@ def rigid_body_rates(
     torque [N m].
     """
     inertia = np.array(vehicle.body.inertia)
-    rate = body[:, 10:13]
+    rate = body[:, RATE]
     rates = np.empty_like(body)
-    rates[:, 0:3] = body[:, 7:10]
-    rates[:, 3:7] = quat_dot(body[:, 3:7], rate)
-    rates[:, 7:10] = force_w / vehicle.body.mass - np.array([0.0, 0.0, GRAVITY])
-    rates[:, 10:13] = (torque_b - cross(rate, inertia * rate)) / inertia
+    rates[:, POS] = body[:, VEL]
+    rates[:, QUAT] = quat_dot(body[:, QUAT], rate)
+    rates[:, VEL] = force_w / vehicle.body.mass - np.array([0.0, 0.0, GRAVITY])
+    rates[:, RATE] = (torque_b - cross(rate, inertia * rate)) / inertia
     return rates

@@ -224,11 +224,9 @@ class RopeDynamics:
             qpos = [*qpos, rope[2][:, None]]
             qvel = [*qvel, rope[3][:, None]]
         positions, velocities, wrenches, accelerations = self._bound[batch]
-        positions[ids], velocities[ids], wrenches[ids] = (
-            np.concatenate(qpos, 1),
-            np.concatenate(qvel, 1),
-            applied,
-        )
+        positions[ids] = np.concatenate(qpos, 1)
+        velocities[ids] = np.concatenate(qvel, 1)
+        wrenches[ids] = applied
         batch.forward(ids if len(ids) < self.count else None)
         return accelerations[ids]
 

@@ -52,9 +52,8 @@ def halving_rk4(
     difference = 0.5 * step * length(k2[:, direction] - k1[:, direction])[:, 0]
     pull = length(k3[:, velocity] - k2[:, velocity])[:, 0]
     phase = step * np.sqrt(pull / np.maximum(difference, 1e-12))
-    turn = step * np.sqrt(
-        np.max(np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1), axis=1)
-    )
+    speeds = np.square(after[:, velocity]).reshape(len(state), -1, 3).sum(-1)
+    turn = step * np.sqrt(np.max(speeds, axis=1))
     fine = (phase <= LARGEST_PHASE) & (turn <= LARGEST_TURN)  # false for NaN too
     coarse = ~fine & (step > 0.0)
     if depth < MOST_HALVINGS and np.any(coarse):
@@ -112,16 +111,15 @@ def crossing(
     """
 
     def path(s: float) -> np.ndarray:
-        bend = s * (1.0 - s)
-        straight = pos_0 + s * (pos_1 - pos_0)
-        return straight + bend * (
-            (1.0 - s) * (step * vel_0 - (pos_1 - pos_0)) - s * (step * vel_1 - (pos_1 - pos_0))
-        )
+        early = (1.0 - s) * (step * vel_0 - way)
+        late = s * (step * vel_1 - way)
+        return pos_0 + s * way + s * (1.0 - s) * (early - late)
 
-    low = 0.0
-    high = 1.0
     if pos_0[2] <= height:
         return 0.0, pos_0
+    way = pos_1 - pos_0
+    low = 0.0
+    high = 1.0
     for _ in range(60):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if path(middle)[2] > height else (low, middle)

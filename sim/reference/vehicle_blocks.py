@@ -52,12 +52,8 @@ def _layout(rotors: RotorParams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np
     x = np.array(rotors.x)
     y = np.array(rotors.y)
     spin = np.array(rotors.spin)
-    return (
-        np.stack((y / np.sum(y**2), -x / np.sum(x**2))),
-        spin,
-        np.flatnonzero(spin > 0.0),
-        np.flatnonzero(spin < 0.0),
-    )
+    tilting = np.stack((y / np.sum(y**2), -x / np.sum(x**2)))
+    return tilting, spin, np.flatnonzero(spin > 0.0), np.flatnonzero(spin < 0.0)
 
 
 def _motor_shares(
@@ -111,9 +107,8 @@ def mixer(
     demand = thrust[:, None] / 4.0 + tilt + clipped_yaw
     raise_by = np.maximum(f_min - demand.min(axis=1), 0.0)
     lower_by = np.maximum(demand.max(axis=1) - f_max, 0.0)
-    yaw_share = np.where(
-        clipped == amount, 1.0, np.abs(clipped) / np.maximum(np.abs(amount), 1e-300)
-    )
+    share = np.abs(clipped) / np.maximum(np.abs(amount), 1e-300)
+    yaw_share = np.where(clipped == amount, 1.0, share)
     return demand + (raise_by - lower_by)[:, None], scale, yaw_share
 
 
@@ -145,32 +140,30 @@ def betaflight(
     gains: ControllerParams = vehicle.controller
     setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
-    torque = np.array(gains.p_gain) * (setpoint - rate) + integral
-    torque = (
-        torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * setpoint_dot
-    )
+    error = setpoint - rate
+    torque = np.array(gains.p_gain) * error + integral
+    torque = torque - np.array(gains.d_gain) * gyro_dot
+    torque = torque + np.array(gains.feedforward_gain) * setpoint_dot
     relative = voltage / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
     thrusts, tilt_share, yaw_share = mixer(
         command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
     )
-    integral_dot = np.array(gains.i_gain) * (setpoint - rate)
+    integral_dot = np.array(gains.i_gain) * error
     growing = integral_dot * integral > 0.0
     full = np.abs(integral) >= np.array(gains.integral_limit)
     delivered = np.where(full, 0.0, np.array((tilt_share, tilt_share, yaw_share)).T)
     integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
-    return (
-        np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None],
-        setpoint_dot,
-        gyro_dot,
-        integral_dot,
-    )
+    speed = np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None]
+    return speed, setpoint_dot, gyro_dot, integral_dot
 
 
 def motor_mixing(
     vehicle: VehicleParams,
-    filters: np.ndarray,
+    low: np.ndarray,
+    gyro: np.ndarray,
+    integral: np.ndarray,
     command: np.ndarray,
     rate: np.ndarray,
     voltage: np.ndarray,
@@ -178,16 +171,16 @@ def motor_mixing(
     """Rate controller that mixes motor commands and relaxes its integral; arguments and result as
     of :func:`betaflight`.
 
-    ``filters`` are low-pass of the command, of the gyro, and integral, shape (E, 9).
+    ``low``: the low-pass of the command's rates [rad/s], shape (E, 3).
     """
     gains: ControllerParams = vehicle.controller
-    low, gyro, integral = np.split(filters, 3, axis=1)
     rate_command = command[:, 1:]
     low_dot = (rate_command - low) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
     error = rate_command - rate - np.array(gains.gyro_share) * (gyro - rate)
     torque = np.array(gains.p_gain) * error + integral
-    torque = torque - np.array(gains.d_gain) * gyro_dot + np.array(gains.feedforward_gain) * low_dot
+    torque = torque - np.array(gains.d_gain) * gyro_dot
+    torque = torque + np.array(gains.feedforward_gain) * low_dot
     relaxed = np.clip(1.0 - np.abs(rate_command - low) / gains.relax_threshold, 0.0, None)
     relaxed[:, 2] = 1.0
     integral_dot = np.array(gains.i_gain) * error * relaxed
@@ -197,20 +190,13 @@ def motor_mixing(
     idle = np.sqrt(gains.min_thrust / gains.max_thrust)
     added = added / np.maximum(np.ptp(added, axis=1) / (1.0 - idle), 1.0)[:, None]
     throttle = np.sqrt(np.maximum(command[:, :1], 0.0) / 4.0 / gains.max_thrust)
-    throttle = np.maximum(
-        np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True)),
-        idle - added.min(axis=1, keepdims=True),
-    )
+    throttle = np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True))
+    throttle = np.maximum(throttle, idle - added.min(axis=1, keepdims=True))
     relative = voltage / gains.calibration_voltage
-    factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * (
-        1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
-    )
-    return (
-        factor[:, None] * np.maximum(throttle + added, 0.0),
-        low_dot,
-        gyro_dot,
-        np.where(windup, 0.0, integral_dot),
-    )
+    correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
+    factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * correction
+    speed = factor[:, None] * np.maximum(throttle + added, 0.0)
+    return speed, low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)
 
 
 def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> np.ndarray:
@@ -277,12 +263,8 @@ def thrust_map(
         gain: error of each motor's thrust besides ``params.gain``, 1 for none, shape (E, 4).
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
-    thrust = (
-        (params.k_f * speed**2 + params.k_1 * speed)
-        * factor[:, None]
-        * np.array(params.gain)
-        * gain
-    )
+    thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None]
+    thrust = thrust * np.array(params.gain) * gain
     return thrust, drag_torque_ratio(params) * thrust
 
 
@@ -327,21 +309,17 @@ def aerodynamics(
         and of its drag torque [N m], shapes (E, 4).
     """
     if params.kind == "none":
-        return (
-            np.zeros_like(rate),
-            np.zeros_like(rate),
-            np.zeros_like(thrust),
-            np.zeros_like(thrust),
-        )
+        none = np.zeros_like(rate)
+        unchanged = np.zeros_like(thrust)
+        return none, none, unchanged, unchanged
     v = air_velocity_b
     force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
     force = force - params.parasitic * length(v) * v
     hub = v[:, None, :] + cross(rate[:, None, :], arms)
-    thrust_change = thrust * (
-        -params.inflow * hub[..., 2]
-        + params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
-    )
-    torque_change = torque_ratio * thrust * (-params.torque_inflow * hub[..., 2])
+    inwards = hub[..., 2]
+    lift = params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
+    thrust_change = thrust * (-params.inflow * inwards + lift)
+    torque_change = torque_ratio * thrust * (-params.torque_inflow * inwards)
     total = thrust.sum(axis=1)
     flapping = params.flapping * total[:, None] * (v @ _QUARTER_TURN)
     return force, flapping, thrust_change, torque_change
@@ -371,9 +349,8 @@ def composer(
     torque = flapping.copy()
     torque[:, 0] += np.sum(arms[..., 1] * lift, axis=1)
     torque[:, 1] -= np.sum(arms[..., 0] * lift, axis=1)
-    torque[:, 2] += np.sum(
-        spin * (rotor_torque + torque_change + rotors.inertia * speed_dot), axis=1
-    )
+    yaw = rotor_torque + torque_change + rotors.inertia * speed_dot
+    torque[:, 2] += np.sum(spin * yaw, axis=1)
     momentum = -rotors.inertia * np.sum(spin * speed, axis=1)
     torque[:, 0] -= rate[:, 1] * momentum
     torque[:, 1] += rate[:, 0] * momentum
@@ -403,7 +380,8 @@ def payload_force(
     airspeed = velocity_w - wind_w
     total = -drag * length(airspeed) * airspeed
     normal = velocity_w - np.sum(velocity_w * along_w, axis=1, keepdims=True) * along_w
-    return total - hanging[:, None] * (rope.swing_damping * normal + rope.downwash * lift_w)
+    friction = rope.swing_damping * normal
+    return total - hanging[:, None] * (friction + rope.downwash * lift_w)
 
 
 def release_lag(params: ReleaseParams, pull: np.ndarray, payload_mass: np.ndarray) -> np.ndarray:

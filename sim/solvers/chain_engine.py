@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import warp as wp
 
+from sim.kernels.exchange import build_body_access
 from sim.kernels.quadrotor.rigid_body import build_flow
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
@@ -47,6 +48,7 @@ def _kernel(world: World) -> wp.Kernel:
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
     extensions = extensions_of(world.vehicles, world.ropes) | {"push"}
+    load_bodies, store_bodies = build_body_access(t, L)
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
@@ -89,17 +91,11 @@ def _kernel(world: World) -> wp.Kernel:
         air.push_w = wrench.force_b[env]
         air.twist_b = wrench.torque_b[env]
         air.payload_push_w = wrench.load_w[env]
-        s = QuadState()
-        s.pos_w = bodies.pos_w[env]
-        s.quat_wb = bodies.quat_wb[env]
-        s.vel_w = bodies.vel_w[env]
-        s.rate_b = bodies.rate_b[env]
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         k = wp.zeros(shape=(L,), dtype=real)
+        s = load_bodies(bodies, env, QuadState(), n, u)
         for i in range(L):
-            n[i] = bodies.cable_dir_w[i, env]
-            u[i] = bodies.cable_vel_w[i, env]
             k[i] = state.stiffness[i, env]
         g = vec3(real(0.0), real(0.0), -gravity)
         s, _total, _fell_back = coupled.step(
@@ -118,16 +114,9 @@ def _kernel(world: World) -> wp.Kernel:
             h,
         )
         for i in range(L):
-            bodies.cable_dir_w[i, env] = n[i]
-            bodies.cable_vel_w[i, env] = u[i]
             if wp.isfinite(k[i]):
                 state.stiffness[i, env] = k[i]
-        bodies.pos_w[env] = s.pos_w
-        bodies.quat_wb[env] = s.quat_wb
-        bodies.vel_w[env] = s.vel_w
-        bodies.rate_b[env] = s.rate_b
         pos, vel = coupled.payload(rope, s, n, u)
-        bodies.payload_pos_w[env] = pos
-        bodies.payload_vel_w[env] = vel
+        store_bodies(bodies, env, s, n, u, pos, vel)
 
     return advance

@@ -117,12 +117,14 @@ def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
     def step() -> None:
         batch.ctrl[:] = ctrl.numpy()
         batch.step()
-        qpos.numpy()[:], qvel.numpy()[:] = batch.qpos, batch.qvel
+        qpos.numpy()[:] = batch.qpos
+        qvel.numpy()[:] = batch.qvel
 
     def placed(mask) -> None:
         rows = mask.numpy() != 0
         batch.expand("body_mass")[rows] = masses.numpy()[rows]
-        batch.qpos[rows], batch.qvel[rows] = qpos.numpy()[rows], qvel.numpy()[rows]
+        batch.qpos[rows] = qpos.numpy()[rows]
+        batch.qvel[rows] = qvel.numpy()[rows]
         batch.bind("qacc_warmstart")[rows] = 0.0
 
     return qpos, qvel, ctrl, masses, step, placed

@@ -33,7 +33,8 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
             _as_box(box, rope, -rope.payload_offset)
         if rope.gripper_mass > 0.0:
             gripper = last.add_body(name="gripper", pos=end)
-            gripper.mass, gripper.explicitinertial = rope.gripper_mass, True
+            gripper.mass = rope.gripper_mass
+            gripper.explicitinertial = True
             gripper.inertia = [GRIPPER_INERTIA] * 3
     for i, name in enumerate(("px", "py", "pz")):
         gear = [0.0] * 6
@@ -71,6 +72,8 @@ def _as_box(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
     """
     a, b, c = (side * side for side in rope.payload_sides)
     twelfth = rope.payload_mass / 12.0
-    body.mass, body.ipos, body.explicitinertial = rope.payload_mass, [0.0, 0.0, centre_z], True
+    body.mass = rope.payload_mass
+    body.ipos = [0.0, 0.0, centre_z]
+    body.explicitinertial = True
     body.inertia = [twelfth * (b + c), twelfth * (a + c), twelfth * (a + b)]
     body.add_site(name="payload", pos=[0.0, 0.0, centre_z])

@@ -18,7 +18,8 @@ from sim.params import RopeParams, VehicleParams
 from sim.solvers import World
 from sim.solvers.rods import AXIAL_INERTIA, Ints, build_place, vec3
 
-LOCKED, FREE = ("transX", "transY", "transZ", "rotZ"), ("rotX", "rotY")
+LOCKED = ("transX", "transY", "transZ", "rotZ")
+FREE = ("rotX", "rotY")
 SCENE = """#usda 1.0
 (
     metersPerUnit = 1
@@ -259,7 +260,9 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
         torque = wp.quat_rotate(q, wrench.torque_b[env])
         pos = bodies.pos_w[env]
         if not (wp.isfinite(force) and wp.isfinite(torque) and wp.isfinite(pos)):
-            force, torque, pos = vec3(), vec3(), vec3()
+            force = vec3()
+            torque = vec3()
+            pos = vec3()
         for k in range(3):
             out[row, 0, k] = force[k]
             out[row, 0, 3 + k] = torque[k]

@@ -4,8 +4,10 @@ import warp as wp
 
 from sim.solvers import World
 
-vec3, quat = wp.vec3f, wp.quatf
-Ints, Table = wp.array(dtype=wp.int32), wp.array2d(dtype=float)
+vec3 = wp.vec3f
+quat = wp.quatf
+Ints = wp.array(dtype=wp.int32)
+Table = wp.array2d(dtype=float)
 
 AXIAL_INERTIA = 1e-8
 """Of a rod about its axis [kg m^2]. Its joints pass the vehicle's yaw on, a cord does not: it must

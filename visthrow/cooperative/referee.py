@@ -25,7 +25,9 @@ class MujocoTeam:
         """Compile a model a world. Raises ValueError: another device than a CPU."""
         if world.device != "cpu":
             raise ValueError(f"the referee on {world.device}; expected 'cpu'")
-        self.world, self.team, self.worlds = world, team, world.count // team
+        self.world = world
+        self.team = team
+        self.worlds = world.count // team
         pairs, kinds = world.models()
         masses = [(pairs[kinds[row]][0].body, pairs[kinds[row]][1]) for row in range(world.count)]
         self._nominal = [_compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)]
@@ -41,27 +43,33 @@ class MujocoTeam:
         )
 
     def place(self, mask) -> None:
-        w, state = self.world, self.world.state
+        w = self.world
+        state = self.world.state
         wp.launch(self._kernel, w.count, [state, mask, self._rows, *self._arrays])
         pose, velocity, angles, rates = (array.numpy() for array in self._arrays)
         scale = state.mass_scale.numpy()
-        load, load_vel = w.bodies.payload_pos_w.numpy(), w.bodies.payload_vel_w.numpy()
+        load = w.bodies.payload_pos_w.numpy()
+        load_vel = w.bodies.payload_vel_w.numpy()
         placed = (mask.numpy() != 0).reshape(self.worlds, self.team).any(1)
         for world in np.flatnonzero(placed):
-            data, model = self._data[world], self._nominal[world]
+            data = self._data[world]
+            model = self._nominal[world]
             mujoco.mj_resetData(model, data)
             rows = range(world * self.team, (world + 1) * self.team)
             for k, row in enumerate(rows):
                 body = model.body(f"{k}_vehicle").id
                 model.body_mass[body] = w.vehicles[row % len(w.vehicles)].body.mass * scale[row]
-            data.qpos[:3], data.qvel[:3] = load[rows[0]], load_vel[rows[0]]
+            data.qpos[:3] = load[rows[0]]
+            data.qvel[:3] = load_vel[rows[0]]
             data.qpos[3:] = np.concatenate((pose[rows], angles[rows]), axis=1).flat
             data.qvel[3:] = np.concatenate((velocity[rows], rates[rows]), axis=1).flat
             self._show(world)
 
     def advance(self, duration: float) -> None:
-        wrench, attached = self.world.wrench, self.world.state.attached.numpy()
-        force, torque = wrench.force_b.numpy(), wrench.torque_b.numpy()
+        wrench = self.world.wrench
+        attached = self.world.state.attached.numpy()
+        force = wrench.force_b.numpy()
+        torque = wrench.torque_b.numpy()
         for world, data in enumerate(self._data):
             first = world * self.team
             for k in range(self.team):
@@ -72,14 +80,14 @@ class MujocoTeam:
 
     def _show(self, world: int) -> None:
         """Copy a world's bodies into the arrays of the exchange."""
-        model, data, bodies = self._nominal[world], self._data[world], self.world.bodies
+        model = self._nominal[world]
+        data = self._data[world]
+        bodies = self.world.bodies
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_comVel(model, data)
-        self.load_pos_w.numpy()[world], self.load_vel_w.numpy()[world] = (
-            data.qpos[:3],
-            data.qvel[:3],
-        )
+        self.load_pos_w.numpy()[world] = data.qpos[:3]
+        self.load_vel_w.numpy()[world] = data.qvel[:3]
         places = data.qpos[3:].reshape(self.team, -1)
         speeds = data.qvel[3:].reshape(self.team, -1)
         for k in range(self.team):
@@ -100,17 +108,20 @@ class MujocoTeam:
 def _compile(members: list[tuple]) -> "mujoco.MjModel":
     """Model of a world from the bodies and ropes of its vehicles."""
     spec = new_spec(constraints=True)
-    spec.option.timestep, spec.option.integrator = STEP, mujoco.mjtIntegrator.mjINT_RK4
+    spec.option.timestep = STEP
+    spec.option.integrator = mujoco.mjtIntegrator.mjINT_RK4
     load = spec.worldbody.add_body(name="load")
     load.mass = sum(rope.payload_mass for _, rope in members)
-    load.inertia, load.explicitinertial = [1e-6] * 3, True
+    load.inertia = [1e-6] * 3
+    load.explicitinertial = True
     load.add_site(name="load")
     for axis in np.eye(3):
         load.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
     for k, (body, rope) in enumerate(members):
         spec.attach(_vehicle(body, rope), prefix=f"{k}_", frame=spec.worldbody.add_frame())
         hold = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")
-        hold.objtype, hold.solref = mujoco.mjtObj.mjOBJ_SITE, list(STIFF)
+        hold.objtype = mujoco.mjtObj.mjOBJ_SITE
+        hold.solref = list(STIFF)
         hold.solimp = [0.9999, 0.9999, 0.001, 0.5, 2.0]
     return spec.compile()
 
@@ -118,7 +129,8 @@ def _compile(members: list[tuple]) -> "mujoco.MjModel":
 def _vehicle(body, rope: RopeParams) -> "mujoco.MjSpec":
     """A vehicle with its cable and the site ``end`` at the cable's lower end."""
     spec = new_spec(constraints=True)
-    vehicle, mount = add_vehicle(spec, body), list(rope.mount)
+    vehicle = add_vehicle(spec, body)
+    mount = list(rope.mount)
     last = add_chain(
         spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=False
     )

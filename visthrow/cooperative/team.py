@@ -84,11 +84,15 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
     A share ``faulty`` of :data:`LEVELS` worlds has a weak vehicle, as many a late latch, evenly
     over their ranges; they repeat.
     """
-    team, vehicle, release = experiment.team, experiment.vehicle, experiment.release
-    vehicles, releases = [], []
+    team = experiment.team
+    vehicle = experiment.vehicle
+    release = experiment.release
+    vehicles = []
+    releases = []
     faults = round(team.faulty * LEVELS)
     for world in range(LEVELS):
-        weak, late = world < faults, world >= LEVELS - faults
+        weak = world < faults
+        late = world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
         gain = between(team.weak, part) if weak else 1.0
         delay = between(team.late, part) if late else 0.0

@@ -66,7 +66,8 @@ def load(name: str, solver: str) -> tuple[Any, Any, Any]:
             f"no policy '{name}', neither a file nor shipped; {suggest(name, POLICIES)}"
         )
     policy = Policy.load(file)
-    changes, build = [], None
+    changes = []
+    build = None
     if solver == "mujoco":
         changes = ["rope.segments=15"]
         module = "visthrow.cooperative.referee"
@@ -105,7 +106,8 @@ def _compare(args: argparse.Namespace) -> int:
     from visthrow.cooperative.team_training import throw
     from visthrow.view.parts import aligned
 
-    rows, cells = [], []
+    rows = []
+    cells = []
     for name in args.policies:
         experiment, policy, build = load(name, args.solver)
         for fault in FAULTS:

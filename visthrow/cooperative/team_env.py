@@ -66,10 +66,15 @@ class TeamEnv(VecEnv):
             count: number of vehicles; default the experiment's.
             build: another solver of the bodies, as of :class:`TeamSim`.
         """
-        self.cfg, self.device, task, team = experiment, device, experiment.task, experiment.team
+        self.cfg = experiment
+        self.device = device
+        task = experiment.task
+        team = experiment.team
         self.rows = count or experiment.ppo.environments
-        self.num_envs, self.num_actions = self.rows // team.flown, team.flown * act.ACTIONS
-        self.team, self.worlds = team.vehicles, self.rows // team.vehicles
+        self.num_envs = self.rows // team.flown
+        self.num_actions = team.flown * act.ACTIONS
+        self.team = team.vehicles
+        self.worlds = self.rows // team.vehicles
         if self.rows % self.team:
             raise ValueError(f"{self.rows} rows; expected a multiple of {self.team}")
         self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
@@ -103,9 +108,12 @@ class TeamEnv(VecEnv):
 
     def _remembered(self) -> dict[str, Tensor]:
         """The buffers that an episode carries beside the simulator's state."""
-        rows, worlds, make = self.rows, self.worlds, {"device": self.device}
+        rows = self.rows
+        worlds = self.worlds
+        make = {"device": self.device}
         steps = 2 + math.ceil(self.cfg.team.age[1] / self.cfg.sim.control_period)
-        history, payload = 1 + self.layout.history, self.layout.payload
+        history = 1 + self.layout.history
+        payload = self.layout.payload
         shapes = {
             "previous": (rows, act.ACTIONS),
             "history": (rows, history, payload),
@@ -188,7 +196,8 @@ class TeamEnv(VecEnv):
 
         Latches trip together, where all asked as long ago as the members know of one another.
         """
-        task, memory = self.cfg.task, self._memory
+        task = self.cfg.task
+        memory = self._memory
         action = act.clip_action(actions)
         noise = torch.randn_like(memory["command_bias"]) * task.noise.command_step
         noisy = action[:, : act.COMMANDS] + noise + memory["command_bias"]
@@ -214,8 +223,10 @@ class TeamEnv(VecEnv):
         Vehicles are spheres of the propellers' reach; a vehicle's own cable is the simulator's to
         judge (``ROPE_IN_ROTOR``), cables meet at the load.
         """
-        state, reach = self.views.state, self.cfg.team.rotor_reach
-        pos, attached = state["pos_w"], state["attached"] != 0
+        state = self.views.state
+        reach = self.cfg.team.rotor_reach
+        pos = state["pos_w"]
+        attached = state["attached"] != 0
         steps = state["cable_dir_w"].cumsum(0) * self._segment[:, None]
         arm = ob.rotation_from_quat(state["quat_wb"]) @ self._mount
         joints = (pos + arm + steps).transpose(0, 1)
@@ -230,7 +241,8 @@ class TeamEnv(VecEnv):
 
     def _landed(self, time: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Worlds whose last vehicle has let go in this step, and what follows from it."""
-        out, memory = self.views.out, self._memory
+        out = self.views.out
+        memory = self._memory
         separated = self._worlds(out["separated"]) != 0
         attached = self._worlds(self.views.state["attached"] != 0).any(1)
         when = torch.where(separated, self._worlds(out["separation_time"]), -1.0)
@@ -243,7 +255,8 @@ class TeamEnv(VecEnv):
         end = begin + when.amax(1)
         chosen["duration"] = end + chosen["time_to_impact"]
         chosen["apart"] = end - memory["first"]
-        chosen["load_w"], chosen["load_vel_w"] = self.load_w.clone(), self.load_vel_w.clone()
+        chosen["load_w"] = self.load_w.clone()
+        chosen["load_vel_w"] = self.load_vel_w.clone()
         chosen["clearance"] = self._clearance(chosen["time_to_impact"])
         return separated.any(1) & ~attached, chosen
 
@@ -256,9 +269,14 @@ class TeamEnv(VecEnv):
 
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Rewards of the rows and ends of the worlds of the step just made."""
-        task, state, team = self.cfg.task, self.views.state, self.cfg.team
-        p, period, release = task.reward, self.cfg.sim.control_period, self.cfg.release
-        time, load = self.episode_length_buf * period, self._rows(self.load_w)
+        task = self.cfg.task
+        state = self.views.state
+        team = self.cfg.team
+        p = task.reward
+        period = self.cfg.sim.control_period
+        release = self.cfg.release
+        time = self.episode_length_buf * period
+        load = self._rows(self.load_w)
         released, landing = self._landed(time[:: self.team])
         gap = self.gap()
         contact = (gap < 0.0) & ~released
@@ -294,7 +312,9 @@ class TeamEnv(VecEnv):
 
     def _start(self, fresh: Tensor) -> None:
         """Start worlds where ``fresh``, bool, shape (W,)."""
-        task, memory, noise = self.cfg.task, self._memory, self.cfg.task.noise
+        task = self.cfg.task
+        memory = self._memory
+        noise = self.cfg.task.noise
         rows = self._rows(fresh)
         mask = rows.to(torch.int32)
         with on_torch_stream(self.device):
@@ -323,7 +343,9 @@ class TeamEnv(VecEnv):
 
     def _form(self, fresh: Tensor) -> None:
         """Move the vehicles that were drawn into a formation around the load, and draw a goal."""
-        team, state, goal = self.cfg.team, self.views.state, self.views.goal_w
+        team = self.cfg.team
+        state = self.views.state
+        goal = self.views.goal_w
         draw = torch.rand(self.worlds, 4, device=self.device)
         heading = 2.0 * math.pi * draw[:, 0]
         distance = between(team.goal, draw[:, 1])
@@ -359,8 +381,11 @@ class TeamEnv(VecEnv):
     @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state; ``fresh``: rows that begin."""
-        state, memory, noise = self.views.state, self._memory, self.cfg.task.noise
-        load, goal = self._rows(self.load_w), self.views.goal_w
+        state = self.views.state
+        memory = self._memory
+        noise = self.cfg.task.noise
+        load = self._rows(self.load_w)
+        goal = self.views.goal_w
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
         poses = hist.push(memory["poses"], torch.cat([vehicle, load], -1), fresh)
@@ -408,7 +433,8 @@ class TeamEnv(VecEnv):
 
     def _see(self, pose: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints of goal and load in each vehicle's camera, with noise."""
-        rot_wb, load = ob.rotation_in(pose), pose[:, ob.VEHICLE :]
+        rot_wb = ob.rotation_in(pose)
+        load = pose[:, ob.VEHICLE :]
         points, valid = keypoints(self.camera, pose[:, :3], rot_wb, goal, load)
         draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
         bias = self._memory["keypoint_bias"]
@@ -416,7 +442,8 @@ class TeamEnv(VecEnv):
 
     def _privileged(self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor) -> Tensor:
         """Critic's view."""
-        state, memory = self.views.state, self._memory
+        state = self.views.state
+        memory = self._memory
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
         history = hist.push(memory["true_history"], offset[:, 2:], fresh)
         memory["true_history"].copy_(history)

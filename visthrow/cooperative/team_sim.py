@@ -30,7 +30,8 @@ class TeamSim(HybridSim):
         """
         if team < 1:
             raise ValueError(f"a team of {team} vehicles; expected 1 or more")
-        self.team, self.worlds = team, worlds
+        self.team = team
+        self.worlds = worlds
         self._build = options.pop("build", TreeSolver)
         super().__init__(params, worlds * team, *args, **options)
         if unknown := sorted(LOADS & self.extensions):

@@ -52,7 +52,8 @@ class TeamTraining(PPOTraining):
 
         Schedules follow the time where no number of iterations is named.
         """
-        start, count = time.perf_counter(), 0
+        start = time.perf_counter()
+        count = 0
         done = 0.0
         while done < 1.0:
             with rounded_products(True):

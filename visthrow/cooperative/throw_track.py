@@ -53,7 +53,8 @@ def record_throw(
         pos = state["pos_w"].numpy(force=True).copy()
         turn = rotation_from_quat(state["quat_wb"]).numpy(force=True)
         frames = pos[:, None, None] + np.einsum("vij,abj->vabi", turn, DIAGONALS)
-        attached, load = state["attached"].numpy(force=True) != 0, env.load_w[0].numpy(force=True)
+        attached = state["attached"].numpy(force=True) != 0
+        load = env.load_w[0].numpy(force=True)
         rows.append((pos, frames, env.sim.cable_points_w(), attached, load.copy()))
 
     values = fly(experiment, policy, count=1, record=record, **options)

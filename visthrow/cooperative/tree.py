@@ -71,7 +71,8 @@ class TreeSolver:
     capturable = True
 
     def __init__(self, world: World, team: int) -> None:
-        self.world, self.team = world, team
+        self.world = world
+        self.team = team
         self.worlds = world.count // team
         vec3 = world.types.vec3
         self.load_pos_w, self.load_vel_w = (

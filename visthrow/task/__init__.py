@@ -31,7 +31,8 @@ Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
 Share = Annotated[float, Bound(0.0, 1.0, "(]")]
 
-AIR_DENSITY, SOUND = 1.2, 343.0  # of air at 20 degrees [kg/m^3], [m/s]
+AIR_DENSITY = 1.2
+SOUND = 343.0  # of air at 20 degrees [kg/m^3], [m/s]
 
 
 @dataclass(frozen=True)

@@ -5,38 +5,25 @@ Markdown for people, CSV for programs. Every table says which plant it was measu
 
 import csv
 import io
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from visthrow.view.parts import aligned
 
-PAPER = {
-    ("state", 1.5): (0.082, 0.035, 1.090, 0.009),
-    ("state", 2.0): (0.105, 0.099, 1.154, 0.015),
-    ("state", 2.5): (0.133, 0.082, 1.188, 0.015),
-    ("vision", 1.5): (0.101, 0.058, 1.051, 0.011),
-    ("vision", 2.0): (0.101, 0.106, 1.125, 0.029),
-    ("TO+MPC", 1.5): (0.127, 0.019, 1.546, 0.010),
-    ("TO+MPC", 2.0): (0.167, 0.033, 1.605, 0.016),
-    ("TO+MPC", 2.5): (0.285, 0.026, 1.648, 0.012),
-}
-"""Layout and target -> landing error [m] and duration [s], mean and deviation, ten throws each
-(Tables III and VI): policies on the paper's vehicle, the model-based TO+MPC in its own simulated
-pendulum.
-"""
+_TABLES = tomllib.loads(Path(__file__).with_name("paper.toml").read_text(encoding="utf-8"))
 
-PAPER_ABLATIONS = {
-    "full": (0.105, 0.099, 1.154, 0.015, "groups about the target"),
-    "no_aerodynamics": (0.342, 0.085, 1.069, 0.008, "undershoots"),
-    "no_motor_lag": (0.254, 0.134, 1.109, 0.032, "undershoots"),
-    "simple_controller": (0.386, 0.103, 1.115, 0.042, "overshoots, lateral bias"),
-    "rigid_cable": (0.306, 0.051, 1.049, 0.009, "undershoots"),
+PAPER = {
+    (layout, float(target)): tuple(figures)
+    for layout, rows in _TABLES["throws"].items()
+    for target, figures in rows.items()
 }
-"""Variant -> landing error [m] and duration [s], mean and deviation, and where the throws land:
-five throws each of the paper's vehicle at 2.0 m, ten for the full model (Table V and the scatter
-beside it).
-"""
+"""Layout and target [m] -> landing error [m] and duration [s], mean and deviation."""
+
+PAPER_ABLATIONS = {name: tuple(figures) for name, figures in _TABLES["ablations"].items()}
+"""Variant -> landing error [m] and duration [s], mean and deviation, and where the throws land."""
 
 PAPER_NOTE = (
     "The paper's figures are ten throws a target, of a real vehicle for policies and in its own"

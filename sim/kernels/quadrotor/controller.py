@@ -29,7 +29,10 @@ def clip_yaw(p: Any, roll_pitch: Any, yaw: Any, room: Any):
     roll and pitch.
     """
     big = type(yaw)(1.0e6)
-    high_plus, low_plus, high_minus, low_minus = -big, big, -big, big
+    high_plus = -big
+    low_plus = big
+    high_minus = -big
+    low_minus = big
     for i in range(4):
         if p.rotors.spin[i] > yaw - yaw:
             high_plus = wp.max(high_plus, roll_pitch[i])
@@ -118,7 +121,8 @@ def rate_controller_motor_mixing(
     Returns what `rate_controller_betaflight` does; the set-point filter is that of iterm_relax.
     """
     c = p.controller
-    zero, one = voltage - voltage, type(voltage)(1.0)
+    zero = voltage - voltage
+    one = type(voltage)(1.0)
     rate_command = type(rate_b)(command[1], command[2], command[3])
     setpoint_rate = (rate_command - setpoint) / c.setpoint_time_constant
     gyro_rate = (rate_b - gyro) / c.gyro_time_constant
@@ -137,7 +141,8 @@ def rate_controller_motor_mixing(
         - wp.cw_mul(c.d_gain, gyro_rate)
         + wp.cw_mul(c.feedforward_gain, setpoint_rate)
     )
-    two, quarter = type(voltage)(2.0), type(voltage)(0.25)
+    two = type(voltage)(2.0)
+    quarter = type(voltage)(0.25)
     idle = wp.sqrt(c.min_thrust / c.max_thrust)
     share = p.mixer.roll * torque[0] + p.mixer.pitch * torque[1] + p.mixer.yaw * torque[2]
     share = share / (two * wp.sqrt(c.mix_thrust * c.max_thrust))

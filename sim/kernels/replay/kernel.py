@@ -25,7 +25,9 @@ EVERYTHING = frozenset(
     EXTENSIONS
 )  # the replay has every extension built in, so that lanes may differ in all of them
 
-ATTACHED, LOOSE, NO_PAYLOAD = 1, 0, 2  # how the payload starts: on the rope, flying, or not there
+ATTACHED = 1
+LOOSE = 0
+NO_PAYLOAD = 2  # how the payload starts: on the rope, flying, or not there
 
 STATE_FIELDS = {
     **QUAD_STATE,
