@@ -191,8 +191,7 @@ class HybridSim:
         Args:
             params: the plant; its kinds and numerics hold for all.
             count: number of environments E.
-            device: Warp device, "cpu" or "cuda:0".
-            seed: of :meth:`randomize`.
+            device: Warp device, "cpu" or "cuda:0". seed: of :meth:`randomize`.
             vehicles: of environment e at ``e % len(vehicles)``; default ``[params.vehicle]``.
             ropes, airs, releases: likewise; all ropes with the same number of segments.
             direct: by-pass the blocks: commands are thrust [N] and torque [N m].
