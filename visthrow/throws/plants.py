@@ -133,10 +133,9 @@ class HybridPlant:
         if start is None:
             self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
         else:
+            # as ThrowEnv, which draws once when it is built and once when it is reset
             self._sim.randomize(start)
-            self._sim.randomize(
-                start
-            )  # as ThrowEnv, which draws once when it is built and once when it is reset
+            self._sim.randomize(start)
             self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
             self._begin()
 
@@ -155,9 +154,8 @@ class HybridPlant:
         self._bias = bias * self._rng.standard_normal((5, count, 3))
         self._age = self._rng.uniform(*self.latency, count)
         self._error = np.zeros((5, count, 3))
-        self._past = [self.state] * max(
-            math.ceil(self.latency[1] / self.period - 1e-9), 1
-        )  # newest first
+        # newest first
+        self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)
 
     def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
@@ -175,9 +173,10 @@ class HybridPlant:
             elif rope is None and separated[e]:
                 separation_time = float(self._sim.get("separation_time")[e])
                 self._separation[e] = self.time + separation_time
-                self._ropes[e] = self._let_go(e)
+                loose = self._let_go(e)
                 if self.period - separation_time > 1e-6:
-                    self._ropes[e].fly(self.period - separation_time)
+                    loose.fly(self.period - separation_time)
+                self._ropes[e] = loose
         self.time += self.period
 
     def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
@@ -222,42 +221,33 @@ class HybridPlant:
 
         max_thrust = self._action.max_thrust
         rates = torch.tensor(self._action.max_rate, dtype=torch.float64)
-        action = act.action_from_command(
-            torch.from_numpy(np.asarray(command, dtype=float)), max_thrust, rates
-        )
-        error = self._command_bias + self.noise.command_step * self._rng.standard_normal(
-            (self.count, 4)
-        )
-        return act.command_from_action(action + torch.from_numpy(error), max_thrust, rates).numpy()
+        wanted = torch.from_numpy(np.asarray(command, dtype=float))
+        action = act.action_from_command(wanted, max_thrust, rates)
+        noise = self.noise.command_step * self._rng.standard_normal((self.count, 4))
+        action = action + torch.from_numpy(self._command_bias + noise)
+        return act.command_from_action(action, max_thrust, rates).numpy()
 
     def _let_go(self, e: int) -> LooseRope:
         """Rope of one plant at separation: the simulator keeps its directions and rates of that
         instant.
         """
         rope = self.params.rope
-        ball, ball_vel = (
-            self._sim.get(name)[e].astype(float) for name in ("payload_pos_w", "payload_vel_w")
-        )
-        link = rope.length / rope.segments
-        direction, turn = (
-            self._sim.get(name)[e].astype(float) for name in ("cable_dir_w", "cable_vel_w")
-        )
+        arrays = self.look("payload_pos_w", "payload_vel_w", "cable_dir_w", "cable_vel_w")
+        ball, ball_vel, direction, turn = (array[e] for array in arrays)
 
         def upwards(end: np.ndarray, step: np.ndarray) -> np.ndarray:
             knot = end - rope.payload_offset * step[-1]
-            above = knot - link * np.cumsum(step[::-1], axis=0)[::-1]
+            above = knot - rope.segment_length * np.cumsum(step[::-1], axis=0)[::-1]
             return np.vstack((above, knot))
 
         return LooseRope(upwards(ball, direction), upwards(ball_vel, turn), ball, ball_vel)
 
     def _ball(self) -> tuple[np.ndarray, np.ndarray]:
         """Ball in flight: position and velocity; at rest after landing."""
-        pos = self._sim.get("payload_pos_w").astype(float)
-        vel = self._sim.get("payload_vel_w").astype(float)
         landing = self.landing
-        pos, vel = flown(
-            self.params.rope, self.params.air, pos, vel, np.nan_to_num(self.time - self._separation)
-        )
+        since = np.nan_to_num(self.time - self._separation)
+        start = self.look("payload_pos_w", "payload_vel_w")
+        pos, vel = flown(self.params.rope, self.params.air, *start, since)
         down = landing.landed[:, None]
         return np.where(down, landing.point_w, pos), np.where(down, 0.0, vel)
 
@@ -268,25 +258,21 @@ class HybridPlant:
         return self._state
 
     def _snapshot(self) -> Snapshot:
-        sim = self._sim
         ball, ball_vel = self._ball()
-        points = sim.cable_points_w()
+        points = self._sim.cable_points_w()
         for e, rope in enumerate(self._ropes):
             if rope is not None:
                 points[e] = rope.points_w(ball[e])
-        body = {
-            name: sim.get(name).astype(float)
-            for name in ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
-        }
+        names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
         return Snapshot(
             self.time,
             payload_pos_w=ball,
             payload_vel_w=ball_vel,
             cable_points_w=points,
-            battery_voltage=sim.get("voltage").astype(float),
-            attached=sim.get("attached") != 0,
+            battery_voltage=self.look("voltage")[0],
+            attached=self._sim.get("attached") != 0,
             latched=self._latched.copy(),
-            **body,
+            **dict(zip(names, self.look(*names))),
         )
 
     def measured(self) -> Snapshot:
@@ -327,10 +313,9 @@ class HybridPlant:
     def landing(self) -> PayloadLandings:
         impact = self._separation + self._sim.get("time_to_impact")
         landed = ~np.isnan(self._separation) & (impact <= self.time + 1e-9)
-        point = np.where(landed[:, None], self._sim.get("landing_w").astype(float), np.nan)
-        return PayloadLandings(
-            landed, point, np.where(landed, impact, np.nan), self._separation.copy()
-        )
+        point = np.where(landed[:, None], self.look("landing_w")[0], np.nan)
+        when = np.where(landed, impact, np.nan)
+        return PayloadLandings(landed, point, when, self._separation.copy())
 
 
 class ReferenceAdapter:
@@ -348,11 +333,9 @@ class ReferenceAdapter:
         from sim.reference.reference_extras import ReferenceExtras
 
         latency = float(np.mean(experiment.task.observation.latency))
-        trained = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)
+        extras = ReferenceExtras(mocap_latency=latency, payload_drag=experiment.rope.payload_drag)
         if realistic:
             extras = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
-        else:
-            extras = trained
         self.name = "reference-realistic" if realistic else "reference"
         self.params = plant_of(experiment)
         self.count = count
@@ -418,14 +401,8 @@ def make_plant(
     latency.
     """
     if known_plant(name) == "hybrid":
-        return HybridPlant(
-            experiment,
-            count,
-            seed,
-            device,
-            experiment.task.noise,
-            experiment.task.observation.latency,
-        )
+        task = experiment.task
+        return HybridPlant(experiment, count, seed, device, task.noise, task.observation.latency)
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
 
 
