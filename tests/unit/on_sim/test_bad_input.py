@@ -7,23 +7,16 @@ from pytest import mark, raises
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.structs import types
-from sim.params import PlantParams
+from sim.params import PlantParams, changed
 from tests.plants import paper_plant
 from tests.simulators import bare_quadrotor
 from visthrow import config
 from visthrow.task import TaskParams
 
 
-def changed(path: str, value) -> PlantParams:
+def plant_with(path: str, value) -> PlantParams:
     """The paper's plant with one field, dotted, changed."""
-    plant = paper_plant()
-    names = path.split(".")
-    owners = [plant]
-    for name in names[:-1]:
-        owners.append(getattr(owners[-1], name))
-    for owner, name in zip(reversed(owners), reversed(names)):
-        value = replace(owner, **{name: value})
-    return value
+    return changed(paper_plant(), {path: value})
 
 
 NAN = float("nan")
@@ -59,13 +52,13 @@ PLANT = [
 @mark.parametrize(("path", "value", "message"), VEHICLE + PLANT)
 def test_bad_plants_are_refused(path, value, message):
     with raises(ValueError, match=message):
-        HybridSim(changed(path, value), 1)
+        HybridSim(plant_with(path, value), 1)
 
 
 @mark.parametrize(("path", "value", "message"), VEHICLE)
 def test_bad_vehicles_are_refused_alone_too(path, value, message):
     with raises(ValueError, match=message):
-        bare_quadrotor(changed(path, value).vehicle, 1)
+        bare_quadrotor(plant_with(path, value).vehicle, 1)
 
 
 @mark.parametrize(
@@ -87,7 +80,7 @@ def test_wrenches_and_engines_that_do_not_fit():
     plant = paper_plant()
     with raises(ValueError, match="extension 'push'"):
         HybridSim(plant, 1).set_wrench(np.zeros((1, 3)), np.zeros((1, 3)))
-    exchanged = changed("sim.solver", "exchanged_chain")
+    exchanged = plant_with("sim.solver", "exchanged_chain")
     with raises(ValueError, match=r"without a rope in sim\.solver 'exchanged_chain'"):
         HybridSim(exchanged, 1, without_rope="rk4")
 
@@ -101,7 +94,7 @@ def test_other_kinds_of_blocks_in_one_batch():
     """A kernel is built for one choice of blocks; a vehicle of another would silently fly with the
     wrong ones.
     """
-    other = changed("vehicle.aero.kind", "none").vehicle
+    other = plant_with("vehicle.aero.kind", "none").vehicle
     plant = paper_plant()
     with raises(ValueError, match=r"'none'.*expected the same blocks"):
         HybridSim(plant, 2, vehicles=[plant.vehicle, other])
@@ -181,3 +174,11 @@ def test_get_is_a_copy():
         for name in names:
             np.testing.assert_array_equal(got[name], kept[name])
             assert np.any(sim.get(name) != kept[name]), name
+
+
+def test_fields_that_fit_only_together_change_together():
+    vehicle = {"motor.kind": "asymmetric", "motor.time_constant_down": 0.05}
+    motor = changed(paper_plant().vehicle, vehicle).motor
+    assert (motor.kind, motor.time_constant_down) == ("asymmetric", 0.05)
+    with raises(TypeError, match="no_such"):
+        changed(paper_plant(), {"rope.no_such": 1.0})
