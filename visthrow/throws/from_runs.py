@@ -22,6 +22,7 @@ NOTE = (
 
 
 TICKS = "ticks.jsonl"  # of a run, a tick a line
+MOST_NAMES = 10  # of files that an error names
 
 
 def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
@@ -33,7 +34,8 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
         paths = sorted(folder.glob(PATTERN))
         if not paths:
             if folder.is_dir():
-                hint = ", ".join(sorted(path.name for path in folder.iterdir()))
+                names = sorted(path.name for path in folder.iterdir())
+                hint = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
             else:
                 hint = "no such folder"
             ticks = folder / TICKS

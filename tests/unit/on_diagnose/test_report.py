@@ -15,7 +15,7 @@ from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-from visthrow.diagnose.reporting import blackbox, blind, gain
+from visthrow.diagnose.reporting import blackbox, blind, explain_cli, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.select import result, search
 from visthrow.diagnose.throw.landing import PredictedLandings
@@ -286,6 +286,19 @@ def test_the_report_of_nothing_is_whole_too(tmp_path):
         tmp_path, "Nothing", report.sentence_of(diagnosis), report.sections(diagnosis)
     )
     assert "NO EFFECT" in paths[0].read_text(encoding="utf-8")
+
+
+def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):
+    def full(*_):
+        raise OSError("no space left")
+
+    model, diagnosis = found
+    monkeypatch.setattr(page, "write", full)
+    monkeypatch.setattr(model, "step_error", dict, raising=False)
+    with raises(OSError, match="no space"):
+        explain_cli.write_report(tmp_path, diagnosis, model, [], 0, limits=False)
+    assert "KNOWN" in capsys.readouterr().out
+    assert '"KNOWN"' in (tmp_path / explain_cli.DIAGNOSIS).read_text(encoding="utf-8")
 
 
 def test_the_recording_is_written(tmp_path, found):

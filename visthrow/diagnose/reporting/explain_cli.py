@@ -61,12 +61,13 @@ def run(args: argparse.Namespace) -> int:
     gain = None
     if args.no_report:
         write_json(folder / DIAGNOSIS, report.to_json(diagnosis, extra=made_with))
-    elif diagnosis.work is not None:
+    if args.no_report or diagnosis.work is None:
+        print("\n" + report.summary(diagnosis))
+    else:
         limits = not args.no_blind
         gain = write_report(
             folder, diagnosis, opened.model, opened.logs, args.seed, limits, made_with
         )
-    print("\n" + report.summary(diagnosis, gain))
     tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
     if args.no_report:
         print(f"JSON: {folder / DIAGNOSIS}")
@@ -129,7 +130,8 @@ def write_report(
     limits: bool = True,
     made_with: Mapping[str, Any] | None = None,
 ):
-    """Write page, JSON, pictures and recording; returns the gain on held-out flights.
+    """Print the summary, write JSON, page, pictures and recording; returns the gain on held-out
+    flights.
 
     ``made_with``: see :func:`visthrow.diagnose.inputs.model_arguments.made_with`.
     """
@@ -153,13 +155,6 @@ def write_report(
         "commit": origin["commit"],
         "time": origin["time"],
     }
-    parts = report.sections(diagnosis, measured, hidden, step_check=steps, provenance=source)
-    page.write(
-        folder,
-        "What the simulation gets wrong about these flights",
-        report.sentence_of(diagnosis),
-        parts,
-    )
     table = (
         blackbox.unexplained(diagnosis.work.after, seed)
         if diagnosis.overall == result.UNKNOWN
@@ -167,6 +162,14 @@ def write_report(
     )
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
-    write_json(folder / DIAGNOSIS, whole)
+    write_json(folder / DIAGNOSIS, whole)  # before pictures, which a full disk may refuse
+    print("\n" + report.summary(diagnosis, measured))
+    parts = report.sections(diagnosis, measured, hidden, step_check=steps, provenance=source)
+    page.write(
+        folder,
+        "What the simulation gets wrong about these flights",
+        report.sentence_of(diagnosis),
+        parts,
+    )
     recording.write(folder / "diagnosis.rrd", diagnosis, logs)
     return measured
