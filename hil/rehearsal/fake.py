@@ -13,7 +13,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from hil.links.backends.thrust_curve import HoverThrustParams
-from hil.links.device import Port, chunks
+from hil.links.device import Port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.roster import SIMULATED
@@ -478,28 +478,6 @@ class Fake(ABC):
     def close(self) -> None:
         """Give the ports back."""
         self.link.close()
-
-
-class PortFake(Fake):
-    """An autopilot whose commands come by a port of its own, beside the link of the
-    motion capture.
-    """
-
-    thrust_map = THRUST
-
-    @abstractmethod
-    def came(self, data: bytes) -> None:
-        """Take what came on the port."""
-
-    def hear(self) -> None:
-        for data in chunks(self.port):
-            self.heard = self.wall()
-            self.came(data)
-        super().hear()
-
-    def close(self) -> None:
-        super().close()
-        self.port.close()
 
 
 class Bridge(Fake):

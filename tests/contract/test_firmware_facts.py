@@ -44,8 +44,7 @@ CHOICES = {
     "hil/links/writer.py": "MOST_WAITING WRITE_EVERY",
     "hil/rehearsal/bridges/ardupilot_bridge.py": "LOW HIGH NEAR",
     "hil/rehearsal/bridges/betaflight_bridge.py": "ASK SAMPLE",
-    "hil/rehearsal/bridges/betaflight_firmware.py": "LAST_WORDS LOOK_AGAIN START ANSWER END FREED"
-    " GAINS",
+    "hil/rehearsal/bridges/betaflight_firmware.py": "LAST_WORDS LOOK_AGAIN START ANSWER END FREED",
     "hil/rehearsal/bridges/packets.py": "TIME MOTORS LARGEST_ANSWER SEA_LEVEL STILL CALIBRATION",
     "hil/rehearsal/bridges/px4_bridge.py": "STREAMS NEAR HALVING MOST_DAMPING SETTLING",
     "hil/rehearsal/fake.py": "MOST_EVENTS ROOM DESCENT LOWEST TOUCH GOES_ON COVARIANCES THRUST",

@@ -28,8 +28,7 @@ from hil.links.backends.betaflight import (
 )
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.links.facts import values
-from hil.rehearsal.fake import PortFake
-from tests.fakes.ports import ListeningPort
+from tests.fakes.ports import ListeningPort, PortFake
 
 FACTS = values("betaflight")
 # silence after which the motors idle, with all channels by MSP [s]

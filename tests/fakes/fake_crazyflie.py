@@ -20,8 +20,7 @@ import numpy as np
 
 from hil.links.device import Device
 from hil.links.facts import values
-from hil.rehearsal.fake import PortFake
-from tests.fakes.ports import AnsweringPort
+from tests.fakes.ports import AnsweringPort, PortFake
 from visthrow.common.rotations import rotate_back, tilt_and_heading
 from visthrow.onboard.hover import GRAVITY
 

@@ -1,9 +1,11 @@
 """Ports of flight controllers in software, which wait for a peer."""
 
 import socket
+from abc import abstractmethod
 
 from hil.errors import LinkError
-from hil.links.device import LARGEST_DATAGRAM, UdpPort, refused
+from hil.links.device import LARGEST_DATAGRAM, UdpPort, chunks, refused
+from hil.rehearsal.fake import THRUST, Fake
 
 
 class ListeningPort:
@@ -65,3 +67,25 @@ class AnsweringPort(UdpPort):
 
     def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
         return super().write(data, to or self.sender)
+
+
+class PortFake(Fake):
+    """An autopilot whose commands come by a port of its own, beside the link of the
+    motion capture.
+    """
+
+    thrust_map = THRUST
+
+    @abstractmethod
+    def came(self, data: bytes) -> None:
+        """Take what came on the port."""
+
+    def hear(self) -> None:
+        for data in chunks(self.port):
+            self.heard = self.wall()
+            self.came(data)
+        super().hear()
+
+    def close(self) -> None:
+        super().close()
+        self.port.close()

@@ -108,21 +108,18 @@ def replay(folder: str | Path) -> dict[str, Any]:
     for line in ticks:
         decision = playback.feed(line, poses.get(line["n"], [])).decision
         actions += decision.action is not None
-        fields = {
+        same_state = last is not None and decision.state == last["state"]
+        moment = {
             "time": decision.time,
             "state": decision.state,
             "reason": decision.reason,
-            "since": decision.time,
+            "since": last["since"] if same_state else decision.time,
+            "vehicle": playback.runner.tracks[VEHICLE].state(decision.time),
         }
-        if last is not None and decision.state == last["state"]:
-            fields["since"] = last["since"]
-        fields["vehicle"] = playback.runner.tracks[VEHICLE].state(decision.time)
-        if turn is None and decision.state == State.ABORT.value:
-            turn = {
-                **fields,
-                **({} if last is None else {"state": last["state"], "since": last["since"]}),
-            }
-        last = fields
+        if turn is None and decision.state == State.ABORT:
+            before = last or moment
+            turn = {**moment, "state": before["state"], "since": before["since"]}
+        last = moment
         for name in COMPARED:
             was, value = line[name], getattr(decision, name)
             value = list(value) if isinstance(value, tuple) else value

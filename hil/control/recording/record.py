@@ -107,23 +107,8 @@ class RunRecorder:
         """
         if self.failed is not None:
             return
-        for p in poses:
-            self._put(
-                POSES,
-                (
-                    index,
-                    p.stamp,
-                    p.arrival,
-                    p.body,
-                    p.pos,
-                    p.quat,
-                    p.vel,
-                    p.rate,
-                    p.reset,
-                    p.measured,
-                    p.valid,
-                ),
-            )
+        for pose in poses:
+            self._put(POSES, (index, *vars(pose).values()))
         self._put(
             TICKS,
             {

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from hil.errors import RunError
-from hil.links.backends.ardupilot import ArduPilot, ArduPilotParams
+from hil.links.backends.ardupilot import ArduPilot
 from hil.links.backends.autopilot import MavlinkAutopilot
-from hil.links.backends.base import Backend, DryRun, Held, Status
-from hil.links.backends.betaflight import Betaflight, BetaflightParams
-from hil.links.backends.crazyflie import Crazyflie, CrazyflieParams
-from hil.links.backends.px4 import Px4, Px4Params
+from hil.links.backends.base import Backend, DryRun, Held
+from hil.links.backends.betaflight import Betaflight
+from hil.links.backends.crazyflie import Crazyflie
+from hil.links.backends.px4 import Px4
 from hil.links.backends.rates import Sticks
 from hil.links.crtp import open_crtp
 from hil.links.device import check_device, open_port
@@ -107,22 +107,3 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
             f" yaw, the policy was trained with {', '.join(f'{r:g}' for r in action['max_rate'])};"
             " raise rates"
         )
-
-
-__all__ = [
-    "AUTOPILOTS",
-    "ArduPilot",
-    "ArduPilotParams",
-    "Backend",
-    "Betaflight",
-    "BetaflightParams",
-    "Crazyflie",
-    "CrazyflieParams",
-    "DryRun",
-    "Px4",
-    "Px4Params",
-    "Status",
-    "make_backend",
-    "mechanism_lag",
-    "require_reach",
-]

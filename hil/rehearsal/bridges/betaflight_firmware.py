@@ -17,6 +17,7 @@ import socket
 import subprocess
 import sys
 import time
+import tomllib
 from pathlib import Path
 
 from hil.errors import RunError
@@ -34,50 +35,7 @@ START, ANSWER, END = (
 )  # time for a start, for an answer of the command line and for the process's end [s]
 FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
 
-GAINS = {
-    "p_roll": 5,
-    "i_roll": 2,
-    "d_roll": 5,
-    "d_max_roll": 5,
-    "p_pitch": 5,
-    "i_pitch": 2,
-    "d_pitch": 5,
-    "d_max_pitch": 5,
-    "p_yaw": 45,
-    "i_yaw": 8,
-}
-"""Those of the training's rate controller by `sim.effects.firmware.controller_of`, in whole
-numbers: 0.0080 N m s/rad, 0.024 N m/rad and 1.3e-4 N m s^2/rad about roll and pitch. A policy that
-was trained on one response is flown on that response, not on a stiffer one: at p_roll = 11 the
-shipped one swung from stop to stop.
-"""
-
-FOR_THUMBS = {
-    "rc_smoothing": "OFF",  # three filters of 18 Hz at 50 commands a second: 13 ms later
-    "f_roll": "0",
-    "f_pitch": "0",
-    "f_yaw": "0",  # feedforward takes the steps of 50 commands a second for flicks of a stick
-    "anti_gravity_gain": "0",
-    "throttle_boost": (
-        "0"
-    ),  # they add to P, I and throttle where the throttle moves, as it does in a throw
-    "tpa_rate": "0",
-    "tpa_low_rate": "0",  # D goes with the throttle
-    "gyro_lpf1_dyn_min_hz": "0",
-    "dterm_lpf1_dyn_min_hz": "0",  # filters that go with the throttle: static ones in their place
-    "dterm_lpf1_static_hz": "0",  # of two filters of D the second is left, 150 Hz
-    "yaw_lowpass_hz": (
-        "0"
-        # P of yaw alone is smoothed by it, the command's steps as well; the gyro has filters of its
-        # own
-    ),
-    "pidsum_limit": "1000",
-    "pidsum_limit_yaw": "1000",  # the mixer knows how much the motors can
-}
-"""What the firmware does for a pilot's thumbs or with the throttle, and is better off where a
-computer commands: the vehicle then is the same at any command, and a policy can be trained in it.
-"""
-
+SETTINGS = Path(__file__).with_name("firmware_settings.toml")
 LOCKSTEP = Path(__file__).with_name("lockstep.c")
 
 PR_SET_PDEATHSIG = 1  # of prctl
@@ -92,21 +50,8 @@ def needed(params: BetaflightParams) -> dict[str, str]:
     prints them under.
     """
     rates = params.rates
-    out = {
-        "serial UART2": "1 115200 57600 0 115200",  # MSP for the bridge, beside the runner's
-        "serial_update_rate_hz": (
-            "1000"
-        ),  # one MSP command a turn: 100 of them cannot take commands and questions at 50 Hz each
-        "small_angle": "180",  # it hangs in a stand: any attitude may arm
-        "rates_type": rates.type.upper(),
-        "min_check": str(params.minimum_us),
-        "deadband": "0",
-        "yaw_deadband": "0",
-        "thr_expo": "0",
-        "blackbox_device": "VIRTUAL",
-        "blackbox_sample_rate": "1/8",  # 1 kHz of 8
-    }
-    out |= {name: str(value) for name, value in GAINS.items()} | FOR_THUMBS
+    out = tomllib.loads(SETTINGS.read_text(encoding="utf-8"))
+    out |= {"rates_type": rates.type.upper(), "min_check": str(params.minimum_us)}
     for i, axis in enumerate(("roll", "pitch", "yaw")):
         out |= {
             f"{axis}_rc_rate": str(rates.rc_rates[i]),
