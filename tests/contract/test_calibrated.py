@@ -2,58 +2,23 @@
 made up for.
 """
 
-import pickle
-
 import numpy as np
 import torch
-from pytest import approx, mark, raises
+from pytest import mark, raises
 from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
 from camera.mount import rotation_from_vector
 from visthrow import config
 from visthrow.common.errors import ConfigError
-from visthrow.common.workers import done
 from visthrow.task import Experiment
-from visthrow.throws import calibrated
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import hover_start
 
-BAD = ["camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
-COUNT = 3
-
 
 def experiment(*changes):
     return config.load(Experiment, config.find("train", "vision"), changes)
-
-
-def test_a_hover_finds_each_camera_and_the_throw_sees_as_the_nominal_one(monkeypatch):
-    """What a process of its own would be sent is sent here: more hovers than these go to others."""
-    monkeypatch.setattr(
-        calibrated,
-        "done",
-        lambda function, hovers, *_: done(*pickle.loads(pickle.dumps((function, hovers)))),
-    )
-    flown = hover_start(experiment(*BAD))
-    torch.manual_seed(2)
-    with torch.inference_mode():
-        env, found = ThrowEnv(flown, "cpu", 2, COUNT), []
-        env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
-        calibrated_start(flown, found)(env)
-        turn, scale = (
-            env.view.buffers["extrinsic_rotation"].numpy(),
-            env.view.buffers["scale_error"].flatten().numpy(),
-        )
-        assert np.abs(turn).max() > 0.03
-        assert np.abs(scale).max() > 0.01
-        for one, is_turned, is_scaled in zip(found, turn, scale, strict=True):
-            np.testing.assert_allclose(one.turn_b, is_turned, atol=4.0 * max(one.turn_sigma))
-            assert max(one.turn_sigma) < np.radians(0.2)
-            assert one.scale == approx(is_scaled, abs=4.0 * one.scale_sigma)
-            assert one.scale_sigma < 0.005
-        assert (env.episode_length_buf == 0).all()
-        assert env.views.state["vel_w"].norm(dim=-1).max() < 0.3, "it hovers again"
 
 
 def test_corrected_keypoints_are_those_of_the_nominal_camera():

@@ -127,7 +127,3 @@ def test_each_count_sees_a_spoilt_line(name):
     plain = {"a/first.py": 'class First:\n    """A thing."""\n'}
     again = {"b/first.py" if name == "file names twice" else "b/second.py": SPOILT[name]}
     assert counts({**plain, **again})[name] > counts(plain)[name]
-
-
-def test_an_address_and_a_table_may_be_wide():
-    assert not any(map(wide, (f"# https://{'a' * WIDEST}", f"| {'a' * WIDEST} |")))

@@ -9,10 +9,9 @@ import torch
 from numpy.testing import assert_array_equal
 from pytest import mark, raises
 
-from camera.keypoints import KeypointCamera
 from visthrow import config
 from visthrow.common.errors import MismatchError, PolicyError
-from visthrow.onboard.pilot import Pilot, camera_conditions
+from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
 from visthrow.throws.loading import load_policy
@@ -110,11 +109,6 @@ def test_command_equals_the_environments():
     assert out.release[0] == bool(env.views.release[0])
 
 
-def test_camera_conditions_are_those_of_the_contract():
-    experiment = quiet("vision")
-    assert camera_conditions(experiment.camera) == contract_of(experiment)["camera"]
-
-
 def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
     camera = config.load(Experiment, config.find("train", "vision")).camera
     assert camera.noise.invalid_reads == "zero"
@@ -151,21 +145,3 @@ def test_wrong_shapes_and_contracts_are_refused():
         Pilot(replace(policy, contract=contract))
     with raises(PolicyError, match="no camera"):
         Pilot(policy).see(still, np.array([[0, 0, 0, 1.0]]), still, still)
-
-
-def test_keypoints_beside_a_state_policy_leave_its_observation_alone():
-    experiment = quiet("state")
-    policy = random_policy(experiment)
-    views = (
-        np.array([[0.1, 0, 1.3]]),
-        np.array([[0, 0.1, 0, 0.995]]),
-        np.ones((1, 3)),
-        np.ones((1, 3)),
-        np.array([[0, 0, 0.95]]),
-    )
-    with_camera = Pilot(policy, experiment.camera).act(*views, [2.0, 0.0, 0.0])
-    without = Pilot(policy).act(*views, [2.0, 0.0, 0.0])
-    assert_array_equal(with_camera.observation, without.observation)
-    assert without.keypoints is None
-    assert with_camera.keypoints.shape == (1, 8, 2)
-    assert isinstance(Pilot(policy, experiment.camera).camera, KeypointCamera)

@@ -91,17 +91,6 @@ def test_a_batch_equals_its_members_alone():
         assert_same(everything(alone), whole, slice(None), slice(e, e + 1))
 
 
-def test_one_parameter_serves_all():
-    start, commands = poses(1, COUNT), random_commands(1, STEPS, COUNT)
-    plant = paper_plant()
-    one = HybridSim(plant, COUNT)
-    each = HybridSim(plant, COUNT, vehicles=[plant.vehicle] * COUNT, ropes=[plant.rope] * COUNT)
-    for sim in (one, each):
-        sim.place(**start)
-        drive(sim, commands, np.ones(COUNT))
-    assert_same(everything(one), everything(each))
-
-
 def test_parameters_of_environments_are_their_own():
     """Environment e takes entry e modulo the list's length."""
     sim = HybridSim(paper_plant(), 4, ropes=ropes(2))
@@ -206,13 +195,6 @@ def test_one_seed_one_flight(seed):
         drive(sim, commands)
     assert_same(everything(first), everything(second))
     assert np.all(first.get("pos_w") != other.get("pos_w"))
-
-
-def test_draws_do_not_depend_on_the_batch():
-    large, small = HybridSim(paper_plant(), COUNT, seed=3), HybridSim(paper_plant(), 2, seed=3)
-    for sim in (large, small):
-        sim.randomize(start_spreads())
-    assert_same(everything(small), everything(large), slice(None), slice(0, 2))
 
 
 @mark.parametrize("place", range(4))

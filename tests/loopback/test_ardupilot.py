@@ -2,14 +2,11 @@
 never sent.
 """
 
-import math
-
-from numpy.testing import assert_allclose
-from pytest import approx, mark, raises
+from pytest import raises
 
 from hil.errors import RunError
 from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
-from hil.links.mavlink_link import Link, attitude_target
+from hil.links.mavlink_link import Link
 from hil.params import HilParams
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_ardupilot import FakeArduPilot
@@ -55,79 +52,6 @@ def test_connected_by_its_heartbeat_until_it_falls_silent():
     assert "in mode 5; expected GUIDED" in backend.status(fake.plant.time).note
 
 
-def test_units_and_axes_of_the_command():
-    backend, link, fake = pair()
-    turn(backend, link, fake)
-    assert backend.send((7.0, 1.0, 2.0, 3.0), 0.1)
-    turn(backend, link, fake)
-    assert_allclose(fake.plant.commands[-1], (7.0, 1.0, 2.0, 3.0), rtol=1e-6)
-    assert fake.followed == 1
-
-
-@mark.parametrize(
-    "change", [{"type_mask": 132}, {"type_mask": 192}, {"type_mask": 0}, {"target_system": 2}, {}]
-)
-def test_the_fake_ignores_what_the_real_one_ignores(change):
-    _, link, fake = pair()
-    message = attitude_target(0.0, (1, 1), 0.5, (0.0, 0.0, 0.0))
-    for name, value in change.items():
-        setattr(message, name, value)
-    if not change:
-        fake.mode = LAND_MODE
-    link.send(message)
-    fake.step()
-    assert (fake.followed, fake.ignored) == (0, 1)
-
-
-def test_silence_levels_the_fake():
-    _, link, fake = pair(parameters={"GUID_TIMEOUT": 3.0})
-    link.send(attitude_target(0.0, (1, 1), 0.9, (1.0, 0.0, 0.0)))
-    for _ in range(590):
-        fake.step()
-    assert fake.plant.commands[-1][1] == approx(1.0)
-    for _ in range(20):
-        fake.step()
-    assert_allclose(fake.plant.commands[-1], (0.272 * 9.81, 0.0, 0.0, 0.0))
-
-
-@mark.parametrize(
-    ("answer", "state", "sends"),
-    [
-        ("accepted", "accepted", 1),
-        ("in-progress", "failed", 1),
-        ("denied", "failed", 1),
-        ("silent", "failed", 13),
-    ],
-)
-def test_release_and_its_answers(answer, state, sends):
-    backend, link, fake = pair(answer)
-    turn(backend, link, fake)
-    backend.release(0.1)
-    assert backend.due() == 0.1
-    backend.release(0.2), backend.release(0.0)
-    while fake.plant.time < 0.1:
-        assert fake.witness.releases == 0
-        turn(backend, link, fake)
-    turn(backend, link, fake, 4)
-    if answer == "in-progress":
-        assert backend.status(fake.plant.time).release == "pending"
-    turn(backend, link, fake, 200)
-    assert backend.status(fake.plant.time).release == state
-    assert fake.witness.releases == approx(sends, abs=1 if sends > 1 else 0)
-    assert backend.due() is None
-
-
-def test_a_release_that_was_stopped_is_not_sent_again():
-    backend, link, fake = pair("silent")
-    turn(backend, link, fake)
-    backend.release(0.0)
-    turn(backend, link, fake, 10)
-    sent = fake.witness.releases
-    backend.stop_release()
-    turn(backend, link, fake, 100)
-    assert 0 < fake.witness.releases <= sent + 1, "one may be on its way"
-
-
 def test_an_abort_asks_for_the_mode_until_it_is_there():
     backend, link, fake = pair()
     turn(backend, link, fake)
@@ -148,17 +72,6 @@ def test_a_payload_that_stayed_on_is_seen_in_its_own_poses():
     assert ("abort", "the release was refused or not answered") in [
         (d.state, d.reason) for d in told
     ]
-
-
-def test_a_throw_with_a_plain_plant_releases_in_time():
-    plant = LevelPlant()
-    summary, fake, _ = throw(plant, loaded=AT_ONCE, seconds=5.0)
-    assert (fake.witness.releases, summary["latches"], len(summary["landings"])) == (1, 1, 1)
-    (latch,) = summary["latch_times"]
-    assert abs(plant.released - latch) <= 5e-3, "latch to separation is the trained lag within 5 ms"
-    assert summary["missed"] == 0
-    down = math.sqrt(2 * (1.333 - 0.383 - 0.04) / 9.81)
-    assert summary["landings"][0]["time"] == approx(plant.released + 0.11 + down, abs=6e-3)
 
 
 def test_plants_that_are_none():

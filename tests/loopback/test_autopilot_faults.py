@@ -7,10 +7,8 @@ the release comes once at most, from an armed vehicle inside its fence."""
 import errno
 import math
 import time
-from dataclasses import replace
 
-import numpy as np
-from pytest import approx, mark, param
+from pytest import approx, mark
 
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput
@@ -233,15 +231,6 @@ def test_a_release_that_does_not_happen(kind, answer):
     assert last[-1] <= latch + 0.11 + 2 * TICK, "none is sent after the time of separation"
 
 
-@mark.parametrize("kind", KINDS)
-def test_a_policy_at_its_limits_stays_within_them(kind):
-    """All of thrust and rates: as much arrives and no more; on a vehicle that obeyed, the fence
-    would end it.
-    """
-    fake, _, _ = run(kind, START + 0.5, loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)))
-    np.testing.assert_allclose(fake.witness.worst, (14.0, 10.0, 10.0, 4.0), rtol=3e-3)
-
-
 @mark.parametrize(
     ("kind", "length", "event"),
     [
@@ -352,27 +341,6 @@ def test_the_disk_is_full(tmp_path, full_at):
     assert fake.witness.releases == 0
 
 
-@mark.parametrize(
-    ("kind", "value"),
-    [(kind, math.nan) for kind in KINDS]
-    + [param(kind, math.inf, marks=mark.slow) for kind in KINDS],
-)
-def test_a_policy_that_puts_out_no_numbers(kind, value):
-    def spoil(now, runner, fake):
-        if now >= START and not spoiled:
-            act = runner.pilot.act
-            runner.pilot.act = lambda *args: replace(
-                act(*args), command=np.full((1, 4), value, np.float32), release=np.array([True])
-            )
-            spoiled.append(now)
-
-    spoiled = []
-    fake, summary, told = run(kind, START + 0.5, watch=spoil)
-    assert "is not finite" in reason(told, "abort")
-    assert when(told, "abort") <= START + 2 * TICK
-    assert (fake.witness.releases, summary["guard"]["refused"]) == (0, 1)
-
-
 @mark.slow
 def test_the_fence_ends_a_policy_at_its_limits():
     from visthrow.throws.wire_plant import make
@@ -387,19 +355,3 @@ def test_the_fence_ends_a_policy_at_its_limits():
     assert reason(told, "abort").startswith("fence: ")
     assert when(told, "abort") - when(told, "throw") < 0.6
     assert fake.witness.releases == 0
-
-
-@mark.parametrize("kind", KINDS)
-def test_ctrl_c_in_mid_throw(kind):
-    """The operator's abort: the autopilot's landing is asked for within a tick; Betaflight is
-    brought down by the runner.
-    """
-    fake, summary, told = run(kind, START + 0.6, operator=OneWord(abort=START))
-    assert reason(told, "abort") == "the operator said abort"
-    assert when(told, "abort") <= START + 2 * TICK
-    assert summary["aborted"]
-    if kind == "betaflight":
-        assert fake.override
-    else:
-        assert fake.events[-1][1] == ("mode 9" if kind == "ardupilot" else "mode 4.6")
-        assert fake.events[-1][0] <= START + 3 * TICK

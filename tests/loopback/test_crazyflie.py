@@ -30,7 +30,6 @@ from tests.loopback.test_backends import HOVER, Desk
 from visthrow import config
 
 FACTS = values("crazyflie")
-LEGACY = struct.Struct("<3fH")
 NEAR = 0.06
 """Of a single landing [m]: sixty land 0.025 m off in the mean, 0.06 m at most."""
 
@@ -61,18 +60,6 @@ def test_the_vehicle_turns_as_it_was_commanded(axis):
     assert thrust == approx(HOVER[0], rel=1e-3)
     assert turns[axis] == approx(1.3 if axis == 2 else 1.0, abs=0.3)
     assert [turn for i, turn in enumerate(turns) if i != axis] == approx([0.0, 0.0])
-
-
-def test_legacy_set_points_mean_what_the_firmware_makes_of_them():
-    """Locked until one without thrust came, yaw the other way round, angles by default."""
-    fake = desk().follow().fake
-    fake._locked, fake.parameters["flightmode.stabModeRoll"] = True, 1
-    header = bytes([FACTS["port_setpoint"] << 4])
-    for thrust, held in ((30000, 0), (0, 0), (65535, FACTS["legacy_most"]), (999, 0)):
-        fake.came(header + LEGACY.pack(5.0, 6.0, 7.0, thrust))
-        assert fake.held.thrust == held
-    assert fake.held.rates == (False, True, True)
-    assert (fake.held.roll, fake.held.pitch, fake.held.yaw) == (5.0, 6.0, -7.0)
 
 
 def test_a_receiver_has_priority():
@@ -186,17 +173,6 @@ def test_a_release_is_answered_or_has_failed(answer, state, note):
     one.turn(1.0, HOVER)
     assert one.backend.release_record.state == state
     assert note in one.backend.release_record.note
-
-
-def test_packets_of_another_length_or_type_end_a_flight():
-    """A manual set-point that is cut restarts the firmware; an unknown type stops the motors."""
-    header = bytes([FACTS["port_generic"] << 4])
-    one = desk().follow()
-    one.fake.came(header + bytes([FACTS["manual"]]) + bytes(14))
-    assert one.fake.supervisor == LOCKED
-    one = desk().follow()
-    one.fake.came(header + bytes([200]))
-    assert one.fake.held.thrust == 0.0
 
 
 def test_packets_and_devices(monkeypatch):

@@ -228,26 +228,3 @@ def test_a_replay_of_a_cut_recording_is_no_success(tmp_path, capsys):
     (tmp_path / "run" / "summary.json").unlink()
     assert main(["hil", "replay", str(tmp_path / "run")]) == 1
     assert "CUT: no summary" in capsys.readouterr().out
-
-
-def test_a_folder_that_holds_a_run_is_not_resumed(tmp_path, capsys):
-    record_run(tmp_path / "run", saved_policy(tmp_path), seconds=0.5)
-    number = free_port()
-    assert (
-        main(
-            [
-                "hil",
-                "run",
-                "--seconds",
-                "0.1",
-                "--out",
-                str(tmp_path / "run"),
-                "--set",
-                f'link.device="udp:127.0.0.1:{number}"',
-            ]
-        )
-        == 2
-    )
-    said = capsys.readouterr().err
-    assert "holds a run already; name another folder with --out" in said
-    assert "resume" not in said

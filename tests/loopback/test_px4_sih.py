@@ -66,24 +66,6 @@ def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulat
     assert reach <= ball.length * (1.0 + 1e-9)
 
 
-def test_a_release_at_a_steady_speed_falls_by_the_parabola():
-    """The ball leaves with the vehicle's speed, and lands where g takes it."""
-    ball, speed = make_ball("vision", 0), np.array([1.0, 0.5, 0.0])
-    fly(ball, 8.0, lambda t: np.array([0.0, 0.0, 2.0]) + t * speed, release=7.0)
-    landing, height = ball.landing, 2.0 + ball.mount_b[2] - ball.length - ball.ground
-    assert landing["landing_time"] - landing["separation_time"] == approx(
-        math.sqrt(2.0 * height / 9.81), abs=0.02
-    )
-    assert not ball.attached
-
-
-def test_a_ball_that_hangs_below_a_vehicle_on_the_ground_lies_on_it():
-    ball = make_ball("vision", 0)
-    fly(ball, 1.0, lambda t: np.array([0.0, 0.0, 0.1]))
-    assert ball.state["payload_pos_w"][2] == approx(ball.ground)
-    assert ball.attached
-
-
 class OtherSide:
     """PX4's side of the bridge's own link: the true state, outputs, parameters; it hears which
     streams are asked for.

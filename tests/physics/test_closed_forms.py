@@ -84,21 +84,6 @@ def test_pendulum_period(amplitude):
     assert norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
 
 
-def test_hanging_rope_stays_at_rest_and_bears_what_is_below():
-    """At rest a rope that hangs from one end is straight; each joint carries the weight
-    below it.
-    """
-    sim = held(paper_plant())
-    advance(sim, 50)
-    rope = sim.params.rope
-    assert np.abs(sim.get("cable_dir_w") - [0.0, 0.0, -1.0]).max() < 1e-9
-    length, mass = rope.length / rope.segments, rope.rope_mass / rope.segments
-    below = rope.payload_mass + mass * np.arange(rope.segments - 1, -1, -1)
-    stiffness = (below + 0.5 * mass) * GRAVITY * length
-    stiffness[-1] += rope.payload_mass * GRAVITY * rope.payload_offset
-    assert_allclose(sim.get("stiffness")[0], stiffness, rtol=1e-6)
-
-
 def turning_shape(rope, rate: float) -> np.ndarray:
     """Angles off the vertical [rad], shape (L,), of a rope that turns steadily about the vertical
     through its mount.
@@ -279,16 +264,6 @@ def test_hover_is_an_equilibrium():
     _, _, centres, velocities, _ = rods(sim)
     assert np.abs(velocities).max() < 1e-9
     assert centres[0, -1, 2] == approx(2.0 - 0.02 - 0.33 - 0.033, abs=1e-9)
-
-
-def test_quadrotor_without_thrust_falls_freely():
-    """No gravity-free hover thrust, no air: ``z = -g t^2 / 2`` and the rate stays."""
-    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
-    idle = replace(vehicle.controller, min_thrust=0.0)
-    vehicle = replace(vehicle, controller=idle, queue=QueueParams(0.0))
-    sim = bare_quadrotor(vehicle, 1, "rk4", 0.002, precision="float64")
-    advance(sim, 25)
-    assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, -0.5 * GRAVITY * 0.25], atol=1e-12)
 
 
 def test_external_wrench():

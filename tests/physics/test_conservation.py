@@ -78,17 +78,6 @@ def test_energy_drift_falls_with_the_step():
     assert drifts[0] > FALLS * drifts[1] > FALLS**2 * drifts[2] > 0.0
 
 
-def test_a_rope_that_moves_as_one_body_keeps_everything():
-    """Straight, at rest against the vehicle: nothing may happen, in float64 not even in the last
-    digits.
-    """
-    energies, momenta = history(
-        free(rate_b=(0.0,) * 3, cable_rate_w=(0.0,) * 3), 2e-3, "float64", gravity=0.0
-    )
-    assert np.abs(energies / energies[0] - 1.0).max() < 1e-13
-    assert np.abs(momenta - momenta[0]).max() < 1e-15
-
-
 def relative_rates(sim):
     """Angular velocity of every rod against what it hangs from [rad/s], shape (L, 3)."""
     rate_w = rotate(sim.get("quat_wb"), sim.get("rate_b"))

@@ -1,9 +1,6 @@
 """The reference's blocks against closed forms and conservation laws."""
 
-from dataclasses import replace
-
 import numpy as np
-from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import fixture, mark
 
@@ -13,7 +10,6 @@ from sim.reference.quadrotor import (
     VehicleErrors,
     initial_blocks,
     rigid_body_rates,
-    rotor_arms,
     vehicle_rates,
 )
 from tests.oracle.quadrotor import ReferenceQuadrotor, rk4
@@ -49,13 +45,6 @@ def test_queue_switches_at_the_delay_exactly(vehicle):
     final = np.sqrt(2.0 * weight / 4.0 / plain.thrust.k_f)
     expected = final + (start - final) * np.exp(-answered / plain.motor.time_constant)
     assert_allclose(quadrotor.blocks[0, 9:13], expected, rtol=1e-9)  # RK4, 15 us to the power of 4
-
-
-def test_queue_takes_the_latest_that_is_due():
-    times = np.array([[-np.inf, -np.inf], [1.0, 2.0], [3.0, 3.0]])
-    commands = np.arange(24.0).reshape(3, 2, 4)
-    picked = vehicle_blocks.command_queue(times, commands, np.array([1.0, 1.999]))
-    np.testing.assert_array_equal(picked, [commands[1, 0], commands[0, 1]])
 
 
 def test_battery_settles_where_source_and_load_meet(vehicle):
@@ -113,52 +102,6 @@ def test_mixer_gives_up_yaw_before_roll_and_pitch(vehicle, torque):
     assert abs(np.ptp(thrusts) - 3.47) < 1e-9  # what there is, is used
 
 
-def test_gyroscopic_torque_does_no_work(vehicle):
-    rng = default_rng(0)
-    rate, speed = rng.normal(size=(5, 3)) * 5.0, rng.uniform(500.0, 4000.0, (5, 4))
-    nothing = np.zeros((5, 4))
-    still = np.zeros((5, 3)), np.zeros((5, 3)), nothing, nothing
-    arms = rotor_arms(vehicle, VehicleErrors.none(5))
-    _, torque = vehicle_blocks.composer(
-        vehicle.rotors, arms, nothing, nothing, speed, nothing, rate, still
-    )
-    assert np.abs(torque).max() > 1e-3
-    assert_allclose(np.sum(torque * rate, axis=1), 0.0, atol=1e-15)
-
-
-def test_rotors_and_body_keep_their_angular_momentum(vehicle):
-    """Spinning rotors up without drag torque turns the body back: J_z w_z + h stays what it was."""
-    frictionless = replace(plain_vehicle(vehicle), thrust=replace(vehicle.thrust, torque_ratio=0.0))
-    spin = np.array(vehicle.rotors.spin)
-    speed_dot = np.array([[100.0, -50.0, 20.0, 400.0]])
-    arms = rotor_arms(frictionless, VehicleErrors.none(1))
-    still, nothing = np.zeros((1, 3)), np.zeros((1, 4))
-    _, torque = vehicle_blocks.composer(
-        vehicle.rotors,
-        arms,
-        nothing,
-        nothing,
-        nothing,
-        speed_dot,
-        still,
-        (still, still, nothing, nothing),
-    )
-    momentum_dot = -vehicle.rotors.inertia * np.sum(spin * speed_dot)
-    assert abs(torque[0, 2] + momentum_dot) < 1e-18
-
-
-def test_air_only_takes_energy_from_a_still_rotor_vehicle(vehicle):
-    rng = default_rng(1)
-    velocity = rng.normal(size=(20, 3)) * 4.0
-    arms = rotor_arms(vehicle, VehicleErrors.none(20))
-    force, torque, thrust_change, torque_change = vehicle_blocks.aerodynamics(
-        vehicle.aero, arms, 0.0075, np.zeros((20, 4)), velocity, np.zeros((20, 3))
-    )
-    assert np.all(np.sum(force * velocity, axis=1) < 0.0)
-    for nothing in (torque, thrust_change, torque_change):
-        assert not np.any(nothing)
-
-
 @mark.parametrize("battery", ["ideal", "sag"])
 def test_hover_is_an_equilibrium(vehicle, battery):
     """Thrust equals weight at the start; a battery that holds 16.7 V makes the rotors a little fast
@@ -186,20 +129,6 @@ def test_rates_reach_their_command(vehicle, controller, motor):
     quadrotor = ReferenceQuadrotor(plain)
     fly(quadrotor, (plain.body.mass * GRAVITY, 2.0, -1.0, 0.5), 40)
     assert_allclose(quadrotor.body[0, 10:13], (2.0, -1.0, 0.5), atol=0.15)
-
-
-def test_thrown_vehicle_falls_freely(vehicle):
-    """No thrust at all: instantaneous rotors at f_min = 0 and no air."""
-    idle = replace(vehicle.controller, kind="geometric", min_thrust=0.0)
-    plain = replace(
-        plain_vehicle(vehicle, motor="instant"),
-        controller=idle,
-        queue=replace(vehicle.queue, delay=0.0),
-    )
-    quadrotor = ReferenceQuadrotor(plain)
-    quadrotor.reset(np.zeros((1, 3)), LEVEL, np.array([[1.0, 2.0, 3.0]]), np.zeros((1, 3)))
-    fly(quadrotor, (0.0, 0.0, 0.0, 0.0), 10)
-    assert_allclose(quadrotor.body[0, :3], (0.2, 0.4, 0.6 - 0.5 * GRAVITY * 0.04), atol=EXACT)
 
 
 def test_turning_body_keeps_momentum_and_energy(vehicle):

@@ -11,12 +11,9 @@ from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
 from tests.oracle.bare_rope import BareScene
 from tests.oracle.converged import converged
-from tests.oracle.quadrotor import ReferenceQuadrotor
 from tests.plants import SCENES, paper_plant, plain_plant
 from tests.scenes import Wrench, load_scene
 
-ROUND_OFF = 1e-9
-"""Some thousand additions of numbers of order 1, and MuJoCo's factorisation [m]."""
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 STILL = np.zeros((1, 3))
 HIGH = np.array([[0.0, 0.0, 1.5]])
@@ -119,18 +116,6 @@ def test_pendulum_period():
     )
 
 
-def test_hover_stays():
-    plant = plain_plant()
-    reference = ReferencePlant(plant, count=1)
-    weight = (plant.vehicle.body.mass + plant.rope.rope_mass + plant.rope.payload_mass) * GRAVITY
-    for _ in range(5):
-        reference.step(np.array([[weight, 0.0, 0.0, 0.0]]))
-    assert_allclose(reference.state.pos_w, HIGH, atol=ROUND_OFF)
-    assert_allclose(
-        reference.state.payload_pos_w, [[0.0, 0.0, 1.5 - 0.02 - 0.33 - 0.033]], atol=ROUND_OFF
-    )
-
-
 def swinging(plant, step=5e-4, count=1, **start):
     """A plant whose rope starts at 0.5 rad and swings down."""
     reference = ReferencePlant(plant, count=count, step=step)
@@ -176,21 +161,6 @@ def test_separation_is_exact_and_continuous():
     assert norm(moved) < 0.5 * 3 * GRAVITY * 0.02**2
     lengths = norm(np.diff(after.cable_points_w, axis=1), axis=-1)
     assert_allclose(lengths, 0.022, atol=1e-12)
-
-
-def test_vehicle_flies_on_alone_after_separation():
-    """Without rope forces: from separation on it is ReferenceQuadrotor with the same blocks."""
-    reference = swinging(paper_plant())
-    command = np.array([[2.5, 0.5, 1.0, 0.2]])
-    for _ in range(10):
-        reference.step(command, True)
-    alone = ReferenceQuadrotor(paper_plant().vehicle)
-    alone.body, alone.blocks = reference._state[:, :13].copy(), reference._state[:, 13:28].copy()
-    alone._queue = [(-np.inf, command)]
-    for _ in range(3):
-        reference.step(command)
-        alone.step(command)
-    assert_allclose(reference.state.pos_w, alone.body[:, :3], atol=ROUND_OFF)
 
 
 @mark.parametrize("step", [2e-3, 1.3e-3])  # a landing lies within a step, of whatever length

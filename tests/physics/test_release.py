@@ -10,14 +10,12 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, PlantParams, QueueParams
+from sim.params import GRAVITY, PlantParams
 from tests.plants import paper_plant
 from tests.simulators import numerics, random_commands, rotate
 
 CLOCK = 1e-6
 """Times are sums of float32 periods [s]."""
-SAME_STATE = 1e-12
-"""Two runs in float64 whose substeps are equal up to round-off [m], [m/s]."""
 ROUND_OFF = 2e-5
 """Of positions of some metres in float32 [m]."""
 PERIOD = 0.02
@@ -80,33 +78,6 @@ def test_asking_again_or_no_more_changes_nothing():
         often.step()
         for name in ("payload_pos_w", "pos_w", "attached", "separated", "release_timer"):
             assert_array_equal(once.get(name), often.get(name))
-
-
-def test_nothing_separates_unasked():
-    sim = HybridSim(plant(0.11), 3)
-    rows = thrown(sim, random_commands(0, 20, 3), asked_at=-1)
-    assert all(np.all(row["attached"] == 1) and not np.any(row["separated"]) for row in rows)
-
-
-@mark.parametrize("lag", [0.11, 0.104])
-def test_separation_is_the_state_of_a_run_that_ends_there(lag):
-    """A second simulator with periods of 2 ms is stopped at the separation: same substeps, same
-    state.
-    """
-    command, count = np.array([[4.0, 2.0, -3.0, 1.0]]), 1
-    without_delay = QueueParams(0.0)
-    sim = HybridSim(plant(lag, "float64", queue=without_delay), count)
-    for _ in range(round(lag / PERIOD + 0.5)):
-        sim.set_command(command, [1])
-        sim.step()
-    assert sim.get("separated")[0] == 1
-    stopped = HybridSim(plant(lag, "float64", 0.002, queue=without_delay), count)
-    for _ in range(round(lag / 0.002)):
-        stopped.set_command(command)
-        stopped.step()
-    assert_allclose(sim.get("payload_pos_w"), stopped.get("payload_pos_w"), atol=SAME_STATE)
-    assert_allclose(sim.get("payload_vel_w"), stopped.get("payload_vel_w"), atol=100 * SAME_STATE)
-    assert_allclose(sim.get("release_pos_w"), stopped.get("pos_w"), atol=SAME_STATE)
 
 
 def test_a_lag_inside_a_substep_lies_between_its_neighbours():

@@ -15,7 +15,7 @@ from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import setup as setups
-from visthrow.task import DiagnosedParams, Experiment, contract_of, drawn_plants, plant_of
+from visthrow.task import DiagnosedParams, Experiment, drawn_plants, plant_of
 
 THETA = {
     "thrust_gain": 0.03,
@@ -94,18 +94,6 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert "wind_y" not in text
     for line in text.splitlines():
         assert " = " not in line or "#" in line or line.startswith("base"), line
-
-
-def test_applied_twice_is_applied_once_more(diagnosis, tmp_path, capsys):
-    """A second diagnosis goes on top of the first."""
-    first, second = tmp_path / "first.toml", tmp_path / "second.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(), "--out", str(first)]) == 0
-    more = diagnosis(plant=str(first), theta={"rope_length": 0.001}, covariance=[[1e-8]])
-    assert cli.main(["diagnose", "apply", more, "--out", str(second)]) == 0
-    capsys.readouterr()
-    after = config.load(Experiment, second)
-    assert after.rope.length == approx(shipped().rope.length - 0.003)
-    assert_allclose(after.vehicle.thrust.gain, 1.03)
 
 
 def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, capsys):
@@ -195,12 +183,6 @@ def test_draws_keep_what_is_pinned_together():
     assert np.corrcoef(gain, mass)[0, 1] > 0.97
     assert drawn_plants(before, 1) == [plant_of(before)]
     assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
-
-
-def test_a_config_without_diagnosis_keeps_its_contract():
-    before = shipped()
-    assert "payload_drag" not in contract_of(before)["rope"]
-    assert "com" not in contract_of(before)["vehicle"]["body"]
 
 
 @mark.parametrize(

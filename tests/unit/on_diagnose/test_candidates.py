@@ -48,7 +48,3 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
     assert diagnosis.named == (NAME,)
     assert diagnosis[NAME].estimate == approx(SIZE * EFFECTS[3].floor, rel=0.1)
     assert diagnosis.overall == result.KNOWN
-
-
-def test_what_whips_where_nothing_is_hidden_is_not_named():
-    assert explained(0.0).overall == result.NO_EFFECT

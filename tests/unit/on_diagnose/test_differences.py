@@ -42,17 +42,6 @@ def interval(statistics: Statistics) -> tuple[float, float]:
     return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)
 
 
-def test_flights_that_agree_leave_little_and_flights_that_differ_their_scatter():
-    """Of sixteen flights nothing of a third of the size is left; where they scatter by more than
-    that, the scatter is.
-    """
-    rng = default_rng(2)
-    assert interval(flights(np.full(16, SIZE), rng))[1] < 0.3
-    apart = 2.0 * allowed(SIZE) * rng.standard_normal(16)
-    found = interval(flights(SIZE + apart, rng))[1]
-    np.testing.assert_allclose(found, apart.std(ddof=1) / 4.0, rtol=0.3)
-
-
 def test_intervals_hold_where_flights_differ_by_what_the_prior_says():
     """Worlds of three to eight flights, each with its own deviation among them."""
     rng, held = default_rng(3), 0

@@ -53,16 +53,6 @@ def test_names_are_confirmed_by_what_flights_agree_on(nats, came, sure):
     assert (low > 0.0) == sure
 
 
-def test_a_cause_that_all_flights_show_is_confirmed():
-    diagnosis = search.explain(
-        SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
-        laws=False,
-    )
-    assert diagnosis.overall == result.KNOWN
-    assert diagnosis.held_out.low > 0.5
-    assert diagnosis["effect_05"].verdict == result.FOUND
-
-
 def test_of_what_flights_hardly_show_no_size_is_claimed():
     """An effect a millionth as strong: its interval would be the prior's."""
     weak = EFFECTS[7]

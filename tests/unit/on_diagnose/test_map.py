@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from tests import logfiles
 from tests.plants import paper_plant
 from tests.unit.on_logs.test_check import flight, log_of
-from visthrow import cli
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
@@ -106,25 +105,6 @@ def test_units_and_axes_are_found_by_physics(tmp_path):
     }
     assert by["rate_b"].axes == "x,-y,-z"
     assert "axes by physics" in found.why["rate_b"]
-
-
-def test_the_command_writes_a_setup_that_check_takes(tmp_path, capsys):
-    path = written(tmp_path / "a.csv.gz", table())
-    assert cli.main(["diagnose", "map", str(path), "--out", str(tmp_path / "mine.toml")]) == 0
-    assert 'name = "rate_b"  # the rates of the attitude' in capsys.readouterr().out
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "check",
-                str(path),
-                "--config",
-                str(tmp_path / "mine.toml"),
-                "--no-pictures",
-            ]
-        )
-        == 0
-    )
 
 
 def test_a_marker_in_millimetres_is_no_velocity_of_another():

@@ -180,10 +180,3 @@ def test_a_spoilt_byte_of_a_card_is_noticed_by_its_checksum(version, tmp_path):
     path.write_bytes(data)
     with raises(LogError, match="its checksum is wrong"):
         table_of(path)
-
-
-def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
-    (tmp_path / "a.h5").write_bytes(b"\x89HDF")
-    with raises(LogError, match=r"pip install 'visthrow\[recordings\]'"):
-        table_of(tmp_path / "a.h5")

@@ -15,7 +15,7 @@ from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
-from visthrow.diagnose.reporting import blackbox, blind, explain_cli, gain
+from visthrow.diagnose.reporting import blind, explain_cli, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.select import result, search
 from visthrow.diagnose.throw.landing import PredictedLandings
@@ -86,13 +86,6 @@ def measured(found):
     return gain.measure(found[1])
 
 
-def test_errors_grow_with_the_horizon(measured):
-    for channel in measured.channels:
-        floor = [row[3] for row in channel.horizons]
-        assert floor == sorted(floor)
-        assert channel.horizons[-1][1] > channel.horizons[0][1]
-
-
 def test_prediction_does_not_look_at_what_it_predicts(found):
     _, diagnosis = found
     point = diagnosis.work.after
@@ -104,20 +97,6 @@ def test_prediction_does_not_look_at_what_it_predicts(found):
     )
     assert_allclose(spoilt[~late], plain[~late])
     assert_allclose((spoilt - plain)[late], 1.0 / window.sigma[late])
-
-
-def test_no_black_box_where_no_latent_force_acts(found):
-    point = found[1].work.before
-    assert blackbox.table_of(point, default_rng(0)) is not None
-    still = replace(point, noise=replace(point.noise, latent_sd={}))
-    assert blackbox.table_of(still, default_rng(0)) is None
-
-
-@mark.parametrize(
-    ("share", "text"), [(-1e-6, "0"), (0.0, "0"), (-0.0, "0"), (0.496, "50"), (-0.02, "-2")]
-)
-def test_nothing_has_no_sign(share, text):
-    assert report.percent(share) == text
 
 
 @fixture(scope="module")
@@ -278,14 +257,6 @@ def test_an_event_is_left_out_or_weighs_little(found):
 )
 def test_residuals_have_units(channel, unit):
     assert forms.unit_of(channel) == unit
-
-
-def test_the_report_of_nothing_is_whole_too(tmp_path):
-    diagnosis = search.explain(SyntheticModel(effects=EFFECTS, throws=3))
-    paths = page.write(
-        tmp_path, "Nothing", report.sentence_of(diagnosis), report.sections(diagnosis)
-    )
-    assert "NO EFFECT" in paths[0].read_text(encoding="utf-8")
 
 
 def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):

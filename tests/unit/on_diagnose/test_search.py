@@ -13,7 +13,6 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import result, search, selector
 from visthrow.diagnose.select.scatter import Varies, disagreement
 
@@ -100,28 +99,6 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     last = diagnosis.steps[-1]
     assert last.nats == last.refitted[last.named] > last.least == selector.EXCHANGE_MARGIN
     assert last.named in list(last.screened)[:3]
-
-
-def test_idempotence_what_was_found_is_not_found_again():
-    model = world(truth={"effect_04": 10.0}, seed=6)
-    first = search.explain(model, laws=False)
-
-    class Applied(Model):
-        effects, channels = model.effects, model.channels
-
-        def windows(self, theta):
-            return model.windows(self._sum(theta))
-
-        def residuals(self, theta, about=None):
-            return model.residuals(self._sum(theta))
-
-        def _sum(self, theta):
-            return {
-                name: first.theta.get(name, 0.0) + theta.get(name, 0.0)
-                for name in {*first.theta, *theta}
-            }
-
-    assert search.explain(Applied(), laws=False).overall == result.NO_EFFECT
 
 
 def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
@@ -256,24 +233,10 @@ def test_catalogues_that_contradict_themselves_are_refused():
         replace(EFFECTS[0], floor=0.0)
 
 
-def small_causes(seed: int) -> SyntheticModel:
-    """Every effect at its floor: nothing that matters."""
-    signs = default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
-    return world(truth={e.name: s for e, s in zip(EFFECTS, signs)}, seed=seed, gust=0.3, noise=0.5)
-
-
-def test_causes_at_their_floors_are_not_named():
-    assert not search.explain(small_causes(3), laws=False).theta
-
-
 def test_flights_without_a_window_are_counted(monkeypatch):
     monkeypatch.setattr(search, "check", lambda *_: [])
     diagnosis = search.diagnose([None] * 9, world(truth={"effect_03": 12.0}, seed=4), laws=False)
     assert "3 of 9 flights have no window in this answer" in diagnosis.reasons
-
-
-def test_gusts_are_no_causes():
-    assert not search.explain(world(gust=2.0, seed=7), laws=False).theta
 
 
 def _priors(count: int) -> Priors:

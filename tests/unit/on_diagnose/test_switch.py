@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.config.effects import catalogue as shipped
 from visthrow.diagnose.select import search
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
@@ -20,13 +19,6 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
         found = fitted(problem, point, [1, 3])
         assert found.theta[3] == at
         assert abs(found.theta[1]) > 2.0
-
-
-def test_the_catalogue_says_which_effects_are_switches():
-    assert {name for name, e in shipped().items() if e.switch} == {
-        name for name, e in shipped().items() if not e.changes
-    }
-    assert shipped()["controller_kind"].switch
 
 
 class Promising(SyntheticModel):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.effects.setting import AERODYNAMICS, generalised
-from sim.params import GRAVITY, SensingParams
+from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow import config
@@ -146,19 +146,6 @@ def test_initial_states_follow_the_effects(planted):
     back = moved(problem, follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
         assert_allclose(again.residual, w.residual, atol=1e-9)
-
-
-def test_what_is_known_of_the_sensors_is_taken_off():
-    sensing = SensingParams(
-        frame_tilt=(0.01, 0.0, 0.0), marker_offset=(0.02, 0.0, 0.01), vehicle_delay=0.01
-    )
-    setting = setting_with(
-        {"frame_tilt_x": 0.01, "marker_off_x": 0.02, "marker_off_z": 0.01, "mocap_delay_quad": 0.01}
-    )
-    logs = fly(setting, noise=0.2, free=1, throws=0, seconds=2.0)
-    informed = ThrowModel(logs, paper_plant(), sensing=sensing, only=["rope_length"])
-    left = informed.residuals({})
-    assert all(np.mean((r / w.sigma) ** 2) < 1.3 for r, w in zip(left, informed.windows({})))
 
 
 def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():

@@ -121,13 +121,6 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
         assert_allclose(about_it, twist, atol=1e-12 * np.abs(away).max() ** 3)
 
 
-def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
-    knots = random_knots() | {"tension": np.array([1.0, 0.5, 0.1, 0.0, 0.0, 0.0])}
-    values = table(laws.terms_of(laws.JOINT, KNOTS), knots)
-    assert not values[3:].any()
-    assert values[:3].any()
-
-
 @mark.parametrize(
     ("term", "unit", "formula"),
     [
@@ -147,12 +140,6 @@ def test_no_torque_acts_in_a_joint_on_which_nothing_hangs():
 def test_units_and_formulas(term, unit, formula):
     assert term.unit == unit
     assert term.formula == formula
-
-
-def test_terms_that_lack_their_knots_are_not_made():
-    for term in laws.terms_of("vehicle force", ("time", "vel_w")):
-        assert term.vector in ("world_z", "vel")
-        assert set(term.factors) <= {"speed"}
 
 
 def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
@@ -238,14 +225,6 @@ def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
         effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
     )
     assert beside_a_law(model, [3, 6], DRAG).law()[0] == {3, 6}
-
-
-def test_known_causes_and_gusts_are_no_laws():
-    diagnosis = search.explain(
-        SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, gust=2.0, seed=5)
-    )
-    assert diagnosis.overall == result.KNOWN
-    assert not diagnosis.laws
 
 
 def test_the_table_takes_up_what_no_name_explains():

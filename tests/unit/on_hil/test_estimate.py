@@ -89,17 +89,6 @@ def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
     assert slopes.update(Pose(1.0, 1.0, "vehicle", (5.0, 0.0, 0.0))) == (0.0, 0.0, 0.0)
 
 
-def test_the_window_is_one_of_time():
-    """Twice the poses a second give twice the samples and so less noise; a source too slow for it
-    keeps what the order needs.
-    """
-    for period, count in ((0.005, 12), (0.01, 6), (0.04, 3)):
-        slopes = SlopeFilter(EstimateParams(0.055, 2))
-        for i in range(40):
-            slopes.update(Pose(i * period, i * period, "vehicle", (0.0, 0.0, 0.0)))
-        assert len(slopes._window) == count
-
-
 def test_wrong_parameters():
     for seconds, order in ((0.0, 1), (0.2, 2), (0.05, 3), (float("nan"), 1)):
         with raises(ConfigError, match=r"window is|order is 3; expected 1 to 2"):

@@ -3,18 +3,15 @@ port takes peer after peer.
 """
 
 import math
-import socket
 
 import numpy as np
 from pytest import mark, raises
 
-from hil.errors import LinkError, RunError
-from hil.links.device import check_device, open_port
+from hil.errors import RunError
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from hil.rehearsal.fake import FakeOptions, Witness
 from hil.rehearsal.process import make_fake
-from tests.fakes.ports import ListeningPort
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow import config
@@ -104,30 +101,3 @@ def test_options_of_a_fake():
         read_options(["servo_delay=-0.1"])
     with raises(RunError, match="did you mean 'ardupilot'"):
         make_fake("ardupilo", LevelPlant(), None)
-
-
-def test_the_msp_port_serves_one_peer_after_another():
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        number = probe.getsockname()[1]
-    port = ListeningPort(number)
-    with raises(
-        LinkError,
-        match=rf"tcp:127\.0\.0\.1:{number}: another program has it.*ss -tlnp.*: --msp-port PORT",
-    ):
-        ListeningPort(number)
-    with raises(LinkError, match="tcp port 99999; expected 1 to 65535"):
-        ListeningPort(99_999)
-    assert port.read() is None
-    assert not port.write(b"nobody there")
-    for word in (b"one", b"two"):
-        peer, heard = open_port(check_device(f"tcp:127.0.0.1:{number}")), None
-        peer.write(word)
-        for _ in range(1000):
-            heard = heard or port.read()
-        assert heard == word
-        assert port.write(word[::-1])
-        peer.close()
-        for _ in range(1000):
-            port.read()
-    port.close()

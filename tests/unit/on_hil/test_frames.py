@@ -9,11 +9,8 @@ from pytest import mark, raises
 from scipy.spatial.transform import Rotation
 
 from hil.errors import FrameError
-from hil.params import HilParams
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import Pose
-from visthrow import config
-from visthrow.common.errors import ConfigError
 from visthrow.logs.axes import TURNS, turn_of
 
 AXES = TURNS
@@ -137,13 +134,3 @@ def test_marker_offset_follows_the_attitude():
     # Turning with 2 rad/s on an arm of 0.1 m to the right the marker sinks at 0.2 m/s against the
     # centre of mass.
     assert_allclose(pose.vel, (0.0, 0.0, 0.4), atol=EXACT)
-
-
-def test_wrong_order_and_numbers_are_refused():
-    for wrong, message in (
-        ('quaternion="zyxw"', "one of 'xyzw', 'wxyz'"),
-        ("yaw_offset_deg=nan", "nan"),
-        ('axes="x,y"', "signed"),
-    ):
-        with raises(ConfigError, match=message):
-            config.load(HilParams, config.find("hil", "dry_run"), [f"frames.vehicle.{wrong}"])

@@ -7,7 +7,7 @@ import math
 from numpy.testing import assert_allclose
 from pytest import approx, mark, raises
 
-from hil.links.clock import ManualClock, MonotonicClock, Ticker
+from hil.links.clock import MonotonicClock
 from hil.poses.body_track import Track
 from hil.poses.estimate import EstimateParams
 from hil.poses.frames import FrameParams
@@ -149,12 +149,6 @@ def test_staleness_is_of_content_not_of_arrival():
         assert limit <= first[level] <= limit + 0.011
 
 
-def test_a_marker_has_no_attitude():
-    gate = Gate(PARAMS)
-    assert gate.check(pose(quat=None)) is None
-    assert gate.check(pose(0.01, 0.01, None)) is None
-
-
 @mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
 def test_a_single_marker_is_a_position(quat):
     """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
@@ -206,13 +200,6 @@ def test_a_step_of_the_sources_clock_costs_nothing(step):
     assert body.accepted == 60
 
 
-def test_reordered_and_doubled_poses_are_dropped():
-    body = track()
-    order = [0, 1, 2, 4, 3, 5, 5, 6]
-    reasons = [body.update(pose(0.01 * i, 0.01 * i, arrival=0.01 * n)) for n, i in enumerate(order)]
-    assert reasons == [None, None, None, None, "old", None, "repeated", None]
-
-
 def test_a_state_is_carried_forward():
     body = track()
     for i in range(5):
@@ -223,23 +210,6 @@ def test_a_state_is_carried_forward():
     assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
     assert state.age == approx(0.01)
     assert track().state(0.0) is None
-
-
-def test_late_ticks_are_counted_and_keep_their_grid():
-    clock = ManualClock(5.0)
-
-    def waited(ticker):
-        clock.sleep_until(ticker.due())
-        return ticker.take()
-
-    ticker = Ticker(clock, 0.02)
-    assert [waited(ticker) for _ in range(3)] == approx([5.0, 5.02, 5.04])
-    clock.time += 0.07
-    assert waited(ticker) == approx(5.11)
-    assert (ticker.index, ticker.missed) == (5, 2)
-    assert ticker.late == approx(0.01)
-    assert waited(ticker) == approx(5.12)
-    assert ticker.worst == approx(0.05)
 
 
 def test_the_monotonic_clock_keeps_its_speed():

@@ -253,28 +253,6 @@ def test_a_topic_without_an_attitude_says_so(tmp_path):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
 
 
-@mark.parametrize(
-    "content", [b"", b"\x00" * 500, b"ULog\x01\x12\x35\x01" + b"\xff" * 40, b"t,x\n1,2\n"]
-)
-def test_files_that_are_no_log(tmp_path, content, capfd):
-    path = tmp_path / "x"
-    path.write_bytes(content)
-    with raises(SourceError, match=r"expected an ArduPilot dataflash log \(\.BIN\)"):
-        read_bin(path, VEHICLE)
-    with raises(SourceError, match="cannot be read"):
-        read_bin(tmp_path / "none.BIN", VEHICLE)
-    importorskip("pyulog")
-    with raises(SourceError, match=r"\.ulg|no vehicle_odometry in this log"):
-        read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
-    assert capfd.readouterr() == ("", "")
-
-
-def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pyulog", None)
-    with raises(SourceError, match=r"pip install 'visthrow\[logs\]'"):
-        read_ulg(tmp_path / "a.ulg", (LogBody("vehicle", "vehicle_odometry"),))
-
-
 @mark.parametrize("kind", ["bin", "ulg"])
 def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy
@@ -339,18 +317,3 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     assert "all bit for bit the same" in capsys.readouterr().out
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == approx(1.333, abs=0.01), "down became up"
-
-
-def test_damage_in_a_bin_costs_a_few_messages(tmp_path):
-    path = tmp_path / "a.BIN"
-    files.write_bin(path, {"VISP": files.VISP}, [vision(i) for i in range(50)])
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2 : len(data) // 2 + 40] = b"\x00" * 40
-    path.write_bytes(data[:-20])
-    assert 40 <= len(read_bin(path, VEHICLE)) < 50
-
-
-def test_a_vision_pose_of_negative_quality_is_none(tmp_path):
-    path = tmp_path / "a.BIN"
-    files.write_bin(path, {"VISP": files.VISP}, [vision(0, quality=-1), vision(1, quality=0)])
-    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True]

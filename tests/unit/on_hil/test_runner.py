@@ -10,7 +10,6 @@ from pytest import approx, mark, raises
 
 from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
-from hil.control.tick.commander import WARM_CALLS, Commander
 from hil.errors import RunError
 from hil.links.backends.base import Status
 from hil.params import HilParams
@@ -19,7 +18,6 @@ from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.onboard.actions import hover_action
-from visthrow.onboard.pilot import Pilot
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
@@ -87,25 +85,6 @@ def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
     assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
     with raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
         runner(mechanism=0.12)
-
-
-def test_a_warm_up_changes_no_bit(monkeypatch):
-    """It calls the policy on a copy, before the run and as a throw is armed."""
-    called = []
-    warm, act = Commander.warm_up, Pilot.act
-
-    def counted(pilot, *args):
-        called.append(pilot)
-        return act(pilot, *args)
-
-    monkeypatch.setattr(Pilot, "act", counted)
-    pilot = runner()
-    pilot.commander.warm_up()
-    decisions = fly(pilot, 4.0)
-    assert sum(each is not pilot.pilot for each in called) == 2 * WARM_CALLS
-    monkeypatch.setattr(Commander, "warm_up", lambda self, vehicle=None: None)
-    assert fly(runner(), 4.0) == decisions
-    monkeypatch.setattr(Commander, "warm_up", warm)
 
 
 def test_nothing_is_released_without_the_operators_word():
@@ -526,13 +505,6 @@ def test_payload_lost_but_not_the_vehicle():
     assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
 
 
-def test_a_short_gap_is_flown_through():
-    _, decisions = thrown(
-        action=NEVER, poses=lost({"vehicle", "payload"}, until=START + 0.08), seconds=6.0
-    )
-    assert decisions[-1].state == "throw"
-
-
 def spoiled(change, until=99.0):
     return lambda time, poses: [change(p) if START < time < until else p for p in poses]
 
@@ -560,20 +532,6 @@ HARMLESS = {
 def test_harmless_faults_end_no_throw(name):
     _, decisions = thrown(action=NEVER, poses=HARMLESS[name], seconds=6.0)
     assert decisions[-1].state == "throw"
-
-
-def test_poses_at_5_hz_from_mid_throw_on_end_the_run():
-    kept = {}
-
-    def slow(time, poses):
-        out = [p for p in poses if time < START or time - kept.get(p.body, -1.0) >= 0.2 - 1e-9]
-        kept.update({p.body: time for p in out})
-        return out
-
-    _, decisions = thrown(action=NEVER, poses=slow, seconds=8.0)
-    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
-    assert changes(decisions)[-1] == ("abort", "no new pose of the vehicle")
-    assert when(decisions, "abort") == approx(START + 0.6, abs=1.5 * TICK)
 
 
 @mark.parametrize("gap", [0.0, 0.15])
@@ -631,11 +589,3 @@ def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it()
     _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
     assert changes(decisions)[-1][0] == "abort"
     assert changes(decisions)[-1][1].startswith("fence: ")
-
-
-def test_a_tick_overrun_in_mid_throw():
-    """A tick that comes 0.15 s late: poses have waited, content is as old as it is."""
-    _, decisions = thrown(
-        action=NEVER, late=lambda t: 0.03 if START < t < START + 0.02 else 0.0, seconds=5.0
-    )
-    assert decisions[-1].state == "throw"

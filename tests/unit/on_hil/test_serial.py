@@ -84,12 +84,6 @@ def test_a_back_end_on_a_serial_port(wire):
     assert asked(controller, msp.SET_RAW_RC)
 
 
-def test_a_port_that_is_none():
-    importorskip("serial")
-    with raises(LinkError, match="cannot open /dev/ttyNONE"):
-        SerialPort(Device("serial", "/dev/ttyNONE", 115200))
-
-
 def read_log(path):
     """Direction and bytes of each chunk."""
     data = path.read_bytes()

@@ -2,7 +2,6 @@
 files told.
 """
 
-import gzip
 import math
 import threading
 
@@ -23,7 +22,6 @@ from tests.loopback.wire import pipe
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
 
 BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
 
@@ -187,23 +185,6 @@ def test_files_that_are_no_tlog(tmp_path):
 
 
 CSV = "t,x,y,z,roll,pitch,yaw\n1000,1,2,3,0,0,90\n1010,1.5,2,3,0,0,90\n\n1020,,2,3,0,0,90\n"
-PLACE = ChannelMap("pos_w", ("x", "y", "z"), "mm")
-MAPPING = TableMap(
-    TimeColumn("t", "ms"), (PLACE, ChannelMap("quat_wb", ("roll", "pitch", "yaw"), "deg", "euler"))
-)
-
-
-@mark.parametrize("packed", [False, True])
-def test_csv_with_units(tmp_path, packed):
-    path = tmp_path / ("a.csv.gz" if packed else "a.csv")
-    path.write_bytes(gzip.compress(CSV.encode()) if packed else CSV.encode())
-    poses = read_table(path, MAPPING)
-    assert [pose.stamp for pose in poses] == approx([1.0, 1.01, 1.02])
-    assert [pose.arrival for pose in poses] == approx([0.0, 0.01, 0.02])
-    assert poses[1].pos == approx((1.5e-3, 2e-3, 3e-3))
-    half = math.sqrt(0.5)
-    assert poses[0].quat == approx((0.0, 0.0, half, half))
-    assert math.isnan(poses[2].pos[0]), "an empty cell is for the gate to refuse"
 
 
 def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
@@ -231,25 +212,6 @@ def test_a_flight_log_is_a_source_without_a_mapping(tmp_path):
     FlightLog({"rate_b": Channel(time, place, "rad/s", "body")}).save(tmp_path / "b.npz")
     with raises(SourceError, match="no row with a position of a body"):
         read_table(tmp_path / "b.npz", None)
-
-
-@mark.parametrize(
-    ("text", "message"),
-    [
-        ("t,x,y,roll,pitch,yaw\n1,2,3,4,5,6\n", "no column 'z'"),
-        (CSV.replace("1.5", "one"), "column 'x' holds text such as 'one' in row 2"),
-        (CSV.replace("1010,1.5", "1010"), "line 3 has 6 cells; the header has 7"),
-        ("", "no header line with the columns' names"),
-        (CSV.partition("\n")[0] + "\n" + "nan,nan,nan,nan,0,0,0\n" * 9, "no row with a position"),
-    ],
-)
-def test_wrong_csv(tmp_path, text, message):
-    path = tmp_path / "a.csv"
-    path.write_text(text)
-    with raises(SourceError, match=message):
-        read_table(path, MAPPING)
-    with raises(SourceError, match="no such file"):
-        read_table(tmp_path / "b.csv", MAPPING)
 
 
 def test_csv_without_mapping(tmp_path):

@@ -117,33 +117,6 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
             require_reach(params, contract)
 
 
-@mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
-def test_the_configs_of_real_vehicles_can_do_what_the_shipped_policies_ask(name):
-    """They differ from those of the fakes in devices, calibration, mechanism and the lateness of
-    commands alone.
-    """
-    real = config.load(HilParams, config.find("hil", name))
-    fake = config.load(
-        HilParams, config.find("hil", "fake" if name == "ardupilot" else f"fake_{name}")
-    )
-    require_reach(real, simple_policy().contract)
-    assert (real.backend, getattr(real, name).audit) == (name, True)
-    swapped = replace(
-        real,
-        link=fake.link,
-        ardupilot=fake.ardupilot,
-        px4=fake.px4,
-        betaflight=fake.betaflight,
-        delay=replace(real.delay, command=fake.delay.command),
-        source=replace(real.source, device=None),
-    )
-    assert swapped == fake
-    with raises(ConfigError, match="a recording flies dry"):
-        config.load(
-            HilParams, config.find("hil", name), ['source.kind="tlog"', 'source.file="a.tlog"']
-        )
-
-
 def test_a_curve_of_the_rotors_is_inverted_exactly():
     """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the
     motors' command.
