@@ -49,19 +49,6 @@ def test_layouts_have_the_papers_sizes():
         observations.layout_of(replace(params, layout="lidar"))
 
 
-def test_groups_shapes_and_fresh_tensors(env):
-    first, _, _, extras = env.step(torch.zeros(16, 5))
-    kept = first["actor"].clone()
-    second, reward, done, _ = env.step(torch.zeros(16, 5))
-    assert set(first.keys()) == {"actor", "critic"}
-    assert second["actor"].shape == (16, 35)
-    assert second["critic"].shape == (16, 42)
-    assert reward.shape == done.shape == (16,)
-    assert first["actor"].data_ptr() != second["actor"].data_ptr()
-    assert_close(first["actor"], kept, rtol=0, atol=0)
-    assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
-
-
 def test_actor_does_not_see_what_only_the_critic_may(env):
     """Mass, voltage, timer and payload velocity change the critic's view alone."""
     still = torch.zeros(16, dtype=torch.bool)

@@ -230,14 +230,6 @@ except ImportError:
     assert len(names) > len(ONBOARD)
 
 
-def test_importing_visthrow_and_the_command_line_is_cheap():
-    code = "import sys, visthrow.cli; print(*sys.modules)"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
-    )
-    assert {"torch", "numpy", "warp", "cv2"}.isdisjoint(result.stdout.split())
-
-
 def test_only_the_configuration_names_a_solver():
     """``visthrow`` and ``hil`` know the simulator, not the engine behind it."""
     wrong = [

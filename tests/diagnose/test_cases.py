@@ -7,10 +7,9 @@ import os
 from itertools import pairwise
 
 import numpy as np
-from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark
 
-from bench.diagnose import altered, cases
+from bench.diagnose import cases
 from bench.diagnose.bad import BAD
 from bench.diagnose.degenerate import PAIRS, manoeuvre_of
 from bench.worlds.follow import ALONE, follow, table_of
@@ -47,46 +46,6 @@ def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
     )  # another seed is another flight
 
 
-def test_a_mirror_undoes_itself_and_turns_rotations_around(logs):
-    once = altered.mirrored(logs[1])
-    twice = altered.mirrored(once)
-    for name, channel in logs[1].channels.items():
-        assert_allclose(twice[name].values, channel.values)
-    rate = lambda log: np.gradient(2.0 * log["quat_wb"].values[:, :3], log["quat_wb"].time, axis=0)  # noqa: E731
-    level = np.abs(logs[1]["quat_wb"].values[:, 3]) > 0.99
-    assert_allclose(rate(once)[level], (rate(logs[1]) * [-1.0, 1.0, -1.0])[level], atol=1e-9)
-    assert_allclose(once["command"].values, logs[1]["command"].values * [1.0, -1.0, 1.0, -1.0])
-    assert altered.mirrored_theta({"com_y": 1.0, "motor_1": 2.0, "com_x": 3.0}) == {
-        "com_y": -1.0,
-        "motor_2": 2.0,
-        "com_x": 3.0,
-    }
-
-
-def test_a_turned_hall_keeps_distances_and_heights(logs):
-    turned = altered.turned(logs[1], 0.5 * np.pi, (2.0, -1.0, 0.0))
-    p, q = (log["pos_w"].values - log["payload_pos_w"].values for log in (logs[1], turned))
-    assert_allclose(
-        q, p @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), atol=1e-12
-    )
-    back = altered.turned(turned, -0.5 * np.pi, (1.0, 2.0, 0.0))
-    assert_allclose(back["pos_w"].values, logs[1]["pos_w"].values, atol=1e-12)
-    alike = np.abs(np.sum(back["quat_wb"].values * logs[1]["quat_wb"].values, axis=1))
-    assert_allclose(alike, np.sum(logs[1]["quat_wb"].values ** 2, axis=1), atol=1e-12)
-
-
-def test_scrambled_logs_keep_their_poses_and_exchange_their_commands(logs):
-    mixed = altered.scrambled(logs)
-    assert_array_equal(mixed[1]["pos_w"].values, logs[1]["pos_w"].values)
-    assert_array_equal(mixed[1]["command"].values, logs[2]["command"].values)
-    assert_array_equal(mixed[2]["command"].values, logs[1]["command"].values)
-
-
-def test_the_tool_is_asked_apart(tmp_path):
-    """What all sealed worlds, cases and bad logs start."""
-    assert "--plant" in cases.tool(tmp_path, "diagnose", "explain", "--help")
-
-
 def test_a_proposed_manoeuvre_is_flown_on_the_plant():
     """The pilot follows a reference to a decimetre; without payload its log shows none, and such a
     flight counts as bare.
@@ -117,17 +76,6 @@ def test_a_design_is_flown_with_the_load_of_its_manoeuvre():
         design = designed(manoeuvre, Limits(), START)
         assert manoeuvre_of(design.name).payload == manoeuvre.payload, design.name
         assert manoeuvre_of(manoeuvre.name).name == manoeuvre.name
-
-
-def test_added_rates_and_thrust_reach_the_commands():
-    known = {m.name: m for m in catalogue()}
-    tables = [
-        table_of(known[name].reference().csv(), True)
-        for name in ("hover", "rate doublets", "thrust steps")
-    ]
-    quiet, rates, thrust = follow(Recipe(5, "rod", {}), tables, 1)
-    assert np.abs(rates["sent"][:, 1]).max() > np.abs(quiet["sent"][:, 1]).max() + 2.0
-    assert thrust["sent"][:, 0].max() > 1.3 * quiet["sent"][:, 0].max()
 
 
 def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):

@@ -103,12 +103,3 @@ def test_order_of_the_step(segments):
     for name in ("pos_w", "ball_pos_w", "ball_vel_w"):
         first, second, third = (getattr(flight, name) for flight in flights)
         assert np.log2(norm(first - second) / norm(second - third)) > ORDER
-
-
-def test_twist_is_all_that_is_left():
-    """Without damping the fine step meets MuJoCo closer than the bodies' twist would
-    allow with it.
-    """
-    scene = replace(load_scene(SCENES / "hard_throw.toml"), joint_damping=0.0)
-    vehicle, ball, _ = errors(fly(scene, 2.5e-4, "float64"), oracle(scene))
-    assert max(vehicle, ball) < 3e-5

@@ -49,21 +49,6 @@ def test_equal_to_opencv_before_the_lens(params):
 
 
 @LENSES
-def test_equal_to_kornia_before_the_lens(params):
-    from kornia.geometry.camera import distort_points_kannala_brandt
-
-    points = torch.from_numpy(points_before_the_lens())
-    values = torch.tensor(
-        [params.fx, params.fy, params.cx, params.cy, *params.coefficients], dtype=torch.float64
-    )
-    theirs = distort_points_kannala_brandt(
-        (points[:, :2] / points[:, 2:])[None], values[None, None]
-    )[0]
-    ours, _ = Fisheye(params).project(points)
-    assert (ours - theirs).abs().max() < PIXEL_TOLERANCE
-
-
-@LENSES
 def test_unprojection_equal_to_opencv(params):
     points = points_before_the_lens(500)
     points = points[
@@ -80,18 +65,3 @@ def test_unprojection_equal_to_opencv(params):
     ours = (rays[:, :2] / rays[:, 2:]).numpy()
     # On the plane z = 1 an angle error is stretched by 1 / cos^2(80 deg) = 33.
     assert np.abs(ours - theirs).max() < 1e-8
-
-
-def test_opencv_mirrors_points_behind_the_lens_and_ours_does_not():
-    # The reason for the model of our own: 100 deg off the axis OpenCV divides by a negative z and
-    # lands on the other side.
-    params = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
-    t = math.radians(100.0)
-    point = np.array([[[math.sin(t), 0.0, math.cos(t)]]])
-    camera_matrix = np.array([[params.fx, 0, params.cx], [0, params.fy, params.cy], [0, 0, 1]])
-    theirs, _ = cv2.fisheye.projectPoints(
-        point, np.zeros(3), np.zeros(3), camera_matrix, np.zeros(4)
-    )
-    ours, valid = Fisheye(params).project(torch.from_numpy(point[0]))
-    assert theirs[0, 0, 0] < params.cx < float(ours[0, 0])
-    assert valid.all()

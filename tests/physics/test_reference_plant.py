@@ -195,15 +195,6 @@ def test_landing_equals_the_closed_form_without_rope_mass(step):
     )
 
 
-def test_environments_do_not_see_each_other():
-    pair, single = swinging(paper_plant(), count=2), swinging(paper_plant())
-    for _ in range(3):
-        pair.step(np.array([[3.0, 1.0, 0.0, 0.0], [1.0, 0.0, 5.0, 0.0]]), np.array([True, False]))
-        single.step(np.array([[3.0, 1.0, 0.0, 0.0]]), True)
-    assert_allclose(pair.state.payload_pos_w[0], single.state.payload_pos_w[0], atol=1e-12)
-    assert pair.state.latched.tolist() == [True, False]
-
-
 def test_wrong_shapes_are_named():
     reference = ReferencePlant(plain_plant())
     with raises(ValueError, match=r"cable_dir_w has shape \(1, 3, 3\), expected \(1, 15, 3\)"):

@@ -80,25 +80,6 @@ def test_asking_again_or_no_more_changes_nothing():
             assert_array_equal(once.get(name), often.get(name))
 
 
-def test_a_lag_inside_a_substep_lies_between_its_neighbours():
-    """0.1037 s is no multiple of 2 ms: the state is that of 0.1037 s, not of a substep
-    beside it.
-    """
-    command = np.array([[4.0, 2.0, -3.0, 1.0]])
-
-    def at(lag):
-        sim = HybridSim(plant(lag, "float64"), 1)
-        for _ in range(6):
-            sim.set_command(command, [1])
-            sim.step()
-        return sim.get("payload_pos_w")[0], sim.get("payload_vel_w")[0]
-
-    (before, vel), (inside, _), (after, vel_after) = at(0.1030), at(0.1037), at(0.1044)
-    middle = 0.5 * (before + after) - 0.0007 * (vel_after - vel) / 4.0
-    assert_allclose(inside, middle, atol=2e-6)
-    assert norm(inside - before) > 1e-4
-
-
 def test_landing_flight_and_clearance():
     """The projectile's formulas, written again, over many throws."""
     count, asked_at = 64, 10

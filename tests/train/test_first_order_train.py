@@ -2,11 +2,7 @@
 however it was stopped.
 """
 
-import os
 import signal
-import subprocess
-import sys
-import time
 
 import numpy as np
 import torch
@@ -109,25 +105,3 @@ def test_replayed_from_graphs_it_computes_what_it_computes_eagerly():
     captured = errors(False)
     assert len(set(captured)) == 6
     np.testing.assert_allclose(captured, errors(True), rtol=1e-3)
-
-
-def test_killed_it_goes_on(whole, tmp_path):
-    """SIGKILL, as a machine without power would."""
-    folder = tmp_path / "run"
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    running = subprocess.Popen(
-        [sys.executable, "-m", "visthrow.cli", *words(folder)], env=environment
-    )
-    end = time.monotonic() + PATIENCE
-    while not (folder / CHECKPOINT).exists():
-        assert time.monotonic() < end, "no checkpoint came"
-        assert running.poll() is None or (folder / CHECKPOINT).exists()
-        time.sleep(0.01)
-    running.kill()
-    running.wait()
-    assert cli.main(words(folder, "--resume")) == 0
-    assert same(whole, folder)
-
-
-PATIENCE = 300.0
-"""Longest wait for what takes seconds on an idle machine [s]."""

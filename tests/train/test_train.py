@@ -22,11 +22,9 @@ from torch.testing import assert_close
 from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
-from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import trainer
-from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -89,48 +87,6 @@ def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):
     assert len(rows) == 1 + 4
     experiment = config.load(Experiment, whole / "config.toml")
     Policy.load(whole / "policy.npz").require(contract_of(experiment))
-
-
-def test_exported_policy_equals_the_network(whole):
-    experiment = config.load(Experiment, whole / "config.toml")
-    trainer = Trainer(experiment, "cpu", 1)
-    trainer.load(whole / CHECKPOINT)
-    obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
-    with torch.inference_mode():
-        difference = (
-            (
-                trainer.algorithm.alg.actor({"actor": obs})
-                - Policy.load(whole / "policy.npz").act(obs)
-            )
-            .abs()
-            .max()
-        )
-    assert difference < 1e-6
-
-
-def test_networks_may_round_their_products_and_observations_do_not(whole, monkeypatch):
-    experiment, allowed = (
-        config.load(Experiment, whole / "config.toml"),
-        {
-            "observed": set(),
-            "learnt": set(),
-        },
-    )
-
-    def watched(owner, name, place):
-        work = getattr(owner, name)
-
-        def noted(*args, **kwargs):
-            allowed[place].add(torch.backends.cuda.matmul.allow_tf32)
-            return work(*args, **kwargs)
-
-        monkeypatch.setattr(owner, name, noted)
-
-    watched(observations, "observe", "observed")
-    watched(PPOTraining, "learn", "learnt")
-    Trainer(experiment, "cpu", 1).step()
-    assert allowed == {"observed": {False}, "learnt": {True}}
-    assert not torch.backends.cuda.matmul.allow_tf32, "left on for whatever comes after"
 
 
 def test_resume_goes_on_bit_for_bit(whole, tmp_path):

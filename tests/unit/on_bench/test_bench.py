@@ -8,9 +8,7 @@ from pathlib import Path
 
 from pytest import fixture, mark, raises
 
-from bench import camera as bench_camera
-from bench import report, start, train
-from bench import sim as sim_cpu
+from bench import report, start
 from visthrow import cli, config
 from visthrow.common.errors import StorageError
 from visthrow.onboard.policy import find_policy
@@ -36,18 +34,6 @@ def test_shipped_records_are_well_formed():
         assert record["provenance"]["versions"]["warp-lang"], path.name
         assert measurements.body(record).startswith(f"### {record['title']}")
         assert measurements.origin(record)
-
-
-def test_records_of_pages_are_well_formed(capsys):
-    paths = sorted(measurements.PAGES.glob("*.json"))
-    assert paths
-    for path in paths:
-        for table in measurements.load(path)["tables"]:
-            assert all(len(row) == len(table["header"]) for row in table["rows"]), path.name
-    assert cli.main(["bench", "records", "training-page"]) == 0
-    printed = capsys.readouterr().out
-    assert "docs/explanation/training.md" in printed
-    assert "0.104 ± 0.056 m" in printed  # a figure of the paper's recipe
 
 
 TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
@@ -96,19 +82,3 @@ def test_records_refuse_what_they_are_not(kept):
 def test_mistakes_are_told(capsys):
     assert cli.main(["bench", "records", "no_such_record"]) == 2
     assert "no record" in capsys.readouterr().err
-
-
-@mark.parametrize(
-    ("of", "words", "message"),
-    [
-        (sim_cpu, "--batch 0", "expected positive"),
-        (sim_cpu, "--batch 4 8", "one batch size"),
-        (sim_cpu, "--core 4096 --without-mujoco --seconds 1e-3 --batch 1", "expected one of"),
-        (bench_camera, "--environments 0", "expected positive"),
-        (train, "no_such", "no train config"),
-        (train, "--iterations 0", "expected positive"),
-    ],
-)
-def test_mistakes_of_developers_are_told(of, words, message, capsys):
-    assert of.main(words.split()) == 2
-    assert message in capsys.readouterr().err

@@ -5,24 +5,17 @@ over UDP.
 import argparse
 import json
 
-from pytest import mark, raises
+from pytest import mark
 
 from bench import faults as hil_faults
 from bench import runner
 from bench import soak as hil_soak
-from bench.processes import Pair
-from visthrow.common.errors import VisthrowError
 
 SOAK_MINUTES = 1.0
 MOST_GROWTH = 100e3
 """Of the runner's memory [bytes/s]: 6 MB a minute; a list of every tick's record would grow by
 more. A minute is short for a line, the recorder's buffers breathe.
 """
-
-
-def test_a_run_that_does_not_start_says_why(tmp_path):
-    with raises(VisthrowError, match=r"did not start.*no policy 'nobody'"):
-        Pair(("--config", "fake", "--set", "policy=nobody"), hil_soak.STILL).fly(tmp_path / "run")
 
 
 @mark.slow

@@ -24,13 +24,6 @@ def test_push_shifts_and_fills_on_reset():
     assert pushed[..., 0].tolist() == [[7.0, 1.0, 2.0], [8.0, 8.0, 8.0]]
 
 
-def test_push_of_one_entry_and_of_bits():
-    bits = torch.tensor([[[True, False]]])
-    assert push(bits, torch.tensor([[False, True]]), torch.tensor([False])).tolist() == [
-        [[False, True]]
-    ]
-
-
 def test_latency_interpolates_between_whole_steps():
     history = torch.tensor([[0.0, 1.0, 4.0, 9.0]]).repeat(4, 1)
     latency = torch.tensor([0.0, 1.0, 1.25, 7.0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from pytest import mark, raises
+from pytest import raises
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -21,9 +21,6 @@ CAMERA = KeypointCamera(
     ),
     dtype=torch.float64,
 )
-# On the narrow side the picture is 320 px for 220 deg; a keypoint and the drawn edge differ by a
-# pixel's width at most.
-PIXEL_TOLERANCE = 1.0
 
 
 def throw_scene(pitch_deg: float):
@@ -40,41 +37,6 @@ def throw_scene(pitch_deg: float):
         CAMERA.fisheye, eye_w, rot_wb[0] @ CAMERA.rot_cb.T, goal_w[0], ball_w[0], supersample=3
     )
     return points[0], valid[0], frame
-
-
-@mark.parametrize("pitch_deg", [0.0, 30.0])
-def test_drawn_ball_and_goal_lie_where_the_keypoints_say(pitch_deg):
-    points, valid, frame = throw_scene(pitch_deg)
-    assert valid.all()
-    pixels = CAMERA.fisheye.denormalize(points).numpy()
-    red, green, blue = frame.numpy().transpose(2, 0, 1)
-    ball = (green > 1.5 * blue) & (red > 1.3 * blue)  # felt is the only yellow in the scene
-    v, u = np.nonzero(ball)
-    drawn = np.array([u.min() - 0.5, v.min() - 0.5, u.max() + 0.5, v.max() + 0.5])
-    box = np.array([pixels[4, 0], pixels[5, 1], pixels[6, 0], pixels[7, 1]])
-    assert np.abs(drawn - box).max() < PIXEL_TOLERANCE + 0.5
-    v, u = np.nonzero(
-        (green > 1.5 * red) & (green > 1.3 * blue)
-    )  # the goal's field is the only green
-    assert (
-        np.hypot(u.mean() - pixels[:4, 0].mean(), v.mean() - pixels[:4, 1].mean()) < PIXEL_TOLERANCE
-    )
-
-
-def test_frame_is_black_outside_the_field_of_view():
-    _, _, frame = throw_scene(0.0)
-    assert frame.shape == (320, 320, 3)
-    assert frame[0, 0].max() == 0.0
-    assert 0.0 < frame[160, 2].max() <= 1.0
-
-
-def test_pixel_rays_hit_pixel_centres():
-    rays, seen = pixel_rays(CAMERA.fisheye)
-    pixels, _ = CAMERA.fisheye.project(rays[100:110, 200:205])
-    assert seen[100, 200]
-    assert torch.allclose(
-        pixels[0, 0], torch.tensor([200.0, 100.0], dtype=torch.float64), atol=1e-9
-    )
 
 
 def test_overlay_colours_the_points_and_leaves_the_input():

@@ -2,7 +2,6 @@
 independent renderer; seeds.
 """
 
-import math
 from dataclasses import replace
 
 import cv2
@@ -157,14 +156,3 @@ def test_photographs_and_what_is_none(tmp_path):
         pyramid(photographs(tmp_path))
     with raises(ValueError, match="samples 0"):
         Renderer(LENS, samples=0)
-
-
-def test_half_a_turn_of_the_lens_model_is_inverted(renderer):
-    """A ring of pixels at the edge of a bent lens's view is lit, and nothing beyond it."""
-    image = renderer.render(hovering())[0].numpy()
-    v, u = np.mgrid[:192, :192]
-    radius = np.hypot((u - 95.5) / 50.0, (v - 95.5) / 50.0)
-    edge = Fisheye(LENS).edge_radius
-    assert image[(radius < edge - 0.03)].max(-1).min() > 0
-    assert not image[radius > edge + 0.03].any()
-    assert edge < math.radians(100.0)

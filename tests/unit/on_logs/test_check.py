@@ -16,12 +16,10 @@ from bench import delays
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
-from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import excitation
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, contradictions, table
-from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81
@@ -167,12 +165,6 @@ def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
         any("the thrust's scale differs" in row.text for one in found for row in one.rows)
         for found in told
     ] == [False, True]
-
-
-def test_noise_is_measured_beside_motion():
-    log = log_of(flight())
-    assert noise(log["pos_w"]) == approx([3e-4] * 3, rel=0.15)
-    assert noise(log["acc_b"]) == approx([0.1] * 3, rel=0.15)
 
 
 @mark.parametrize(
@@ -478,21 +470,6 @@ def test_invalid_channels_do_not_stop_it():
     )
     assert "valid" in faults(log_of(columns, est_pos_w=none))
     assert check([FlightLog({})])[0].verdict == "bad"
-
-
-def test_relate_finds_delay_and_scale():
-    time = np.arange(0, 20, 0.01)
-    a = np.column_stack(
-        [np.sin(1.1 * time) + np.sin(3.7 * time), np.cos(2.3 * time), np.sin(0.9 * time + 1)]
-    )
-    b = 2.0 * np.column_stack([np.interp(time - 0.0234, time, c) for c in a.T])
-    found = relate(time, a, time, b)
-    assert found.delay == approx(0.0234, abs=5e-4)
-    assert found.scale == approx(2.0, rel=0.01)
-    assert found.axes == "x,y,z"
-    turned = relate(time, a, time, b[:, [1, 0, 2]] * [1, -1, 1])
-    assert turned.axes == "y,-x,z"
-    assert not is_mirror(turned.axes)
 
 
 def test_command_line(tmp_path, capsys):

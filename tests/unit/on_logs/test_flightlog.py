@@ -9,7 +9,7 @@ from pytest import fixture, mark, raises
 
 from visthrow.common.errors import LogError
 from visthrow.logs.export import columns, export
-from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog, FlightRecorder
+from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
 
 
 @fixture
@@ -152,12 +152,3 @@ def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
         ]
     with raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
         export(log, tmp_path / "f.xlsx")
-
-
-def test_standard_channels_are_in_known_frames():
-    from visthrow.logs.flightlog import FRAMES
-
-    assert {spec.frame for spec in STANDARD_CHANNELS.values()} <= set(FRAMES)
-    for name, spec in STANDARD_CHANNELS.items():
-        suffix = {"_w": "world", "_b": "body", "_c": "camera"}.get(name[-2:])
-        assert suffix in (None, spec.frame), f"{name} is named for another frame than {spec.frame}"

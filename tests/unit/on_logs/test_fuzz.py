@@ -264,15 +264,6 @@ def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
     assert not said.err
 
 
-def test_bytes_that_do_not_inflate(tmp_path):
-    path = tmp_path / "payload.csv.gz"
-    data = bytearray(gzip.compress(payload_table()))
-    data[200:260] = b"\xff" * 60
-    path.write_bytes(data)
-    with raises(LogError, match="cannot be read"):
-        read(path, setups.load("cf_payload").table)
-
-
 @mark.parametrize(
     ("channel", "words"),
     [
@@ -309,22 +300,3 @@ def test_cut_at_many_places(name, tmp_path):
         said.append(looked_at(path))
     first = said.index(True)
     assert all(said[first:])  # what was readable when less was there stays so
-
-
-def test_text_where_numbers_stood(tmp_path):
-    path = tmp_path / "export.csv"
-    export(own(), path)
-    path.write_bytes(path.read_bytes().replace(b"True", b"Tr", 1))
-    with raises(LogError, match="holds text such as 'Tr'"):
-        read(path)
-
-
-def test_stamps_that_are_text(tmp_path):
-    path = tmp_path / "decoded.csv"
-    rows = lines_of("betaflight_bbl", "LOG00037_start.csv.gz").decode().splitlines()
-    at = [name.split(" ")[0] for name in rows[0].split(",")].index("time")
-    cells = rows[5].split(",")
-    cells[at] = "late"
-    path.write_text("\n".join([*rows[:5], ",".join(cells), *rows[6:]]))
-    with raises(LogError, match="column 'time'"):
-        read(path)

@@ -6,9 +6,6 @@ import numpy as np
 import torch
 
 from visthrow.onboard.compiled import Compiled
-from visthrow.onboard.estimator import Estimator
-
-CALLS = 60
 
 
 def equal(compiled: Compiled, arrays: list[np.ndarray]) -> tuple[np.ndarray, ...]:
@@ -18,33 +15,6 @@ def equal(compiled: Compiled, arrays: list[np.ndarray]) -> tuple[np.ndarray, ...
     for one, other in zip(found, expected):
         np.testing.assert_array_equal(one, other.numpy(), strict=True)
     return found
-
-
-def test_a_memory_that_torch_writes_in_place():
-    generator = torch.Generator().manual_seed(0)
-    width, hidden, memory, count = 20, 16, 8, 12
-    part = lambda *shape: 0.3 * torch.randn(*shape, generator=generator)  # noqa: E731
-    estimator = Estimator(
-        part(width),
-        part(width).abs() + 1.0,
-        part(hidden, width),
-        part(hidden),
-        part(3 * memory, hidden),
-        part(3 * memory),
-        part(3 * memory, memory),
-        part(3 * memory),
-        part(count, memory),
-        part(count),
-        torch.arange(count) + 3,
-    )
-    rng, compiled, held = (
-        np.random.default_rng(0),
-        Compiled(estimator.step),
-        np.zeros((1, memory), dtype=np.float32),
-    )
-    for _ in range(CALLS):
-        _, held = equal(compiled, [rng.normal(size=(1, width)).astype(np.float32), held])
-    assert np.abs(held).max() > 0.01
 
 
 def test_results_are_the_callers_own_and_arguments_stay():

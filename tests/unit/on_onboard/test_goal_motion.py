@@ -2,7 +2,6 @@
 and both layouts' geometry.
 """
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -126,27 +125,3 @@ def test_a_located_state_layout_has_the_mean_goal():
         assert kept is frame
         wanted = np.mean(seen, axis=0) - frame[0, :2].numpy()
         assert_allclose(places[0].numpy(), wanted, atol=1e-5)
-
-
-def test_accuracy_is_what_the_docstring_promises():
-    """Four measurements of 0.01 m, 20 ms apart, leave 0.2 m/s; the fit over half a second leaves a
-    tenth of it.
-    """
-    rng = default_rng(2)
-    truth = np.array([0.5, 0.0])
-
-    def spread(steps: int) -> float:
-        times = np.arange(steps)[:, None, None] * PERIOD
-        noisy = times * truth + 0.01 * rng.standard_normal((steps, 4000, 2))
-        velocity = fitted(torch.tensor(noisy, dtype=torch.float32), 0.01).numpy()
-        return float(np.sqrt(np.mean((velocity - truth) ** 2)))
-
-    free = 0.01 / (PERIOD * math.sqrt(5.0))  # slope of four points without the prior: 0.22 m/s
-    assert 0.5 * free < spread(4) < free
-    assert spread(25) < 0.02
-
-
-def test_layout_and_contract_grow_by_the_velocity_alone():
-    params = config.load(Experiment, config.find("train", "state_moving")).task.observation
-    still = replace(params, goal_velocity=False)
-    assert ob.layout_of(params).dimension == ob.layout_of(still).dimension + 2

@@ -126,10 +126,3 @@ def test_middle_is_the_median_of_what_is_valid():
         torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
     )
     assert_close(middle(points, valid), expected)
-
-
-def test_a_layout_counts_it():
-    params = config.load(Experiment, config.find("train", "laptop_vision")).task.observation
-    assert (
-        ob.layout_of(params).dimension == ob.layout_of(replace(params, located=False)).dimension + 6
-    )

@@ -72,14 +72,6 @@ def test_a_response_with_gaps_is_that_of_regular_steps(times):
     assert np.abs(speeds[2] - speeds[1]).max() > 5e-3, "without the times it is not"
 
 
-def test_steps_in_time_are_the_same_bits():
-    times = np.arange(12) + 0.04 * np.sin(np.arange(12.0))
-    pilots = [Pilot(simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0))) for _ in range(2)]
-    for t in times:
-        first, second = seen(pilots[0], PERIOD * t, PERIOD * t), seen(pilots[1], PERIOD * t, None)
-        assert np.array_equal(first, second)
-
-
 def test_what_is_older_than_the_throw_is_its_first_step():
     history = torch.tensor([[[4.0], [1.0], [1.0], [1.0]]])
     found = resampled(history, torch.tensor([[8.0]]), [0.04, 0.06], PERIOD)

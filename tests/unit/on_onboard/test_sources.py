@@ -6,9 +6,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from pytest import mark
 
-from visthrow.onboard import observations as ob
 from visthrow.onboard.pilot import Pilot
-from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.loading import load_policy
 
 SEEN = ("goal", "payload", "validity")
@@ -65,11 +63,3 @@ def test_validity_bits_are_the_cameras():
     bits = shown[-1, layout.columns("validity")]
     assert_array_equal(bits[4:], valid[4:])
     assert bits[:4].sum() >= valid[:4].sum()
-
-
-def test_groups_cover_the_input():
-    for name in ("state", "vision", "vision_located"):
-        policy = Policy.load(find_policy(name))
-        layout = load_policy(name).experiment.task.observation
-        layout = ob.layout_of(layout)
-        assert layout.columns(*layout.groups) == list(range(policy.obs_dim))

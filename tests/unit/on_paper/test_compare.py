@@ -2,7 +2,7 @@
 
 import json
 
-from pytest import approx, importorskip
+from pytest import importorskip
 
 from visthrow import cli
 from visthrow.cli import compare
@@ -20,14 +20,6 @@ def test_units_are_cut_into_batches_on_reference_plants_alone():
     cut = thrower.units("reference", "both", 2.0, 2 * BATCH + 1)
     assert [(u["throws"], u["batch"]) for u in cut] == [(BATCH, 0), (BATCH, 1), (1, 2)]
     assert len({results.key_of(u) for u in cut}) == 3
-
-
-def test_a_unit_knows_its_plant():
-    light = thrower.unit("hybrid", "both", 2.0, 1, overrides=["vehicle.body.mass=0.2"])
-    plain = thrower.unit("hybrid", "both", 2.0, 1)
-    assert light["conditions"] != plain["conditions"]
-    assert plain["speed"] == approx(2.935)
-    assert plain["w_t"] == spline.PlanParams().duration
 
 
 def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):

@@ -11,7 +11,6 @@ from visthrow.paper.baseline import spline as sp
 from visthrow.paper.baseline.pendulum_model import Pendulum
 from visthrow.paper.baseline.spline import PlanError, PlanParams
 from visthrow.paper.baseline.throw_plan import (
-    default_release,
     landing_point,
     plan_throw,
     read_release,
@@ -61,12 +60,6 @@ def test_release_is_read_off_a_flight():
         read_release(FlightRecorder({"result": {"failure": "the vehicle tilted too far"}}).log())
 
 
-def test_defaults_lie_between_what_was_measured():
-    near, middle, far = (default_release(x) for x in (1.5, 1.75, 2.0))
-    assert middle == approx(np.mean([near, far], axis=0))
-    assert default_release(0.5) == near
-
-
 @mark.parametrize(("height", "speed"), [(0.04, 2.0), (1.0, 0.0), (1.0, float("nan"))])
 def test_impossible_releases_are_refused(height, speed):
     with raises(ConfigError, match="expected"):
@@ -88,12 +81,6 @@ def test_derivatives_of_the_spline_are_its_slopes():
     time, h = np.array([0.1, 0.5, 0.95]), 1e-6
     slopes = (path.sample(time + h) - path.sample(time - h)) / (2 * h)
     assert np.allclose(slopes[:, :5], path.sample(time)[:, 1:], rtol=1e-4, atol=1e-3)
-
-
-def test_past_its_end_the_path_goes_on_straight(plan):
-    beyond = plan.path.sample(np.array([plan.path.duration + 0.3]))[0]
-    assert np.allclose(beyond[0], plan.release.pos_w + 0.3 * plan.release.vel_w)
-    assert np.allclose(beyond[2:], 0.0)
 
 
 def test_plan_ends_in_the_release_on_the_grid_and_within_bounds(plan):

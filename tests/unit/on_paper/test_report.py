@@ -161,15 +161,6 @@ def test_front_tells_honestly_who_beats_whom(full):
     assert "none of 1 setting landed all its throws" in told(error=0.004, duration=1.0, lost=1)
 
 
-def test_hypervolume_of_one_setting_is_its_rectangle():
-    rng = default_rng(4)
-    found = made_up.baseline(rng, "hybrid", "both", 2.0, 0.05, 1.5, speed=2.2)
-    volume = trade.hypervolume([found])
-    expected = (2.5 - found.of("duration").mean()) * (0.5 - found.of("error").mean())
-    assert volume.value == approx(expected)
-    assert expected in volume
-
-
 def test_the_page_stands_alone(written):
     folder, sections = written
     html = (folder / "report.html").read_text(encoding="utf-8")

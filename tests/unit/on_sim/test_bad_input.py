@@ -55,12 +55,6 @@ def test_bad_plants_are_refused(path, value, message):
         HybridSim(plant_with(path, value), 1)
 
 
-@mark.parametrize(("path", "value", "message"), VEHICLE)
-def test_bad_vehicles_are_refused_alone_too(path, value, message):
-    with raises(ValueError, match=message):
-        bare_quadrotor(plant_with(path, value).vehicle, 1)
-
-
 @mark.parametrize(
     ("options", "message"),
     [

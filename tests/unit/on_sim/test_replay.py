@@ -180,15 +180,6 @@ def test_release_falls_between_steps(flight):
     assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
 
 
-def test_lanes_do_not_see_each_other(flight):
-    heavy = replace(plant(), rope=replace(plant().rope, payload_mass=0.08))
-    rows = np.array([0, 1, 0, 1, 1, 0, 0])
-    seen, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
-    for i, row in enumerate(rows):
-        np.testing.assert_array_equal(seen["pos"][:, i], seen["pos"][:, list(rows).index(row)])
-    assert np.abs(seen["pos"][:, 0] - seen["pos"][:, 1]).max() > 1e-3
-
-
 def test_latent_forces_push(flight):
     """A constant force on the vehicle, made of all its triangles, is gravity changed by it."""
     force = 0.01

@@ -24,7 +24,7 @@ from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
-from visthrow.throws.loading import load_policy, unique_names
+from visthrow.throws.loading import load_policy
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
 from visthrow.throws.plants import flown as flown_payload
@@ -82,18 +82,6 @@ def test_loose_rope_keeps_its_links_and_its_energy():
     assert np.abs(lengths - 0.03).max() < LINK_ERROR
     assert abs(np.sum(rope.velocity_w**2) / energy - 1.0) < ENERGY_DRIFT
     assert norm(ends[0] - (points[0] - ball)) > 0.1, "it must have turned"
-
-
-def test_loose_rope_ends_on_the_ground():
-    points = np.column_stack((np.zeros(9), np.zeros(9), np.linspace(0.3, 0.07, 9)))
-    rope = LooseRope(
-        points, np.tile([0.3, 0.0, -4.0], (9, 1)), np.array([0.0, 0.0, 0.04]), np.zeros(3)
-    )
-    rope.sink(2.0, 0.003 - 0.04)
-    resting = rope.points_w(np.array([0.0, 0.0, 0.04]))
-    assert resting[:-1, 2].min() > 0.0
-    assert resting[0, 2] < 0.02
-    assert norm(rope.velocity_w, axis=1).max() < 0.2
 
 
 def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
@@ -426,11 +414,6 @@ def test_table_says_success_rate_and_leaves_failures_blank():
     assert csv_text([("b", "hybrid", throws(0.1, 3))]).splitlines()[-1] == "b,hybrid,2.0,3,0,,,,,,"
 
 
-def test_names_are_made_unique(dropper):
-    loaded = load_policy(dropper)
-    assert unique_names([loaded, loaded]) == ["dropper 1", "dropper 2"]
-
-
 @mark.parametrize(
     ("words", "message"),
     [
@@ -482,11 +465,6 @@ def test_a_policy_without_its_config_asks_for_one(tmp_path):
     assert load_policy(tmp_path / "bare.npz", "state").experiment.task.observation.layout == "state"
     with raises(MismatchError):
         load_policy(tmp_path / "bare.npz", "state", ["vehicle.body.mass=0.3"])
-
-
-def test_targets_must_differ_from_each_other():
-    with raises(ConfigError):
-        compare.check([2.0, 2.0], 10)
 
 
 def test_throws_are_within_an_error_only_where_nearly_all_land():

@@ -101,19 +101,3 @@ def test_a_base_that_is_nowhere_suggests_its_own_kind(tmp_path):
     with raises(ConfigError, match=r"did you mean 'train/vision\.toml'") as caught:
         config.load(Experiment, tmp_path / "mine.toml")
     assert "vehicle/" not in str(caught.value)
-
-
-@mark.parametrize(
-    ("override", "message"),
-    [
-        ("gate.max_speed=-1", "gate: max_speed is -1.0; expected above 0"),
-        ("fence.deceleration=0", "fence: deceleration is 0.0; expected above 0"),
-        ("states.throw=-1", "states: throw is -1.0; expected above 0"),
-    ],
-)
-def test_a_range_error_names_the_one_key(override, message):
-    from hil.params import HilParams
-
-    with raises(ConfigError) as caught:
-        config.load(HilParams, config.find("hil", "vicon"), [override])
-    assert str(caught.value).endswith(f"{message} (with {override})")

@@ -9,7 +9,6 @@ import torch
 from numpy.testing import assert_allclose
 from pytest import approx, mark, raises
 
-from sim.hybrid import HybridSim
 from sim.params import GRAVITY
 from sim.vehicle_class import draw
 from visthrow import config
@@ -105,43 +104,6 @@ def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
         near = 0.15 * (high - low)  # both ends are reached
         assert low * (1 - 1e-9) <= factor.min() < low + near, name
         assert high - near < factor.max() <= high * (1 + 1e-9), name
-
-
-def test_a_vehicle_flies_the_same_in_a_batch_as_alone_to_the_bit():
-    plants = [member.plant for member in members(experiment())]
-    parts = {
-        f"{name}s": [getattr(p, name) for p in plants] for name in ("vehicle", "rope", "release")
-    }
-    together = HybridSim(plants[0], 6, **parts)
-    commands = np.random.default_rng(0).uniform(
-        (1.0, -3.0, -3.0, -1.0), (6.0, 3.0, 3.0, 1.0), (25, 1, 4)
-    )
-
-    def fly(sim: HybridSim) -> dict[str, np.ndarray]:
-        sim.place(np.tile([0.0, 0.0, 1.3], (sim.count, 1)))
-        for k, command in enumerate(commands):
-            sim.set_command(np.repeat(command, sim.count, 0), np.full(sim.count, k >= 16))
-            sim.step()
-        return {
-            name: sim.get(name)
-            for name in (
-                "pos_w",
-                "quat_wb",
-                "motor_speed",
-                "landing_w",
-                "time_to_impact",
-                "cable_dir_w",
-            )
-        }
-
-    batch = fly(together)
-    for k, plant in enumerate(plants):
-        single = fly(HybridSim(plant, 1))
-        for name, value in single.items():
-            np.testing.assert_array_equal(
-                batch[name][[k, k + 3]], np.repeat(value, 2, 0), err_msg=f"{k}: {name}"
-            )
-    assert len(np.unique(batch["landing_w"][:, 0])) == 3
 
 
 def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them():
