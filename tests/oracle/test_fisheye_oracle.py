@@ -49,6 +49,21 @@ def test_equal_to_opencv_before_the_lens(params):
 
 
 @LENSES
+def test_equal_to_kornia_before_the_lens(params):
+    from kornia.geometry.camera import distort_points_kannala_brandt
+
+    points = torch.from_numpy(points_before_the_lens())
+    values = torch.tensor(
+        [params.fx, params.fy, params.cx, params.cy, *params.coefficients], dtype=torch.float64
+    )
+    theirs = distort_points_kannala_brandt(
+        (points[:, :2] / points[:, 2:])[None], values[None, None]
+    )[0]
+    ours, _ = Fisheye(params).project(points)
+    assert (ours - theirs).abs().max() < PIXEL_TOLERANCE
+
+
+@LENSES
 def test_unprojection_equal_to_opencv(params):
     points = points_before_the_lens(500)
     points = points[
