@@ -12,6 +12,7 @@ from pathlib import Path
 from pytest import mark
 
 from sim.solvers import SOLVERS
+from tests.commands import run_command
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
@@ -115,11 +116,10 @@ def test_nothing_imports_an_optional_room_from_outside(room):
 
 
 def test_an_optional_room_names_its_extra(monkeypatch, capsys):
-    from visthrow.cli import main
 
     monkeypatch.setitem(sys.modules, "piqp", None)
     monkeypatch.delitem(sys.modules, "visthrow.paper.baseline.rival", raising=False)
-    assert main(["compare", "baseline", "--throws", "1"]) == 2
+    assert run_command("compare baseline --throws 1") == 2
     assert "pip install 'visthrow[paper]'" in capsys.readouterr().err
 
 

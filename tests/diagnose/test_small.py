@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from bench.diagnose import foreign, small
 from bench.diagnose.flown import ball_log, fly
 from sim.params import LawParams
+from tests.commands import run_command
 from tests.unit.on_diagnose.test_models import BALL, FLYER
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
@@ -121,39 +122,12 @@ def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_p
     plain.write_text(
         config.dumps(setups.Setup("flights of others", **{kind: small.WORLDS[kind][2]}))
     )
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "explain",
-                *logs[:4],
-                "--config",
-                str(plain),
-                "--no-blind",
-                "--out",
-                str(out),
-            ]
-        )
-        == 0
-    )
+    assert run_command(f"diagnose explain --config {plain} --no-blind --out {out}", *logs[:4]) == 0
     report = json.loads((out / "diagnosis.json").read_text())
     assert report["overall"] == "UNKNOWN"
     assert not report["theta"]
     assert report["laws"][0]["formula"] == small.formula(kind, law)
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "apply",
-                str(out / "diagnosis.json"),
-                "--laws",
-                "1",
-                "--out",
-                str(extended),
-            ]
-        )
-        == 0
-    )
+    assert run_command(f"diagnose apply {out}/diagnosis.json --laws 1 --out {extended}") == 0
     (written,) = setups.load(extended).laws
     told = report["explanations"][0][0]
     assert written.coefficient == told["coefficient"]
@@ -211,10 +185,7 @@ def test_an_unknown_of_a_model_without_laws_says_so(capsys, tmp_path, monkeypatc
         / "motor_prop_stand"
         / "all_tests.csv.gz"
     )
-    assert (
-        cli.main(["diagnose", "explain", f"{tests}:a1_*", "--config", "motor_stand", "--no-report"])
-        == 0
-    )
+    assert run_command(f"diagnose explain {tests}:a1_* --config motor_stand --no-report") == 0
     said = capsys.readouterr().out
     assert "UNKNOWN" in said
     assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
@@ -240,20 +211,7 @@ def test_models_without_laws_say_why(kind, tmp_path, capsys):
     }
     (tmp_path / "diagnosis.json").write_text(json.dumps(given))
     out = tmp_path / "extended.toml"
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "apply",
-                str(tmp_path / "diagnosis.json"),
-                "--laws",
-                "1",
-                "--out",
-                str(out),
-            ]
-        )
-        == 2
-    )
+    assert run_command(f"diagnose apply {tmp_path}/diagnosis.json --laws 1 --out {out}") == 2
     said = capsys.readouterr().err
     assert f"no law can act in the model '{kind}'" in said
     assert setups.MODELS[kind].lawless in said

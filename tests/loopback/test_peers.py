@@ -18,9 +18,9 @@ from hil.links.roster import SILENT
 from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.open_source import open_source
+from tests.commands import run_command
 from tests.hil_runs import record_run, saved_policy
 from visthrow import config
-from visthrow.cli import main
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
 
@@ -183,17 +183,7 @@ def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch):
 
         monkeypatch.setattr(MavlinkSource, "poll", sending)
         assert (
-            main(
-                [
-                    "hil",
-                    "check",
-                    "--seconds",
-                    "0.5",
-                    "--set",
-                    f'link.device="udp:127.0.0.1:{number}"',
-                ]
-            )
-            == 1
+            run_command(f'hil check --seconds 0.5 --set link.device="udp:127.0.0.1:{number}"') == 1
         )
         port = sender.getsockname()[1]
     out = capsys.readouterr().out
@@ -207,24 +197,21 @@ def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch):
         " this run" in out
     )
     monkeypatch.setattr(MavlinkSource, "poll", poll)
-    assert (
-        main(["hil", "check", "--seconds", "0.1", "--set", f'link.device="udp:127.0.0.1:{number}"'])
-        == 1
-    )
+    assert run_command(f'hil check --seconds 0.1 --set link.device="udp:127.0.0.1:{number}"') == 1
     assert f"nobody speaks on udp:127.0.0.1:{number}" in capsys.readouterr().out
 
 
 def test_a_replay_of_a_cut_recording_is_no_success(tmp_path, capsys):
     record_run(tmp_path / "run", saved_policy(tmp_path), seconds=3.0)
-    assert main(["hil", "replay", str(tmp_path / "run")]) == 0
+    assert run_command(f"hil replay {tmp_path}/run") == 0
     ticks = tmp_path / "run" / "ticks.jsonl"
     rows = ticks.read_text().splitlines()
     for kept, gone in ((rows[:6], len(rows) - 6), (rows[:50] + rows[53:], 3)):
         shutil.copytree(tmp_path / "run", tmp_path / "cut", dirs_exist_ok=True)
         (tmp_path / "cut" / "ticks.jsonl").write_text("\n".join(kept) + "\n")
         capsys.readouterr()
-        assert main(["hil", "replay", str(tmp_path / "cut")]) == 1
+        assert run_command(f"hil replay {tmp_path}/cut") == 1
         assert f"CUT: {gone} of {len(rows)} ticks are missing" in capsys.readouterr().out
     (tmp_path / "run" / "summary.json").unlink()
-    assert main(["hil", "replay", str(tmp_path / "run")]) == 1
+    assert run_command(f"hil replay {tmp_path}/run") == 1
     assert "CUT: no summary" in capsys.readouterr().out

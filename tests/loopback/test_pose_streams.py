@@ -10,10 +10,10 @@ from hil.control.state_machine import OperatorInput
 from hil.links.backends.base import DryRun
 from hil.links.clock import ManualClock
 from hil.params import HilParams
+from tests.commands import run_command
 from tests.hil_flight import simple_policy
 from tests.pose_streams import SECONDS, STREAMS, Sent
 from visthrow import config
-from visthrow.cli import main
 
 SETTINGS = [
     "policy=state",
@@ -38,7 +38,7 @@ def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     sent = Sent(params, stream)
     monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, None, True))
     words = [word for setting in SETTINGS for word in ("--set", setting)]
-    status = main(["hil", "check", "--seconds", f"{SECONDS - 0.1}", *words])
+    status = run_command(f"hil check --seconds {SECONDS - 0.1}", *words)
     out = capsys.readouterr().out
     fails = [line for line in out.splitlines() if line.startswith("FAIL")]
     assert status == bool(stream.says), out
@@ -57,5 +57,5 @@ def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, c
     sent = Sent(loaded(), STREAMS["100 Hz"])
     monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, sent.links[0], True))
     words = [word for setting in (*SETTINGS, "backend=ardupilot") for word in ("--set", setting)]
-    assert main(["hil", "check", "--seconds", f"{SECONDS - 0.1}", *words]) == 1
+    assert run_command(f"hil check --seconds {SECONDS - 0.1}", *words) == 1
     assert "FAIL  autopilot not ready (no heartbeat)" in capsys.readouterr().out

@@ -17,6 +17,7 @@ from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.params import RopeParams
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.cli.fly import _rendered_eyes
 from visthrow.detector_training.eyes import HANGING, RenderedEyes
@@ -147,9 +148,7 @@ def test_the_command_throws_with_the_eyes_that_its_options_name(monkeypatch, cap
     made = create_autospec(RenderedEyes, return_value=Blind())
     made.return_value.found = {"ball": 0, "goal": 0, "frames": 1, "refused": 0}
     monkeypatch.setattr("visthrow.detector_training.eyes.RenderedEyes", made)
-    assert (
-        cli.main(["detector", "throw", "--by", "learnt", "--throws", "1", "--device", "cpu"]) == 0
-    )
+    assert run_command("detector throw --by learnt --throws 1 --device cpu") == 0
     assert made.call_args.kwargs["method"] == "learnt"
     assert "vision by learnt on hybrid" in capsys.readouterr().out
 

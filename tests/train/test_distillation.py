@@ -9,6 +9,7 @@ import torch
 from pytest import approx, fixture, mark
 from torch.testing import assert_close
 
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
@@ -218,19 +219,6 @@ def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path,
     ],
 )
 def test_what_cannot_be_distilled_is_refused(tmp_path, capsys, change, said):
-    assert (
-        cli.main(
-            [
-                "train",
-                "vision",
-                "--device",
-                "cpu",
-                "--out",
-                str(tmp_path / "run"),
-                *overrides(change),
-            ]
-        )
-        == 2
-    )
+    assert run_command(f"train vision --device cpu --out {tmp_path}/run", *overrides(change)) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -19,6 +19,7 @@ from numpy.testing import assert_array_equal
 from pytest import fixture, mark, raises
 from torch.testing import assert_close
 
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
@@ -268,12 +269,12 @@ def test_resume_under_another_configuration_is_refused(tmp_path, capsys):
     assert train(folder, "--iterations", "1") == 0
     assert train(folder, "--resume", "--set", "ppo.clip=0.3") == 2
     assert "another configuration" in capsys.readouterr().err
-    assert cli.main(["train", "vision", "--resume", "--out", str(folder), "--device", "cpu"]) == 2
+    assert run_command(f"train vision --resume --out {folder} --device cpu") == 2
     assert "another configuration than vision" in capsys.readouterr().err
 
 
 def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys):
-    assert cli.main(["train", "stat", "--out", str(tmp_path / "a")]) == 2
+    assert run_command(f"train stat --out {tmp_path}/a") == 2
     assert "state" in capsys.readouterr().err
     assert train(tmp_path / "b", "--set", "ppo.minibatches=7") == 2
     assert "minibatches" in capsys.readouterr().err
@@ -290,7 +291,7 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
     for change in changes:
         words += ["--set", change]
     figures = tmp_path / "figures.json"
-    assert cli.main([*words, "--out", str(tmp_path / "run"), "--json", str(figures)]) == 0
+    assert cli.main([*words, "--out", f"{tmp_path}/run", "--json", str(figures)]) == 0
     printed = capsys.readouterr().out
     assert "under the faults of its training:" in printed
     assert re.search(r"target 2\.0 m: error 0\.\d+ \[0\.\d+, 0\.\d+\] m", printed)

@@ -9,6 +9,7 @@ from pathlib import Path
 from pytest import fixture, mark, raises
 
 from bench import report, start
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.common.errors import StorageError
 from visthrow.onboard.policy import find_policy
@@ -80,5 +81,5 @@ def test_records_refuse_what_they_are_not(kept):
 
 
 def test_mistakes_are_told(capsys):
-    assert cli.main(["bench", "records", "no_such_record"]) == 2
+    assert run_command("bench records no_such_record") == 2
     assert "no record" in capsys.readouterr().err

@@ -6,14 +6,14 @@ import numpy as np
 from pytest import approx
 
 from bench.cooperative import split
-from visthrow.cli import main
+from tests.commands import run_command
 from visthrow.cooperative.team_command import load
 from visthrow.cooperative.throw_track import record_throw
 
 
 def test_the_shipped_policy_lands_under_every_fault(tmp_path, capsys):
     file = tmp_path / "table.json"
-    assert main(["cooperative", "compare", "--throws", "30", "--json", str(file)]) == 0
+    assert run_command(f"cooperative compare --throws 30 --json {file}") == 0
     rows = {row["fault"]: row for row in json.loads(file.read_text())}
     assert "late" in capsys.readouterr().out
     assert all(row["landed"] == 1.0 and row["contact"] == 0.0 for row in rows.values())
@@ -45,5 +45,5 @@ def test_the_load_in_halves_takes_two_throws_of_time(tmp_path):
 
 
 def test_a_policy_that_is_not_there_is_told(tmp_path, capsys):
-    assert main(["cooperative", "fly", "trio", "--out", str(tmp_path)]) == 2
+    assert run_command(f"cooperative fly trio --out {tmp_path}") == 2
     assert "no policy 'trio'" in capsys.readouterr().err

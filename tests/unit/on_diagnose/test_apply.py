@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
 from sim.params import LawParams
+from tests.commands import run_command
 from tests.unit.on_diagnose.test_models import ball_log
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
@@ -63,7 +64,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     ]
     own = {"name": "wind_x", "estimate": 0.21, "low": 0.16, "high": 0.26, "unit": "m/s"}
     given = diagnosis(scatter=scatter, findings=[own, own | {"name": "wind_y"}])
-    assert cli.main(["diagnose", "apply", given, "--out", str(out), "--plants", "8"]) == 0
+    assert run_command(f"diagnose apply {given} --out {out} --plants 8") == 0
     capsys.readouterr()
     after, before = config.load(Experiment, out), shipped()
     assert_allclose(after.vehicle.thrust.gain, 1.03)
@@ -297,36 +298,12 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys)
             **{**BALL, "theta": theta, "findings": [{"name": next(iter(theta)), "unit": unit}]}
         )
         assert (
-            cli.main(
-                [
-                    "diagnose",
-                    "apply",
-                    report,
-                    "--config",
-                    name,
-                    "--out",
-                    str(tmp_path / "none.toml"),
-                ]
-            )
-            == 2
+            run_command(f"diagnose apply {report} --config {name} --out {tmp_path}/none.toml") == 2
         )
         assert message in capsys.readouterr().err
         assert not (tmp_path / "none.toml").exists()
     at_bound = diagnosis(**{**BALL, "theta": {"ball_drag": 0.1 + 1e-12}})
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "apply",
-                at_bound,
-                "--config",
-                str(out),
-                "--out",
-                str(tmp_path / "bound.toml"),
-            ]
-        )
-        == 0
-    )
+    assert run_command(f"diagnose apply {at_bound} --config {out} --out {tmp_path}/bound.toml") == 0
     setups.model_of(setups.load(tmp_path / "bound.toml"), [ball_log(seed=1)])
     for entry, message in (
         ("ball_drag = 9.0", "ball_drag = 9 1/m; this model has it from"),
@@ -379,7 +356,7 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
     command = ["diagnose", "apply", str(log), "--plant", "vision", "--out", str(out)]
     assert cli.main(command) == 2
     assert "--hover" in capsys.readouterr().err
-    assert cli.main([*command, "--hover", "0.3645", "--delay", "0.003"]) == 0
+    assert cli.main([*command, *"--hover 0.3645 --delay 0.003".split()]) == 0
     after = config.load(Experiment, out)
     assert after.vehicle.controller.kind == "motor_mixing"
     assert after.vehicle.controller.p_gain[0] == approx(0.01748, rel=1e-3)

@@ -8,6 +8,7 @@ from pytest import approx, fixture
 from bench.diagnose.altered import with_values
 from bench.diagnose.cases import logs_of
 from bench.worlds.world import Recipe
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.diagnose.reporting.explain_cli import REFUSED
 from visthrow.logs.flightlog import FlightLog
@@ -49,7 +50,7 @@ def test_what_was_explained_is_what_training_draws(flights, tmp_path):
     """From flights to the draws of a training, through the files that users pass on."""
     explained(flights, tmp_path)
     out = tmp_path / "mine.toml"
-    assert cli.main(["diagnose", "apply", str(tmp_path / "diagnosis.json"), "--out", str(out)]) == 0
+    assert run_command(f"diagnose apply {tmp_path}/diagnosis.json --out {out}") == 0
     diagnosed = config.load(Experiment, out).diagnosed
     assert diagnosed.effects == ("com_x",)
     (sd,) = np.sqrt(diagnosed.covariance[0])

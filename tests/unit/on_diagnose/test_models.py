@@ -14,8 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
+from tests.commands import run_command
 from tests.plants import paper_plant
-from visthrow import cli, config
+from visthrow import config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
 from visthrow.diagnose.inputs import fit as fitting
 from visthrow.diagnose.inputs import measures
@@ -196,22 +197,9 @@ class TestStand:
         (tmp_path / "mine.toml").write_text(config.dumps(setup))
         logs = [str(tmp_path / f"{i}.csv") for i in range(3)]
         out = tmp_path / "out"
-        assert (
-            cli.main(
-                [
-                    "diagnose",
-                    "fit",
-                    *logs,
-                    "--config",
-                    str(tmp_path / "mine.toml"),
-                    "--out",
-                    str(out),
-                ]
-            )
-            == 0
-        )
+        assert run_command(f"diagnose fit --config {tmp_path}/mine.toml --out {out}", *logs) == 0
         assert "thrust_gain" in capsys.readouterr().out
-        assert cli.main(["config", "vehicle", str(out / "vehicle.toml")]) == 0
+        assert run_command(f"config vehicle {out}/vehicle.toml") == 0
         vehicle = config.load(fitting.VehicleParams, out / "vehicle.toml")
         speed = 1000.0
         assert vehicle.thrust.k_f * speed**2 + vehicle.thrust.k_1 * speed == approx(1.7, rel=0.03)

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pytest import approx, mark
 
-from visthrow import cli
+from tests.commands import run_command
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.select.result import (
     CANDIDATE,
@@ -146,18 +146,7 @@ def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
     parts that were left out.
     """
     flight = REAL / "crazypad_faults" / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
-    code = cli.main(
-        [
-            "diagnose",
-            "explain",
-            str(flight),
-            "--config",
-            "crazypad",
-            "--no-blind",
-            "--out",
-            str(tmp_path),
-        ]
-    )
+    code = run_command(f"diagnose explain {flight} --config crazypad --no-blind --out {tmp_path}")
     assert code == 0
     said = capsys.readouterr().out
     assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", said)
@@ -233,9 +222,7 @@ def test_the_camera_sees_the_load_nearer_the_axis():
 def test_spoiled_tables_get_a_verdict_or_an_error(setup, path, how, tmp_path, capsys):
     lines = gzip.decompress(path.read_bytes()).decode().splitlines()[:2000]
     (tmp_path / "a.csv").write_text("\n".join(_spoiled(lines, how)) + "\n")
-    code = cli.main(
-        ["diagnose", "check", str(tmp_path / "a.csv"), "--config", setup, "--no-pictures"]
-    )
+    code = run_command(f"diagnose check {tmp_path}/a.csv --config {setup} --no-pictures")
     said = capsys.readouterr()
     assert code in (0, 1) or said.err.startswith("visthrow: error:")
     if how in ("three rows", "one row again and again", "zeros") and setup != "motor_stand":

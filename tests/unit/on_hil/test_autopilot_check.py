@@ -13,11 +13,11 @@ from hil.errors import RunError
 from hil.fly_run import autopilot_record
 from hil.params import HilParams
 from hil.poses.pose import VEHICLE
+from tests.commands import run_command
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers
 from visthrow import config
-from visthrow.cli import main
 
 QUICK = ("states.check_hold=0.2",)
 NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
@@ -61,7 +61,7 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
     found, text = hover_of_run(tmp_path)
     assert found == good
-    assert main(["hil", "check", "--hover-of", str(tmp_path)]) == (0 if good else 1)
+    assert run_command(f"hil check --hover-of {tmp_path}") == (0 if good else 1)
     ratio = float(text.split()[2])
     assert ratio == approx(factor, rel=0.01)
     share = float(text.split("the hover share is ")[1].split(",")[0])

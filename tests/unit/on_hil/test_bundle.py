@@ -10,8 +10,8 @@ from pytest import approx, fixture, raises
 
 from hil.control.recording.record import pack
 from hil.errors import RunError
+from tests.commands import run_command
 from tests.hil_runs import record_run, saved_policy
-from visthrow.cli import main
 
 LOST = 2.5
 """From which on no pose comes [s]: some ticks later the runner aborts."""
@@ -34,7 +34,7 @@ def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, capsy
     before = decisions[turn - 1].state
     bundle = pack(folder)
     assert bundle.parent == folder.parent
-    assert main(["hil", "replay", str(bundle)]) == 0
+    assert run_command(f"hil replay {bundle}") == 0
     out = capsys.readouterr().out
     assert "all bit for bit the same" in out
     told = out.splitlines()[-1]
@@ -61,17 +61,17 @@ def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
 
 def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, capsys):
     record_run(tmp_path / "b", saved_policy(tmp_path), seconds=2.0, close=False)
-    assert main(["hil", "replay", str(tmp_path / "b")]) == 1
+    assert run_command(f"hil replay {tmp_path}/b") == 1
     out = capsys.readouterr().out
     assert "b.zip  what there is of the run" in out
-    assert main(["hil", "replay", str(tmp_path / "b.zip")]) == 1
+    assert run_command(f"hil replay {tmp_path}/b.zip") == 1
     assert "the recording ends" in capsys.readouterr().out.splitlines()[-1]
 
 
 def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
     folder = shutil.copytree(aborted[0], tmp_path / "none")
     (folder / "ticks.jsonl").write_text("")
-    assert main(["hil", "replay", str(folder)]) == 1
+    assert run_command(f"hil replay {folder}") == 1
     assert (
         capsys.readouterr().out.splitlines()[-1]
         == "Whether it went wrong is not known: no tick is recorded."
@@ -80,18 +80,18 @@ def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
 
 def test_what_is_no_bundle(tmp_path, capsys):
     (tmp_path / "no.zip").write_bytes(b"PK no")
-    assert main(["hil", "replay", str(tmp_path / "no.zip")]) == 2
+    assert run_command(f"hil replay {tmp_path}/no.zip") == 2
     assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as bundle:
         bundle.writestr("holiday.txt", "x")
-    assert main(["hil", "replay", str(tmp_path / "other.zip")]) == 2
+    assert run_command(f"hil replay {tmp_path}/other.zip") == 2
     assert (
         "other.zip: no bundle of a run, it holds holiday.txt; expected config.toml"
         in capsys.readouterr().err
     )
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")
-    assert main(["hil", "replay", str(tmp_path / "out.zip")]) == 2
+    assert run_command(f"hil replay {tmp_path}/out.zip") == 2
     assert not (tmp_path.parent / "outside.txt").exists()
 
 
@@ -100,5 +100,5 @@ def test_a_damaged_bundle_is_refused_in_a_sentence(aborted, tmp_path, capsys):
     for at in range(200, 6000):  # within what is packed: bytes that no deflated block begins with
         whole[at] ^= 0xFF
     (tmp_path / "damaged.zip").write_bytes(whole)
-    assert main(["hil", "replay", str(tmp_path / "damaged.zip")]) == 2
+    assert run_command(f"hil replay {tmp_path}/damaged.zip") == 2
     assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err

@@ -7,6 +7,7 @@ from pytest import mark, raises
 from hil.cli import ACTIONS
 from hil.poses.pose import Pose
 from hil.poses.sources.pose_source import RecordedSource
+from tests.commands import run_command
 from tests.hil_flight import OURS
 from visthrow.cli import main
 
@@ -21,7 +22,7 @@ def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
     ]
     monkeypatch.setattr("hil.check.open_source", lambda *args: (RecordedSource(poses), None, True))
     settings = [word for setting in OURS for word in ("--set", setting)]
-    assert main(["hil", "check", "--seconds", "1.9", *settings]) == 1
+    assert run_command("hil check --seconds 1.9", *settings) == 1
     out = capsys.readouterr().out
     fails = [line for line in out.splitlines() if line.startswith("FAIL")]
     assert len(fails) == 2, "the vehicle's alone"
@@ -39,7 +40,7 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
     results = [(True, "parameters were read"), (False, "hover share measured 0.9")]
     monkeypatch.setattr("hil.check.AutopilotCheck.results", lambda *args: results)
     settings = [word for setting in OURS for word in ("--set", setting)]
-    assert main(["hil", "check", "--seconds", "2.4", *settings]) == 1
+    assert run_command("hil check --seconds 2.4", *settings) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2:] == ["parameters were read", "FAIL  hover share measured 0.9"]
 
@@ -47,7 +48,7 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
 @mark.parametrize("action", ACTIONS)
 def test_each_action_has_an_example(action, capsys):
     with raises(SystemExit):
-        main(["hil", action, "--help"])
+        run_command(f"hil {action} --help")
     shown = capsys.readouterr().out.partition("examples:\n")[2].splitlines()
     commands = [line for line in shown if line.startswith("  visthrow")]
     assert commands

@@ -10,6 +10,7 @@ from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
+from tests.commands import run_command
 from visthrow.cli import main
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
@@ -313,7 +314,7 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
     told = capsys.readouterr().out
     assert "vehicle: 60 poses taken; refused: none" in told
     assert "payload: 60 poses taken; refused: none" in told
-    assert main(["hil", "replay", str(out)]) == 0
+    assert run_command(f"hil replay {out}") == 0
     assert "all bit for bit the same" in capsys.readouterr().out
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == approx(1.333, abs=0.01), "down became up"

@@ -13,8 +13,8 @@ from hil.links.clock import MonotonicClock
 from hil.params import HilParams
 from hil.poses.pose import Pose
 from hil.poses.sources.open_source import open_source, read_poses, unit_problems
+from tests.commands import run_command
 from visthrow import config
-from visthrow.cli import main
 from visthrow.common import toml_text
 
 DATA = Path(__file__).parents[2] / "data"
@@ -146,7 +146,7 @@ def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     assert open_source(lax, tmp_path, MonotonicClock())[2]
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
-    assert main(["hil", "check", "--config", "crazyflie_log", "--set", file, "--set", wrong]) == 2
+    assert run_command(f"hil check --config crazyflie_log --set {file} --set {wrong}") == 2
     assert "no column 'acc'; " in capsys.readouterr().err
 
 
@@ -157,12 +157,9 @@ def test_recorded_flights_replay(name, tmp_path, capsys):
     """
     file = f"source.file={DATA / FLIGHTS[name]}"
     out = str(tmp_path / "run")
-    assert (
-        main(["hil", "record", "--config", name, "--set", file, "--seconds", "4", "--out", out])
-        == 0
-    )
+    assert run_command(f"hil record --config {name} --set {file} --seconds 4 --out {out}") == 0
     capsys.readouterr()
-    assert main(["hil", "replay", out]) == 0
+    assert run_command(f"hil replay {out}") == 0
     told = capsys.readouterr().out
     assert "all bit for bit the same" in told
     assert int(told.split(" actions")[0].split()[-1]) > 150, "of 200 ticks"
@@ -174,20 +171,8 @@ def test_a_run_recorded_with_another_form_of_mapping_replays(tmp_path, capsys):
     """
     file, out = f"source.file={DATA / FLIGHTS['crazyflie_log']}", tmp_path / "run"
     assert (
-        main(
-            [
-                "hil",
-                "record",
-                "--config",
-                "crazyflie_log",
-                "--set",
-                file,
-                "--seconds",
-                "1",
-                "--bare",
-                "--out",
-                str(out),
-            ]
+        run_command(
+            f"hil record --config crazyflie_log --set {file} --seconds 1 --bare --out {out}"
         )
         == 0
     )
@@ -200,5 +185,5 @@ def test_a_run_recorded_with_another_form_of_mapping_replays(tmp_path, capsys):
     del tree["source"]["time"]
     (out / "config.toml").write_text(toml_text.dumps(tree))
     capsys.readouterr()
-    assert main(["hil", "replay", str(out)]) == 0
+    assert run_command(f"hil replay {out}") == 0
     assert "all bit for bit the same" in capsys.readouterr().out

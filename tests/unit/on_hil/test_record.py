@@ -11,6 +11,7 @@ from bench.processes import free_port
 from hil.control.recording.record import RunRecorder, lines, load_run
 from hil.control.runner import Runner
 from hil.errors import RunError
+from tests.commands import run_command
 from tests.hil_flight import Spy, fly, params
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
@@ -60,7 +61,7 @@ def test_one_bit_that_differs_is_found(run_folder, tmp_path, capsys):
     changed = next(row for row in rows if row["action"] is not None)
     changed["action"][1] = float(np.nextafter(np.float32(changed["action"][1]), np.float32(1.0)))
     (tmp_path / "ticks.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    assert main(["hil", "replay", str(tmp_path)]) == 1
+    assert run_command(f"hil replay {tmp_path}") == 1
     assert f"tick {changed['n']}: action was" in capsys.readouterr().out
 
 
@@ -71,7 +72,7 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
         data = (tmp_path / name).read_bytes()
         (tmp_path / name).write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
-    assert main(["hil", "replay", str(tmp_path)]) == 1, (
+    assert run_command(f"hil replay {tmp_path}") == 1, (
         "what there is is the same, and not all is there"
     )
     out = capsys.readouterr().out
@@ -111,7 +112,7 @@ def test_numbers_out_of_range_on_the_command_line(words, expected, capsys):
 def test_a_folder_that_cannot_be_made(tmp_path, capsys):
     (tmp_path / "file").touch()
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
-    assert main(["hil", "run", "--out", str(tmp_path / "file" / "run"), "--set", device]) == 2
+    assert run_command(f"hil run --out {tmp_path}/file/run --set {device}") == 2
     assert "cannot write" in (said := capsys.readouterr().err)
     assert "--out" in said
 
@@ -124,7 +125,7 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder
     first = tmp_path / "first"
     shutil.copytree(run_folder, first)
     (first / "link.tlog").write_bytes(b"of the first run")
-    assert main(["hil", "run", "--out", str(first), "--set", device]) == 2
+    assert run_command(f"hil run --out {first} --set {device}") == 2
     assert "holds a run already" in capsys.readouterr().err
     assert (first / "link.tlog").read_bytes() == b"of the first run"
     late = [
@@ -133,13 +134,13 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder
         "--set",
         "betaflight.device=tcp:127.0.0.1:9",
     ]  # nobody listens there
-    assert main(["hil", "run", "--out", str(tmp_path / "new"), "--set", device, *late]) == 2
+    assert run_command(f"hil run --out {tmp_path}/new --set {device}", *late) == 2
     assert "cannot connect" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
 def test_a_view_is_a_recording(run_folder, tmp_path, capsys):
-    assert main(["hil", "view", str(run_folder), "--out", str(tmp_path / "a.txt")]) == 2
+    assert run_command(f"hil view {run_folder} --out {tmp_path}/a.txt") == 2
     assert "ends in .rrd or .mcap" in capsys.readouterr().err
     assert not (tmp_path / "a.txt").exists()
 
@@ -200,7 +201,7 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "poses.csv").write_text(CSV)
     (tmp_path / "mine.toml").write_text(MAPPING.format(base="hil/dry_run.toml", file="poses.csv"))
-    assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 0
+    assert run_command("hil run --config mine.toml --out run") == 0
     text = capsys.readouterr()
     assert "vehicle: 300 poses taken; refused: none" in text.out
     assert "throws 0, released 0" in text.out
@@ -210,20 +211,20 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     assert len(asked[0]["keypoints"]) == 8
     vel = np.array(asked[-1]["observation"][3:6])
     np.testing.assert_allclose(vel, (0.03, 0.0, 0.0), atol=1e-4)
-    assert main(["hil", "replay", "run"]) == 0
-    assert main(["hil", "check", "--config", "mine.toml", "--seconds", "2"]) == 0
+    assert run_command("hil replay run") == 0
+    assert run_command("hil check --config mine.toml --seconds 2") == 0
     out = capsys.readouterr().out
     assert "PASS  all checks" in out
     assert "vehicle: 99 poses/s" in out
-    assert main(["hil", "check", "--config", "mine.toml", "--seconds", "1.2", *HOLD]) == 1
+    assert run_command("hil check --config mine.toml --seconds 1.2", *HOLD) == 1
     assert "FAIL  all was well for the last " in capsys.readouterr().out
     wrong = ["--config", "mine.toml", "--set", "check.heading_deg=90.0"]
     assert main(["hil", "check", *wrong]) == 1
     assert "FAIL  heading" in capsys.readouterr().out
-    assert main(["hil", "record", *wrong, "--set", "states.check=0.5", "--out", "looked"]) == 0
+    assert run_command("hil record --set states.check=0.5 --out looked", *wrong) == 0
     assert "throws 0" in capsys.readouterr().out, "recorded to the end although the checks fail"
     assert len(load_run("looked")[2]) == len(ticks)
-    assert main(["hil", "run", "--config", "mine.toml", "--out", "run"]) == 2
+    assert run_command("hil run --config mine.toml --out run") == 2
     assert "holds a run already" in capsys.readouterr().err
 
 

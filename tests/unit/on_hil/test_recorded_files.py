@@ -9,7 +9,7 @@ import warnings
 from pytest import mark
 
 from hil.links.pymav import mav
-from visthrow import cli
+from tests.commands import run_command
 
 NAN = (math.nan,) * 4
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -59,7 +59,7 @@ def checked(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
-        status = cli.main(["hil", "check", "--config", "a.toml"])
+        status = run_command("hil check --config a.toml")
     return status, capsys.readouterr().out
 
 

@@ -13,6 +13,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
 from bench import delays
+from tests.commands import run_command
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
@@ -387,16 +388,7 @@ def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, ca
     columns = flight()
     columns["rate_b"] = columns["rate_b"] * 57.3
     log_of(columns).save(tmp_path / "a.npz")
-    cli.main(
-        [
-            "diagnose",
-            "explain",
-            str(tmp_path / "a.npz"),
-            "--no-report",
-            "--json",
-            str(tmp_path / "a.json"),
-        ]
-    )
+    run_command(f"diagnose explain {tmp_path}/a.npz --no-report --json {tmp_path}/a.json")
     assert "DATA INCONSISTENT" in capsys.readouterr().out
     assert json.loads((tmp_path / "a.json").read_text())["overall"] == "DATA INCONSISTENT"
 
@@ -475,23 +467,13 @@ def test_invalid_channels_do_not_stop_it():
 def test_command_line(tmp_path, capsys):
     log_of(flight(6.0)).save(tmp_path / "a.npz")
     assert (
-        cli.main(
-            [
-                "diagnose",
-                "check",
-                str(tmp_path / "a.npz"),
-                "--out",
-                str(tmp_path),
-                "--json",
-                str(tmp_path / "a.json"),
-            ]
-        )
+        run_command(f"diagnose check {tmp_path}/a.npz --out {tmp_path} --json {tmp_path}/a.json")
         == 0
     )
     assert "a.npz: ok" in capsys.readouterr().out
     assert (tmp_path / "01-a.npz.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "a.json").read_text())["logs"][0]["verdict"] == "ok"
-    assert cli.main(["diagnose", "check", str(tmp_path / "b.npz")]) == 2
+    assert run_command(f"diagnose check {tmp_path}/b.npz") == 2
     FlightLog({}).save(tmp_path / "empty.npz")
     logs = [str(tmp_path / "a.npz"), str(tmp_path / "empty.npz")]
     short, whole = (
@@ -540,18 +522,7 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
             == 2
         )
         assert refused in capsys.readouterr().err
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "explain",
-                str(tmp_path / "a.npz"),
-                "--config",
-                str(tmp_path / "mine.toml"),
-            ]
-        )
-        == 2
-    )
+    assert run_command(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml") == 2
     assert refused in capsys.readouterr().err
     for files, setup in (
         (["a.npz", "t.csv"], str(tmp_path / "mine.toml")),

@@ -17,7 +17,7 @@ import numpy as np
 from pytest import mark, raises
 
 from tests import logfiles
-from visthrow import cli
+from tests.commands import run_command
 from visthrow.common.errors import LogError, VisthrowError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
@@ -257,7 +257,7 @@ def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
     data = bytearray(path.read_bytes())
     data[9000:9300] = bytes(300)
     path.write_bytes(data)
-    code = cli.main(["diagnose", "check", str(path), "--no-pictures", "--all"])
+    code = run_command(f"diagnose check {path} --no-pictures --all")
     said = capfd.readouterr()
     assert code in (0, 1)
     assert "damaged stretches in the file" in said.out

@@ -27,7 +27,7 @@ def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, 
     monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     out = tmp_path / "rows.json"
     words = ["compare", "state", "baseline", "--throws", "2", "--targets", "1.5", "--device", "cpu"]
-    assert cli.main([*words, "--out", str(tmp_path), "--json", str(out)]) == 0
+    assert cli.main([*words, *f"--out {tmp_path} --json {out}".split()]) == 0
     rows = json.loads(out.read_text())["rows"]
     own = thrower.title_of(thrower.IDEAL, "none")
     assert [row["policy"] for row in rows] == [

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
 
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
@@ -197,7 +198,7 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
 
 
 def test_the_command_refuses_what_it_cannot_fly(tmp_path, capsys):
-    assert cli.main(["baseline", "--plants", "hybird", "--out", str(tmp_path)]) == 2
+    assert run_command(f"baseline --plants hybird --out {tmp_path}") == 2
     assert "did you mean 'hybrid'" in capsys.readouterr().err
-    assert cli.main(["baseline", "--throws", "0"]) == 2
+    assert run_command("baseline --throws 0") == 2
     assert "expected 1 or more" in capsys.readouterr().err

@@ -8,8 +8,8 @@ from numpy.random import default_rng
 from pytest import approx, fixture
 
 from bench import baseline as baseline_record
+from tests.commands import run_command
 from tests.unit.on_paper import made_up_results as made_up
-from visthrow import cli
 from visthrow.paper.commands import report_command as command
 from visthrow.paper.report import ablations, result_set, throws, trade
 from visthrow.throws import results
@@ -180,18 +180,15 @@ def test_the_page_stands_alone(written):
 def test_the_command_reports_from_records(tmp_path, full, capsys):
     results.pack(full.results[:18], tmp_path / "records" / "throws" / "shipped.json")
     out = tmp_path / "out"
-    assert cli.main(["report", "--records", str(tmp_path / "records"), "--out", str(out)]) == 0
+    assert run_command(f"report --records {tmp_path}/records --out {out}") == 0
     printed = capsys.readouterr().out
     assert "realistic reference plant" in printed
     assert "0 trainings" in printed
     assert (out / "report.html").stat().st_size > 50_000
     for option in ("--results", "--records"):
-        assert (
-            cli.main(["report", option, str(tmp_path / "none"), "--out", str(tmp_path / "other")])
-            == 2
-        )
+        assert run_command(f"report {option} {tmp_path}/none --out {tmp_path}/other") == 2
         assert "no such folder" in capsys.readouterr().err
-        assert cli.main(["report", option, str(tmp_path), "--out", str(tmp_path / "other")]) == 2
+        assert run_command(f"report {option} {tmp_path} --out {tmp_path}/other") == 2
         assert "in it; expected" in capsys.readouterr().err
         assert not (tmp_path / "other").exists()
 

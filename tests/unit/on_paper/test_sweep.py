@@ -11,6 +11,7 @@ import time
 import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
 
+from tests.commands import run_command
 from visthrow import cli, config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
@@ -301,31 +302,16 @@ def test_records_join_what_two_machines_did(path, tmp_path):
 
 
 def test_status_and_mistakes_on_the_command_line(path, tmp_path, capsys):
-    assert cli.main(["sweep", "status", path, "--out", str(tmp_path)]) == 1
+    assert run_command(f"sweep status {path} --out {tmp_path}") == 1
     out = capsys.readouterr().out
     assert "state_rigid_cable-2" in out
     assert "23 units left" not in out
     assert "22 units left" in out, "4 trainings, 4 x (2 + 2) throws and 2 of the shipped policy"
-    assert cli.main(["sweep", "status", "papre"]) == 2
+    assert run_command("sweep status papre") == 2
     assert "did you mean 'paper'" in capsys.readouterr().err
-    assert cli.main(["sweep", "run", path, "--minutes", "0"]) == 2
+    assert run_command(f"sweep run {path} --minutes 0") == 2
     assert "expected more than 0" in capsys.readouterr().err
-    assert (
-        cli.main(
-            [
-                "sweep",
-                "run",
-                path,
-                "--slurm",
-                "partition=gpu",
-                "--devices",
-                "cuda:0",
-                "--minutes",
-                "9",
-            ]
-        )
-        == 2
-    )
+    assert run_command(f"sweep run {path} --slurm partition=gpu --devices cuda:0 --minutes 9") == 2
     assert "the number of GPUs" in capsys.readouterr().err
 
 
@@ -342,7 +328,7 @@ def test_the_status_of_a_sweep_says_how_it_ended(
     outcome, status, path, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(pool.ProcessPool, "run", lambda *_: outcome)
-    assert cli.main(["sweep", "run", path, "--out", str(tmp_path), "--devices", "cpu"]) == status
+    assert run_command(f"sweep run {path} --out {tmp_path} --devices cpu") == status
     said = capsys.readouterr().err
     assert ("state-1 failed: out of memory" in said) == bool(outcome.failed)
     assert ("the same command goes on" in said) == outcome.stopped

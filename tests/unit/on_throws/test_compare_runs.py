@@ -8,8 +8,8 @@ import numpy as np
 from pytest import approx, raises
 
 from hil.control.recording.run_report import finish
+from tests.commands import run_command
 from tests.hil_runs import record_run, saved_policy
-from visthrow.cli import main
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 from visthrow.task.measurement import Throws
@@ -91,7 +91,7 @@ def test_the_command(tmp_path, capsys):
     log(landed=None).save(other / "throw-02.npz")
     out = tmp_path / "out"
     runs = ["--from", str(folder), str(other)]
-    assert main(["compare", *runs, "--out", str(out), "--json", str(tmp_path / "t.json")]) == 0
+    assert run_command(f"compare --out {out} --json {tmp_path}/t.json", *runs) == 0
     text = capsys.readouterr().out
     assert "3 throws of 2 runs" in text
     assert "0.101 ± 0.106, 1.125 ± 0.029" in text, "the paper's figures beside ours"
@@ -110,7 +110,7 @@ def test_the_command(tmp_path, capsys):
 
 
 def test_what_holds_no_throws(tmp_path, capsys):
-    assert main(["compare", "--from", str(tmp_path / "none")]) == 2
+    assert run_command(f"compare --from {tmp_path}/none") == 2
     assert "no such folder" in capsys.readouterr().err
     (tmp_path / "summary.json").write_text("{}")
     with raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
@@ -121,5 +121,5 @@ def test_what_holds_no_throws(tmp_path, capsys):
     bare = FlightLog({}, {"policy": "x"})
     with raises(LogError, match="holds no throw of a run"):
         from_runs.entries([bare])
-    assert main(["compare", "vision", "--from", str(tmp_path)]) == 2
+    assert run_command(f"compare vision --from {tmp_path}") == 2
     assert "the runs say which policies" in capsys.readouterr().err

@@ -15,7 +15,8 @@ from pytest import approx, fixture, importorskip, mark, raises
 from scipy.integrate import solve_ivp
 
 from sim.params import GRAVITY
-from visthrow import config
+from tests.commands import run_command
+from visthrow import cli, config
 from visthrow.cli import compare, demo, main
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
@@ -234,7 +235,7 @@ def test_a_flights_modes_and_commands(flown):
 def test_a_flight_without_release_fails_and_recovers(tmp_path):
     path, out = tmp_path / "holder.npz", tmp_path / "out"
     dropping_policy(release=-1.0, overrides=["task.bounds.time_limit=0.3"]).save(path)
-    assert main(["fly", "--policy", str(path), "--target", "1.0", "--out", str(out)]) == 1
+    assert run_command(f"fly --policy {path} --target 1.0 --out {out}") == 1
     log = FlightLog.load(out / "flight.npz")
     assert not log.meta["result"]["success"]
     assert "no release within 0.3 s" in log.meta["result"]["failure"]
@@ -302,7 +303,7 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
         "--json",
         str(out / "c.json"),
     ]
-    assert main([*words, "--device", "cpu", "--seed", "3"]) == 0
+    assert cli.main([*words, *"--device cpu --seed 3".split()]) == 0
     told = capsys.readouterr().out
     assert "`hybrid`, seed 3" in told
     assert "No vehicle was flown" in told
@@ -354,7 +355,7 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
         dropping_policy(name).save(tmp_path / f"{name}.npz")
     monkeypatch.setattr(demo, "THROWS", 3)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert main(["demo", "--out", str(tmp_path / "out")]) == 0
+    assert run_command(f"demo --out {tmp_path}/out") == 0
     told = capsys.readouterr().out
     assert "needs MuJoCo" in told
     listed = [
@@ -453,7 +454,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr("sim.hybrid.HybridSim.step", None)  # nothing may fly
     policy = ["--policy", str(dropper)] if command == "fly" else [str(dropper)]
-    assert main([command, *policy, "--out", str(tmp_path / "file" / "out")]) == 2
+    assert run_command(f"{command} --out {tmp_path}/file/out", *policy) == 2
     assert "cannot make the folder" in capsys.readouterr().err
 
 

@@ -15,6 +15,7 @@ from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
 from tests import lens_files
+from tests.commands import run_command
 from tests.drawn import pixel_rays
 from visthrow.cli import main
 
@@ -178,37 +179,27 @@ SLOW = {"opencv", "ros", "basalt", "ocam", "circles", "charuco"}
 def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, boards, capsys):
     right = tmp_path / "kalibr.yaml"
     lens_files.write_kalibr(right, LENS)
-    assert main(["camera", "calibrate", str(right), "--out", str(tmp_path / "right.toml")]) == 0
+    assert run_command(f"camera calibrate {right} --out {tmp_path}/right.toml") == 0
     asked = [str(boards("chessboard")), *words(BOARDS["chessboard"])]
-    assert main(["camera", "check", str(tmp_path / "right.toml"), *asked]) == 0
+    assert run_command(f"camera check {tmp_path}/right.toml", *asked) == 0
     said = capsys.readouterr().out
     assert "the configured lens fits" in said
     text = (tmp_path / "right.toml").read_text()
     (tmp_path / "wrong.toml").write_text(text.replace("fx = 96.0", "fx = 99.0"))
-    assert main(["camera", "check", str(tmp_path / "wrong.toml"), *asked]) == 1
+    assert run_command(f"camera check {tmp_path}/wrong.toml", *asked) == 1
     assert "does NOT fit" in capsys.readouterr().out
-    assert main(["camera", "check", "fisheye", *asked]) == 2
+    assert run_command("camera check fisheye", *asked) == 2
     assert "320 x 320 px came; expected 640 x 640" in capsys.readouterr().err
 
 
 def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, capsys):
     lens_files.write_ros(tmp_path / "ros.yaml", LENS)
     camera, out = tmp_path / "camera.toml", tmp_path / "seen.png"
-    assert main(["camera", "calibrate", str(tmp_path / "ros.yaml"), "--out", str(camera)]) == 0
+    assert run_command(f"camera calibrate {tmp_path}/ros.yaml --out {camera}") == 0
     frame = str(boards("chessboard") / "0.png")
     assert (
-        main(
-            [
-                "camera",
-                "show",
-                str(camera),
-                frame,
-                *words(BOARDS["chessboard"]),
-                "--straight",
-                "100",
-                "--out",
-                str(out),
-            ]
+        run_command(
+            f"camera show {camera} {frame} --straight 100 --out {out}", *words(BOARDS["chessboard"])
         )
         == 0
     )
@@ -225,9 +216,7 @@ def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, caps
 
 
 def test_a_payload_below_the_ground_is_not_drawn(tmp_path, capsys):
-    assert (
-        main(["camera", "show", "fisheye", "--hangs", "1.4", "--out", str(tmp_path / "a.png")]) == 2
-    )
+    assert run_command(f"camera show fisheye --hangs 1.4 --out {tmp_path}/a.png") == 2
     assert (
         "--hangs 1.4 below --height 1.333; expected a payload above the ground"
         in capsys.readouterr().err

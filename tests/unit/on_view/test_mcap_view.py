@@ -9,6 +9,7 @@ import numpy as np
 from numpy.testing import assert_array_equal
 from pytest import fixture, importorskip
 
+from tests.commands import run_command
 from visthrow.cli import main
 from visthrow.logs.flightlog import FlightLog
 
@@ -24,7 +25,7 @@ def flown(tmp_path_factory):
         for ending in ("mcap", "parquet", "csv")
         for word in ("--export", str(folder / f"flight.{ending}"))
     ]
-    assert main(["fly", "--device", "cpu", "--out", str(folder), "--target", "1.5", *exports]) == 0
+    assert run_command(f"fly --device cpu --out {folder} --target 1.5", *exports) == 0
     return folder
 
 
@@ -77,7 +78,7 @@ def test_every_channel_is_there_with_its_unit_and_schema(flown):
 def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, capsys):
     assert (flown / "flight.csv").read_text().startswith("time [s],")
     assert (flown / "flight.parquet").stat().st_size > 0
-    assert main(["fly", "--out", str(tmp_path), "--export", "flight.xyz"]) == 2
+    assert run_command(f"fly --out {tmp_path} --export flight.xyz") == 2
     assert "'.xyz'; expected one of .csv, .parquet, .mcap" in capsys.readouterr().err
 
 
@@ -100,14 +101,14 @@ def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
 
 
 def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, capsys):
-    assert main(["fly", "--out", str(tmp_path), "--set", "task.noise.command_step=0"]) == 2
+    assert run_command(f"fly --out {tmp_path} --set task.noise.command_step=0") == 2
     assert "fly sends commands as they are" in capsys.readouterr().err
 
 
 def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     folder = tmp_path / "flown"
-    assert main(["fly", "--out", str(folder), "--export", str(tmp_path / "flight.mcap")]) == 2
+    assert run_command(f"fly --out {folder} --export {tmp_path}/flight.mcap") == 2
     assert "visthrow[recordings]" in capsys.readouterr().err
     assert not folder.exists()
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from pytest import fixture, mark, raises
 
+from tests.commands import run_command
 from visthrow import cli
 from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
@@ -142,7 +143,7 @@ def test_a_reader_that_goes_away_is_no_failure():
 
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(command, tmp_path, capsys):
     command(KeyboardInterrupt())
-    assert cli.main(["try", "--json", str(tmp_path)]) == 2
+    assert run_command(f"try --json {tmp_path}") == 2
     assert "it is a folder" in capsys.readouterr().err
 
 
@@ -160,9 +161,7 @@ def test_a_missing_optional_package_names_the_extra(command, capsys):
 
 def test_the_command_s_status_is_returned(command):
     command(3)
-    assert (
-        cli.main(["try", "--device", "cpu", "--set", "a=1", "--set", "b.c=2", "--json", "x"]) == 3
-    )
+    assert run_command("try --device cpu --set a=1 --set b.c=2 --json x") == 3
     command(None)
     assert cli.main(["try"]) == 0
 
@@ -171,20 +170,7 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
     from sim.params import VehicleParams
     from visthrow import config
 
-    assert (
-        cli.main(
-            [
-                "config",
-                "vehicle",
-                "paper",
-                "--set",
-                "body.mass=0.25",
-                "--json",
-                str(tmp_path / "a.json"),
-            ]
-        )
-        == 0
-    )
+    assert run_command(f"config vehicle paper --set body.mass=0.25 --json {tmp_path}/a.json") == 0
     printed = config.loads(VehicleParams, capsys.readouterr().out)
     assert printed.body.mass == 0.25
     assert '"mass": 0.25' in (tmp_path / "a.json").read_text()

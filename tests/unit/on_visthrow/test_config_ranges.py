@@ -4,7 +4,8 @@ file finds its base.
 
 from pytest import mark, raises
 
-from visthrow import cli, config
+from tests.commands import run_command
+from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.task import Experiment
 
@@ -84,7 +85,7 @@ from visthrow.task import Experiment
     ],
 )
 def test_the_command_refuses(kind, name, change, message, capsys):
-    assert cli.main(["config", kind, name, "--set", change]) == 2
+    assert run_command(f"config {kind} {name} --set {change}") == 2
     assert message in capsys.readouterr().err
 
 

@@ -8,7 +8,7 @@ import torch
 from numpy.testing import assert_allclose
 from pytest import mark
 
-from visthrow import cli
+from tests.commands import run_command
 from visthrow.cli.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -113,10 +113,10 @@ def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
 
 
 def test_the_command_writes_by_the_ending_and_refuses_others(tmp_path, capsys):
-    assert cli.main(["policy", "export", "state", "--out", str(tmp_path / "p.c")]) == 0
+    assert run_command(f"policy export state --out {tmp_path}/p.c") == 0
     assert (tmp_path / "p.c").read_text().startswith("/* Network of a visthrow policy")
     assert "35 observations, 5 actions" in capsys.readouterr().out
-    assert cli.main(["policy", "export", "state", "--out", str(tmp_path / "p.tflite")]) == 2
+    assert run_command(f"policy export state --out {tmp_path}/p.tflite") == 2
     assert "expected a name that ends in .onnx or .c" in capsys.readouterr().err
     assert not (tmp_path / "p.tflite").exists()
 
