@@ -356,7 +356,7 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
     command = ["diagnose", "apply", str(log), "--plant", "vision", "--out", str(out)]
     assert cli.main(command) == 2
     assert "--hover" in capsys.readouterr().err
-    assert cli.main([*command, *"--hover 0.3645 --delay 0.003".split()]) == 0
+    assert cli.main([*command, *["--hover", "0.3645", "--delay", "0.003"]]) == 0
     after = config.load(Experiment, out)
     assert after.vehicle.controller.kind == "motor_mixing"
     assert after.vehicle.controller.p_gain[0] == approx(0.01748, rel=1e-3)

@@ -303,7 +303,7 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
         "--json",
         str(out / "c.json"),
     ]
-    assert cli.main([*words, *"--device cpu --seed 3".split()]) == 0
+    assert cli.main([*words, *["--device", "cpu", "--seed", "3"]]) == 0
     told = capsys.readouterr().out
     assert "`hybrid`, seed 3" in told
     assert "No vehicle was flown" in told

@@ -10,7 +10,7 @@ def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
     ends = {}
     for name in ("rk4", "euler"):
         words = ["fly", "--no-rope", name, "--target", "1", "0.5", "--out", str(tmp_path / name)]
-        assert cli.main([*words, *"--policy state --device cpu".split()]) == 0
+        assert cli.main([*words, *["--policy", "state", "--device", "cpu"]]) == 0
         log = FlightLog.load(tmp_path / name / "flight.npz")
         assert "payload_pos_w" not in log
         ends[name] = log["pos_w"].values
