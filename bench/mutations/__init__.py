@@ -10,5 +10,6 @@ test can notice: the mutation is equivalent.
     python -m bench.mutations --summary           # the table alone
 
 Each runs in a copy of the tracked files, so the checkout stays untouched. What survives its file's
-tests meets the room's. A killed mutation is not run again until its line leaves the ledger.
+tests meets the room's, then all. A killed mutation is not run again until its line leaves the
+ledger.
 """

@@ -22,6 +22,8 @@ from bench.mutations import process
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = Path(__file__).parent
 LEDGER = ROOT / "out" / "mutations.jsonl"
+ALL = ("tests",)
+ALL_LIMIT = 2400  # s; they take 20 minutes on one core
 DIGITS = re.compile(r"bits|digest|byte_for_byte|recorded")
 """Names of tests that compare with recorded digits rather than with behaviour."""
 STATES = ("killed", "survived", "equivalent", "broken", "not run")
@@ -80,17 +82,19 @@ def copy_checkout(folder: Path) -> None:
         shutil.copy2(ROOT / name, target)
 
 
-def judge(mutation: Mutation, folder: Path, room: bool) -> dict:
-    """Run the tests on the mutated copy, of a survivor those of its ``room`` too; returns a line of
-    the ledger.
+def judge(mutation: Mutation, folder: Path, wider: bool) -> dict:
+    """Run the tests on the mutated copy, of a survivor those of its room and then all, where
+    ``wider``; returns a line of the ledger.
     """
     path = folder / mutation.file
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace(mutation.old, mutation.new), encoding="utf-8")
     start = time.time()
     state, test = process.outcome(folder, mutation.tests)
-    if state == "survived" and room:
+    if state == "survived" and wider:
         state, test = process.outcome(folder, mutation.room_tests)
+    if state == "survived" and wider:
+        state, test = process.outcome(folder, ALL, ALL_LIMIT)
     path.write_text(text, encoding="utf-8")
     return {
         "key": mutation.key,
@@ -104,7 +108,7 @@ def judge(mutation: Mutation, folder: Path, room: bool) -> dict:
     }
 
 
-def work(todo: "queue.Queue[Mutation]", ledger: Path, room: bool, lock: threading.Lock) -> None:
+def work(todo: "queue.Queue[Mutation]", ledger: Path, wider: bool, lock: threading.Lock) -> None:
     """Judge mutations until none is left, in a copy of the checkout."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name) / "visthrow"
@@ -114,7 +118,7 @@ def work(todo: "queue.Queue[Mutation]", ledger: Path, room: bool, lock: threadin
                 mutation = todo.get_nowait()
             except queue.Empty:
                 return
-            line = judge(mutation, folder, room)
+            line = judge(mutation, folder, wider)
             with lock, open(ledger, "a", encoding="utf-8") as file:
                 file.write(json.dumps(line) + "\n")
                 shown = f"{line['state']:9} {line['seconds']:6.1f} s  {mutation.file}"

@@ -8,7 +8,7 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 
-LIMIT = 900  # s, for one run of tests
+LIMIT = 900  # s, for one run of a file's or a room's tests
 FAILED = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 PYTEST = ["-x", "-q", "-p", "no:cacheprovider"]
 HEAVY = ["numpy", "scipy.optimize", "torch", "tensordict", "warp", "cv2", "pytest"]
@@ -32,13 +32,13 @@ def run_tests(folder: str, tests: tuple[str, ...], log: str) -> None:
     sys.exit(pytest.main([*PYTEST, *tests]))
 
 
-def outcome(folder: Path, tests: tuple[str, ...]) -> tuple[str, str]:
+def outcome(folder: Path, tests: tuple[str, ...], limit: float = LIMIT) -> tuple[str, str]:
     """Return whether tests fail on a copy of the checkout, and the first that does."""
     log = folder.parent / "log.txt"
     context = multiprocessing.get_context("forkserver")
     process = context.Process(target=run_tests, args=(str(folder), tests, str(log)))
     process.start()
-    process.join(LIMIT)
+    process.join(limit)
     late = process.is_alive()
     with suppress(ProcessLookupError):
         os.killpg(process.pid, signal.SIGKILL)  # and what the tests started

@@ -11,7 +11,7 @@ from bench import baseline as baseline_record
 from tests.commands import run_command
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, result_set, throws, trade
+from visthrow.paper.report import ablations, gap, result_set, throws, trade
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page
@@ -102,6 +102,16 @@ def test_difference_of_vision_has_the_right_sign():
     assert row[3].startswith("-0.0")
     assert row[4] == "vision nearer"
     assert row[6] == "-0.004, -0.029"
+
+
+def test_sight_that_doubles_the_error_has_a_ratio_of_two():
+    rng, variant = default_rng(3), next(name for name in gap.TRAINED if name != "full")
+    thrown = [
+        made_up.policy(rng, name, "vision", "hybrid", 2.0, spread, variant=name, count=500)
+        for name, spread in (("full", 0.02), (variant, 0.04))
+    ]
+    rows = {row[0]: row for row in grids(gap.section(only(*thrown)))[-1].rows}
+    assert float(rows[gap.TRAINED[variant]][5].split(" ")[0]) == approx(2.0, abs=0.2)
 
 
 def test_ablation_ratio_bias_and_the_verdict():
