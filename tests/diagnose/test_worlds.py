@@ -96,7 +96,7 @@ def test_every_hidden_effect_shows_in_the_flight():
         "mount_x": 0.01,
         "mass_quad": 0.01,
     }
-    quiet = fly_recipe(Recipe(3, "rod", {}, free=2, free_seconds=3.0, throws=2))
+    quiet = fly_recipe(Recipe(3, "rod", {}, free=1, free_seconds=1.5, throws=1))
     for name in (
         "thrust_gain",
         "com_x",
@@ -108,6 +108,6 @@ def test_every_hidden_effect_shows_in_the_flight():
         *large,
     ):
         theta = large.get(name, 0.02)
-        flown = fly_recipe(Recipe(3, "rod", {name: theta}, free=2, free_seconds=3.0, throws=2))
+        flown = fly_recipe(Recipe(3, "rod", {name: theta}, free=1, free_seconds=1.5, throws=1))
         moved = max(np.abs(a.ball - b.ball).max() for a, b in zip(quiet, flown))
         assert moved > 1e-3, name

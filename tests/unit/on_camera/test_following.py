@@ -155,6 +155,7 @@ def test_a_goal_is_looked_for_where_it_was_but_reads_nothing_while_it_is_missed(
             "the vehicle flies, the goal lies"
         )
         assert following.take(FrameDetections(None, None), rot, i * PERIOD).goal is None
+    assert following.prior(rot, rot[:, 2], eye, None, 5.0 + MEMORY).goal_ray_c is None
 
 
 HERE, THERE = (2.0, 0.0), (0.7, 1.4)

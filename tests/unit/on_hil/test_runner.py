@@ -10,9 +10,11 @@ from pytest import approx, mark, raises
 
 from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
+from hil.control.tick.commander import can_hand_over
 from hil.errors import RunError
 from hil.links.backends.base import Status
 from hil.params import HilParams
+from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
 from visthrow import config
@@ -136,6 +138,37 @@ BAD = {
 }
 
 
+def test_a_body_that_was_reset_on_the_ground_is_taken_again():
+    _, decisions = thrown(
+        action=NEVER,
+        poses=lambda t, poses: [replace(p, reset=int(t > 0.5)) for p in poses],
+        status=lambda t: Status(t > 2.5),
+        seconds=6.0,
+    )
+    assert decisions[-1].state == "throw"
+
+
+def test_a_payload_that_is_seen_again_in_its_fall_is_farther_off_than_its_cable():
+    latch = next(d.time for d in thrown()[1] if d.release)
+
+    def blink(time, poses):
+        gone = latch + LAG + 0.05 < time < latch + LAG + 0.25
+        return [p for p in poses if not (gone and p.body == "payload")]
+
+    pilot, _ = thrown(poses=blink)
+    assert pilot.tracks["payload"].gate.refused == {}
+    assert len(pilot.latch.landings) == 1
+
+
+@mark.parametrize(
+    ("speed", "tilt_deg", "able"), [(0.9, 19.0, True), (1.1, 0.0, False), (0.0, 21.0, False)]
+)
+def test_a_vehicle_that_is_slow_and_level_is_handed_over(speed, tilt_deg, able):
+    half = 0.5 * math.radians(tilt_deg)
+    quat = (math.sin(half), 0.0, 0.0, math.cos(half))
+    assert can_hand_over(BodyState((0.0,) * 3, quat, (0.0, speed, 0.0), (0.0,) * 3, 0.0)) is able
+
+
 def test_poses_at_5_hz_never_start_a_throw():
     kept = {}
 
@@ -226,7 +259,8 @@ def test_no_throw_on_pictures_that_do_not_show(name):
             thing: None if thing == name and hidden[0] <= time < hidden[1] else rays
             for thing, rays in shown.items()
         }
-        pilot.estimator.take_detections([Detection(time, seen["goal"], seen["ball"])])
+        older, newest = Detection(time - 0.01, None, None), Detection(time, *seen.values())
+        pilot.estimator.take_detections([older, newest])
 
     decisions = fly(pilot, hidden[1] + 2.0, watch=watch)
     begun = when(decisions, "throw")
