@@ -146,7 +146,7 @@ def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     assert open_source(lax, tmp_path, MonotonicClock())[2]
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
-    assert run_command(f"hil check --config crazyflie_log --set {file} --set {wrong}") == 2
+    assert run_command(f"hil check --config crazyflie_log --set {file} --set", wrong) == 2
     assert "no column 'acc'; " in capsys.readouterr().err
 
 
