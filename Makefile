@@ -77,7 +77,7 @@ install: $(STAMP)
 # What is imported is compiled then; to compile all of it here takes three times as long.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or newer with venv was found; install one, or say PYTHON=/path/to/python3" >&2; exit 1; }
-	@echo "make: installing into $(VENV); 2.9 GB on disk with a CPU build of torch, about 7.5 GB with CUDA; some minutes, and pip says nothing until it is done"
+	@echo "make: installing into $(VENV); 3 GB on disk with a CPU build of torch, about 7.5 GB with CUDA; some minutes, and pip says nothing until it is done"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
