@@ -177,19 +177,15 @@ def _channels(poses: list[Pose], frames: Frames, names: tuple[str, ...]) -> dict
         if not p.lost() and np.all(np.isfinite((p.stamp, p.arrival, *p.pos)))
     ]
     # A clock may be set in between: stamps that do not ascend are left to the gate.
-    ours = [p for p, before in zip(ours, [None, *ours]) if before is None or p.stamp > before.stamp]
-    times = np.array([p.stamp for p in ours])
-    rest_of_path = (
-        np.diff(np.maximum.accumulate(times), prepend=-np.inf) > 0.0
-        if len(times)
-        else np.zeros(0, bool)
-    )
-    if np.sum(rest_of_path) < FEWEST_POSES:
+    latest = np.maximum.accumulate([-np.inf, *(p.stamp for p in ours)])
+    ours = [p for p, before in zip(ours, latest) if p.stamp > before]
+    if len(ours) < FEWEST_POSES:
         return {}
+    times = np.array([p.stamp for p in ours])
     channels = {}
     for name, (kind, (unit, frame)) in zip(names, _KINDS.items()):
-        values = [getattr(p, kind) for p, good in zip(ours, rest_of_path) if good]
+        values = [getattr(p, kind) for p in ours]
         unknown = any(value is None or not np.all(np.isfinite(value)) for value in values)
         if not unknown and (kind != "quat" or all(map(has_attitude, values))):
-            channels[name] = Channel(times[rest_of_path], np.array(values), unit, frame)
+            channels[name] = Channel(times, np.array(values), unit, frame)
     return channels

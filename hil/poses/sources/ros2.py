@@ -45,46 +45,47 @@ NETWORK = (
 )
 
 
+STRUCTURES = """
+builtin_interfaces/Time sec:int32 nanosec:uint32
+std_msgs/Header stamp:Time frame_id:string
+geometry_msgs/Point x:float64 y:float64 z:float64
+geometry_msgs/Vector3 x:float64 y:float64 z:float64
+geometry_msgs/Quaternion x:float64 y:float64 z:float64 w:float64
+geometry_msgs/Pose position:Point orientation:Quaternion
+geometry_msgs/Twist linear:Vector3 angular:Vector3
+geometry_msgs/PoseWithCovariance pose:Pose covariance:float64[36]
+geometry_msgs/TwistWithCovariance twist:Twist covariance:float64[36]
+geometry_msgs/Transform translation:Vector3 rotation:Quaternion
+geometry_msgs/TransformStamped header:Header child_frame_id:string transform:Transform
+geometry_msgs/PoseStamped header:Header pose:Pose
+nav_msgs/Odometry header:Header child_frame_id:string pose:PoseWithCovariance \
+twist:TwistWithCovariance
+tf2_msgs/TFMessage transforms:TransformStamped[]
+"""
+"""Messages that are read, and their parts, those first of which others are made."""
+
+
 def message_types() -> dict[str, Any]:
     """Return the messages that are read, by name, as Cyclone DDS has them; raises `SourceError`
     where the package is missing.
     """
     idl = load_extra("cyclonedds.idl", "ros2", "ROS 2 topics", SourceError)
     types = load_extra("cyclonedds.idl.types", "ros2", "ROS 2 topics", SourceError)
-
-    def struct(package: str, name: str, **fields: Any) -> Any:
-        meta, typename = type(idl.IdlStruct), f"{package}::msg::dds_::{name}_"
-        return dataclasses.dataclass(
-            meta(
-                name,
-                (idl.IdlStruct,),
-                {"__annotations__": fields, "__module__": __name__},
-                typename=typename,
-            )
+    known: dict[str, Any] = {"string": str, "float64[36]": types.array[types.float64, 36]}
+    known |= {name: getattr(types, name) for name in ("float64", "int32", "uint32")}
+    messages = {}
+    for line in STRUCTURES.split("\n")[1:-1]:
+        full_name, *fields = line.split()
+        package, name = full_name.split("/")
+        kinds = dict(field.split(":") for field in fields)
+        notes = {"__annotations__": {field: known[kind] for field, kind in kinds.items()}}
+        typename = f"{package}::msg::dds_::{name}_"
+        meta = type(idl.IdlStruct)(
+            name, (idl.IdlStruct,), {**notes, "__module__": __name__}, typename=typename
         )
-
-    real = types.float64
-    stamp = struct("builtin_interfaces", "Time", sec=types.int32, nanosec=types.uint32)
-    header = struct("std_msgs", "Header", stamp=stamp, frame_id=str)
-    point = struct("geometry_msgs", "Point", x=real, y=real, z=real)
-    vector = struct("geometry_msgs", "Vector3", x=real, y=real, z=real)
-    quaternion = struct("geometry_msgs", "Quaternion", x=real, y=real, z=real, w=real)
-    pose = struct("geometry_msgs", "Pose", position=point, orientation=quaternion)
-    twist = struct("geometry_msgs", "Twist", linear=vector, angular=vector)
-    spread = types.array[real, 36]
-    placed = struct("geometry_msgs", "PoseWithCovariance", pose=pose, covariance=spread)
-    moving = struct("geometry_msgs", "TwistWithCovariance", twist=twist, covariance=spread)
-    transform = struct("geometry_msgs", "Transform", translation=vector, rotation=quaternion)
-    stamped = struct(
-        "geometry_msgs", "TransformStamped", header=header, child_frame_id=str, transform=transform
-    )
-    return {
-        KINDS[0]: struct("geometry_msgs", "PoseStamped", header=header, pose=pose),
-        KINDS[1]: struct(
-            "nav_msgs", "Odometry", header=header, child_frame_id=str, pose=placed, twist=moving
-        ),
-        KINDS[2]: struct("tf2_msgs", "TFMessage", transforms=types.sequence[stamped]),
-    }
+        known[name] = messages[full_name] = dataclasses.dataclass(meta)
+        known[f"{name}[]"] = types.sequence[known[name]]
+    return messages
 
 
 def domain(params: MocapParams) -> Any:
