@@ -15,23 +15,14 @@ from typing import Any
 from hil.control.state_machine import OperatorInput, TickRecord
 from visthrow.onboard.calibration import Calibration
 
-ENDING = tuple(
-    getattr(signal, name)
-    for name in (
-        "SIGINT",
-        "SIGTERM",
-        "SIGHUP",
-        "SIGQUIT",
-        "SIGUSR1",
-        "SIGUSR2",
-        "SIGALRM",
-        "SIGVTALRM",
-        "SIGPROF",
-        "SIGXCPU",
-        "SIGPWR",
-        "SIGIO",
-    )
-    if hasattr(signal, name)
+
+def _signals(names: str) -> tuple[signal.Signals, ...]:
+    """Return the signals of these names that this system has."""
+    return tuple(getattr(signal, name) for name in names.split() if hasattr(signal, name))
+
+
+ENDING = _signals(
+    "SIGINT SIGTERM SIGHUP SIGQUIT SIGUSR1 SIGUSR2 SIGALRM SIGVTALRM SIGPROF SIGXCPU SIGPWR SIGIO"
 )
 """Signals that would end the process and can be caught:
 
@@ -39,9 +30,7 @@ Ctrl-C; systemd, ``timeout`` and a shutdown; a dropped ssh or a closed terminal;
 nobody means.
 """
 
-PAUSING = tuple(
-    getattr(signal, name) for name in ("SIGTSTP", "SIGTTIN", "SIGTTOU") if hasattr(signal, name)
-)
+PAUSING = _signals("SIGTSTP SIGTTIN SIGTTOU")
 """Signals that would stop the process in mid flight:
 
 Ctrl-Z, and a terminal that belongs to another job.

@@ -167,22 +167,11 @@ def pose_from_message(message: Any, body: str, arrival: float) -> Pose | None:
     another frame than LOCAL_NED or LOCAL_FRD."""
     kind = message.get_type()
     if kind == "ATT_POS_MOCAP":
-        return Pose(
-            message.time_usec / 1e6,
-            arrival,
-            body,
-            (message.x, message.y, message.z),
-            tuple(message.q),
-        )
+        pos = (message.x, message.y, message.z)
+        return Pose(message.time_usec / 1e6, arrival, body, pos, tuple(message.q))
     if kind == "VISION_POSITION_ESTIMATE":
-        quat, pos = (
-            quaternion_from_euler(message.roll, message.pitch, message.yaw),
-            (
-                message.x,
-                message.y,
-                message.z,
-            ),
-        )
+        pos = (message.x, message.y, message.z)
+        quat = quaternion_from_euler(message.roll, message.pitch, message.yaw)
         return Pose(message.usec / 1e6, arrival, body, pos, quat, reset=message.reset_counter)
     if kind != "ODOMETRY" or message.frame_id not in LOCAL_FRAMES:
         return None

@@ -29,9 +29,8 @@ def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ())
     where there are any; raises `RunError` where there is none, or one
     that makes no plant of these two.
     """
-    module, _, name = target.partition(":")
     try:
-        make = getattr(importlib.import_module(module), name)
+        make = _named(target)
         given = (policy, seed, *([changes] if changes else []))
         inspect.signature(make).bind(*given)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
@@ -47,13 +46,18 @@ def load_fake(kind: str) -> type[Fake]:
 
     Raises `RunError`: no such class.
     """
-    module, _, name = FAKES.get(kind, kind).partition(":")
-    if not name:
+    target = FAKES.get(kind, kind)
+    if ":" not in target:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, FAKES)}, or module:class")
     try:
-        return getattr(importlib.import_module(module), name)
+        return _named(target)
     except (ImportError, AttributeError) as error:
         raise RunError(f"fake of kind '{kind}': {error}; expected module:class") from error
+
+
+def _named(target: str) -> Any:
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
 
 
 def make_fake(

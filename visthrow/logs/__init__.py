@@ -17,7 +17,10 @@ TABLES = (".csv", ".csv.gz", ".csv.xz", ".tsv", ".txt", ".parquet")
 SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
 """What says itself what it holds: no mapping is used for it."""
 RUN_LOG = "flight.npz"
-"""In the folder of a run of ``visthrow hil``: its flight log."""
+RUN_TICKS = "ticks.jsonl"
+"""In the folder of a run of ``visthrow hil``: its flight log, which is there where no throw was
+flown and ``--bare`` was not given, and what it is made of.
+"""
 BAG = "metadata.yaml"
 """In the folder of a ROS 2 bag."""
 
@@ -110,9 +113,11 @@ def _of_folder(path: Path) -> list[FlightLog]:
         return read(path / RUN_LOG)
     logs = sorted(p for p in path.glob("*.npz") if p.name != "policy.npz")
     if not logs:
-        raise LogError(
-            f"{path}: a folder without {RUN_LOG} or other .npz logs; name the files themselves"
+        is_run = (path / RUN_TICKS).is_file()
+        expected = (
+            f"visthrow hil view {path} writes them" if is_run else "name the files themselves"
         )
+        raise LogError(f"{path}: a folder without {RUN_LOG} or other .npz logs; {expected}")
     return read_all(logs)
 
 

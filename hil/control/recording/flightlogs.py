@@ -185,6 +185,11 @@ class TickLogger:
                 estimated.append(name)
 
 
+def logger_of(played: PlayedRun, start: float) -> TickLogger:
+    """Return what adds ticks to a log of the run that begins at a time [s]."""
+    return TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
+
+
 def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
     """Return the metadata that are known from a run's beginning on; ``start`` [s] is the zero of
     its pictures.
@@ -227,7 +232,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     ticks, runner = played.ticks[first : last + 1], played.playback.runner
     begin = first if throw is None else played.throws[throw][0]
     start = played.ticks[begin].line["time"]
-    logger = TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
+    logger = logger_of(played, start)
     thrown = [tick for tick in ticks if tick.line["time"] >= start]
     landing: Landing | None = None
     if throw is not None:

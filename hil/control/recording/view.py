@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.recording.flightlogs import TickLogger, events, meta_of, read
+from hil.control.recording.flightlogs import TickLogger, events, logger_of, meta_of, read
 from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import (
     CONFIG,
@@ -170,10 +170,7 @@ def write(folder: str | Path, path: str | Path) -> None:
 
     played = read(folder)
     if Path(path).suffix == ".mcap":
-        samples = TickLogger(
-            played.playback,
-            meta_of(played.playback, played.provenance, played.ticks[0].line["time"]),
-        )
+        samples = logger_of(played, played.ticks[0].line["time"])
         for tick in played.ticks:
             samples.add(tick)
         log = samples.flush()

@@ -71,6 +71,13 @@ which the signs of its rates show [s]: for longer they would make frames queue u
 """
 
 AXES = ("roll", "pitch", "yaw")
+ZEROS = {
+    "throttle_limit_type": "else full throttle is not full",
+    "throttle_expo": "thrust is computed for a straight line",
+    "deadband": "small rates would be lost",
+    "yaw_deadband": "as above",
+}
+"""Settings that must be 0, and why."""
 
 
 @dataclass(frozen=True)
@@ -159,10 +166,7 @@ class Betaflight(OnPort):
             for name, values in curves.items()
         ]
         rules += [
-            equal("throttle_limit_type", 0.0, "else full throttle is not full", False),
-            equal("throttle_expo", 0.0, "thrust is computed for a straight line", False),
-            equal("deadband", 0.0, "small rates would be lost", False),
-            equal("yaw_deadband", 0.0, "as above", False),
+            *(equal(name, 0.0, why, False) for name, why in ZEROS.items()),
             equal("min_check", p.minimum_us, "throttle that counts as 0 [us]", False),
             equal("mid_rc", MIDDLE, "middle of the sticks [us]", False),
             Rule(

@@ -65,12 +65,7 @@ def sample(
         x,
         y,
         z,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
+        *[0.0] * 6,  # velocity and position
         SEA_LEVEL,
     )
 
