@@ -3,8 +3,8 @@
 import math
 
 from hil.control.tick.body_estimate import Estimate
-from hil.poses.body_track import BodyState, turned
-from visthrow.common.rotations import rotate_one
+from hil.poses.body_track import BodyState
+from visthrow.common.rotations import rotate_one, turned_one
 from visthrow.onboard.hover import GRAVITY
 
 RESPONSE = 0.05  # time constant with which body rates follow their command [s]
@@ -57,7 +57,7 @@ def _advanced(
     if rates is None:
         share = 1.0 - math.exp(-step / RESPONSE)
         rates = tuple(rate + share * (new - rate) for rate, new in zip(state.rate, commanded))
-    quat = turned(state.quat, rates, step)
+    quat = turned_one(state.quat, rates, step)
     force_w = rotate_one(quat, (0.0, 0.0, thrust / mass))
     acceleration_w = (force_w[0], force_w[1], force_w[2] - GRAVITY)
     vel = tuple(v + step * a for v, a in zip(state.vel, acceleration_w))

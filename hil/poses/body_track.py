@@ -9,7 +9,7 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
-from visthrow.common.rotations import multiply
+from visthrow.common.rotations import turned_one
 
 MOST_PREDICTION = (
     0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
@@ -149,15 +149,7 @@ class Track:
             pos = tuple(x + lead * v for x, v in zip(pos, vel))
             vel = tuple(v + TRUST * lead * a for v, a in zip(vel, self.filter.acceleration))
             if quat is not None:
-                quat = turned(quat, rate, lead)
+                quat = turned_one(quat, rate, lead)
             if self._turns:
                 rate = tuple(r + TRUST * lead * a for r, a in zip(rate, self.filter.spin))
         return BodyState(pos, quat, vel, rate, age)
-
-
-def turned(quat: Quaternion, rate: Vector, time: float) -> Quaternion:
-    """Return an attitude after a short time [s] at a body rate [rad/s]."""
-    half = 0.5 * time
-    turn = multiply(quat, (*(half * r for r in rate), 1.0))
-    norm = sum(x * x for x in turn) ** 0.5
-    return tuple(x / norm for x in turn)

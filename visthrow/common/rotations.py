@@ -125,6 +125,14 @@ def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
     )
 
 
+def turned_one(quat: Quaternion, rate_b: Vector, time: float) -> Quaternion:
+    """Return a single attitude after a short time [s] at body rates [rad/s]."""
+    half = 0.5 * time
+    turn = multiply(quat, (*(half * r for r in rate_b), 1.0))
+    norm = sum(x * x for x in turn) ** 0.5
+    return tuple(x / norm for x in turn)
+
+
 def conjugate(quat: Quaternion) -> Quaternion:
     """Return the inverse turn of a single unit quaternion."""
     x, y, z, w = quat
