@@ -280,6 +280,10 @@ class ReferencePlant:
         pos = np.where(on, state[:, POS] + arm, free[:, :3])
         return pos, np.where(on, state[:, VEL] + arm_dot, free[:, 3:])
 
+    def _points(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Joints of the ropes, position and velocity of the payloads."""
+        return self._ropes.points(*self._upper_end(state), self._rope_of(state))
+
     def _rates(
         self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray
     ) -> np.ndarray:
@@ -309,10 +313,11 @@ class ReferencePlant:
         rope = self._rope_of(state)
         root = self._upper_end(state, rotation)
         lift_w = rotation[:, :, 2] * thrust.sum(axis=1, keepdims=True)
+        payload_vel_w = self._ropes.payload_velocity(root[1], rope)
         drag_w = vehicle_blocks.payload_force(
             self.params.rope,
             self.extras.payload_drag,
-            self._ropes.payload_velocity(root[1], rope),
+            payload_vel_w,
             wind_w,
             rope[0][:, -1],
             lift_w,
@@ -365,15 +370,13 @@ class ReferencePlant:
         """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
         acceleration.
         """
-        command = vehicle_blocks.command_queue(
-            np.array(self._queue_times),
-            np.array(self._queue_commands),
-            np.full(self.count, self.time),
-        )
-        with_rope, without = (
-            self._rates(self._state, command, self._wind, np.full(self.count, moving))[:, VEL]
-            for moving in (True, False)
-        )
+        times = np.array(self._queue_times)
+        commands = np.array(self._queue_commands)
+        now = np.full(self.count, self.time)
+        command = vehicle_blocks.command_queue(times, commands, now)
+        moving = np.ones(self.count, bool)
+        with_rope = self._rates(self._state, command, self._wind, moving)[:, VEL]
+        without = self._rates(self._state, command, self._wind, ~moving)[:, VEL]
         force_w = self.params.vehicle.body.mass * (with_rope - without)
         return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
 
@@ -469,11 +472,8 @@ class ReferencePlant:
         if not np.any(flying):
             return
         height = self.params.release.landing_height
-        ends = [
-            self._ropes.points(*self._upper_end(state), self._rope_of(state))[1:]
-            for state in (before, self._state)
-        ]
-        (pos_0, vel_0), (pos_1, vel_1) = ends
+        _, pos_0, vel_0 = self._points(before)
+        _, pos_1, vel_1 = self._points(self._state)
         for e in np.flatnonzero(flying & (pos_1[:, 2] <= height)):
             share, point = crossing(pos_0[e], vel_0[e], pos_1[e], vel_1[e], step[e], height)
             self._landed[e] = True
@@ -509,15 +509,16 @@ class ReferencePlant:
         rotation = rotation_from_quat(state[:, QUAT])
         blocks = state[:, OWN]
         offset = self._errors.com_offset
-        points, ball, ball_vel = self._ropes.points(*self._upper_end(state), self._rope_of(state))
+        points, ball, ball_vel = self._points(state)
+        landed = self._landed[:, None]
         return Snapshot(
             time=self.time,
             pos_w=state[:, POS] - turned(rotation, offset),
             quat_wb=state[:, QUAT].copy(),
             vel_w=state[:, VEL] - turned(rotation, cross(state[:, RATE], offset)),
             rate_b=state[:, RATE].copy(),
-            payload_pos_w=np.where(self._landed[:, None], self._landing_point, ball),
-            payload_vel_w=np.where(self._landed[:, None], 0.0, ball_vel),
+            payload_pos_w=np.where(landed, self._landing_point, ball),
+            payload_vel_w=np.where(landed, 0.0, ball_vel),
             cable_points_w=points,
             motor_speed=blocks[:, MOTORS].copy(),
             battery_voltage=blocks[:, VOLTAGE].copy(),
@@ -560,10 +561,10 @@ class ReferencePlant:
             name: getattr(sample, name) + sigma * rng.standard_normal((self.count, 3))
             for name, sigma in sigmas.items()
         }
+        noisy["quat_wb"] = quat / np.linalg.norm(quat, axis=1, keepdims=True)
         return replace(
             sample,
             time=max(time, 0.0),
-            quat_wb=quat / np.linalg.norm(quat, axis=1, keepdims=True),
             attached=self._attached.copy(),
             latched=self._latched.copy(),
             **noisy,

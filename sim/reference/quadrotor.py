@@ -42,7 +42,8 @@ class VehicleErrors:
 def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
     """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""
     rotors = vehicle.rotors
-    return np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T - errors.com_offset[:, None, :]
+    hubs = np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T
+    return hubs - errors.com_offset[:, None, :]
 
 
 def initial_blocks(

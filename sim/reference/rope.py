@@ -169,12 +169,8 @@ class RopeDynamics:
         qacc = self._forward(self._attached, ids, qpos, qvel, rope, applied)
         alpha = turned(rotation, qacc[:, 3:6])
         relative = qacc[:, 6 : 6 + 3 * self.segments].reshape(len(ids), -1, 3)
-        return (
-            qacc[:, :3],
-            qacc[:, 3:6],
-            self._unpack(alpha, frames, relative, local, rates, n),
-            self._elongation(qacc),
-        )
+        second = self._unpack(alpha, frames, relative, local, rates, n)
+        return qacc[:, :3], qacc[:, 3:6], second, self._elongation(qacc)
 
     def free(
         self,
@@ -202,11 +198,8 @@ class RopeDynamics:
         applied = self._applied(self._free, ids, 1, n, couples, force_w)
         qacc = self._forward(self._free, ids, qpos, qvel, rope, applied)
         relative = qacc[:, 3 : 3 + 3 * self.segments].reshape(len(ids), -1, 3)
-        return (
-            qacc[:, :3],
-            self._unpack(np.zeros((len(ids), 3)), frames, relative, local, rates, n),
-            self._elongation(qacc),
-        )
+        second = self._unpack(np.zeros((len(ids), 3)), frames, relative, local, rates, n)
+        return qacc[:, :3], second, self._elongation(qacc)
 
     def _elongation(self, qacc: np.ndarray) -> np.ndarray:
         return np.zeros(len(qacc)) if self.stretch is None else qacc[:, -1]
@@ -242,10 +235,9 @@ class RopeDynamics:
             rope: as in ``attached``.
         """
         n, _, elongation, _ = rope
-        length = self.length[:, None, None]
-        points = np.concatenate(
-            (root_pos[:, None], root_pos[:, None] + np.cumsum(length * n, axis=1)), 1
-        )
+        root = root_pos[:, None]
+        steps = np.cumsum(self.length[:, None, None] * n, axis=1)
+        points = np.concatenate((root, root + steps), 1)
         pos = points[:, -1] + (self.offset + elongation)[:, None] * n[:, -1]
         return points, pos, self.payload_velocity(root_vel, rope)
 
@@ -254,11 +246,9 @@ class RopeDynamics:
         as of :meth:`points`.
         """
         n, n_dot, elongation, elongation_dot = rope
-        direction_rate = (
-            self.length[:, None] * n_dot.sum(axis=1)
-            + (self.offset + elongation)[:, None] * n_dot[:, -1]
-        )
-        return root_vel + direction_rate + elongation_dot[:, None] * n[:, -1]
+        below = (self.offset + elongation)[:, None]
+        turning = self.length[:, None] * n_dot.sum(axis=1) + below * n_dot[:, -1]
+        return root_vel + turning + elongation_dot[:, None] * n[:, -1]
 
 
 def _from_above(rates: np.ndarray, above: np.ndarray) -> np.ndarray:

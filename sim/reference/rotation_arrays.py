@@ -67,10 +67,9 @@ def turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
 def rotation_from_quat(quat: np.ndarray) -> np.ndarray:
     """Return rotation matrices of quaternions xyzw of any length, shape (..., 3, 3)."""
     unit = quat / length(quat)
-    products = unit[..., :, None] * unit[..., None, :]
-    return np.eye(3) + (products.reshape(*quat.shape[:-1], 16) @ _FROM_PRODUCTS).reshape(
-        *quat.shape[:-1], 3, 3
-    )
+    leading = quat.shape[:-1]
+    products = (unit[..., :, None] * unit[..., None, :]).reshape(*leading, 16)
+    return np.eye(3) + (products @ _FROM_PRODUCTS).reshape(*leading, 3, 3)
 
 
 def quat_dot(quat: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
