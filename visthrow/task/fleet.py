@@ -117,21 +117,19 @@ def members(experiment: Experiment) -> list[Member]:
     fleet = experiment.fleet
     if fleet is None:
         return []
-    paper_plant = plant_of(experiment)
-    vehicles = [draw(fleet, paper_plant, fleet.first + k) for k in range(fleet.count)] or [
-        paper_plant
-    ]
-
-    def member(plant: PlantParams) -> Member:
+    nominal = plant_of(experiment)
+    plants = [draw(fleet, nominal, fleet.first + k) for k in range(fleet.count)]
+    release = experiment.release
+    task = {
+        "release.landing_height": release.landing_height,
+        "release.clearance_margin": release.clearance_margin,
+        "sim": experiment.sim,
+    }
+    vehicles = []
+    for plant in plants or [nominal]:
         units = fleet.units_of(plant)
-        stated = in_units(plant, units)
-        task = {
-            f"release.{name}": getattr(experiment.release, name)
-            for name in ("landing_height", "clearance_margin")
-        }
-        return Member(changed(stated, {**task, "sim": experiment.sim}), units)
-
-    return [member(plant) for plant in vehicles]
+        vehicles.append(Member(changed(in_units(plant, units), task), units))
+    return vehicles
 
 
 def alone(experiment: Experiment, number: int = 0) -> Experiment:

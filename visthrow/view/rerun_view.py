@@ -6,6 +6,7 @@ motion capture knows no motor speeds, a simulated one no age of its poses. Sizes
 experiment, or from anything with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``."""
 
 import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -24,8 +25,7 @@ from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 
 TIMELINE = "throw_time"
-ROTOR_NAMES = ("front left", "front right", "rear left", "rear right")
-BODIES = ("vehicle", "payload", "goal")
+SIGNALS = tomllib.loads(Path(__file__).with_name("signals.toml").read_text(encoding="utf-8"))
 FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
 
@@ -288,42 +288,27 @@ def _outline(stream, log: FlightLog, name: str, points: np.ndarray, whole: np.nd
     _send(stream, f"camera/{name}/outline", log, "keypoints", columns)
 
 
-def _curves(log: FlightLog) -> list[tuple[str, str, int | None, str, str]]:
-    """Entity, channel, component, label and colour of each curve that the log has samples for."""
-    c = style.COLOURS
-    states = ", ".join(log.meta.get("states", ()))
-    curves: list[tuple[str, str, int | None, str, str]] = [
-        ("thrust", "command", 0, "collective thrust [N]", c[0]),
-        ("battery", "battery_voltage", None, "battery [V]", c[2]),
-        ("phase/mode", "mode", None, "0 hover controller, 1 policy", c[0]),
-        ("phase/attached", "attached", None, "payload attached", c[1]),
-        ("phase/release", "release_command", None, "release command", c[3]),
-        ("phase/state", "state", None, f"state: {states}", c[2]),
-    ]
-    for i, axis in enumerate("xyz"):
-        curves.append((f"rate_command/{axis}", "command", 1 + i, f"{axis} commanded [rad/s]", c[i]))
-        curves.append((f"rate/{axis}", "rate_b", i, f"{axis} flown [rad/s]", _paler(c[i])))
-    for i, name in enumerate(ROTOR_NAMES):
-        curves.append((f"motors/{i}", "motor_speed", i, f"{name} [rad/s]", c[i]))
-    for i, body in enumerate(BODIES):
-        curves.append((f"age/{body}", f"age_{body}", None, f"{body}'s pose [ms]", c[i]))
-    ticks = [name.removeprefix("tick_") for name in log.channels if name.startswith("tick_")]
-    for i, name in enumerate(ticks):
-        curves.append((f"tick/{name}", f"tick_{name}", None, f"{name} [ms]", c[i % len(c)]))
-    return [curve for curve in curves if curve[1] in log]
-
-
-MILLISECONDS = ("age", "tick")  # groups whose channels, in seconds, are drawn in milliseconds
-
-
 def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
-    for entity, name, component, label, colour in _curves(log):
-        values = log[name].values if component is None else log[name].values[:, component]
-        scale = 1e3 if entity.split("/")[0] in MILLISECONDS else 1.0
-        series = rr.SeriesLines(names=[label], colors=[colour_code(colour)])
-        stream.log(f"signals/{entity}", series, static=True)
-        column = rr.Scalars.columns(scalars=scale * values.astype(float))
-        _send(stream, f"signals/{entity}", log, name, column)
+    """Send a curve of each component of the channels that the log has samples for."""
+    tables = dict(SIGNALS["curves"])
+    ticks = [name for name in log.channels if name.startswith("tick_")]
+    for i, name in enumerate(ticks):
+        step = name.removeprefix("tick_")
+        tables[name] = {f"tick/{step}": [f"{step} [ms]", i % len(style.COLOURS)]}
+    states = ", ".join(log.meta.get("states", ()))
+    for channel, curves in tables.items():
+        if channel not in log:
+            continue
+        components = np.atleast_2d(log[channel].values.T.astype(float))
+        for (entity, curve), values in zip(curves.items(), components, strict=True):
+            label, number, *pale = curve
+            colour = _paler(style.COLOURS[number]) if pale else style.COLOURS[number]
+            label = label.format(states=states)
+            series = rr.SeriesLines(names=[label], colors=[colour_code(colour)])
+            stream.log(f"signals/{entity}", series, static=True)
+            scale = 1e3 if label.endswith("[ms]") else 1.0  # channels are in seconds
+            column = rr.Scalars.columns(scalars=scale * values)
+            _send(stream, f"signals/{entity}", log, channel, column)
 
 
 def _paler(colour: str) -> str:
@@ -342,22 +327,13 @@ def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
     image = rrb.Spatial2DView(
         origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds
     )
-    live = "state" in channels
-    plots = [
-        _plot("Phase", -0.1, 8.1 if live else 1.1, "phase"),
-        _plot("Collective thrust [N]", 0.0, 14.0, "thrust"),
-        _plot("Body rates [rad/s]", -11.0, 11.0, "rate_command", "rate"),
+    plots: list[Any] = [
+        _plot(plot["name"], *plot["range"], *plot["entities"])
+        for plot in SIGNALS["plots"]
+        if channels.issuperset(plot["needs"]) and channels.isdisjoint(plot["lacks"])
     ]
-    if "motor_speed" in channels:
-        plots.append(_plot("Motor speeds [rad/s]", 0.0, 4000.0, "motors"))
-    if "battery_voltage" in channels:
-        plots.append(_plot("Battery [V]", 13.0, 17.0, "battery"))
-    if live:
-        plots += [
-            _plot("Age of poses [ms]", 0.0, 120.0, "age"),
-            _plot("Tick [ms]", 0.0, 5.0, "tick"),
-            rrb.TextLogView(origin="events", name="States"),
-        ]
+    if "state" in channels:
+        plots.append(rrb.TextLogView(origin="events", name="States"))
     top = rrb.Horizontal(scene, image, column_shares=[2.2, 1.0])
     below = rrb.Grid(*plots, grid_columns=3)
     return rrb.Blueprint(rrb.Vertical(top, below, row_shares=[1.7, 1.0]), collapse_panels=True)
