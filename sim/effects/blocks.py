@@ -28,12 +28,12 @@ def _lagging(setting: Setting) -> Setting:
     return _with(setting, {"motor.kind": "asymmetric", "motor.time_constant_down": tau})
 
 
-def _pid(setting: Setting) -> bool:
-    return setting.plant.vehicle.controller.kind in ("betaflight", "motor_mixing")
+def _kind(block: str, *kinds: str) -> Callable[[Setting], bool]:
+    """Return whether a block of a setting's vehicle is of one of these kinds."""
+    return lambda setting: getattr(setting.plant.vehicle, block).kind in kinds
 
 
-def _mixes_motors(setting: Setting) -> bool:
-    return setting.plant.vehicle.controller.kind == "motor_mixing"
+PID = _kind("controller", "betaflight", "motor_mixing")
 
 
 def _motor_mixing(setting: Setting) -> Setting:
@@ -53,21 +53,21 @@ def _motor_mixing(setting: Setting) -> Setting:
 
 CONDITIONS: dict[str, Callable[[Setting], bool]] = {
     "always": lambda s: True,
-    "aerodynamics": lambda s: s.plant.vehicle.aero.kind != "none",
+    "aerodynamics": _kind("aero", "rotor_drag"),
     "no aerodynamics": lambda s: (
         not any(getattr(s.plant.vehicle.aero, name) for name in AERODYNAMICS)
     ),
-    "PID controller": _pid,
-    "proportional controller": lambda s: not _pid(s),
-    "thrust mixing": lambda s: _pid(s) and not _mixes_motors(s),
-    "motor mixing": _mixes_motors,
-    "feed-forward": lambda s: _pid(s) and any(s.plant.vehicle.controller.feedforward_gain),
-    "integral limit": lambda s: _pid(s) and all(s.plant.vehicle.controller.integral_limit),
-    "motor lag": lambda s: s.plant.vehicle.motor.kind != "instant",
-    "motor lag of two": lambda s: s.plant.vehicle.motor.kind == "asymmetric",
-    "no motor lag": lambda s: s.plant.vehicle.motor.kind == "instant",
+    "PID controller": PID,
+    "proportional controller": _kind("controller", "geometric"),
+    "thrust mixing": _kind("controller", "betaflight"),
+    "motor mixing": _kind("controller", "motor_mixing"),
+    "feed-forward": lambda s: PID(s) and any(s.plant.vehicle.controller.feedforward_gain),
+    "integral limit": lambda s: PID(s) and all(s.plant.vehicle.controller.integral_limit),
+    "motor lag": _kind("motor", "first_order", "asymmetric"),
+    "motor lag of two": _kind("motor", "asymmetric"),
+    "no motor lag": _kind("motor", "instant"),
     "rotor inertia": lambda s: s.plant.vehicle.rotors.inertia > 0.0,
-    "battery": lambda s: s.plant.vehicle.battery.kind == "sag",
+    "battery": _kind("battery", "sag"),
     "payload inertia": lambda s: s.plant.rope.payload_inertia > 0.0,
     "long rope": lambda s: s.plant.rope.length > LONGEST_OFFSET,
     "flexible rope": lambda s: s.plant.rope.segments > 1,
