@@ -7,17 +7,15 @@ import os
 from itertools import pairwise
 
 import numpy as np
-from pytest import approx, fixture, mark
+from pytest import fixture, mark
 
 from bench.diagnose import cases
 from bench.diagnose.bad import BAD
 from bench.diagnose.degenerate import PAIRS, manoeuvre_of
-from bench.worlds.follow import ALONE, follow, table_of
 from bench.worlds.world import Recipe
 from visthrow.diagnose.planning.design import START, Limits, designed
 from visthrow.diagnose.planning.manoeuvres import catalogue
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
-from visthrow.diagnose.throw.recorded_flight import carriers, record_of
 from visthrow.logs.flightlog import FlightLog
 
 SMALL = dict(free=1, free_seconds=1.0, throws=2)
@@ -44,31 +42,6 @@ def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
     assert (
         np.abs(logs[0]["pos_w"].values - again[0]["pos_w"].values).max() > 1e-3
     )  # another seed is another flight
-
-
-def test_a_proposed_manoeuvre_is_flown_on_the_plant():
-    """The pilot follows a reference to a decimetre; without payload its log shows none, and such a
-    flight counts as bare.
-    """
-    known = {m.name: m for m in catalogue()}
-    recipe = Recipe(5, "rod", {})
-    for name in ("vertical sine", "hover without payload"):
-        manoeuvre = known[name]
-        table = table_of(manoeuvre.reference().csv(), manoeuvre.payload)
-        (record,) = follow(recipe, [table], 1)
-        begin = 0.0 if manoeuvre.payload else ALONE
-        reference = manoeuvre.reference()
-        want = np.column_stack(
-            [np.interp(record["time"] - begin, reference.time, c) for c in reference.pos_w.T]
-        )
-        assert np.abs(record["pos"] - want).max() < 0.15, name
-        assert record["time"][-1] - record["time"][0] == approx(manoeuvre.seconds, abs=0.05)
-        assert np.isfinite(record["ball"]).all() == manoeuvre.payload
-    loaded, bare = (
-        cases.flight_log(r)
-        for r in (follow(recipe, [table_of(known["hover"].reference().csv(), True)], 2)[0], record)
-    )
-    assert carriers([record_of(loaded), record_of(bare)]) == [True, False]
 
 
 def test_a_design_is_flown_with_the_load_of_its_manoeuvre():

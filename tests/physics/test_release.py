@@ -12,7 +12,7 @@ from pytest import mark
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY, PlantParams
 from tests.plants import paper_plant
-from tests.simulators import numerics, random_commands, rotate
+from tests.simulators import numerics, random_commands
 
 CLOCK = 1e-6
 """Times are sums of float32 periods [s]."""
@@ -147,23 +147,3 @@ def test_the_vehicle_flies_on_alone():
     assert_allclose(
         np.diff(speeds) / PERIOD, weight / params.vehicle.body.mass - GRAVITY, rtol=1e-9
     )
-
-
-def test_payload_of_the_outputs_is_the_end_of_the_rope():
-    sim = HybridSim(plant(0.11), 8)
-    for command in random_commands(3, 10, 8):
-        sim.set_command(command)
-        sim.step()
-    rope = sim.params.rope
-    mount = np.tile(rope.mount, (8, 1))
-    quat, rate = sim.get("quat_wb").astype(float), sim.get("rate_b").astype(float)
-    reach = np.full(rope.segments, rope.length / rope.segments)
-    reach[-1] += rope.payload_offset
-    n, u = sim.get("cable_dir_w").astype(float), sim.get("cable_vel_w").astype(float)
-    pos = sim.get("pos_w") + rotate(quat, mount) + np.einsum("l,elx->ex", reach, n)
-    vel = sim.get("vel_w") + rotate(quat, np.cross(rate, mount)) + np.einsum("l,elx->ex", reach, u)
-    assert_allclose(sim.get("payload_pos_w"), pos, atol=ROUND_OFF)
-    assert_allclose(sim.get("payload_vel_w"), vel, atol=10 * ROUND_OFF)
-    points = sim.cable_points_w()
-    assert_allclose(points[:, 0], sim.get("pos_w") + rotate(quat, mount), atol=ROUND_OFF)
-    assert_allclose(points[:, -1] + rope.payload_offset * n[:, -1], pos, atol=ROUND_OFF)

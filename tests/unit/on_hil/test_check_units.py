@@ -2,9 +2,8 @@
 
 import math
 
-from pytest import mark, raises
+from pytest import mark
 
-from hil.cli import ACTIONS
 from hil.poses.pose import Pose
 from hil.poses.sources.pose_source import RecordedSource
 from tests.commands import run_command
@@ -43,16 +42,6 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
     assert run_command("hil check --seconds 2.4", *settings) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2:] == ["parameters were read", "FAIL  hover share measured 0.9"]
-
-
-@mark.parametrize("action", ACTIONS)
-def test_each_action_has_an_example(action, capsys):
-    with raises(SystemExit):
-        run_command(f"hil {action} --help")
-    shown = capsys.readouterr().out.partition("examples:\n")[2].splitlines()
-    commands = [line for line in shown if line.startswith("  visthrow")]
-    assert commands
-    assert all(line.startswith(f"  visthrow hil {action}") for line in commands)
 
 
 def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):

@@ -101,26 +101,6 @@ def test_our_own_frame_changes_no_bit():
         assert frames().pose_from_source(pose) == pose
 
 
-def test_level_and_north_in_mavlink_is_level_and_ahead_here():
-    level = Pose(
-        0.0,
-        0.0,
-        "vehicle",
-        (1.0, 2.0, -3.0),
-        (1.0, 0.0, 0.0, 0.0),
-        (0.5, 0.0, 0.0),
-        (0.1, 0.2, 0.3),
-    )
-    ahead = frames("x,-y,-z", "x,-y,-z", "wxyz").pose_from_source(level)
-    assert ahead.pos == (1.0, -2.0, 3.0)
-    assert same_turn(ahead.quat, (0.0, 0.0, 0.0, 1.0))
-    assert_allclose(ahead.rate, (0.1, -0.2, -0.3), atol=EXACT)
-    east = frames("y,x,-z", "x,-y,-z", "wxyz").pose_from_source(level)
-    assert_allclose(east.pos, (2.0, 1.0, 3.0), atol=EXACT)
-    turn = Rotation.from_quat(east.quat) * Rotation.from_quat(ahead.quat).inv()
-    assert_allclose(turn.as_rotvec(degrees=True), (0.0, 0.0, 90.0), atol=1e-12)
-
-
 def test_marker_offset_follows_the_attitude():
     """Marker 0.1 m above the centre of mass; rolled by 90 deg to the right it lies 0.1 m to the
     right of it.

@@ -12,7 +12,7 @@ from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import can_hand_over
 from hil.errors import RunError
-from hil.links.backends.base import Status
+from hil.links.backends.base import HOLD, Status
 from hil.params import HilParams
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
@@ -167,6 +167,31 @@ def test_a_vehicle_that_is_slow_and_level_is_handed_over(speed, tilt_deg, able):
     half = 0.5 * math.radians(tilt_deg)
     quat = (math.sin(half), 0.0, 0.0, math.cos(half))
     assert can_hand_over(BodyState((0.0,) * 3, quat, (0.0, speed, 0.0), (0.0,) * 3, 0.0)) is able
+
+
+def test_a_release_that_waits_for_late_commands_is_not_stopped_before_its_time():
+    pilot, ticks, stops = runner(AT_ONCE, "delay.command=0.05", "delay.compensate=true"), [0.0], []
+    pilot.backend.stop_release = lambda: stops.append(ticks[-1])
+    fly(pilot, 5.0, watch=lambda time, decision: ticks.append(time))
+    latch = pilot.latch.command_time - LAG - 0.05
+    assert pilot.backend.release_times == [approx(latch + LAG + 0.05)]
+    assert stops[0] >= pilot.backend.release_times[0] - TICK
+
+
+@mark.parametrize(("share", "throws"), [(0.1, True), (1.05, True), (1.3, False)])
+def test_another_hover_thrust_than_the_weights_forbids_a_throw_unless_it_stands(share, throws):
+    pilot = runner(NEVER)
+    pilot.parts.thrust_tolerance = 0.1
+    thrust = share * pilot.mass * 9.81
+    decisions = fly(pilot, 5.0, status=lambda time: Status(True, thrust=thrust))
+    assert ("throw" in {d.state for d in decisions}) is throws
+
+
+def test_errors_are_not_integrated_while_the_vehicle_follows_another():
+    pilot, resets = runner(NEVER), []
+    pilot.parts.hovering.reset = lambda: resets.append(1)
+    fly(pilot, 3.0, status=lambda time: Status(True, mode=HOLD))
+    assert len(resets) > 50
 
 
 def test_poses_at_5_hz_never_start_a_throw():

@@ -9,7 +9,6 @@ from pytest import approx, mark
 from tests import logfiles
 from visthrow.logs import read
 from visthrow.logs.check.run import check, contradictions
-from visthrow.logs.flightlog import FlightLog
 
 LOCAL = ["uint64_t timestamp", *(f"float {x}" for x in ["x", "y", "z", "vx", "vy", "vz", "eph"])]
 LOCAL += [f"uint8_t {name}" for name in ["xy_valid", "z_valid", "v_xy_valid", "v_z_valid"]]
@@ -327,18 +326,3 @@ def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, goo
     ]
     logfiles.write_bin(tmp_path / "a.BIN", {"VISP": logfiles.VISP}, rows)
     assert np.all(read(tmp_path / "a.BIN")[0]["mocap_pos_w"].valid == good)
-
-
-def test_external_odometry_and_ground_truth_are_channels_of_their_own(tmp_path):
-    odometry = ["uint64_t timestamp", "float[3] position", "float[4] q", "int8_t quality"]
-    truth = ["uint64_t timestamp", "float x", "float y", "float z"]
-    times = [1_000_000 + 50_000 * i for i in range(300)]
-    rows = [(t, 1.0, 2.0, -1.0, 1.0, 0, 0, 0, -1 if i > 99 else 90) for i, t in enumerate(times)]
-    topics = {
-        ("vehicle_mocap_odometry", 0): (odometry, rows),
-        ("vehicle_local_position_groundtruth", 0): (truth, [(t, 1.0, 2.0, -3.0) for t in times]),
-    }
-    log: FlightLog = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
-    assert log["mocap_pos_w"].values[0].tolist() == [1.0, -2.0, 1.0]
-    assert np.sum(log["mocap_pos_w"].valid) == 100
-    assert log["truth_pos_w"].values[0].tolist() == [1.0, -2.0, 3.0]

@@ -72,15 +72,6 @@ def test_a_goal_to_the_side_of_another_hover_point():
     np.testing.assert_allclose(throws.landing_w, [[2.1, 0.1]], atol=1e-9)
 
 
-def test_two_policies_of_one_name_are_told_apart():
-    names = [entry.name for entry in from_runs.entries([log(sha="a"), log(sha="b")])]
-    assert names == ["vision aaaaaaaa", "vision bbbbbbbb"]
-
-
-def test_smoothness_is_that_of_simulated_throws():
-    assert from_runs.smoothness(log()) == approx(0.1)
-
-
 def test_the_command(tmp_path, capsys):
     folder = tmp_path / "flown"
     record_run(folder, saved_policy(tmp_path), seconds=6.0)

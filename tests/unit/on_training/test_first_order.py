@@ -6,7 +6,7 @@ import itertools
 from types import SimpleNamespace
 
 import torch
-from pytest import approx, mark
+from pytest import approx, mark, param
 from torch.testing import assert_close
 
 from sim.params import GRAVITY
@@ -339,7 +339,7 @@ def small_task():
     )
 
 
-@mark.parametrize("seed", range(5))
+@mark.parametrize("seed", [0, *(param(seed, marks=mark.slow) for seed in range(1, 5))])
 def test_every_seed_learns(seed):
     """Of the last five of 35 iterations nearly all flights release, and land near."""
     trainer = Trainer(small_task(), "cpu", seed)

@@ -109,13 +109,6 @@ def test_a_string_for_a_table_includes_a_file_beside_it(write):
     assert config.load(Outer, path).inner == Inner("b", (3.0, 4.0))
 
 
-def test_an_error_inside_an_included_file_names_that_file(write):
-    write("parts/inner.toml", 'kind = "b"\ngain = [3, "4"]')
-    path = write("a.toml", 'name = "x"\ncount = 1\nmass = 1.5\ninner = "parts/inner.toml"')
-    with raises(ConfigError, match=r"inner\.toml: inner\.gain\[1\]"):
-        config.load(Outer, path)
-
-
 def test_an_include_falls_back_to_the_configs_folder(write, monkeypatch, tmp_path):
     write("root/inner/x.toml", 'kind = "b"\ngain = [3, 4]')
     monkeypatch.setattr(config, "configs_root", lambda: tmp_path / "root")
