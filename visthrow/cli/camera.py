@@ -10,17 +10,23 @@ TOOLS = (
 )
 
 
+EXAMPLES = f"""\
+examples:
+  visthrow camera calibrate camchain.yaml --out my_camera.toml
+  visthrow camera calibrate boards/ --board chessboard 7 5 0.04 --fov-deg 190 --out my_camera.toml
+  visthrow camera check my_camera.toml boards/ --board chessboard 7 5 0.04
+  visthrow camera show my_camera.toml frame.png --target 1.5 0 --out seen.png
+  visthrow train vision --set camera=my_camera.toml
+
+A board is {BOARD}:
+points (inner corners, or circles) along x and y, side of a square or distance of circles [m], side
+of a marker [m].
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the actions of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow camera calibrate camchain.yaml --out my_camera.toml\n  visthrow"
-        " camera calibrate boards/ --board chessboard 7 5 0.04 --fov-deg 190 --out"
-        " my_camera.toml\n  visthrow camera check my_camera.toml boards/ --board chessboard 7 5"
-        " 0.04\n  visthrow camera show my_camera.toml frame.png --target 1.5 0 --out seen.png\n "
-        f" visthrow train vision --set camera=my_camera.toml\n\nA board is {BOARD}:\npoints (inner"
-        " corners, or circles) along x and y, side of a square or distance of circles [m], side of"
-        " a marker [m].\n"
-    )
+    parser.epilog = EXAMPLES
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     _add_calibrate(
         actions.add_parser(

@@ -5,12 +5,16 @@ durations.
 import argparse
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from visthrow.common.arguments import add_common, add_conditions, add_out
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
-from visthrow.common.storage import writable
+from visthrow.common.storage import atomic_write, writable
 from visthrow.common.workers import status
 from visthrow.onboard.shipped import find_policy
 from visthrow.throws.results import Entry
@@ -19,23 +23,80 @@ BASELINE = "baseline"  # trajectory optimisation and MPC, beside the policies
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
 
+EXAMPLES = """\
+examples:
+  visthrow compare                               state against vision, 200 throws at three targets
+  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own
+  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC
+  visthrow compare --plant reference-realistic --throws 50   on the independent plant (minutes)
+  visthrow compare --from runs/hil/*             throws of HIL runs, from their folders
+
+A throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal
+distance from the target. The duration runs from the policy's start to the landing. Smoothness is
+the root mean square change of the normalised commands from step to step. The policy 'baseline'
+gives four rows: one in the controller's own model, an idealised bound, and three on the plant that
+compensate no, most or all known delays.
+"""
+
+PLANTS = {
+    "hybrid": "the training simulator with all its noise and randomisation",
+    "reference": (
+        "the reference plant (MuJoCo) without extras: measurements late but exact, still air"
+    ),
+    "reference-realistic": (
+        "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise"
+    ),
+}
+"""Name -> what titles of tables call it."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Throws of several policies: a table, and a picture of where they landed."""
+
+    plant: str  # in the names of files; "runs" for throws of HIL runs
+    title: str
+    subtitle: str  # of the picture
+    entries: Sequence[Entry]
+    note: str = ""  # on the paper's figures; empty for the usual one
+
+    def table(self) -> str:
+        """Return the table under its title, as Markdown."""
+        from visthrow.view.tables import markdown
+
+        return markdown(rows_of(self.entries), self.title)
+
+    def text(self) -> str:
+        """Return the table with its note on the paper's figures."""
+        from visthrow.view.tables import PAPER_NOTE
+
+        return f"{self.table()}\n{self.note or PAPER_NOTE}\n"
+
+    def write(self, folder: Path) -> list[Path]:
+        """Write Markdown, CSV and scatter plot; returns their paths."""
+        from visthrow.view import figures, tables
+
+        paths = [folder / f"compare-{self.plant}.{ending}" for ending in ("md", "csv", "png")]
+        atomic_write(paths[0], self.text())
+        rows = [(entry.name, self.plant, row) for entry in self.entries for row in entry.throws]
+        atomic_write(paths[1], tables.csv_text(rows))
+        panels = [
+            (f"target {column[0].target:.1f} m", list(map(_landings, self.entries, column)))
+            for column in zip(*(entry.throws for entry in self.entries))
+        ]
+        heading = f"Landing points from above: {self.subtitle}"
+        atomic_write(paths[2], figures.scatter(panels, heading=heading))
+        return paths
+
+
+def _landings(entry: Entry, throws: Any) -> tuple[str, np.ndarray]:
+    """Return a policy's name and where its throws landed, from the target [m], shape (N, 2)."""
+    return entry.name, throws.landing_w[throws.success] - (throws.target, 0.0)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow compare                               state against vision, 200"
-        " throws at each of three targets\n  visthrow compare vision runs/v2/policy.npz     a"
-        " shipped policy against one of your own\n  visthrow compare state baseline --throws 50   "
-        " against trajectory optimisation and MPC on the same throws\n  visthrow compare --plant"
-        " reference-realistic --throws 50   on the independent plant (minutes)\n "
-        " visthrow compare --from runs/hil/*              throws of HIL runs, from their"
-        " folders\n\nA throw starts in hover with the payload near z = 0.95 m. The landing error is"
-        " the horizontal distance\nfrom the target. The duration runs from the policy's start to"
-        " the landing. Smoothness is the root mean square\nchange of the normalised commands from"
-        " step to step. The policy 'baseline' gives four rows: one in the\ncontroller's own model,"
-        " an idealised bound, and three on the plant that compensate no, most or all known\n"
-        "delays.\n"
-    )
+    parser.epilog = EXAMPLES
     add = parser.add_argument
     add(
         "policies",
@@ -124,30 +185,20 @@ def run(args: argparse.Namespace) -> int:
         " trained otherwise"
         for name, departed in departures.items()
     ]
-    title = title_of(args.plant, args.seed) + "".join(notes)
-    rows = rows_of(entries)
-    figures = {"plant": args.plant, "seed": args.seed, "rows": rows, "departures": departures}
-    return _tell(args, entries, rows, figures, title)
+    comparison = on_plant(args.plant, args.seed, entries, "".join(notes))
+    figures = {"plant": args.plant, "seed": args.seed, "departures": departures}
+    return _publish(args, comparison, figures)
 
 
-def _tell(
-    args: argparse.Namespace,
-    entries: Sequence[Entry],
-    rows: Sequence[dict],
-    notes: dict,
-    title: str,
-    *lines: str | None,
-) -> int:
-    """Print and write a table; ``notes`` is its JSON, ``lines`` subtitle and note of
-    :func:`write`.
-    """
+def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str, Any]) -> int:
+    """Print and write a comparison; ``figures``: what its JSON says beside the rows."""
     from visthrow.common.storage import write_json
 
-    print(report(title, rows, *lines[1:]))
-    for path in write(Path(args.out), entries, rows, notes["plant"], title, *lines):
+    print(comparison.text())
+    for path in comparison.write(Path(args.out)):
         print(path)
     if args.json:
-        write_json(args.json, notes)
+        write_json(args.json, {**figures, "rows": rows_of(comparison.entries)})
     return 0
 
 
@@ -164,14 +215,12 @@ def _from_runs(args: argparse.Namespace) -> int:
         )
     writable(Path(args.out))
     logs = from_runs.logs_of(args.runs)
-    entries = from_runs.entries(logs)
-    rows = [row for row in rows_of(entries) if row["throws"]]
     how = ", ".join(sorted({log.meta["plant_meaning"] for log in logs}))
     title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
-    figures = {"plant": "runs", "runs": args.runs, "rows": rows}
-    return _tell(
-        args, entries, rows, figures, title, f"{len(logs)} throws of HIL runs", from_runs.NOTE
-    )
+    entries = from_runs.entries(logs)
+    subtitle = f"{len(logs)} throws of HIL runs"
+    comparison = Comparison("runs", title, subtitle, entries, from_runs.NOTE)
+    return _publish(args, comparison, {"plant": "runs", "runs": args.runs})
 
 
 def entries_of(loaded: Sequence, names: Sequence[str], throws: Sequence[Sequence]) -> list[Entry]:
@@ -231,72 +280,21 @@ def throw_hybrid(
     return rows
 
 
-def title_of(plant: str, seed: int) -> str:
-    """Heading of a table: which plant, which noise, which seed."""
-    meaning = {
-        "hybrid": "the training simulator with all its noise and randomisation",
-        "reference": (
-            "the reference plant (MuJoCo) without extras: measurements late but exact, still air"
-        ),
-        "reference-realistic": (
-            "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise"
-        ),
-    }[plant]
-    return f"Throws from hover on {meaning} (`{plant}`, seed {seed})"
+def on_plant(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
+    """Return throws on a plant with what they are called; ``notes`` end the title."""
+    from visthrow.throws import plants
+
+    title = f"Throws from hover on {PLANTS[plant]} (`{plant}`, seed {seed}){notes}"
+    subtitle = f"{len(entries[0].throws[0].success)} throws each, {plants.PLANTS[plant]}"
+    return Comparison(plant, title, subtitle, entries)
 
 
 def rows_of(entries: Sequence[Entry]) -> list[dict]:
-    """Summaries, target after target, throwers side by side."""
+    """Summaries, target after target, throwers side by side; none of a target without throws."""
     columns = zip(*(entry.throws for entry in entries))
-    return [
+    rows = [
         {"policy": entry.name, "layout": entry.layout, **row.summary()}
         for column in columns
         for entry, row in zip(entries, column)
     ]
-
-
-def report(title: str, rows: Sequence[dict], note: str | None = None) -> str:
-    """Table with its note on the paper's figures."""
-    from visthrow.view.tables import PAPER_NOTE, markdown
-
-    return f"{markdown(rows, title)}\n{note or PAPER_NOTE}\n"
-
-
-def write(
-    folder: Path,
-    entries: Sequence[Entry],
-    rows: Sequence[dict],
-    plant: str,
-    title: str,
-    subtitle: str | None = None,
-    note: str | None = None,
-) -> list[Path]:
-    """Write Markdown, CSV and scatter plot; returns their paths."""
-    from visthrow.common.storage import atomic_write
-    from visthrow.throws.plants import PLANTS
-    from visthrow.view import figures, tables
-
-    stem = f"compare-{plant}"
-    paths = [folder / f"{stem}.md", folder / f"{stem}.csv", folder / f"{stem}.png"]
-    atomic_write(paths[0], report(title, rows, note))
-    atomic_write(
-        paths[1],
-        tables.csv_text(
-            [(entry.name, plant, thrown) for entry in entries for thrown in entry.throws]
-        ),
-    )
-    subtitle = subtitle or f"{len(entries[0].throws[0].success)} throws each, {PLANTS[plant]}"
-    panels = [
-        (
-            f"target {thrown.target:.1f} m",
-            [
-                (e.name, e.throws[i].landing_w[e.throws[i].success] - (thrown.target, 0.0))
-                for e in entries
-            ],
-        )
-        for i, thrown in enumerate(entries[0].throws)
-    ]
-    atomic_write(
-        paths[2], figures.scatter(panels, heading=f"Landing points from above: {subtitle}")
-    )
-    return paths
+    return [row for row in rows if row["throws"]]

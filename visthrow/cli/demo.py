@@ -103,10 +103,7 @@ def _throw_here(loaded: list, folder: Path, throws: int) -> list[Path]:
 
 def _tabled(loaded: list, throws: list, plant: str, folder: Path) -> list[Path]:
     """Print the table and write it with its plot."""
-    from visthrow.view.tables import markdown
-
     entries = compare.entries_of(loaded, compare.DEFAULT_POLICIES, throws)
-    title = compare.title_of(plant, SEED)
-    rows = compare.rows_of(entries)
-    print(markdown(rows, title), flush=True)
-    return compare.write(folder, entries, rows, plant, title)
+    comparison = compare.on_plant(plant, SEED, entries)
+    print(comparison.table(), flush=True)
+    return comparison.write(folder)

@@ -15,17 +15,21 @@ FILES = {
 }
 
 
+EXAMPLES = """\
+examples:
+  visthrow fly                                   the shipped vision policy, a target 2 m ahead
+  visthrow fly --policy state --target 1.5
+  visthrow fly --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left
+  visthrow fly --plant reference-realistic       on the independent plant (about a minute)
+  visthrow fly --no-rope --target 1.5            the vehicle alone
+
+The vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.
+"""
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow fly                                   the shipped vision policy"
-        " throws at a target 2 m ahead\n  visthrow fly --policy state --target 1.5\n  visthrow fly"
-        " --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left\n  visthrow"
-        " fly --plant reference-realistic       on the independent plant (about a"
-        " minute)\n  visthrow fly --no-rope --target 1.5            the vehicle alone\n"
-        "\nThe vehicle hovers until the swing is quiet, the policy throws, the hover"
-        " controller brings it back.\n"
-    )
+    parser.epilog = EXAMPLES
     add = parser.add_argument
     add(
         "--policy",

@@ -7,15 +7,15 @@ from dataclasses import fields
 
 from visthrow.common.arguments import ABOVE_ZERO, SOLVER, WHOLE, add_common
 
-EXAMPLES = (
-    "examples:\n  visthrow train laptop                          a state policy on the cores of"
-    " a laptop\n  visthrow train laptop --until 0.04             stop once throws at 2.0 m land"
-    " within 4 cm on average\n  visthrow train mine.toml --from state          adapt the"
-    " shipped policy to a vehicle of your own\n  visthrow train vision --seed 2 --out runs/v2  "
-    " another seed, in a folder of its own\n  visthrow train --resume --out runs/v2          go"
-    " on where an interrupted run stopped\n  torchrun --nproc-per-node 2 -m visthrow.cli train"
-    " state   on two GPUs\n"
-)
+EXAMPLES = """\
+examples:
+  visthrow train laptop                          a state policy on the cores of a laptop
+  visthrow train laptop --until 0.04             stop once throws at 2.0 m land 4 cm off on average
+  visthrow train mine.toml --from state          adapt the shipped policy to a vehicle of your own
+  visthrow train vision --seed 2 --out runs/v2   another seed, in a folder of its own
+  visthrow train --resume --out runs/v2          go on where an interrupted run stopped
+  torchrun --nproc-per-node 2 -m visthrow.cli train state   on two GPUs
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 
 from visthrow import __version__
 from visthrow.common.errors import StorageError
-from visthrow.common.storage import atomic_write, write_json
+from visthrow.common.storage import atomic_write, writable, write_json
 
 PACKAGES = (
     "numpy",
@@ -125,8 +125,12 @@ def write_run_folder(
     ``resume`` is not set, or cannot be written."""
     folder = Path(folder)
     record = {**collect(), **extra}
+    writable(folder)
     if not resume:
-        check_free(folder)
+        try:
+            (folder / "config.toml").touch(exist_ok=False)  # of two that begin at once one succeeds
+        except FileExistsError:
+            check_free(folder)
     elif (folder / "config.toml").exists():
         count = len(list(folder.glob("provenance*.json")))
         write_json(folder / f"provenance_{count}.json", record)

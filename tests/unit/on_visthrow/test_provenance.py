@@ -4,8 +4,10 @@ import getpass
 import json
 import socket
 import sys
+import threading
 import tomllib
 import types
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 from pytest import raises
@@ -87,3 +89,20 @@ def test_json_has_no_nan(tmp_path):
         tmp_path / "a.json", {"a": float("nan"), "b": np.float32(1.5), "c": np.array([1.0, np.inf])}
     )
     assert json.loads((tmp_path / "a.json").read_text()) == {"a": None, "b": 1.5, "c": [1.0, None]}
+
+
+def test_of_runs_that_begin_at_once_in_a_folder_one_goes_on(tmp_path):
+    together = threading.Barrier(8)
+
+    def begin(seed):
+        together.wait()
+        try:
+            provenance.write_run_folder(tmp_path, config.dumps(Settings(seed, 1.0)), seed=seed)
+        except StorageError:
+            return None
+        return seed
+
+    with ThreadPoolExecutor(8) as pool:
+        (seed,) = [seed for seed in pool.map(begin, range(8)) if seed is not None]
+    assert json.loads((tmp_path / "provenance.json").read_text())["seed"] == seed
+    assert tomllib.loads((tmp_path / "config.toml").read_text())["seed"] == seed
