@@ -81,7 +81,7 @@ class CapturedPPO(PPO):
             *storage.distribution_params,
         )
         with torch.no_grad():
-            gathered = [model.prepared(obs)[self._order] for model in (self.actor, self.critic)]
+            gathered = [model.get_latent(obs)[self._order] for model in (self.actor, self.critic)]
             gathered += [t.flatten(0, 1)[self._order] for t in stored]
         batches = list(zip(*(part.split(self._minibatch) for part in gathered)))
         self._totals.zero_()
