@@ -25,7 +25,7 @@ from visthrow.common import storage
 from visthrow.common.errors import TrainError
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training import trainer
+from visthrow.training import session, trainer
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -299,6 +299,22 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
     flown, trained = written["throws"][1], written["throws_under_faults"][1]
     assert flown["throws"] == 5 * trainer.EVALUATED
     assert flown["error_mean"] < 0.04 < trained["error_mean"], "four times the noise must show"
+
+
+def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
+    words = [*SMALL, "ppo.segments=5", "ppo.substep=0.004"]
+    experiment = config.load(Experiment, config.find("train", "laptop"), words)
+    coarse = Trainer(experiment, "cpu", 1).algorithm.env.cfg
+    assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
+    assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
+
+
+def test_the_end_compares_the_seed_with_recorded_ones(capsys):
+    session._compare("state_fast", [{"target": 2.0, "error_mean": 0.0001}])
+    printed = capsys.readouterr().out
+    assert re.search(r"at 2\.0 m (\d+) of \1 recorded seeds landed farther off", printed)
+    session._compare("mine.toml", [{"target": 2.0, "error_mean": 0.0001}])
+    assert not capsys.readouterr().out
 
 
 def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):

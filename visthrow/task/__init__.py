@@ -221,6 +221,10 @@ class PPOParams(Bounded):
     products: Literal["float32", "bfloat16"] = (
         "float32"  # of the hidden layers; weights are float32 either way
     )
+    # rope segments at most, and least substep [s], of the simulator that is trained in: 0 for the
+    # plant's own, in which throws are measured
+    segments: Annotated[int, Bound(0)] = 0
+    substep: NotNegative = 0.0
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
     critic_first: Annotated[int, Bound(0)] = (
         0  # iterations at the beginning in which the critic alone learns
@@ -248,9 +252,7 @@ class FirstOrderParams(Bounded):
 
     iterations: Count = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    # rope segments at most and least substep [s] of the simulator that gradients come from; throws
-    # are measured in the plant's own
-    segments: Count = 5
+    segments: Count = 5  # as ppo.segments and ppo.substep
     substep: Positive = 0.004
     decay: Positive = 0.985  # of derivatives, per step backward
     learning_rate: Positive = 2e-3  # at the first iteration

@@ -244,19 +244,10 @@ class Distillation:
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"
             )
-        parts = {
-            "encoder.weight": e.encoder_weight,
-            "encoder.bias": e.encoder_bias,
-            "gru.weight_ih_l0": e.input_weight,
-            "gru.bias_ih_l0": e.input_bias,
-            "gru.weight_hh_l0": e.memory_weight,
-            "gru.bias_hh_l0": e.memory_bias,
-            "output.weight": e.output_weight,
-            "output.bias": e.output_bias,
-        }
-        for i, (weight, bias) in enumerate(e.inner):
-            parts |= {f"inner.{i}.weight": weight, f"inner.{i}.bias": bias}
-        n.load_state_dict(n.state_dict() | parts)
+        taken = n.frozen().parts()  # the network's own memory, but for the masked output's
+        for name, value in e.parts().items():
+            taken[name].copy_(value)
+        n.output.load_state_dict({"weight": e.output_weight, "bias": e.output_bias})
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
         self._refresh()

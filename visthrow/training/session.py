@@ -12,6 +12,7 @@ import os
 import signal
 import sys
 import time
+import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,8 @@ from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, fitted
 
 EVALUATION_TARGET = 2.0  # [m]
+
+RECORDED = Path(__file__).with_name("recorded.toml")
 
 EVALUATION_SHARE, CHECKPOINT_SHARE = (
     0.05,
@@ -57,9 +60,6 @@ class Options:
     device: str = "auto"
     overrides: Sequence[str] = ()
     json: str | None = None
-
-
-"""Of a trainer: while it is entered, a function that shows an evaluation's throws."""
 
 
 def run(args: Options) -> int:
@@ -288,6 +288,21 @@ def _line(throws: Throws) -> str:
     )
 
 
+def _compare(name: str | None, rows: list[dict]) -> None:
+    """Print how a training's landing error compares with that of recorded seeds, where there are
+    any of its configuration.
+    """
+    recorded = tomllib.loads(RECORDED.read_text(encoding="utf-8")).get(name)
+    errors = [row.get("error_mean") for row in rows if row["target"] == EVALUATION_TARGET]
+    if recorded is None or errors == [None]:
+        return
+    worse = sum(error > errors[0] for error in recorded)
+    print(
+        f"at {EVALUATION_TARGET} m {worse} of {len(recorded)} recorded seeds landed farther off;"
+        f" they were {min(recorded):.3f} to {max(recorded):.3f} m off"
+    )
+
+
 def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -> None:
     """Throw at all targets, write the policy with what came of it, and print it."""
     throws = trainer.final_throws()
@@ -310,6 +325,9 @@ def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -
         print("under the faults of its training:")
         for one in throws["trained"]:
             print(_line(one))
+    whole = trainer.iteration == trainer.algorithm.iterations
+    if whole and not args.overrides and not args.start:
+        _compare(args.config, rows)
     print(f"policy: {folder / 'policy.npz'}")
     if args.json:
         write_json(args.json, figures)

@@ -74,15 +74,8 @@ class FirstOrder:
             math.prod((remainder - b) / (a - b) for b in NODES if b != a) for a in NODES
         ]
         simulated = dataclasses.replace(
-            experiment,
-            ppo=dataclasses.replace(p, privileged=()),  # there is no critic
-            rope=dataclasses.replace(
-                experiment.rope, segments=min(self.p.segments, experiment.rope.segments)
-            ),
-            sim=dataclasses.replace(
-                experiment.sim, substep=max(self.p.substep, experiment.sim.substep)
-            ),
-        )
+            experiment, ppo=dataclasses.replace(p, privileged=())
+        )  # there is no critic
         self.env = env = ThrowEnv(simulated, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
         shape = {
