@@ -3,14 +3,13 @@
 import math
 
 from hil.control.tick.body_estimate import Estimate
+from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
 from visthrow.common.rotations import rotate_one, turned_one
 from visthrow.onboard.hover import GRAVITY
 
 RESPONSE = 0.05  # time constant with which body rates follow their command [s]
 ROUNDING = 1e-6  # tolerance of differences of times [s]
-
-Command = tuple[float, ...]  # thrust [N] and body rates [rad/s]
 
 
 class DeadReckoning:

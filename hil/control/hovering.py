@@ -4,6 +4,7 @@ from collections import deque
 
 import numpy as np
 
+from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
 from visthrow.onboard.hover import HoverController, HoverParams
@@ -35,7 +36,7 @@ class Hovering:
         x, y, z = self.place_w
         self.place_w = (x, y, max(z - DESCENT * self._period, 0.0))
 
-    def command(self, vehicle: BodyState, mass: float) -> tuple[float, ...]:
+    def command(self, vehicle: BodyState, mass: float) -> Command:
         """Return thrust [N] and body rates [rad/s] for a vehicle and its load of a mass [kg]."""
         output = self._controller.step(
             np.array([vehicle.pos]),

@@ -14,6 +14,7 @@ from collections import deque
 
 import numpy as np
 
+from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
 from visthrow.common.rotations import rotate_one
 from visthrow.onboard.hover import GRAVITY
@@ -100,7 +101,7 @@ class Response:
 
     def note(
         self,
-        command: tuple[float, ...],
+        command: Command,
         vehicle: BodyState,
         rates: tuple[float, ...] | None = None,
     ) -> None:

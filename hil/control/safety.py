@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
 from visthrow.common.errors import ConfigError
@@ -32,14 +33,14 @@ class Guard:
         """
         self._low, self._high = (0.0, *(-r for r in max_rate)), (max_thrust, *max_rate)
         self._slew = (params.slew_thrust, *params.slew_rate)
-        self._last: tuple[float, ...] | None = None
+        self._last: Command | None = None
         self.clipped = self.slewed = self.refused = 0
 
     def reset(self) -> None:
         """Forget the last command: after a silence the vehicle's state is unknown."""
         self._last = None
 
-    def check(self, command: tuple[float, ...]) -> tuple[float, ...] | None:
+    def check(self, command: Command) -> Command | None:
         """Return the command that may be sent, [N, rad/s], or None where it is not finite."""
         if len(command) != 4 or not all(map(math.isfinite, command)):
             self.refused += 1

@@ -11,6 +11,7 @@ command of the operator."""
 from dataclasses import dataclass
 from enum import StrEnum
 
+from hil.links.backends.base import Command
 from hil.links.team_link import NOTHING, THROW
 from hil.poses.gate import ABORT, HOLD
 from visthrow.config.bounds import Bounded, Positive
@@ -329,7 +330,7 @@ class TickRecord:
     time: float
     state: str
     reason: str
-    command: tuple[float, ...] | None = None  # as sent [N, rad/s]
+    command: Command | None = None  # as sent [N, rad/s]
     action: list[float] | None = None  # of the policy, normalised
     observation: list[float] | None = None
     keypoints: list | None = None

@@ -11,7 +11,7 @@ from hil.control.safety import Guard, box_violation
 from hil.control.state_machine import FLYING, Inputs, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
 from hil.control.tick.flight_parts import FlightParts
-from hil.links.backends.base import FOLLOW, LAND, Status
+from hil.links.backends.base import FOLLOW, LAND, Command, Status
 from hil.links.backends.base import HOLD as HOLDING
 from hil.links.team_link import NOTHING, RELEASE, THROW
 from hil.poses.body_track import BodyState
@@ -31,8 +31,6 @@ LEVEL_TIME = 0.5
 
 # calls of the policy before it flies: the first one compiles, the others warm the caches
 WARM_CALLS = 3
-
-Command = tuple[float, ...]  # thrust [N] and body rates [rad/s]
 
 
 def is_level(vehicle: BodyState) -> bool:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from hil.links.backends.audit import Audit, Rule, equal
-from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Release
+from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Command, Release
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
@@ -289,7 +289,7 @@ class MavlinkAutopilot(Autopilot, ABC):
     def _expected_modes(self) -> str:
         """Return modes that a throw may begin in, in words."""
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         p = self.params
         thrust, x, y, z = command
         share = p.thrust.share(thrust, self.voltage)

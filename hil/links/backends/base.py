@@ -22,6 +22,9 @@ WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
 by itself.
 """
 
+Command = tuple[float, ...]
+"""Collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up."""
+
 ROUNDING = 1e-6  # tolerance of times that are sums [s]: a microsecond early is in time
 
 
@@ -57,10 +60,8 @@ class Backend:
         """Return what is known now."""
         raise NotImplementedError
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
-        """Send collective thrust [N] and body rates [rad/s], body frame x forward, y left, z up;
-        whether it was taken.
-        """
+    def send(self, command: Command, host_time: float) -> bool:
+        """Send a command; whether it was taken."""
         raise NotImplementedError
 
     def ask(self, mode: str, host_time: float) -> None:
@@ -113,7 +114,7 @@ class DryRun(Backend):
     def status(self, host_time: float) -> Status:
         return Status(True, "dry run", self._release)
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         self.commands += 1
         return True
 
@@ -336,12 +337,12 @@ class Held:
     def __init__(self, backend: Backend, hold: float) -> None:
         """Hold the commands of a back-end back by a time [s]."""
         self._backend, self._hold, self._taken = backend, hold, True
-        self._waiting: deque[tuple[float, tuple[float, ...]]] = deque()
+        self._waiting: deque[tuple[float, Command]] = deque()
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._backend, name)
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         """Let a command wait; whether the last one that went out was taken."""
         self._waiting.append((host_time + self._hold, command))
         return self._taken

@@ -22,7 +22,16 @@ from typing import Annotated
 
 from hil.links import msp
 from hil.links.backends.audit import Audit, Rule, equal
-from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, ROUNDING, WAIT, OnPort, Release
+from hil.links.backends.base import (
+    ACCEPTED,
+    FOLLOW,
+    PENDING,
+    ROUNDING,
+    WAIT,
+    Command,
+    OnPort,
+    Release,
+)
 from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
@@ -232,7 +241,7 @@ class Betaflight(OnPort):
     def _box(self, number: int) -> bool:
         return number in self._boxes and bool(self._flags >> self._boxes.index(number) & 1)
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         thrust, *rates = command
         share = self.params.thrust.share(thrust, self.voltage)
         low = self.params.minimum_us

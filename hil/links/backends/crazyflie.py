@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from hil.links import crtp
 from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, equal
-from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, OnPort, Release
+from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Command, OnPort, Release
 from hil.links.backends.crazyflie_gyro import GyroStream
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
@@ -137,7 +137,7 @@ class Crazyflie(OnPort):
             self._place = pose.pos, math.degrees(tilt_and_heading(pose.quat)[1])
             self.poses += self._put(crtp.external_pose(pose.pos, pose.quat))
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         thrust, *rates = command
         if not (self._state & FACTS["armed"] and self._taken):
             thrust, rates = 0.0, [0.0, 0.0, 0.0]

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from hil.links.backends.audit import Rule, bits, equal, within
 from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
-from hil.links.backends.base import FOLLOW, HOLD, LAND
+from hil.links.backends.base import FOLLOW, HOLD, LAND, Command
 from hil.links.facts import values
 from hil.links.pymav import mav
 from visthrow.config.bounds import Bound
@@ -77,7 +77,7 @@ class Px4(MavlinkAutopilot):
             ", or Hold (4.3) or Position (3.0) to take it" if self.params.take else ""
         )
 
-    def send(self, command: tuple[float, ...], host_time: float) -> bool:
+    def send(self, command: Command, host_time: float) -> bool:
         if host_time - self._sent_at > STREAM_GAP:
             self._stream_since = host_time
         self._sent_at = host_time
