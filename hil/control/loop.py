@@ -88,8 +88,8 @@ class Loop:
         self.ticker = Ticker(self.clock, self.runner.pilot.period, grid)
 
     def fly(self, limit: float = math.inf) -> dict[str, Any]:
-        """Run until the state machine is done, the recorded poses have ended, or for ``most``
-        seconds; returns the summary.
+        """Run until the state machine is done, the recorded poses have ended, or for a time ``limit``
+        [s]; returns the summary.
 
         A vehicle that is ours is never left without a word: where the time is over in flight, or
         something raises, the run is aborted and goes on until it has ended. A second Ctrl-C ends it
@@ -113,7 +113,7 @@ class Loop:
         return self.summary()
 
     def turn(self, finished: bool) -> None:
-        """Do one tick; ``over``: the run's time is, and what flies is to come down."""
+        """Do one tick; ``finished``: the run's time is over, and what flies is to come down."""
         runner, source, clock, ticker, backend = (
             self.runner,
             self.source,

@@ -75,7 +75,7 @@ class Runner:
         """Decide one tick and send its command.
 
         Args:
-            now: on the runner's clock [s].
+            time: on the runner's clock [s].
             poses: raw, since the last tick.
             status: of the back-end at this tick.
             words: of the operator.

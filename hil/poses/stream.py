@@ -104,8 +104,8 @@ class Stream:
         )
 
     def problems(self, time: float) -> list[str]:
-        """Return what of the last seconds' poses no estimate is to be made of, in words; judged
-        anew every :data:`AGAIN`.
+        """Return why no estimate is to be made of the last seconds' poses, in words; judged anew
+        every :data:`JUDGE_INTERVAL`.
         """
         if time - self._judged[0] >= JUDGE_INTERVAL:
             self._judged = (time, self._judge(time))

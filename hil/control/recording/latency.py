@@ -93,7 +93,7 @@ class Stages:
             self.stages[name].add(seconds)
 
     def poses(self, poses: list[Pose], time: float) -> dict[str, float]:
-        """Return times of the vehicle's poses that have come for a tick at ``now`` [s]; transport
+        """Return times of the vehicle's poses that have come for a tick at a ``time`` [s]; transport
         is counted a pose.
         """
         newest = None

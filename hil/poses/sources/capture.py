@@ -93,7 +93,7 @@ def listen(
     could not be taken, a number of datagrams of others.
 
     A frame or a body that raises is told, and the next one taken. Ends by what connecting raises,
-    or once there is to be no ``more``.
+    or once ``going`` returns False.
     """
     capture = connect(system, options)
     put(None)

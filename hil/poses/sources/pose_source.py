@@ -29,7 +29,7 @@ class Source:
         self.rosters = [link.roster for link in links]
 
     def poll(self, time: float) -> list[Pose]:
-        """Return raw poses that have arrived by ``now`` [s] on the runner's clock, in order of
+        """Return raw poses that have arrived by a ``time`` [s] on the runner's clock, in order of
         arrival.
         """
         raise NotImplementedError
