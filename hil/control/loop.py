@@ -88,8 +88,8 @@ class Loop:
         self.ticker = Ticker(self.clock, self.runner.pilot.period, grid)
 
     def fly(self, limit: float = math.inf) -> dict[str, Any]:
-        """Run until the state machine is done, the recorded poses have ended, or for a time ``limit``
-        [s]; returns the summary.
+        """Run until the state machine is done, the recorded poses have ended, or for a limit [s];
+        returns the summary.
 
         A vehicle that is ours is never left without a word: where the time is over in flight, or
         something raises, the run is aborted and goes on until it has ended. A second Ctrl-C ends it

@@ -93,8 +93,8 @@ class Stages:
             self.stages[name].add(seconds)
 
     def poses(self, poses: list[Pose], time: float) -> dict[str, float]:
-        """Return times of the vehicle's poses that have come for a tick at a ``time`` [s]; transport
-        is counted a pose.
+        """Return times of the vehicle's poses that have come for a tick at a time [s]; transport is
+        counted a pose.
         """
         newest = None
         for pose in poses:

@@ -138,7 +138,7 @@ class MavlinkSource(Source):
         clock: Callable[[], float],
         autopilot_link: Link | None = None,
     ) -> None:
-        """Listen to a link; ``clock`` gives the arrivals. ``autopilot_link`` is another link to serve."""
+        """Listen to a link; ``clock`` gives the arrivals. Another ``autopilot_link`` is served."""
         super().__init__((link,) if autopilot_link is None else (link, autopilot_link), clock)
         self._link, self._decoder = link, MavlinkDecoder(bodies, self._drop)
         self._waiting: list[Pose] = []
