@@ -359,15 +359,13 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
         return FlightLog({})
     if message == "POS":
         data = data | _from_globe(data, log.first("ORGN"))
-    sources: dict[str, tuple[Tap, Fields]] = {}
-    for tap in taps:
-        if tap.message == message and all(column in data for column in tap.entry.columns):
-            sources.setdefault(_pose_part(tap), (tap, data))
+    sources = {_pose_part(tap): (tap, data) for tap in reversed(taps) if _fits(tap, message, data)}
     together = [*sources]
     if "quat_wb" not in sources:
         for tap in taps:
             fields = log.first(tap.message)
-            if tap.entry.name in ("quat_wb", "rate_b") and fields is not None:
+            turns = tap.entry.name in ("quat_wb", "rate_b")
+            if turns and fields is not None and _fits(tap, tap.message, fields):
                 sources.setdefault(tap.entry.name, (tap, fields))
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
@@ -395,6 +393,11 @@ def _pose_part(tap: Tap) -> str:
     return tap.entry.name.removeprefix("mocap_").removeprefix("est_")
 
 
+def _fits(tap: Tap, message: str, fields: Fields) -> bool:
+    """Return whether a tap is of a message with these fields."""
+    return tap.message == message and all(column in fields for column in tap.entry.columns)
+
+
 def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     """Return a part of a pose about the autopilot's axes, without the samples that are not known;
     a position keeps those that are not valid.
@@ -410,14 +413,9 @@ def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
 def _in_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
     """Return velocities in the world frame; NaN for a body's without an attitude."""
     quat = np.column_stack([odometry[f"q[{i}]"] for i in (1, 2, 3, 0)]).astype(float)
-    body_frame = odometry["velocity_frame"] == BODY_FRAME
-    known = np.all(np.isfinite(quat), axis=1) & (np.linalg.norm(quat, axis=1) > 0.0)
-    vel_w = np.where((body_frame & ~known)[:, None], np.nan, vel)
-    rows = body_frame & known
-    if np.any(rows):
-        turns = quat[rows] / np.linalg.norm(quat[rows], axis=1, keepdims=True)
-        vel_w[rows] = rotate(turns, vel[rows])
-    return vel_w
+    with np.errstate(invalid="ignore"):  # of attitudes that are not known
+        vel_w = rotate(quat / np.linalg.norm(quat, axis=1, keepdims=True), vel)
+    return np.where((odometry["velocity_frame"] == BODY_FRAME)[:, None], vel_w, vel)
 
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
