@@ -13,7 +13,7 @@ from hil.control.state_machine import State
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.pose import Pose
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common.rotations import multiply, rotate_one
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -36,7 +36,7 @@ def params(*overrides: str) -> HilParams:
         "aim.bound=9.0",
         *overrides,
     )  # releases in hover
-    return config.load(HilParams, config.find("hil", "dry_run"), given)
+    return load_run("dry_run", given)
 
 
 def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:

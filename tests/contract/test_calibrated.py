@@ -9,16 +9,15 @@ from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
 from camera.mount import rotation_from_vector
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.common.errors import ConfigError
-from visthrow.task import Experiment
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import hover_start
 
 
 def experiment(*changes):
-    return config.load(Experiment, config.find("train", "vision"), changes)
+    return load_experiment("vision", changes)
 
 
 def test_corrected_keypoints_are_those_of_the_nominal_camera():
@@ -56,7 +55,7 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
         "camera.noise.bias_std=0.0",
     )
     changes = [*quiet, "camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
-    flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), changes))
+    flown = hover_start(load_experiment("vision_ideal", changes))
     torch.manual_seed(0)
     with torch.inference_mode():
         env, found = ThrowEnv(flown, "cpu", 0, 6), []

@@ -11,10 +11,9 @@ from pytest import approx, fixture, mark, raises
 from torch.testing import assert_close
 
 from sim.kernels.state import COLLISION, NONFINITE
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions, observations
-from visthrow.task import Experiment
 from visthrow.training import rewards, terminations
 from visthrow.training.env import ThrowEnv
 
@@ -23,7 +22,7 @@ PERIOD = 0.02
 
 def experiment(kind="state", noise=True):
     """A shipped experiment; without noise every measurement is exact and current."""
-    e = config.load(Experiment, config.find("train", kind))
+    e = load_experiment(kind)
     if noise:
         return e
     quiet = replace(
@@ -77,7 +76,7 @@ def test_the_papers_recipe_and_nothing_else(name):
     III-C and IV-C: 35 or 61 numbers, the critic's 38, no latency, a full battery, Table II
     unscaled.
     """
-    paper = config.load(Experiment, config.find("train", name))
+    paper = load_experiment(name)
     env = ThrowEnv(paper, count=32, seed=1)
     seen, reward, _, _ = env.step(torch.zeros(32, 5))
     assert seen["actor"].shape == (32, 61 if "vision" in name else 35)

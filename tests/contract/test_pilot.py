@@ -9,7 +9,7 @@ import torch
 from numpy.testing import assert_array_equal
 from pytest import mark, raises
 
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
@@ -22,7 +22,7 @@ STEPS = 200
 
 def quiet(name: str) -> Experiment:
     """An experiment without any noise or latency."""
-    experiment = config.load(Experiment, config.find("train", name))
+    experiment = load_experiment(name)
     noise = replace(
         experiment.task.noise,
         observation_step=0.0,
@@ -110,13 +110,9 @@ def test_command_equals_the_environments():
 
 
 def test_a_policy_keeps_its_own_rule_for_what_is_out_of_view(tmp_path):
-    camera = config.load(Experiment, config.find("train", "vision")).camera
+    camera = load_experiment("vision").camera
     assert camera.noise.invalid_reads == "zero"
-    older = random_policy(
-        config.load(
-            Experiment, config.find("train", "vision_ideal"), ["camera.noise.invalid_reads=edge"]
-        )
-    )
+    older = random_policy(load_experiment("vision_ideal", ["camera.noise.invalid_reads=edge"]))
     path = tmp_path / "older.npz"
     older.save(path)
     assert Pilot(Policy.load(path), camera).camera.edge_reads

@@ -11,7 +11,8 @@ from numpy.testing import assert_allclose
 from pytest import approx, raises
 
 from sim.hybrid import rope_variants, tether_lengths
-from visthrow import cli, config
+from tests.configs import load_experiment
+from visthrow import cli
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
 from visthrow.throws.loading import load_policy
@@ -23,7 +24,7 @@ PERIOD = 0.02
 
 
 def experiment(name: str, *changes: str) -> Experiment:
-    return config.load(Experiment, config.find("train", name), changes)
+    return load_experiment(name, changes)
 
 
 def test_goals_move_as_drawn_and_the_landing_counts_where_they_are_at_impact():

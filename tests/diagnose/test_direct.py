@@ -16,12 +16,12 @@ from bench.worlds.turns import matrix
 from bench.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
 from camera.keypoints import KeypointCamera, keypoints
 from sim.effects.setting import Setting
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.throw.cutting import cut
 from visthrow.diagnose.throw.direct import CameraView
 from visthrow.diagnose.throw.recorded_flight import record_of
-from visthrow.task import Experiment, plant_of
+from visthrow.task import plant_of
 
 BOX = 0.5
 """Largest error of the package's box, which takes the ball's outline to second order [px]."""
@@ -36,7 +36,7 @@ class Eyes:
     def __init__(self, flown, effects: dict):
         records = recorded(replace(RECIPE, effects=effects), flown)
         self.logs = [flight_log(record) for record in records]
-        experiment = config.load(Experiment, config.find("train", "state"), ["rope.segments=1"])
+        experiment = load_experiment("state", ["rope.segments=1"])
         self.setting = Setting(plant_of(experiment), experiment.sensing, camera=experiment.camera)
         flights = [record_of(log, i) for i, log in enumerate(self.logs)]
         release = self.setting.plant.release
@@ -85,9 +85,7 @@ def test_the_worlds_camera_sees_what_the_packages_sees():
     )
     found, seen = marks(flight, 0, flight.time, goal, hide({}))
 
-    lens = KeypointCamera(
-        config.load(Experiment, config.find("train", "state")).camera, dtype=torch.float64
-    )
+    lens = KeypointCamera(load_experiment("state").camera, dtype=torch.float64)
     arrays = pos, matrix(quat), np.tile(goal, (count, 1)), ball
     points, valid = (
         x.numpy()

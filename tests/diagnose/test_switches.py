@@ -7,9 +7,9 @@ from pytest import approx, mark, param
 
 from bench.diagnose.sealed import flight_log, model_of
 from bench.worlds.world import Recipe, fly_recipe, recorded
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.diagnose.throw.throw_model import ThrowModel
-from visthrow.task import Experiment, plant_of
+from visthrow.task import plant_of
 
 LEFT = 0.1
 """Part of the misfit, in its square, that may be left once the other kind of block has its column:
@@ -30,9 +30,7 @@ def test_a_missing_block_is_worth_its_whole_size(lacks, name):
     """
     recipe = Recipe(31, "rod", {}, free=0, throws=2, held=0)
     logs = [flight_log(r) for r in recorded(recipe, fly_recipe(recipe))]
-    plant = plant_of(
-        config.load(Experiment, config.find("train", "state"), [*model_of(recipe), lacks])
-    )
+    plant = plant_of(load_experiment("state", [*model_of(recipe), lacks]))
     model = ThrowModel(logs, plant, only=[name])
     throws = [w for w in model.windows({}) if w.phase == "throw"]
     misfit = left = 0.0

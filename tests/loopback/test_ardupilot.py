@@ -7,17 +7,16 @@ from pytest import raises
 from hil.errors import RunError
 from hil.links.backends.ardupilot import GUIDED, LAND_MODE, ArduPilot
 from hil.links.mavlink_link import Link
-from hil.params import HilParams
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_ardupilot import FakeArduPilot
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import load_plant
+from tests.configs import load_run
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe, throw
-from visthrow import config
 
-PARAMS = config.load(HilParams, config.find("hil", "fake"), ["ardupilot.audit=false"]).ardupilot
+PARAMS = load_run("fake", ["ardupilot.audit=false"]).ardupilot
 AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 
 

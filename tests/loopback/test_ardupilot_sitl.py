@@ -16,13 +16,12 @@ from pytest import approx, fixture, mark
 from hil.links.clock import ManualClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
-from hil.params import HilParams
 from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
 from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl, outputs
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import serve
-from visthrow import config
+from tests.configs import load_run
 from visthrow.throws.wire_plant import make_motors
 
 HOVER = 1437
@@ -57,7 +56,7 @@ def servos(*motors, hook=1900):
 def bridge(monkeypatch):
     monkeypatch.setattr(ardupilot, "SERVOS", 0)  # any port that is free
     monkeypatch.setattr(ardupilot, "PATIENCE", PATIENCE)
-    params = config.load(HilParams, config.find("hil", "ardupilot_sitl")).ardupilot
+    params = load_run("ardupilot_sitl").ardupilot
     link = Link(UdpPort(Device("udpout", "127.0.0.1", 14998)), *VEHICLE_ID)
     made = ArduPilotSitl(
         make_motors("vision", 0), link, FakeMocapParams(), 0, FakeOptions(), params

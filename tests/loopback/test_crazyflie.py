@@ -21,13 +21,12 @@ from hil.links.backends.crazyflie import MODES, Crazyflie
 from hil.links.device import Device, UdpPort
 from hil.links.facts import values
 from hil.links.mavlink_link import Link
-from hil.params import HilParams
 from hil.rehearsal.fake import VEHICLE_ID
+from tests.configs import load_run
 from tests.fakes.fake_crazyflie import CRASHED, FLYING, LEVEL, LOCKED, FakeCrazyflie
 from tests.fakes.ports import AnsweringPort
 from tests.level import LevelPlant
 from tests.loopback.test_backends import HOVER, Desk
-from visthrow import config
 
 FACTS = values("crazyflie")
 NEAR = 0.06
@@ -196,7 +195,7 @@ def test_by_udp():
         f'crazyflie.device="udpout:127.0.0.1:{number}"',
         f'link.device="udp:127.0.0.1:{poses}"',
     ]
-    params = config.load(HilParams, config.find("hil", "fake_crazyflie"), over)
+    params = load_run("fake_crazyflie", over)
     port = AnsweringPort(Device("udp", "127.0.0.1", number))
     link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
     fake, backend = FakeCrazyflie(LevelPlant(), link, port=port), make_backend(params)
@@ -217,11 +216,7 @@ def test_nobody_else_speaks_for_a_crazyflie():
     their sender said once.
     """
     ticks, number, said = 200, free_port(), []
-    params = config.load(
-        HilParams,
-        config.find("hil", "crazyflie"),
-        [f'crazyflie.device="udpout:127.0.0.1:{number}"'],
-    )
+    params = load_run("crazyflie", [f'crazyflie.device="udpout:127.0.0.1:{number}"'])
     backend = make_backend(params, tell=said.append)
     stranger = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     stranger.bind(("127.0.0.2", 0))

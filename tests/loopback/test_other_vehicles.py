@@ -12,12 +12,11 @@ from hil.control.state_machine import State
 from hil.errors import RunError
 from hil.links.backends import require_reach
 from hil.links.backends.base import FOLLOW
-from hil.params import HilParams
+from tests.configs import load_run
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.loopback.test_endings import NEVER
 from tests.loopback.wire import CONFIGS, peers
 from tests.point import PointPlant
-from visthrow import config
 
 KINDS = tuple(CONFIGS)
 QUICK = ("states.idle=3.0", "states.check=3.0", "states.abort=0.5")
@@ -112,7 +111,7 @@ def test_a_yaw_that_does_not_turn_is_handed_back(kind):
 def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, times):
     weight = 2.668 * times
     over = [f"{kind}.thrust.weight={weight}", f"{kind}.thrust.hover={min(0.1906 * times, 0.9)}"]
-    params = config.load(HilParams, config.find("hil", CONFIGS[kind]), over)
+    params = load_run(CONFIGS[kind], over)
     with raises(RunError, match=r"times the weight that the policy was trained with"):
         require_reach(params, simple_policy().contract)
 

@@ -15,12 +15,11 @@ from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
 from hil.links.roster import SILENT
-from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.open_source import open_source
 from tests.commands import run_command
+from tests.configs import load_run
 from tests.hil_runs import record_run, saved_policy
-from visthrow import config
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
 
@@ -35,7 +34,7 @@ class Wire:
             f'link.device="udp:127.0.0.1:{self.number}"',
             *(o.format(other=self.other) for o in overrides),
         )
-        self.params = config.load(HilParams, config.find("hil", base), given)
+        self.params = load_run(base, given)
         self.source, self.link, _ = open_source(
             self.params, folder, MonotonicClock(), None, self.said.append
         )

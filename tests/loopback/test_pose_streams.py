@@ -11,9 +11,9 @@ from hil.links.backends.base import DryRun
 from hil.links.clock import ManualClock
 from hil.params import HilParams
 from tests.commands import run_command
+from tests.configs import load_run
 from tests.hil_flight import simple_policy
 from tests.pose_streams import SECONDS, STREAMS, Sent
-from visthrow import config
 
 SETTINGS = [
     "policy=state",
@@ -29,7 +29,7 @@ class Nobody:
 
 
 def loaded() -> HilParams:
-    return config.load(HilParams, config.find("hil", "dry_run"), SETTINGS)
+    return load_run("dry_run", SETTINGS)
 
 
 @mark.parametrize("name", STREAMS)

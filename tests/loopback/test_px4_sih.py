@@ -12,13 +12,12 @@ from hil.links.clock import MonotonicClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
-from hil.params import HilParams
 from hil.rehearsal.bridges.px4_bridge import ORIGIN, Motion, Place, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_command import make_ball
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import serve
-from visthrow import config
+from tests.configs import load_run
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 STILL = np.zeros(3)
@@ -118,7 +117,7 @@ class OtherSide:
 
 @fixture
 def bridge():
-    port, params = free_port(), config.load(HilParams, config.find("hil", "px4")).px4
+    port, params = free_port(), load_run("px4").px4
     own = Link(UdpPort(Device("udp", "127.0.0.1", port)), 254, 190)
     poses = Link(UdpPort(Device("udpout", "127.0.0.1", free_port())), *VEHICLE_ID)
     made = Px4Sih(make_ball("vision", 0), poses, FakeMocapParams(), 0, FakeOptions(), params, own)

@@ -20,12 +20,11 @@ from hil.links.clock import MonotonicClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.links.writer import TlogWriter
-from hil.params import HilParams
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.player import read_tlog
+from tests.configs import load_run
 from tests.hil_flight import AutoOperator
 from tests.loopback.wire import throw
-from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make
 
@@ -80,9 +79,7 @@ def test_a_throw_over_udp_against_a_process_of_its_own(tmp_path):
     flown on.
     """
     device = f"127.0.0.1:{free_port()}"
-    params = config.load(
-        HilParams, config.find("hil", "fake"), [f'link.device="udp:{device}"', "states.abort=0.5"]
-    )
+    params = load_run("fake", [f'link.device="udp:{device}"', "states.abort=0.5"])
     clock = MonotonicClock()
     recorder = RunRecorder(tmp_path / "run", params)
     link = Link(

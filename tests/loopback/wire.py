@@ -17,10 +17,10 @@ from hil.poses.sources.open_source import parties
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import make_fake
+from tests.configs import load_run
 from tests.fakes import KINDS
 from tests.hil_flight import AutoOperator
 from tests.mocap_faults import MocapFault
-from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
 HERE = ("127.0.0.1", 1)
@@ -119,14 +119,11 @@ def peers(
     **options,
 ):
     """Runner and fake at the ends of a pipe: runner, source, clock, fake."""
-    from hil.params import HilParams
 
     wild = (
         ("aim.bound=9.0",) if loaded is not None and len(loaded.weights) == 1 else ()
     )  # it releases in hover, 2 m off
-    params = config.load(
-        HilParams, config.find("hil", CONFIGS[kind]), [f"policy={policy}", *wild, *overrides]
-    )
+    params = load_run(CONFIGS[kind], [f"policy={policy}", *wild, *overrides])
     here, there = pipe()
     mine, its = pipe()
     mine.whole = its.whole = kind == "crazyflie"

@@ -20,13 +20,13 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, LawParams, PlantParams
 from sim.solvers.mujoco import _on_gpu
+from tests.configs import load_experiment
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
 from tests.simulators import fly
-from visthrow import config
 from visthrow.cli import build_parser
 from visthrow.common.errors import ConfigError
-from visthrow.task import Experiment, plant_of
+from visthrow.task import plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import HybridPlant
 
@@ -78,7 +78,7 @@ def test_physx_converges_onto_the_chain():
 
 def flown(solver: str, substep: float, count: int = 12, device: str = "cpu") -> HybridSim:
     """Random vehicles and ropes, a second of drawn commands, and releases on the way."""
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     plant = on(plant_of(experiment), solver, substep)
     lag = replace(plant.release, lag=0.1113)  # within a substep
     plant, spreads = replace(plant, release=lag), experiment.task.start
@@ -141,7 +141,7 @@ def test_what_stood_still_flies_on_from_there(solver, substep, near):
 
 def hanging(name: str, **vehicle) -> HybridSim:
     """A payload of ``configs/rope`` on a vehicle without blocks, whose command is a wrench."""
-    experiment = config.load(Experiment, config.find("train", f"state_{name}"))
+    experiment = load_experiment(f"state_{name}")
     plant = on(plant_of(experiment), "mujoco_warp", 0.00025)
     body = replace(plant.vehicle.body, **vehicle)
     controller = plant.vehicle.controller
@@ -236,7 +236,7 @@ def test_a_solver_flies_on_a_gpu_as_the_fused_chain_does(solver, substep, near):
 
 
 def test_what_a_solver_cannot_hold_is_refused():
-    box = plant_of(config.load(Experiment, config.find("train", "state_box")))
+    box = plant_of(load_experiment("state_box"))
     with raises(ValueError, match=r"payload_sides is .*'mujoco_warp'"):
         HybridSim(on(box, "chain", 0.002), 1)
     plant = paper_plant()

@@ -15,8 +15,8 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import FALLBACK, NONFINITE
 from sim.params import PlantParams
 from sim.torch_bridge import TorchViews
+from tests.configs import load_experiment
 from tests.simulators import numerics, random_commands
-from visthrow import config
 from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, plant_of
 from visthrow.training import terminations
@@ -33,7 +33,7 @@ RATE_DIFFERENCE = 0.1
 
 
 def experiment() -> Experiment:
-    return config.load(Experiment, config.find("train", "state"))
+    return load_experiment("state")
 
 
 def started(count: int, seed: int, plant: PlantParams | None = None) -> HybridSim:

@@ -11,9 +11,9 @@ from pytest import approx, mark, raises
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
 from sim.units import Units, in_units
+from tests.configs import load_experiment
 from tests.plants import EVERYTHING
-from visthrow import config
-from visthrow.task import Experiment, TaskParams, plant_of
+from visthrow.task import TaskParams, plant_of
 from visthrow.task.fleet import TASK
 
 UNITS = Units(2.5, 0.3)
@@ -27,7 +27,7 @@ def plant() -> PlantParams:
     """The shipped plant in float64, with a number in every field of the usual blocks that is 0
     there.
     """
-    p = plant_of(config.load(Experiment, config.find("train", "state")))
+    p = plant_of(load_experiment("state"))
     rope = replace(
         p.rope,
         payload_drag=2e-3,
@@ -112,7 +112,7 @@ def numbers(value: object) -> list[float]:
 
 
 def test_every_field_of_plant_and_task_has_a_dimension():
-    task = config.load(Experiment, config.find("train", "any")).task
+    task = load_experiment("any").task
     assert isinstance(in_units(task, UNITS, TASK), TaskParams)
     with raises(ValueError, match="control_period: no dimension told"):
         in_units(plant().sim, UNITS, {})

@@ -21,9 +21,8 @@ from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.pymav import mav
 from hil.links.roster import Roster
-from hil.params import HilParams
 from hil.poses.sources.open_source import parties
-from visthrow import config
+from tests.configs import load_run
 
 pytestmark = mark.sitl
 
@@ -57,9 +56,7 @@ class Bench:
             skip(f"VISTHROW_SITL_{kind.upper()} is not set")
         names = {"ardupilot": "fake", "px4": "fake_px4"}
         self.kind = kind
-        self.params = config.load(
-            HilParams, config.find("hil", names[kind]), (*HOVER_SHARE[kind], *overrides)
-        )
+        self.params = load_run(names[kind], (*HOVER_SHARE[kind], *overrides))
         port = open_port(check_device(address))
         self.rates, self.placed = [], False
         self.tables: list[str] = []

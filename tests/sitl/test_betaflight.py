@@ -26,13 +26,12 @@ from hil.links.backends.base import FOLLOW
 from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight, version_text
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
-from hil.params import HilParams
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
+from tests.configs import load_run
 from tests.loopback import test_endings as endings
-from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.throws.wire_plant import make_motors
 
@@ -108,7 +107,7 @@ def program() -> Path:
 def settings(tmp_path_factory):
     """A folder with the firmware's settings, written and read back once, and what was read."""
     folder = tmp_path_factory.mktemp("firmware")
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    params = load_run("betaflight_sitl").betaflight
     return folder, Firmware(program(), folder).set_up(needed(params))
 
 
@@ -117,7 +116,7 @@ class Bench:
 
     def __init__(self, folder: Path, settings: Path):
         shutil.copy(settings / "eeprom.bin", folder)
-        self.params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+        self.params = load_run("betaflight_sitl").betaflight
         self.firmware = Firmware(program(), folder)
         self.firmware.start()
         self.plant = make_motors("vision", 0)
@@ -188,7 +187,7 @@ def stiff(tmp_path):
     """With `STIFF` gains: those of the throws hold no rate against the ball, as the training's do
     not.
     """
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    params = load_run("betaflight_sitl").betaflight
     gains = {f"{gain}_{axis}": value for axis in ("roll", "pitch") for gain, value in STIFF.items()}
     folder = tmp_path / "stiff"
     Firmware(program(), folder).set_up({**needed(params), **gains})
@@ -198,7 +197,7 @@ def stiff(tmp_path):
 
 
 def test_settings_are_written_and_read_back(settings):
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    params = load_run("betaflight_sitl").betaflight
     assert settings[1] == needed(params)
     assert settings[1]["small_angle"] == "180"
     assert settings[1]["blackbox_device"] == "VIRTUAL"
@@ -279,7 +278,7 @@ def test_throws_in_lock_step_are_the_same_to_the_bit(tmp_path, settings, monkeyp
     """
     monkeypatch.setattr(sys.modules[throw.__module__], "AFTER", ON)
     shutil.copytree(settings[0], tmp_path / "settings")
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl"))
+    params = load_run("betaflight_sitl")
     policy, reports = Policy.load(find_policy(params.policy)), []
     for name in ("first", "again"):
         plant = make_motors(params.policy, 1)
@@ -341,7 +340,7 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
         1.2 if way == "source raises" else 1.5
     )  # [s]; without poses nothing is sent, and after 1.5 s the firmware would disarm
     overrides = (*endings.QUICK, f"states.abort={abort}", *endings.STATES[state])
-    params = config.load(HilParams, config.find("hil", "betaflight_sitl"), overrides)
+    params = load_run("betaflight_sitl", overrides)
     monkeypatch.setattr(endings, "OVER", OVER[state])
     if way == "SIGINT twice":
         endings.twice(monkeypatch)

@@ -10,6 +10,7 @@ from pytest import approx, fixture, mark, param
 from torch.testing import assert_close
 
 from tests.commands import run_command
+from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
@@ -79,7 +80,7 @@ def trained(iterations, sign=1.0, *extra, seed=1):
         "distillation.learning_rate=0.005",
         *extra,
     )
-    experiment = config.load(Experiment, config.find("train", "vision_ideal"), sets)
+    experiment = load_experiment("vision_ideal", sets)
     trainer = Trainer(experiment, "cpu", seed)
     for parameter in trainer.algorithm.network.parameters():
         parameter.register_hook(lambda gradient: sign * gradient)

@@ -6,11 +6,11 @@ import numpy as np
 from pytest import mark
 
 from sim.params import LawParams
+from tests.configs import load_experiment
 from tests.flown import fly, setting_with
-from visthrow import config
 from visthrow.diagnose.extend.patch import extended
 from visthrow.diagnose.throw.throw_model import ThrowModel
-from visthrow.task import DiagnosedParams, Experiment
+from visthrow.task import DiagnosedParams
 from visthrow.training.trainer import Trainer
 
 LAW = LawParams("payload force", (), "vertical_cross_vel", 0.03)
@@ -20,7 +20,7 @@ SMALL = ["ppo.environments=12", "ppo.steps=4", "ppo.hidden=[8]", "ppo.minibatche
 @mark.slow
 def test_training_in_an_extended_simulator():
     """Two iterations with effects, plants drawn from what is uncertain of them, and a law."""
-    plain = config.load(Experiment, config.find("train", "state"), SMALL)
+    plain = load_experiment("state", SMALL)
     loose = DiagnosedParams(
         ("payload_drag", "com_x", "release_lag"),
         ((1e-8, 0.0, 0.0), (0.0, 1e-8, 0.0), (0.0, 0.0, 1e-6)),

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from pytest import fixture, mark
 
+from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
@@ -95,9 +96,7 @@ def test_replayed_from_graphs_it_computes_what_it_computes_eagerly():
     """
 
     def errors(eager):
-        trainer = Trainer(
-            config.load(Experiment, config.find("train", "state"), SMALL), "cuda:0", 1
-        )
+        trainer = Trainer(load_experiment("state", SMALL), "cuda:0", 1)
         if eager:
             trainer.algorithm.rollout = trainer.algorithm._fly
         return [trainer.step()["cost"] for _ in range(6)]

@@ -13,6 +13,7 @@ from rsl_rl.algorithms import PPO
 from tensordict import TensorDict
 from torch.testing import assert_close
 
+from tests.configs import load_experiment
 from visthrow import config
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
@@ -218,7 +219,7 @@ def reached(seed: int, iterations: int = 24) -> tuple[float, list[float]]:
     torch.manual_seed(seed)
     changes = ("environments=64", "steps=8", "hidden=[32,32]")
     words = [f"ppo.{change}" for change in changes]
-    experiment = config.load(Experiment, config.find("train", "state"), words)
+    experiment = load_experiment("state", words)
     training = PPOTraining(experiment, "cpu", seed, Ranks("cpu"), build=Reach)
     targets = []
     for i in range(iterations):

@@ -11,8 +11,7 @@ import torch
 from numpy.testing import assert_array_equal
 from pytest import fixture, mark
 
-from visthrow import config
-from visthrow.task import Experiment
+from tests.configs import load_experiment
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import Trainer
 
@@ -54,7 +53,7 @@ def process(rank: int, port: int, folder: Path) -> None:
     torch.set_num_threads(1)
     ranks = Ranks.join(on_gpu=False)
     for name, (base, sets) in RUNS.items():
-        experiment = config.load(Experiment, config.find("train", base), [*SMALL, *sets])
+        experiment = load_experiment(base, [*SMALL, *sets])
         whole = Trainer(experiment, "cpu", 1, ranks)
         for _ in range(2):
             whole.step()
@@ -113,7 +112,7 @@ def test_a_process_that_a_checkpoint_does_not_know_throws_on_its_own(folder):
     """Two processes' checkpoint taken up by three: the third must not collect the first one's data
     again.
     """
-    experiment = config.load(Experiment, config.find("train", "state"), [*SMALL, *PPO])
+    experiment = load_experiment("state", [*SMALL, *PPO])
     first, third = (Trainer(experiment, "cpu", 1) for _ in range(2))
     third.ranks = Ranks(rank=2, world=3)
     for trainer in (first, third):

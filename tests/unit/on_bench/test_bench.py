@@ -10,11 +10,11 @@ from pytest import fixture, mark, raises
 
 from bench import report, start
 from tests.commands import run_command
-from visthrow import cli, config
+from tests.configs import load_experiment
+from visthrow import cli
 from visthrow.common.errors import StorageError
 from visthrow.onboard.policy import find_policy
 from visthrow.paper import measurements
-from visthrow.task import Experiment
 
 
 @fixture
@@ -61,7 +61,7 @@ def test_the_command_of_today_beside_each_record_runs(path, monkeypatch):
             args = importlib.import_module(words[2]).main(words[3:])
             names = getattr(args, "configs", [])
         for name in names:
-            config.load(Experiment, config.find("train", name), args.overrides)
+            load_experiment(name, args.overrides)
         for name in {
             *getattr(args, "policies", []),
             *([args.policy] if hasattr(args, "policy") else []),

@@ -10,6 +10,7 @@ from pytest import approx, fixture, mark, raises
 
 from sim.params import LawParams
 from tests.commands import run_command
+from tests.configs import load_experiment
 from tests.unit.on_diagnose.test_models import ball_log
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
@@ -30,7 +31,7 @@ COVARIANCE[0, 1] = COVARIANCE[1, 0] = 0.99 * 0.01 * 0.002
 
 
 def shipped() -> Experiment:
-    return config.load(Experiment, config.find("train", "state"))
+    return load_experiment("state")
 
 
 @fixture

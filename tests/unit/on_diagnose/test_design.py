@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from pytest import approx, fixture, mark, raises
 
+from tests.configs import load_experiment
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.ball import BallModel
@@ -14,18 +15,15 @@ from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
 from visthrow.diagnose.select import search
-from visthrow.task import Experiment, plant_of
+from visthrow.task import plant_of
 
 BASES = {m.name: m for m in catalogue()}
 ABOUT = ("rotor_drag_xy", "rotor_drag_z", "cmd_delay", "motor_tau", "thrust_curve")
 
 
 def plant(params):
-    from visthrow import config
 
-    return fly_manoeuvres.vehicle_of(
-        params, plant_of(config.load(Experiment, config.find("train", "state")))
-    )
+    return fly_manoeuvres.vehicle_of(params, plant_of(load_experiment("state")))
 
 
 def hovered(params):

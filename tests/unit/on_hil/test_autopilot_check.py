@@ -11,13 +11,12 @@ from hil.control.recording.record import CONFIG, TICKS, RunRecorder
 from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import autopilot_record
-from hil.params import HilParams
 from hil.poses.pose import VEHICLE
 from tests.commands import run_command
+from tests.configs import load_run
 from tests.hil_flight import simple_policy
 from tests.level import LevelPlant
 from tests.loopback.wire import peers
-from visthrow import config
 
 QUICK = ("states.check_hold=0.2",)
 NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
@@ -86,7 +85,7 @@ def test_a_hover_counts_once_it_has_settled(run, tmp_path):
     ("height", "speed", "counted"), [(0.31, 0.14, 1), (0.29, 0.14, 0), (0.31, 0.16, 0)]
 )
 def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
-    params = config.load(HilParams, config.find("hil", "fake"))
+    params = load_run("fake")
     backend = SimpleNamespace(share=0.2, service=lambda now: None)
     check = AutopilotCheck(params, backend)
     state = SimpleNamespace(pos=(0.0, 0.0, height))

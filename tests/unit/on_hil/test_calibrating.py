@@ -21,7 +21,7 @@ from hil.links.backends.base import DryRun
 from hil.params import HilParams
 from hil.poses.detection import Detection
 from hil.poses.pose import Pose
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.calibration import Calibration, Hovered, Spreads, solved
 from visthrow.onboard.observations import rotation_from_quat
@@ -43,7 +43,7 @@ OURS = [
 
 def run_params(*overrides: str) -> HilParams:
     given = [*OURS, "observe=false", "delay.source=0.01", f"images.delay={DELAY}", *overrides]
-    return config.load(HilParams, config.find("hil", "detector"), given)
+    return load_run("detector", given)
 
 
 class Hall:
@@ -235,7 +235,7 @@ def test_what_is_not_sure_is_refused_and_a_failure_is_tried_again():
     with raises(ConfigError, match="expected above 0"):
         CalibrationParams(rate=0.0)
     with raises(ConfigError, match="expected keypoints"):
-        config.load(HilParams, config.find("hil", "dry_run"), ["calibration.rate=1.0"])
+        load_run("dry_run", ["calibration.rate=1.0"])
     assert Spreads().keypoint == 0.01
 
 

@@ -16,7 +16,6 @@ from hil.links import msp
 from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
-from hil.params import HilParams
 from hil.rehearsal.bridges import betaflight_bridge as betaflight
 from hil.rehearsal.bridges import betaflight_firmware as firmware
 from hil.rehearsal.bridges import packets
@@ -24,14 +23,14 @@ from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
+from tests.configs import load_run
 from tests.fakes.ports import ListeningPort
-from visthrow import config
 from visthrow.throws.wire_plant import make_motors
 
 
 @fixture
 def params():
-    return config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight
+    return load_run("betaflight_sitl").betaflight
 
 
 def free_port(kind=socket.SOCK_STREAM):
@@ -238,9 +237,7 @@ def test_settings_follow_the_runs_configuration(params):
     assert found["yaw_srate"] == "30"
     assert found["aux 0"] == "0 0 1700 2100 0 0"
     assert "aux 1" not in found
-    override = config.load(
-        HilParams, config.find("hil", "betaflight_sitl"), ["betaflight.arm_channel=0"]
-    ).betaflight
+    override = load_run("betaflight_sitl", ["betaflight.arm_channel=0"]).betaflight
     assert needed(override)["msp_override_channels_mask"] == "143"  # sticks and AUX 4
     assert needed(override)["aux 1"].startswith("50 ")
 

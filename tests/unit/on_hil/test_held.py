@@ -4,8 +4,7 @@ from pytest import approx, raises
 
 from hil.links.backends import make_backend
 from hil.links.backends.base import DryRun, Held
-from hil.params import HilParams
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common.errors import ConfigError
 
 
@@ -55,10 +54,8 @@ def test_nothing_goes_out_after_the_end():
 
 def test_a_vehicle_acts_sooner_or_later_but_not_both():
     with raises(ConfigError, match="one of them 0"):
-        config.load(
-            HilParams, config.find("hil", "fake"), ["delay.hold=0.02", "delay.command=0.01"]
-        )
+        load_run("fake", ["delay.hold=0.02", "delay.command=0.01"])
     assert isinstance(
-        make_backend(config.load(HilParams, config.find("hil", "dry_run"), ["delay.hold=0.02"])),
+        make_backend(load_run("dry_run", ["delay.hold=0.02"])),
         DryRun,
     )

@@ -22,7 +22,6 @@ from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
 from hil.control.recording.record import lines
 from hil.errors import SourceError
-from hil.params import HilParams
 from hil.poses.detection import Detection, Detections
 from hil.poses.sources.images import (
     DETECTORS,
@@ -34,8 +33,8 @@ from hil.poses.sources.images import (
     RecordedImages,
 )
 from tests.commands import run_command
+from tests.configs import load_run
 from tests.drawn import render_scene
-from visthrow import config
 from visthrow.cli import main
 from visthrow.common.errors import ConfigError
 
@@ -47,7 +46,7 @@ FRAMES = 4
 
 
 def training():
-    return config.load(HilParams, config.find("hil", "dry_run")).camera
+    return load_run("dry_run").camera
 
 
 def pose(i):
@@ -371,7 +370,7 @@ def test_wrong_pictures(folder, tmp_path):
     with raises(ConfigError, match=r"images\.path is none"):
         ImageParams("folder")
     with raises(ConfigError, match=r"no table \[images\]"):
-        config.load(HilParams, config.find("hil", "dry_run"), ["keypoints=detector"])
+        load_run("dry_run", ["keypoints=detector"])
     (tmp_path / STAMPS).write_text("file,time_s\na.png,0.0\n")
     with raises(SourceError, match=r"names a\.png, which is not there"):
         RecordedImages(params(tmp_path), training())

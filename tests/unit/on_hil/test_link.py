@@ -20,10 +20,9 @@ from hil.links.mavlink_link import Link, attitude_target, pose_from_message, qua
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
 from hil.links.writer import TlogWriter
-from hil.params import HilParams
 from hil.poses.sources.open_source import open_source
+from tests.configs import load_run
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from visthrow import config
 
 
 def packed(message, system=1, component=1) -> bytes:
@@ -132,9 +131,7 @@ def test_loopback_only_unless_told_otherwise():
 def test_a_port_that_is_taken_says_who_may_have_it_and_what_names_another():
     number = free_port()
     first = open_port(check_device(f"udp:127.0.0.1:{number}"))
-    params = config.load(
-        HilParams, config.find("hil", "fake"), [f"link.device=udp:127.0.0.1:{number}"]
-    )
+    params = load_run("fake", [f"link.device=udp:127.0.0.1:{number}"])
     with raises(LinkError) as caught:
         open_source(params, Path("unused"), time.monotonic)
     first.close()

@@ -7,15 +7,14 @@ from pytest import mark, raises
 
 from hil.links import msp
 from hil.links.backends.betaflight import Betaflight
-from hil.params import HilParams
+from tests.configs import load_run
 from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe
-from visthrow import config
 
 HELLO = msp.Frame(
     msp.STATUS, struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0), msp.ANSWER
 )
-PARAMS = config.load(HilParams, config.find("hil", "fake_betaflight")).betaflight
+PARAMS = load_run("fake_betaflight").betaflight
 
 
 def test_published_bytes():

@@ -14,7 +14,7 @@ from hil.params import HilParams
 from hil.poses.pose import Pose
 from hil.poses.sources.open_source import open_source, read_poses, unit_problems
 from tests.commands import run_command
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common import toml_text
 
 DATA = Path(__file__).parents[2] / "data"
@@ -29,9 +29,7 @@ def flight(name: str, **units: str) -> HilParams:
     """The config of a recorded flight, some units of its mapping replaced, by channel; ``time`` is
     its clock's.
     """
-    params = config.load(
-        HilParams, config.find("hil", name), [f'source.file="{DATA / FLIGHTS[name]}"']
-    )
+    params = load_run(name, [f'source.file="{DATA / FLIGHTS[name]}"'])
     columns = tuple(replace(c, unit=units.get(c.name, c.unit)) for c in params.source.columns)
     time = replace(params.source.time, unit=units.get("time", "s"))
     return replace(params, source=replace(params.source, columns=columns, time=time))

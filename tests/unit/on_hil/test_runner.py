@@ -13,11 +13,10 @@ from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import can_hand_over
 from hil.errors import RunError
 from hil.links.backends.base import HOLD, Status
-from hil.params import HilParams
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
+from tests.configs import load_run
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
-from visthrow import config
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.onboard.actions import hover_action
 
@@ -487,7 +486,7 @@ def test_another_camera_is_refused():
 )
 def test_wrong_configs(override, message):
     with raises(ConfigError, match=message):
-        config.load(HilParams, config.find("hil", "dry_run"), [override])
+        load_run("dry_run", [override])
 
 
 def test_operators_abort_in_mid_throw():

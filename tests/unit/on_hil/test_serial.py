@@ -12,13 +12,10 @@ from hil.links import msp
 from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, SerialPort
 from hil.links.writer import HEAD, LoggedPort
-from hil.params import HilParams
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common.errors import StorageError
 
-PARAMS = config.load(
-    HilParams, config.find("hil", "fake_betaflight"), ["betaflight.audit=false"]
-).betaflight
+PARAMS = load_run("fake_betaflight", ["betaflight.audit=false"]).betaflight
 STATUS = struct.pack("<HHHIBHHBBI", 125, 0, 33, 1, 0, 10, 0, 0, 29, 0)
 
 

@@ -13,13 +13,12 @@ from hil.links.mavlink_link import Link
 from hil.links.pymav import Parser, mav
 from hil.links.roster import Party, Roster
 from hil.links.writer import TlogWriter
-from hil.params import HilParams
 from hil.poses.pose import Pose
 from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.poses.sources.player import read_table, read_tlog
 from hil.poses.sources.pose_source import RecordedSource
+from tests.configs import load_run
 from tests.loopback.wire import pipe
-from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -249,11 +248,7 @@ def test_csv_without_mapping(tmp_path):
 )
 def test_wrong_mappings(settings, message):
     with raises(ConfigError, match=message):
-        config.load(
-            HilParams,
-            config.find("hil", "dry_run"),
-            ("source.kind=csv", "source.file=a.csv", *settings),
-        )
+        load_run("dry_run", ("source.kind=csv", "source.file=a.csv", *settings))
 
 
 def test_recorded_poses_come_when_their_time_has_come():

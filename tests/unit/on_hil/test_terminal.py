@@ -13,8 +13,7 @@ from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import require_fake
 from hil.operator_terminal import ENDING, PAUSING, Console, Terminal
-from hil.params import HilParams
-from visthrow import config
+from tests.configs import load_run
 
 
 @fixture
@@ -99,12 +98,12 @@ def test_auto_arm_is_for_what_says_that_it_is_simulated(typed):
     ],
 )
 def test_auto_arm_is_refused_for_what_is_not_on_this_machine(base, override):
-    params = config.load(HilParams, config.find("hil", base), (override, "link.remote=true"))
+    params = load_run(base, (override, "link.remote=true"))
     with raises(
         RunError, match=r"--auto-arm with .*; it is for `visthrow hil fake` on this machine alone"
     ):
         require_fake(params)
-    require_fake(config.load(HilParams, config.find("hil", "fake_betaflight")))
+    require_fake(load_run("fake_betaflight"))
 
 
 def test_a_terminal_that_takes_nothing_holds_nobody_up(monkeypatch):

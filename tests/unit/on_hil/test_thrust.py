@@ -7,9 +7,8 @@ from pytest import approx, mark, raises
 from hil.errors import RunError
 from hil.links.backends import require_reach
 from hil.links.backends.thrust_curve import LEAST_SHARES, HoverMeter, HoverThrustParams
-from hil.params import HilParams
+from tests.configs import load_run
 from tests.hil_flight import simple_policy
-from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.hover import GRAVITY
 
@@ -101,14 +100,12 @@ def test_too_few_values_measure_nothing():
 )
 def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
     contract = simple_policy().contract
-    require_reach(config.load(HilParams, config.find("hil", name)), contract)
-    params = config.load(HilParams, config.find("hil", name), [override])
+    require_reach(load_run(name), contract)
+    params = load_run(name, [override])
     if message is None:  # with actual rates the end counts, and is never below the middle's slope
         require_reach(params, contract)
-        slow = config.load(
-            HilParams,
-            config.find("hil", name),
-            ["betaflight.rates.rc_rates=[30, 60, 30]", "betaflight.rates.rates=[30, 60, 30]"],
+        slow = load_run(
+            name, ["betaflight.rates.rc_rates=[30, 60, 30]", "betaflight.rates.rates=[30, 60, 30]"]
         )
         with raises(RunError, match=r"reach 5\.2, 10\.5, 5\.2 rad/s on roll, pitch, yaw"):
             require_reach(slow, contract)

@@ -6,13 +6,12 @@ from hil.errors import LinkError, RunError
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.base import DryRun
 from hil.links.backends.betaflight import Betaflight
-from hil.params import HilParams
-from visthrow import config
+from tests.configs import load_run
 from visthrow.common.errors import ConfigError
 
 
 def load(*overrides, name="dry_run"):
-    return config.load(HilParams, config.find("hil", name), overrides)
+    return load_run(name, overrides)
 
 
 @mark.parametrize(

@@ -11,10 +11,9 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark
 
 from camera.keypoints import KeypointCamera, keypoints
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment
 
 PERIOD = 0.02
 
@@ -64,7 +63,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
     """Exact frames of random attitudes and places give the goal exactly; the camera's rays meet the
     ground there.
     """
-    params = config.load(Experiment, config.find("train", f"{kind}_moving"))
+    params = load_experiment(f"{kind}_moving")
     layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
     rng = default_rng(1)
     count = 64
@@ -107,7 +106,7 @@ def test_both_layouts_find_the_goal_where_it_is(kind):
 
 def test_a_located_state_layout_has_the_mean_goal():
     """Ten noisy frames of one goal: their mean less the measured position, beside the offset."""
-    params = config.load(Experiment, config.find("train", "state")).task.observation
+    params = load_experiment("state").task.observation
     layout = ob.layout_of(replace(params, located=True))
     assert layout.dimension == ob.layout_of(params).dimension + 2
     rng, goal = default_rng(1), np.array([1.5, -0.5])

@@ -9,11 +9,10 @@ from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.onboard.goal_motion import fitted_goal, middle
-from visthrow.task import Experiment
 
 EXACT = 2e-3
 """Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre
@@ -25,7 +24,7 @@ def scene():
     """Layout, camera, a frame of noise-free keypoints of eight poses, their validity, goal -
     vehicle and lens - payload's ray.
     """
-    params = config.load(Experiment, config.find("train", "laptop_vision"))
+    params = load_experiment("laptop_vision")
     layout, camera = ob.layout_of(params.task.observation), KeypointCamera(params.camera)
     torch.manual_seed(1)
     pos = torch.tensor([0.0, 0.0, 1.3]) + 0.2 * torch.randn(8, 3)

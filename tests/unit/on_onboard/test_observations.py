@@ -4,9 +4,8 @@ neither notices an exchange.
 
 import torch
 
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment
 
 POS, VEL, RATE = (
     torch.tensor([[1.0, 2, 3]]),
@@ -31,7 +30,7 @@ def test_what_the_vehicle_answered():
 
 
 def test_the_papers_state_is_assembled_in_its_order():
-    layout = ob.layout_of(config.load(Experiment, config.find("train", "state")).task.observation)
+    layout = ob.layout_of(load_experiment("state").task.observation)
     frame = torch.tensor([[*VEHICLE, 100, 101, 102, 103, 104]], dtype=torch.float32)
     previous = torch.tensor([[60.0, 61, 62, 63, 64]])
     history = torch.arange(200.0, 200 + 3 * (1 + layout.history)).reshape(1, -1, 3)

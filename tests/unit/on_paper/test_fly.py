@@ -8,7 +8,8 @@ import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
 
 from tests.commands import run_command
-from visthrow import cli, config
+from tests.configs import load_experiment
+from visthrow import cli
 from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
 from visthrow.paper.baseline import front, spline
@@ -44,7 +45,7 @@ CONDENSED = 1e-4
 
 @fixture(scope="module")
 def experiment() -> Experiment:
-    return config.load(Experiment, config.find("train", "state"))
+    return load_experiment("state")
 
 
 @fixture(scope="module")

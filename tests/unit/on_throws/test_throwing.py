@@ -16,12 +16,13 @@ from scipy.integrate import solve_ivp
 
 from sim.params import GRAVITY
 from tests.commands import run_command
+from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.cli import compare, demo, main
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.task import contract_of, plant_of
 from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
@@ -41,7 +42,7 @@ JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt,
 
 def dropping_policy(name: str = "state", release: float = 1.0, overrides=()) -> Policy:
     """A policy that hovers with fixed thrust and asks for the release at once."""
-    experiment = config.load(Experiment, config.find("train", name), overrides)
+    experiment = load_experiment(name, overrides)
     contract = contract_of(experiment)
     weight = 9.81 * (
         experiment.vehicle.body.mass + experiment.rope.rope_mass + experiment.rope.payload_mass
@@ -86,7 +87,7 @@ def test_loose_rope_keeps_its_links_and_its_energy():
 
 
 def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     plant = HybridPlant(experiment, 2)
     tilt = np.tile([0.5, 0.0, -0.866], (2, experiment.rope.segments, 1))
     plant.reset(np.tile([0.0, 0.0, 1.5], (2, 1)), tilt)
@@ -115,7 +116,7 @@ MEASURED_VECTORS = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
 
 def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
     """A vehicle that is told not to turn turns as fast as its bias says."""
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     quiet = replace(experiment.task.noise, command_bias=0.0, command_step=0.0)
     weight = GRAVITY * plant_of(experiment).total_mass
     still = replace(experiment.task.start, rate_deg=(0.0, 0.0, 0.0))
@@ -132,7 +133,7 @@ def test_commands_of_the_hybrid_plant_have_the_tasks_bias():
 
 def test_a_payload_flies_under_drag_side_force_lift_and_wind():
     """Against scipy's integrator: drag against the air, side force to its left, lift up."""
-    plant = plant_of(config.load(Experiment, config.find("train", "state")))
+    plant = plant_of(load_experiment("state"))
     mass = plant.rope.payload_mass
     rope = replace(plant.rope, payload_drag=0.05, payload_side=0.02, payload_lift=0.03)
     wind = np.array([1.0, -2.0, 0.5])
@@ -152,7 +153,7 @@ def test_a_payload_flies_under_drag_side_force_lift_and_wind():
 
 
 def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     plant = make_plant("hybrid", experiment, 400)
     truth, seen = (
         plant.state,
@@ -173,7 +174,7 @@ def test_measurements_of_the_hybrid_plant_have_the_tasks_noise():
 
 
 def test_measurements_of_the_hybrid_plant_are_late():
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     plant = HybridPlant(experiment, 2, latency=(0.01, 0.01))
     for _ in range(5):
         before = plant.state
@@ -366,7 +367,7 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
 
 
 def test_failures_name_their_cause():
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     plant = HybridPlant(experiment, 5)
     flight = Flight(plant, SimpleNamespace(experiment=experiment))
     flight.begin = plant.time - 0.1

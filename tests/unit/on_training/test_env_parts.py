@@ -9,8 +9,7 @@ import torch
 from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture
 
-from visthrow import config
-from visthrow.task import Experiment
+from tests.configs import load_experiment
 from visthrow.training.env.options import POSE, DetectorView, MovingGoals, PoseDelay
 
 COUNT = 4096
@@ -26,7 +25,7 @@ def seeded():
 
 
 def delay_of(**changes) -> PoseDelay:
-    params = config.load(Experiment, config.find("train", "state")).task.observation
+    params = load_experiment("state").task.observation
     return PoseDelay(replace(params, **changes), PERIOD, LIKE, None)
 
 
@@ -65,7 +64,7 @@ def test_goals_move_in_every_direction_at_the_configured_speeds():
 
 def view_of(mount: dict | None = None, **noise) -> DetectorView:
     """A detector without errors but those that are named."""
-    camera = config.load(Experiment, config.find("train", "vision_ideal")).camera
+    camera = load_experiment("vision_ideal").camera
     exact = {name: 0.0 for name in ("step_std", "bias_std", "scale_std", "latency")}
     exact |= {"drop_probability": 0.0, "wrong_probability": 0.0, "held_probability": 0.0}
     errors = {"rotation_error_std": 0.0, "position_error_std": 0.0} | (mount or {})

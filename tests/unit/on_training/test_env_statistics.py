@@ -9,10 +9,9 @@ import torch
 from pytest import approx
 from torch.testing import assert_close
 
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment
 from visthrow.training.env import ThrowEnv
 
 COUNT = 4096
@@ -21,7 +20,7 @@ SPREAD = 0.05  # relative; four and a half standard errors
 
 
 def env_of(*overrides: str, name: str = "state", count: int = COUNT) -> ThrowEnv:
-    experiment = config.load(Experiment, config.find("train", name), list(overrides))
+    experiment = load_experiment(name, list(overrides))
     torch.manual_seed(7)
     return ThrowEnv(experiment, "cpu", seed=7, count=count)
 

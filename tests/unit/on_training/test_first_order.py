@@ -10,11 +10,10 @@ from pytest import approx, mark, param
 from torch.testing import assert_close
 
 from sim.params import GRAVITY
-from visthrow import config
+from tests.configs import load_experiment
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy, find_policy
-from visthrow.task import Experiment
 from visthrow.training import protocol
 from visthrow.training.first_order.surrogate import TAUT
 from visthrow.training.trainer import Trainer
@@ -58,9 +57,7 @@ pytestmark = mark.usefixtures("one_thread")
 
 def first_order(name="state", *changes):
     """A first-order training of a small network that has been made to react to what it sees."""
-    found = Trainer(
-        config.load(Experiment, config.find("train", name), [*SMALL, *changes]), "cpu", 3
-    ).algorithm
+    found = Trainer(load_experiment(name, [*SMALL, *changes]), "cpu", 3).algorithm
     with torch.no_grad():
         found.network.mlp[-1].weight.mul_(5.0)
     return found
@@ -294,7 +291,7 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
 
 def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
     """Fewer segments and longer steps give more than twice as many flights."""
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     coarse = first_order("state").env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
     assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
@@ -334,9 +331,7 @@ def small_task():
             "sharp=0.7",
         )
     ]
-    return config.load(
-        Experiment, config.find("train", "state"), ['algorithm="first_order"', *words]
-    )
+    return load_experiment("state", ['algorithm="first_order"', *words])
 
 
 @mark.parametrize("seed", [0, *(param(seed, marks=mark.slow) for seed in range(1, 5))])

@@ -11,6 +11,7 @@ from pytest import approx, mark, raises
 
 from sim.params import GRAVITY
 from sim.vehicle_class import draw
+from tests.configs import load_experiment
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
@@ -32,7 +33,7 @@ NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 
 
 def experiment(*overrides: str, policy: str = "any") -> Experiment:
-    return config.load(Experiment, config.find("train", policy), ["fleet.count=3", *overrides])
+    return load_experiment(policy, ["fleet.count=3", *overrides])
 
 
 def of(name: str, policy: str = "any") -> Experiment:
@@ -190,7 +191,7 @@ def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(nam
 
 def test_one_vehicles_experiment_is_the_same_task_at_its_size():
     one = alone(of("x500"))
-    size, usual = 0.8 / 0.33, config.load(Experiment, config.find("train", "any"))
+    size, usual = 0.8 / 0.33, load_experiment("any")
     assert one.fleet is None
     assert one.task.observation.setup == "none"
     assert one.task.bounds.horizontal == approx(usual.task.bounds.horizontal * size)
@@ -202,7 +203,7 @@ def test_one_vehicles_experiment_is_the_same_task_at_its_size():
 
 
 def test_a_policy_of_one_vehicle_is_not_specialised():
-    base = config.load(Experiment, config.find("train", "state"))
+    base = load_experiment("state")
     with raises(
         PolicyError, match="contract of one vehicle; expected one that was trained for a fleet"
     ):
