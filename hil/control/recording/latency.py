@@ -4,7 +4,6 @@ with the run.
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -38,13 +37,6 @@ SHORTEST, GROWTH, BINS = (
     # cent
 )
 CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
-_WIDTH, _ROW, _BELOW, _ABOVE = (
-    8.6,
-    0.88,
-    0.6,
-    0.3,
-)  # of the picture, of a stage's row, and the margins for axis and title [inch]
-_BAR = 0.72  # height of the highest bar, in rows; the rest is for the words above it
 
 
 class Stage:
@@ -142,11 +134,9 @@ def table(latency: dict[str, dict[str, float]], speed: float = 1.0) -> list[str]
 
 
 def draw(path: str | Path, stages: Stages, title: str) -> None:
-    """Draw a histogram a stage, one below the other over one axis of time, as a PNG file; raises
+    """Draw for each stage how many of its times are longer than a time, as a PNG file; raises
     `StorageError` where it cannot be written.
-
-    A run ends with this: one axis with fixed margins is drawn four times as fast as an axis a stage
-    whose labels are measured."""
+    """
     from visthrow.common import style
     from visthrow.common.storage import atomic_write
     from visthrow.view.parts import png_of
@@ -154,68 +144,15 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     style.use()
     import matplotlib.pyplot as plt
 
-    stages_with_data = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
-    rows = max(len(stages_with_data), 1)
-    height = _BELOW + _ROW * rows + _ABOVE
-    figure, axis = plt.subplots(figsize=(_WIDTH, height))
-    figure.subplots_adjust(
-        left=1.05 / _WIDTH,
-        right=1.0 - 0.2 / _WIDTH,
-        bottom=_BELOW / height,
-        top=1.0 - _ABOVE / height,
-    )
-    for row, (name, stage) in enumerate(stages_with_data.items()):
-        _histogram(axis, row, name, stage)
-    axis.set_xscale("log")
-    axis.set_xlabel("time [ms]; thin lines: p50, p95, p99; triangle: the longest")
-    axis.set_ylim(rows - 1.0, -1.0)
-    axis.set_yticks(range(len(stages_with_data)), list(stages_with_data))
-    axis.tick_params("y", length=0.0)
-    axis.spines[["left", "bottom"]].set_visible(False)
-    figure.suptitle(title, x=0.02, ha="left", fontsize=11.5)
+    figure, axis = plt.subplots(figsize=(8.6, 6.0), layout="constrained")
+    edges = 1e3 * SHORTEST * GROWTH ** np.arange(1, BINS + 1)  # [ms]
+    counted = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
+    for name, stage in counted.items():
+        longer = 1.0 - np.cumsum(stage.counts) / stage.counts.sum()
+        drawn = (longer > 0.0) & (longer < 1.0)
+        axis.step(edges[drawn], longer[drawn], label=f"{name}: {STAGES[name]}")
+    axis.set(xscale="log", yscale="log", xlabel="time [ms]", ylabel="share that took longer")
+    axis.set_title(title, loc="left", fontsize=11.5)
+    if counted:
+        figure.legend(loc="outside lower left", fontsize=8.0)
     atomic_write(path, png_of(figure))
-
-
-def _histogram(axis: Any, row: int, name: str, stage: Stage) -> None:
-    """Draw upwards from ``row``; the highest bar is :data:`_BAR` rows high."""
-    from visthrow.common import style
-
-    group = 8  # bins of one per cent to a bar
-    counts = stage.counts.reshape(-1, group).sum(1)
-    edges = 1e3 * SHORTEST * GROWTH ** (group * np.arange(len(counts) + 1))
-    used = np.flatnonzero(counts)
-    part = slice(used[0], used[-1] + 1)
-    heights = row - _BAR * counts[part] / counts.max()
-    axis.stairs(
-        heights,
-        edges[used[0] : used[-1] + 2],
-        baseline=row,
-        fill=True,
-        color=style.COLOURS[0],
-        alpha=0.75,
-    )
-    axis.vlines(
-        [1e3 * stage.percentile(share) for share in (0.5, 0.95, 0.99)],
-        row,
-        row - _BAR,
-        color=style.INK,
-        lw=0.8,
-    )
-    axis.plot(
-        1e3 * max(stage.most, SHORTEST),
-        row,
-        "v",
-        color=style.COLOURS[1],
-        ms=7,
-        clip_on=False,
-        zorder=4,
-    )
-    axis.axhline(row, color=style.QUIET, lw=0.8)
-    axis.text(
-        0.0,
-        row - _BAR - 0.02,
-        STAGES[name],
-        transform=axis.get_yaxis_transform(),
-        fontsize=8.0,
-        va="bottom",
-    )

@@ -73,14 +73,11 @@ def test_report_and_picture(tmp_path, monkeypatch):
         in table(stages.summary(), 0.2)[0]
     )
     (axis,) = figures[0].axes
-    assert [label.get_text() for label in axis.get_yticklabels()] == [
-        "poll",
-        "observation",
-        "total",
-    ]
-    assert [text.get_text() for text in axis.texts] == [
-        STAGES[name] for name in ("poll", "observation", "total")
-    ]
+    labels = [text.get_text() for text in figures[0].legends[0].texts]
+    assert labels == [f"{name}: {STAGES[name]}" for name in ("poll", "observation", "total")]
+    times, longer = axis.lines[2].get_data()
+    median = stages.summary()["total"]["p50_ms"]
+    assert np.interp(-0.5, -longer, times) == approx(median, rel=0.03)
     draw(tmp_path / "empty.png", Stages(), "nothing flown")
 
 
