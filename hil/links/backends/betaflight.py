@@ -361,7 +361,6 @@ class Betaflight(OnPort):
         return self._put(msp.pack(msp.Frame(command, payload)))
 
     def _hear(self, frame: msp.Frame, host_time: float) -> None:
-        p = self.params
         if frame.command == msp.STATUS:
             self._heard = host_time
             self._hear_status(frame)
@@ -369,26 +368,38 @@ class Betaflight(OnPort):
                 self._free_since = None
             elif self._free_since is None:
                 self._free_since = host_time
-        elif frame.command == msp.RC:
-            self._hear_channels(frame.words())
-        elif frame.command == msp.RAW_IMU and len(frame.payload) >= IMU.size:
-            self.rates = tuple(map(math.radians, IMU.unpack_from(frame.payload)))
-        elif frame.command == msp.ANALOG and (volts := frame.number("<H", FACTS["analog_volts"])):
-            self.voltage = 0.01 * volts
-        elif frame.command == msp.SERVO and 1 <= p.servo_output <= len(outputs := frame.words()):
-            self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
-        elif frame.command == msp.BOXIDS:
-            self._boxes = tuple(frame.payload)
-        elif frame.command == msp.RX_MAP and sorted(first := list(frame.payload[:STICKS])) == list(
-            range(STICKS)
-        ):
-            self._order = first
-        elif frame.command == msp.RC_TUNING and not self.audit.written:
-            self._tuning = frame.payload
-        for name, value in settings(frame, p).items():
+        elif frame.command in _HANDLERS:
+            _HANDLERS[frame.command](self, frame)
+        for name, value in settings(frame, self.params).items():
             self.audit.feed(name, value)
             if name == "channel_forwarding" and value:
                 self.release_record.read_back = False
+
+    def _hear_rates(self, frame: msp.Frame) -> None:
+        if len(frame.payload) >= IMU.size:
+            self.rates = tuple(map(math.radians, IMU.unpack_from(frame.payload)))
+
+    def _hear_voltage(self, frame: msp.Frame) -> None:
+        volts = frame.number("<H", FACTS["analog_volts"])
+        if volts:
+            self.voltage = 0.01 * volts
+
+    def _hear_outputs(self, frame: msp.Frame) -> None:
+        p, outputs = self.params, frame.words()
+        if 1 <= p.servo_output <= len(outputs):
+            self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
+
+    def _hear_boxes(self, frame: msp.Frame) -> None:
+        self._boxes = tuple(frame.payload)
+
+    def _hear_order(self, frame: msp.Frame) -> None:
+        first = list(frame.payload[:STICKS])
+        if sorted(first) == list(range(STICKS)):
+            self._order = first
+
+    def _hear_tuning(self, frame: msp.Frame) -> None:
+        if not self.audit.written:
+            self._tuning = frame.payload
 
     def _hear_status(self, frame: msp.Frame) -> None:
         flags = frame.number("<I", FACTS["status_flags"])
@@ -401,9 +412,9 @@ class Betaflight(OnPort):
         self._flags = flags | further << FACTS["status_flag_bits"]
         self._blocks = frame.number("<I", end + 1) or 0
 
-    def _hear_channels(self, channels: tuple[int, ...]) -> None:
+    def _hear_channels(self, frame: msp.Frame) -> None:
         """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
-        p = self.params
+        p, channels = self.params, frame.words()
         if len(channels) < STICKS:
             return
         if not self._box(BOX_OVERRIDE):
@@ -427,6 +438,18 @@ class Betaflight(OnPort):
         self._tuning = bytes(changed)
         self._write(msp.SET_RC_TUNING, self._tuning)
         self._write(msp.EEPROM_WRITE)
+
+
+_HANDLERS = {
+    msp.RC: Betaflight._hear_channels,
+    msp.RAW_IMU: Betaflight._hear_rates,
+    msp.ANALOG: Betaflight._hear_voltage,
+    msp.SERVO: Betaflight._hear_outputs,
+    msp.BOXIDS: Betaflight._hear_boxes,
+    msp.RX_MAP: Betaflight._hear_order,
+    msp.RC_TUNING: Betaflight._hear_tuning,
+}
+"""Answer -> the method that takes it; others tell settings alone."""
 
 
 @dataclass(frozen=True)
