@@ -191,16 +191,12 @@ def test_a_field_of_an_autopilot(ending, message, fields, values, channel, expec
 
 
 @mark.parametrize(
-    ("ending", "taps"),
-    [
-        ("ulg", autopilot_logs.ULOG),
-        ("BIN", autopilot_logs.DATAFLASH),
-        ("tlog", autopilot_logs.TELEMETRY),
-    ],
+    ("ending", "kind"), [("ulg", "ulog"), ("BIN", "dataflash"), ("tlog", "telemetry")]
 )
-def test_no_field_is_untested(ending, taps):
+def test_no_field_is_untested(ending, kind):
+    taps = autopilot_logs.fields_of_autopilots()["taps"][kind]
     written = {(row[0], row[3]) for row in ROWS[ending]}
-    named = {(tap.message, tap.entry.name) for tap in taps} - {("ESC", "motor_speed")}
+    named = {(tap.message, tap.channel) for tap in taps} - {("ESC", "motor_speed")}
     assert written == named
 
 

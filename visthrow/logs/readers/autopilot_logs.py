@@ -6,8 +6,11 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 forward, left, up."""
 
 import math
+import tomllib
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -26,212 +29,59 @@ from visthrow.logs.readers.table import make_channel
 from visthrow.logs.readers.vehicles import Vehicle, vehicle_of
 
 NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike
-WIDEST_EPH = 5.0  # PX4's COM_POS_FS_EPH: a position worse than this is none [m]
-Range = tuple[str, float, float]
-"""A field, and the least and largest value with which a sample is valid."""
+FIELDS = Path(__file__).with_name("autopilot_fields.toml")
+POSE_PARTS = ("pos_w", "quat_wb", "vel_w", "rate_b")
+EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
+BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
 
 
 @dataclass(frozen=True)
 class Tap:
-    """Fields of one kind of message that make a channel."""
+    """Fields of one kind of message that make a channel; a row of `FIELDS`, which describes it."""
 
     message: str
-    # its columns may hold {0} to {3}, motors front left, front right, rear left, rear right, from 0
-    entry: ChannelMap
-    good: tuple[Range, ...] = ()  # a sample is valid where all of these fields that it has are so
-    only: tuple[Range, ...] = ()  # rows of other values are of another kind
+    channel: str
+    unit: str
+    columns: str = ""
+    motors: str = ""
+    outputs: str = ""
+    kind: Any = "vector"
+    axes: str = NED
+    frame: str = ""
+    scale: float = 1.0
+    good: str = ""
+    only: tuple[str, float, float] | None = None
 
-
-def _t(
-    message: str,
-    fields: str,
-    channel: str,
-    unit: str,
-    kind: str = "vector",
-    good: str = "",
-    only: tuple[Range, ...] = (),
-    axes: str = NED,
-    **options,
-) -> Tap:
-    """Return a tap; of those to one channel the first that is there is used. ``good``: flags that
-    are 1 where a sample is valid, or quality, which is 0 or more.
-    """
-    columns = tuple(fields.split())
-    turned = kind != "vector"
-    order = "wxyz" if kind == "quaternion" else "xyzw"
-    conditions = tuple(RANGES.get(flag, (flag, 1.0, math.inf)) for flag in good.split())
-    entry = ChannelMap(
-        channel,
-        columns,
-        unit,
-        kind,  # type: ignore[arg-type]
-        order,
-        axes=axes if turned or len(columns) == 3 else "",
-        body_axes=NED if turned else "",
-        **options,
-    )
-    return Tap(message, entry, conditions, only)
-
-
-RANGES = {
-    "quality": ("quality", 0.0, math.inf),  # -1: the tracker has failed
-    "Q": ("Q", 0.0, math.inf),
-    "Ign": ("Ign", 0.0, 0.0),
-    "eph": ("eph", 0.0, WIDEST_EPH),
-}
-"""Flags that are no plain flags."""
-FOUR = "{0} {1} {2} {3}"
-
-
-def _motors(pattern: str) -> str:
-    """Columns of four motors, of a pattern with an asterisk where the motor's number stands."""
-    return " ".join(pattern.replace("*", place) for place in FOUR.split())
-
-
-def _vector(name: str, count: int = 3) -> str:
-    return " ".join(f"{name}[{i}]" for i in range(count))
-
-
-def _odometry(message: str, prefix: str) -> tuple[Tap, ...]:
-    """Position and attitude of PX4's VehicleOdometry, of today and before 1.14."""
-    world = {"frame": "world", "good": "quality"}
-    return (
-        _t(message, _vector("position"), f"{prefix}pos_w", "m", **world),
-        _t(message, "x y z", f"{prefix}pos_w", "m", **world),
-        _t(message, _vector("q", 4), f"{prefix}quat_wb", "1", "quaternion", **world),
-    )
-
-
-ULOG = (
-    _t("vehicle_local_position", "x y z", "pos_w", "m", good="xy_valid z_valid eph"),
-    _t("vehicle_local_position", "vx vy vz", "vel_w", "m/s", good="v_xy_valid v_z_valid"),
-    _t("vehicle_attitude", _vector("q", 4), "quat_wb", "1", "quaternion"),
-    _t("vehicle_angular_velocity", _vector("xyz"), "rate_b", "rad/s"),
-    _t("sensor_combined", _vector("gyro_rad"), "rate_b", "rad/s"),
-    _t("sensor_combined", _vector("accelerometer_m_s2"), "acc_b", "m/s^2", frame="body"),
-    *_odometry("vehicle_mocap_odometry", "mocap_"),
-    *_odometry("vehicle_visual_odometry", "mocap_"),
-    *_odometry("vehicle_odometry", "est_"),
-    _t("vehicle_local_position_groundtruth", "x y z", "truth_pos_w", "m", frame="world"),
-    _t("vehicle_local_position_groundtruth", "vx vy vz", "truth_vel_w", "m/s", frame="world"),
-    _t(
-        "vehicle_attitude_groundtruth",
-        _vector("q", 4),
-        "truth_quat_wb",
-        "1",
-        "quaternion",
-        frame="world",
-    ),
-    _t("vehicle_rates_setpoint", "roll pitch yaw", "rate_setpoint_b", "rad/s", frame="body"),
-    _t("vehicle_rates_setpoint", "thrust_body[2]", "throttle", "1", scale=-1.0),
-    _t("battery_status", "voltage_v", "battery_voltage", "V"),
-    _t("battery_status", "current_a", "current", "A"),
-    _t("actuator_motors", _motors("control[*]"), "motor_command", "1"),
-    _t("actuator_outputs", _motors("output[*]"), "motor_output", "1"),
-    _t("esc_status", _motors("esc[*].esc_rpm"), "motor_speed", "rpm"),
-)
-
-DATAFLASH = (
-    *(
-        tap
-        for core in ("XKF1", "NKF1", "EKF1")
-        for tap in (
-            _t(core, "PN PE PD", "pos_w", "m"),
-            _t(core, "VN VE VD", "vel_w", "m/s"),
+    def entry(self, vehicle: Vehicle) -> ChannelMap:
+        """Map its columns, those of motors by where they sit in a vehicle."""
+        columns = tuple(self.columns.split())
+        if self.motors:
+            columns = tuple(self.motors.replace("*", str(n)) for n in vehicle.motors)
+        if self.outputs:
+            columns = tuple(self.outputs.replace("*", str(n + 1)) for n in vehicle.outputs)
+        turned = self.kind != "vector"
+        return ChannelMap(
+            self.channel,
+            columns,
+            self.unit,
+            self.kind,
+            "wxyz" if self.kind == "quaternion" else "xyzw",
+            axes=self.axes if turned or len(columns) == 3 else "",
+            body_axes=NED if turned else "",
+            frame=self.frame,
+            scale=self.scale,
         )
-    ),
-    _t("ATT", "Roll Pitch Yaw", "quat_wb", "deg", "euler"),
-    _t("IMU", "GyrX GyrY GyrZ", "rate_b", "rad/s"),
-    _t("IMU", "AccX AccY AccZ", "acc_b", "m/s^2", frame="body"),
-    _t("VISP", "PX PY PZ", "mocap_pos_w", "m", frame="world", good="Ign Q"),
-    _t("VISP", "R P Y", "mocap_quat_wb", "deg", "euler", frame="world", good="Ign Q"),
-    _t("VISP", "Roll Pitch Yaw", "mocap_quat_wb", "deg", "euler", frame="world", good="Ign Q"),
-    _t("SIM2", "PN PE PD", "truth_pos_w", "m", frame="world"),
-    _t("SIM2", "VN VE VD", "truth_vel_w", "m/s", frame="world"),
-    _t("SIM", "Q1 Q2 Q3 Q4", "truth_quat_wb", "1", "quaternion", frame="world"),
-    _t("RATE", "RDes PDes YDes", "rate_setpoint_b", "deg/s", frame="body"),
-    _t("BAT", "Volt", "battery_voltage", "V"),
-    _t("BAT", "Curr", "current", "A"),
-    _t("RCOU", _motors("C+*"), "motor_output", "1"),
-    _t("RCOU", _motors("Ch+*"), "motor_output", "1"),
-    _t("RCOU", _motors("Chan+*"), "motor_output", "1"),
-    _t("ESC", _motors("RPM[*]"), "motor_speed", "rpm"),
-    _t("CTUN", "ThO", "throttle", "1"),
-)
 
-POSE_PARTS = ("pos_w", "quat_wb", "vel_w", "rate_b")
-EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
-BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
-POSE_TAPS = {
-    "bin": (
-        _t("POS", "N E D", "pos_w", "m"),
-        *(
-            _t(core, "Roll Pitch Yaw", "quat_wb", "deg", "euler")
-            for core in ("XKF1", "NKF1", "EKF1")
-        ),
-    ),
-    "ulg": tuple(
-        _t(f"vehicle_{kind}", fields, channel, unit)
-        for kind in ("odometry", "visual_odometry", "mocap_odometry")
-        for fields, channel, unit in (
-            (_vector("velocity"), "vel_w", "m/s"),
-            ("vx vy vz", "vel_w", "m/s"),
-            (_vector("angular_velocity"), "rate_b", "rad/s"),
-            ("rollspeed pitchspeed yawspeed", "rate_b", "rad/s"),
-        )
-    ),
-}
-"""Kind of log -> fields of poses that :func:`log_of_poses` alone reads: places on the globe become
-N, E, D, and a velocity may be of the body.
-"""
 
-LOCAL = ("frame_id", 1.0, 1.0)  # MAV_FRAME_LOCAL_NED
-FRD, FLU = ("frame_id", 20.0, 20.0), ("frame_id", 21.0, 21.0)  # about a yaw of the sender's
-MOCAP = ("frame_id", 14.0, 14.0)  # MAV_FRAME_MOCAP_NED of before 2019
-TELEMETRY = (
-    _t("LOCAL_POSITION_NED", "x y z", "pos_w", "m"),
-    _t("LOCAL_POSITION_NED", "vx vy vz", "vel_w", "m/s"),
-    *(
-        tap
-        for where, axes in ((LOCAL, NED), (FRD, NED), (MOCAP, NED), (FLU, "x,y,z"))
-        for tap in (
-            _t("ODOMETRY", "x y z", "pos_w", "m", good="quality", only=(where,), axes=axes),
-            _t("ODOMETRY", _vector("q", 4), "quat_wb", "1", "quaternion", only=(where,), axes=axes),
-        )
-    ),
-    _t("ATTITUDE_QUATERNION", "q1 q2 q3 q4", "quat_wb", "1", "quaternion"),
-    _t("ATTITUDE", "roll pitch yaw", "quat_wb", "rad", "euler"),
-    _t("ATTITUDE", "rollspeed pitchspeed yawspeed", "rate_b", "rad/s"),
-    _t("HIGHRES_IMU", "xacc yacc zacc", "acc_b", "m/s^2", frame="body"),
-    _t("SCALED_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
-    _t("RAW_IMU", "xacc yacc zacc", "acc_b", "mg", frame="body"),
-    _t("VISION_POSITION_ESTIMATE", "x y z", "mocap_pos_w", "m", frame="world"),
-    _t("ATT_POS_MOCAP", "x y z", "mocap_pos_w", "m", frame="world"),
-    _t("ATT_POS_MOCAP", _vector("q", 4), "mocap_quat_wb", "1", "quaternion", frame="world"),
-    _t(
-        "ATTITUDE_TARGET",
-        "body_roll_rate body_pitch_rate body_yaw_rate",
-        "rate_setpoint_b",
-        "rad/s",
-        frame="body",
-    ),
-    _t("ATTITUDE_TARGET", "thrust", "throttle", "1"),
-    _t("SYS_STATUS", "voltage_battery", "battery_voltage", "mV"),
-    _t("SERVO_OUTPUT_RAW", _motors("servo+*_raw"), "motor_output", "1"),
-    _t("ESC_TELEMETRY_1_TO_4", _motors("rpm[*]"), "motor_speed", "rpm"),
-)
+@cache
+def fields_of_autopilots() -> dict[str, Any]:
+    """Return the tables of `FIELDS`, the taps of each kind of log as such."""
+    tables = tomllib.loads(FIELDS.read_text(encoding="utf-8"))
+    for taps in (tables["taps"], tables["pose_taps"]):
+        taps |= {kind: tuple(Tap(**row) for row in rows) for kind, rows in taps.items()}
+    return tables
 
-FLYING: dict[str, tuple[tuple[str, str, float, float], ...]] = {
-    "ulog": (("vehicle_status", "arming_state", 2, 2), ("vehicle_land_detected", "landed", 0, 0)),
-    "dataflash": (("ARM", "ArmState", 1, 1), ("STAT", "isFlying", 1, 1)),
-    "telemetry": (
-        ("HEARTBEAT", "base_mode", 128, 255),
-        ("EXTENDED_SYS_STATE", "landed_state", 2, 4),
-    ),
-}
-"""Kind of log -> messages and fields that say whether it is armed and in the air: the least and the
-largest value that does.
-"""
+
 MOTORS_ALONE = ("actuator_motors", "esc_status", "ESC")
 """Messages of motors that hold no other outputs, such as those of a gimbal."""
 RESETS = tuple(f"{name}_reset_counter" for name in ("xy", "z", "vxy", "vz")) + (
@@ -248,11 +98,11 @@ sweeps rates of roll, pitch, yaw.
 """
 
 READERS = {
-    ".ulg": (read_ulog, ULOG),
-    ".bin": (read_dataflash, DATAFLASH),
-    ".tlog": (read_telemetry, TELEMETRY),
+    ".ulg": (read_ulog, "ulog"),
+    ".bin": (read_dataflash, "dataflash"),
+    ".tlog": (read_telemetry, "telemetry"),
 }
-"""Ending -> reader of the messages, and what they tell."""
+"""Ending -> reader of the messages, and the kind of log."""
 
 
 def log_of_autopilot(path: str | Path) -> FlightLog:
@@ -260,20 +110,22 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
 
     Raises LogError: it cannot be read, or holds nothing of a vehicle's motion.
     """
-    reader, taps = READERS[Path(path).suffix.lower()]
+    reader, kind = READERS[Path(path).suffix.lower()]
+    tables = fields_of_autopilots()
+    taps = tables["taps"][kind]
     tapped = {tap.message for tap in taps}
-    state_messages = {message for states in FLYING.values() for message, *_ in states}
-    log = reader(path, tapped | state_messages | set(SWEEP))
+    states = {message for message, *_ in tables["flying"][kind]}
+    log = reader(path, tapped | states | set(SWEEP))
     vehicle = vehicle_of(log)
     _join_escs(log)
     channels: dict[str, Channel] = {}
     notes: dict[str, dict] = {}
     left_out = list(log.meta.pop("left_out", []))
     for tap in taps:
-        if tap.entry.name not in channels:
+        if tap.channel not in channels:
             signal = _channel(tap, log, vehicle, str(path), left_out)
             if signal is not None:
-                channels[tap.entry.name], notes[tap.entry.name] = signal
+                channels[tap.channel], notes[tap.channel] = signal
     left_out += _of_other_kinds(log, taps)
     _add_sweep(channels, notes, log)
     if not channels:
@@ -298,37 +150,30 @@ def _channel(
     tap: Tap, log: Messages, vehicle: Vehicle, source: str, left_out: list[str]
 ) -> tuple[Channel, dict] | None:
     """Channel of a tap and notes on it; None where the log has none of its fields."""
-    columns = tap.entry.columns
-    if "{0}" in "".join(columns):
-        if not vehicle.motors:
-            if log.first(tap.message) is not None:
-                left_out.append(
-                    f"{tap.message}: of a {vehicle.kind}, whose motors are not those of a"
-                    " quadrotor X"
-                )
-            return None
-        numbers = vehicle.outputs if "+" in columns[0] else vehicle.motors
-        first = 1 if "+" in columns[0] else 0
-        columns = tuple(
-            column.replace("+", "").format(*(n + first for n in numbers)) for column in columns
-        )
-    chosen = _moving(log.instances(tap.message), columns, tap)
+    fields_of_motors = tap.motors or tap.outputs
+    if fields_of_motors and not vehicle.motors:
+        if log.first(tap.message) is not None:
+            left_out.append(
+                f"{tap.message}: of a {vehicle.kind}, whose motors are not those of a quadrotor X"
+            )
+        return None
+    entry = tap.entry(vehicle)
+    chosen = _moving(log.instances(tap.message), entry.columns, tap)
     if chosen is None:
         return None
     number, fields = chosen
     if tap.message in MOTORS_ALONE:
-        count = _moving_motors(fields, tap.entry.columns[0])
-        if count > len(columns):
+        count = _moving_motors(fields, fields_of_motors)
+        if count > len(entry.columns):
             left_out.append(f"{tap.message}: {count} motors move, not the four of a quadrotor")
             return None
-    entry = replace(tap.entry, columns=columns)
     with np.errstate(invalid="ignore"):  # damaged floats
-        values = np.column_stack([fields[column] for column in columns]).astype(float)
-    bad = ~in_range(fields, tap.good)
+        values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
+    bad = ~valid_rows(fields, tap.good)
     channel, notes = make_channel(np.asarray(fields["time"], float), values, entry, source, bad)
     notes |= {"clock": "autopilot", "message": tap.message, "instance": number}
     if np.any(bad):
-        notes["flagged"] = ", ".join(bounds[0] for bounds in tap.good if bounds[0] in fields)
+        notes["flagged"] = ", ".join(flag for flag in tap.good.split() if flag in fields)
     resets = [int(np.sum(np.diff(fields[name]) != 0)) for name in RESETS if name in fields]
     if sum(resets):
         notes["resets"] = sum(resets)
@@ -364,9 +209,9 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     if "quat_wb" not in sources:
         for tap in taps:
             fields = log.first(tap.message)
-            turns = tap.entry.name in ("quat_wb", "rate_b")
+            turns = tap.channel in ("quat_wb", "rate_b")
             if turns and fields is not None and _fits(tap, tap.message, fields):
-                sources.setdefault(tap.entry.name, (tap, fields))
+                sources.setdefault(tap.channel, (tap, fields))
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
     channels = {name: _of_pose(name, *source, str(path)) for name, source in sources.items()}
@@ -384,29 +229,32 @@ def pose_messages(kind: str) -> list[str]:
 
 
 def _pose_taps(kind: str) -> list[Tap]:
-    taps = (*READERS[f".{kind}"][1], *POSE_TAPS[kind])
+    name = READERS[f".{kind}"][1]
+    tables = fields_of_autopilots()
+    taps = (*tables["taps"][name], *tables["pose_taps"][name])
     return [tap for tap in taps if _pose_part(tap) in POSE_PARTS]
 
 
 def _pose_part(tap: Tap) -> str:
     """Return the part of a pose that a tap holds, whoever measured or estimated it."""
-    return tap.entry.name.removeprefix("mocap_").removeprefix("est_")
+    return tap.channel.removeprefix("mocap_").removeprefix("est_")
 
 
 def _fits(tap: Tap, message: str, fields: Fields) -> bool:
     """Return whether a tap is of a message with these fields."""
-    return tap.message == message and all(column in fields for column in tap.entry.columns)
+    return tap.message == message and all(column in fields for column in tap.columns.split())
 
 
 def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:
     """Return a part of a pose about the autopilot's axes, without the samples that are not known;
     a position keeps those that are not valid.
     """
-    values = np.column_stack([fields[column] for column in tap.entry.columns]).astype(float)
+    entry = replace(tap.entry(Vehicle()), name=part, axes="", body_axes="")
+    values = np.column_stack([fields[column] for column in entry.columns]).astype(float)
     if part == "vel_w" and "velocity_frame" in fields:
         values = _in_world(values, fields)
-    entry = replace(tap.entry, name=part, axes="", body_axes="")
-    channel, _ = make_channel(fields["time"], values, entry, source, ~in_range(fields, tap.good))
+    bad = ~valid_rows(fields, tap.good)
+    channel, _ = make_channel(fields["time"], values, entry, source, bad)
     return channel if part == "pos_w" else channel.only(np.asarray(channel.valid))
 
 
@@ -432,14 +280,20 @@ def _from_globe(data: Fields, origins: Fields | None) -> Fields:
     }
 
 
-def in_range(fields: Fields, ranges: tuple[Range, ...]) -> np.ndarray:
-    """Whether each row has all of these fields, as far as it has them, in their range."""
+def valid_rows(fields: Fields, flags: str) -> np.ndarray:
+    """Tell the rows that those of these flags that a message has call valid, bool, shape (T,)."""
     good = np.ones(len(fields["time"]), bool)
-    for name, lowest, largest in ranges:
-        if name in fields:
-            value = np.asarray(fields[name], float)
-            good &= (value >= lowest) & (value <= largest)
+    ranges = fields_of_autopilots()["ranges"]
+    for flag in flags.split():
+        if flag in fields:
+            good &= in_range(fields[flag], *ranges.get(flag, (1.0, math.inf)))
     return good
+
+
+def in_range(values: np.ndarray, least: float, largest: float) -> np.ndarray:
+    """Tell the values within bounds, bool, shape (T,)."""
+    numbers = np.asarray(values, float)
+    return (numbers >= least) & (numbers <= largest)
 
 
 def _moving(
@@ -449,7 +303,10 @@ def _moving(
     candidates = []
     for number, fields in instances.items():
         if all(column in fields for column in columns):
-            rows = in_range(fields, tap.only)
+            rows = np.ones(len(fields["time"]), bool)
+            if tap.only is not None:
+                name, *bounds = tap.only
+                rows = in_range(fields[name], *bounds)
             if np.any(rows):
                 candidates.append((number, {name: values[rows] for name, values in fields.items()}))
     moving = [
@@ -463,22 +320,23 @@ def _moving(
 def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
     """Messages of which every row is of a kind that no tap takes."""
     notes = []
-    for message in dict.fromkeys(tap.message for tap in taps if tap.only):
-        ranges = {tap.only[0] for tap in taps if tap.message == message}
+    limited = [tap for tap in taps if tap.only is not None]
+    for message in dict.fromkeys(tap.message for tap in limited):
+        ranges = sorted({tuple(tap.only) for tap in limited if tap.message == message})
         fields = log.first(message)
-        if fields is not None and not any(np.any(in_range(fields, (bounds,))) for bounds in ranges):
-            name = next(iter(ranges))[0]
+        if fields is None:
+            continue
+        name = ranges[0][0]
+        if not any(np.any(in_range(fields[name], *bounds)) for _, *bounds in ranges):
             received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
-            accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in sorted(ranges))
+            accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in ranges)
             notes.append(f"{message}: its {name} is {received}; those that are read: {accepted}")
     return notes
 
 
 def _moving_motors(fields: Fields, pattern: str) -> int:
-    """Count the motors of a message that move, named by a pattern such as
-    ``control[{0}]``, move.
-    """
-    names = [pattern.format(number) for number in range(16)]
+    """Count the motors of a message that move, named by a pattern such as ``control[*]``."""
+    names = [pattern.replace("*", str(number)) for number in range(16)]
     return sum(np.ptp(np.nan_to_num(fields[name])) > 0.0 for name in names if name in fields)
 
 
@@ -498,13 +356,11 @@ def _join_escs(log: Messages) -> None:
 def _flying(log: Messages) -> Channel | None:
     """Whether the vehicle is armed and in the air; None where the log does not say."""
     signals = []
-    for message, field, lowest, largest in FLYING[log.kind]:
+    for message, field, *bounds in fields_of_autopilots()["flying"][log.kind]:
         fields = log.first(message)
         if fields is not None and field in fields:
             order = np.argsort(fields["time"], kind="stable")
-            signals.append(
-                (fields["time"][order], in_range(fields, ((field, lowest, largest),))[order])
-            )
+            signals.append((fields["time"][order], in_range(fields[field], *bounds)[order]))
     if not signals:
         return None
     time = np.unique(np.concatenate([time for time, _ in signals]))
