@@ -1,9 +1,10 @@
 """The record of one flight: channels, each with its own time stamps, and what is known about the
-flight as a whole. `STANDARD_CHANNELS` lists the channels.
+flight as a whole. `STANDARD_CHANNELS`, of ``flightlog.toml``, lists the channels.
 
 Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant
 and flights of a real vehicle, so that whatever reads one reads them all."""
 
+import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -28,37 +29,14 @@ class ChannelSpec:
     meaning: str
 
 
-STANDARD_CHANNELS = {
-    "pos_w": ChannelSpec("m", "world", (3,), "position of the vehicle's centre of mass"),
-    "quat_wb": ChannelSpec("1", "world", (4,), "attitude, xyzw, body to world"),
-    "vel_w": ChannelSpec("m/s", "world", (3,), "velocity of the vehicle's centre of mass"),
-    "rate_b": ChannelSpec("rad/s", "body", (3,), "angular velocity"),
-    "payload_pos_w": ChannelSpec("m", "world", (3,), "position of the payload's centre"),
-    "payload_vel_w": ChannelSpec("m/s", "world", (3,), "velocity of the payload's centre"),
-    "cable_points_w": ChannelSpec("m", "world", (None, 3), "joints of the rope, mount first"),
-    "motor_speed": ChannelSpec(
-        "rad/s", "none", (4,), "rotor speeds: front left, front right, rear left, rear right"
-    ),
-    "battery_voltage": ChannelSpec("V", "none", (), "terminal voltage"),
-    "command": ChannelSpec("N, rad/s", "body", (4,), "collective thrust and body rates, as sent"),
-    "release_command": ChannelSpec("1", "none", (), "release command, as sent"),
-    "action": ChannelSpec("1", "none", (None,), "normalised output of the policy"),
-    "observation": ChannelSpec("mixed", "none", (None,), "input of the policy"),
-    "keypoints": ChannelSpec(
-        "1", "image", (None, 2), "normalised image points: goal corners, then payload"
-    ),
-    "keypoints_valid": ChannelSpec("bool", "none", (None,), "which of them the camera sees"),
-    "goal_w": ChannelSpec("m", "world", (3,), "target of the throw"),
-    "attached": ChannelSpec("bool", "none", (), "whether the payload still hangs on the vehicle"),
-    "flying": ChannelSpec("bool", "none", (), "whether it is armed and in the air"),
-    "mode": ChannelSpec("1", "none", (), "who commands: 0 hover controller, 1 policy"),
-    "separation": ChannelSpec(
-        "m", "world", (3,), "payload's centre as the rope let go; one sample at that time"
-    ),
-    "landing": ChannelSpec(
-        "m", "world", (3,), "payload's centre at impact; one sample at that time"
-    ),
-}
+def _standard_channels() -> dict[str, ChannelSpec]:
+    rows = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    for row in rows.values():
+        row["shape"] = tuple(None if size < 0 else size for size in row["shape"])
+    return {name: ChannelSpec(**row) for name, row in rows.items()}
+
+
+STANDARD_CHANNELS = _standard_channels()
 """Channels of these names hold this, in this unit and frame; other names are free."""
 
 

@@ -1,6 +1,9 @@
 """What a log excites, and what it can therefore answer."""
 
+import tomllib
 from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
 
 import numpy as np
 
@@ -25,42 +28,24 @@ class Question:
 
     name: str
     needs: tuple[tuple[str, ...], ...]  # each: any one of these channels
-    excited: str  # figure of the excitation that must reach a size; "": none
-    least: float = 0.0
+    excited: str  # figure of the excitation that must reach a size
+    least: float
 
 
-QUESTIONS = (
-    Question("thrust gain against mass", (THRUSTS, POSITIONS + ("acc_b",)), "seconds_flown", 3.0),
-    Question("thrust curve", (THRUSTS, POSITIONS + ("acc_b",)), "thrust_range", 0.3),
-    Question(
-        "battery sag", (THRUSTS, ("battery_voltage",), POSITIONS + ("acc_b",)), "voltage_range", 0.1
-    ),
-    Question("rotor drag", (POSITIONS, ATTITUDES), "speed_p95_m_s", 0.7),
-    Question("wind or frame tilt", (POSITIONS, ATTITUDES), "seconds_flown", 5.0),
-    Question("wind against frame tilt", (POSITIONS, ATTITUDES), "yaw_range_deg", 60.0),
-    Question(
-        "centre of mass, motor by motor gain",
-        (MOTORS, POSITIONS + ("rate_b",)),
-        "seconds_flown",
-        3.0,
-    ),
-    Question(
-        "motor lag and command delay",
-        (("command", "motor_command", "rate_setpoint_b"), ("rate_b",)),
-        "rate_p95_rad_s",
-        0.3,
-    ),
-    Question("rope length", (("payload_pos_w",),), "swing_deg", 2.0),
-    Question("payload drag", (("payload_pos_w",),), "payload_speed_p95_m_s", 1.5),
-    Question("release lag", (("payload_pos_w",), ("release_command",)), "releases", 1.0),
-    Question(
-        "camera against motion capture",
-        (("marker_pos_c", "keypoints"), POSITIONS, ("payload_pos_w",)),
-        "seconds",
-        5.0,
-    ),
-    Question("ground effect", (THRUSTS, POSITIONS), "seconds_low", 2.0),
-)
+def _questions() -> tuple[Question, ...]:
+    rows = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    groups = {"thrusts": THRUSTS, "positions": POSITIONS, "attitudes": ATTITUDES, "motors": MOTORS}
+    questions = []
+    for name, row in rows.items():
+        needs = []
+        for need in row["needs"]:
+            channels = [groups.get(word, (word,)) for word in need.split()]
+            needs.append(tuple(chain.from_iterable(channels)))
+        questions.append(Question(name, tuple(needs), row["excited"], row["least"]))
+    return tuple(questions)
+
+
+QUESTIONS = _questions()
 
 
 def look(log: FlightLog) -> list[Row]:
@@ -108,7 +93,7 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
     if figures.get("still") or figures.get("idle"):
         return Row("answers", question.name, "warn", "cannot be answered: the vehicle did not fly")
     reached = figures.get(question.excited)
-    if question.excited and (reached is None or reached < question.least):
+    if reached is None or reached < question.least:
         measured = "nothing" if reached is None else f"{reached:.3g}"
         text = (
             f"cannot be answered: {question.excited} is {measured}, at least {question.least:g} is"

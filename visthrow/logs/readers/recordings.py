@@ -16,6 +16,7 @@ import struct
 import warnings
 import zlib
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 from operator import itemgetter
 from pathlib import Path
@@ -67,11 +68,49 @@ def is_card(path: Path) -> bool:
     return len(head) == 5 and head[0] == _CARD and struct.unpack("<H", head[1:3])[0] in (1, 2)
 
 
+CARD_STAMPS = {1: ("<HI", 1e-3), 2: ("<HQ", 1e-6)}
+"""Version of a card's log -> form of an event's number and stamp, and the stamp's unit [s]."""
+
+
+@dataclass
+class _CardEvent:
+    """An event of a card's log: a table."""
+
+    name: str
+    fields: list[str]
+    form: str
+    rows: list[tuple[float, ...]]
+
+
 def _card(path: Path) -> Table:
-    """Events of the card's log: each a table; stamps of version 1 in milliseconds, of version 2 in
-    microseconds.
-    """
+    """Read the events of a card's log, each a table."""
     data = path.read_bytes()
+    version, kinds = _card_head(path, data)
+    events, position = _card_events(path, data, kinds)
+    form, unit = CARD_STAMPS[version]
+    while position + struct.calcsize(form) <= len(data) - 4:
+        number, time = struct.unpack_from(form, data, position)
+        if number not in events:
+            raise LogError(
+                f"{path}: event {number} near byte {position} was not announced; damaged"
+            )
+        event = events[number]
+        position += struct.calcsize(form)
+        event.rows.append((time * unit, *struct.unpack_from(event.form, data, position)))
+        position += struct.calcsize(event.form)
+    start = min((event.rows[0][0] for event in events.values() if event.rows), default=0.0)
+    table: Table = {}
+    for event in events.values():
+        if event.rows:
+            time, *columns = np.array(event.rows, dtype=float).T
+            table[f"{event.name}:time"] = time - start
+            names = [f"{event.name}:{field}" for field in event.fields]
+            table |= dict(zip(names, columns))
+    return table
+
+
+def _card_head(path: Path, data: bytes) -> tuple[int, int]:
+    """Return the version of a card's log and its number of events."""
     if len(data) < 9 or data[0] != _CARD:
         raise LogError(
             f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log of a"
@@ -80,52 +119,34 @@ def _card(path: Path) -> Table:
     if struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
         raise LogError(f"{path}: its checksum is wrong: cut short or damaged")
     version, kinds = struct.unpack_from("<HH", data, 1)
-    if version not in (1, 2):
+    if version not in CARD_STAMPS:
         raise LogError(
             f"{path}: version {version} of a Crazyflie's card; versions 1 and 2 are known"
         )
-    stamp, unit = ("<HI", 1e-3) if version == 1 else ("<HQ", 1e-6)
+    return version, kinds
+
+
+def _card_events(path: Path, data: bytes, kinds: int) -> tuple[dict[int, _CardEvent], int]:
+    """Return the announced events by their number, and where the first one begins."""
     position = 5
     events = {}
     for _ in range(kinds):
         number = struct.unpack_from("<H", data, position)[0]
-        position = position + 2
-        name, position = _word(data, position)
+        name, position = _word(data, position + 2)
         count = struct.unpack_from("<H", data, position)[0]
-        position = position + 2
-        fields = []
+        position += 2
+        event = _CardEvent(name, [], "<", [])
         for _ in range(count):
             field, position = _word(data, position)
-            fields.append((field[:-3], field[-2]))
-        if not all(kind in _CARD_TYPES for _, kind in fields):
+            event.fields.append(field[:-3])
+            event.form += field[-2]
+        if not _CARD_TYPES.issuperset(event.form[1:]):
             raise LogError(
                 f"{path}: a variable of {name} has a type that is not known; known:"
                 f" {''.join(sorted(_CARD_TYPES))}"
             )
-        events[number] = (
-            name,
-            [field for field, _ in fields],
-            "<" + "".join(kind for _, kind in fields),
-            [],
-        )
-    while position + struct.calcsize(stamp) <= len(data) - 4:
-        number, time = struct.unpack_from(stamp, data, position)
-        if number not in events:
-            raise LogError(
-                f"{path}: event {number} near byte {position} was not announced; damaged"
-            )
-        _, _, form, rows = events[number]
-        position += struct.calcsize(stamp)
-        rows.append((time * unit, *struct.unpack_from(form, data, position)))
-        position += struct.calcsize(form)
-    start = min((rows[0][0] for *_, rows in events.values() if rows), default=0.0)
-    table: Table = {}
-    for name, fields, _, rows in events.values():
-        columns = np.array(rows, dtype=float).reshape(-1, 1 + len(fields))
-        if len(columns):
-            table |= {f"{name}:{field}": columns[:, i] for i, field in enumerate(["time", *fields])}
-            table[f"{name}:time"] = columns[:, 0] - start
-    return table
+        events[number] = event
+    return events, position
 
 
 def _word(data: bytes, position: int) -> tuple[str, int]:

@@ -5,6 +5,7 @@ Convention: Betaflight's body axes are ours (x forward, y left, z up; a level ve
 
 import math
 import re
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -113,47 +114,54 @@ def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
 def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     if "time" not in table:
         raise LogError(f"{meta['source']}: no numbers in a column 'time'; a flight needs stamps")
-    stamps = table["time"].copy()
+    stamps = table["time"]
     turns = np.concatenate([[0], np.cumsum(np.diff(stamps) < -_CLOCK_TURN / 2)])
     time = (stamps + _CLOCK_TURN * turns) * 1e-6
     meta["start"] = float(time[0]) if len(time) else 0.0
-    time = time - meta["start"]
     meta["ingest"] = {}
     channels: dict[str, Channel] = {}
-
-    def add(
-        name: str,
-        columns: list[str],
-        unit: str,
-        scale: float = 1.0,
-        offset: float = 0.0,
-        frame: str = "",
-    ) -> None:
-        if not all(column in table for column in columns):
-            return
-        entry = ChannelMap(name, tuple(columns), unit, scale=scale, offset=offset, frame=frame)
-        values = np.column_stack([table[column] for column in columns])
-        channels[name], notes = make_channel(time, values, entry, meta["source"])
-        meta["ingest"][name] = notes | {"clock": "flight controller"}
-
-    xyz = range(3)
-    add("rate_b", [f"gyroADC[{i}]" for i in xyz], "deg/s", _gyro_scale(header))
-    acc_1g = float(header.get("acc_1G", _ACC_1G)) or _ACC_1G
-    add("acc_b", [f"accSmooth[{i}]" for i in xyz], "g", 1.0 / acc_1g, frame="body")
-    add("rate_setpoint_b", [f"setpoint[{i}]" for i in xyz], "deg/s", frame="body")
-    add("throttle", ["setpoint[3]"], "1/1000")
-    add("battery_voltage", ["vbatLatest"], "cV")
-    add("current", ["amperageLatest"], "cA")
-    low, high = (float(x) for x in header.get("motorOutput", _MOTOR_OUTPUT).split(","))
-    count = sum(1 for name in table if re.fullmatch(r"motor\[\d\]", name))
-    order = MOTOR_ORDER if count == 4 else range(count)
-    if count:
-        span = (high - low) or 1.0
-        add("motor_command", [f"motor[{i}]" for i in order], "1", 1.0 / span, -low / span)
-    poles = float(header.get("motor_poles", 14)) or 14.0
-    if count == 4:
-        add("motor_speed", [f"eRPM[{i}]" for i in order], "rpm", 100.0 * 2.0 / poles)
+    for entry in [*_sensed(header), *_driven(table, header)]:
+        if table.keys() >= set(entry.columns):
+            values = np.column_stack([table[column] for column in entry.columns])
+            channel, notes = make_channel(time - meta["start"], values, entry, meta["source"])
+            channels[entry.name] = channel
+            meta["ingest"][entry.name] = notes | {"clock": "flight controller"}
     return FlightLog(channels, meta)
+
+
+def _numbered(name: str, numbers: Iterable[int]) -> tuple[str, ...]:
+    return tuple(f"{name}[{number}]" for number in numbers)
+
+
+def _sensed(header: dict[str, str]) -> list[ChannelMap]:
+    """Return the channels of sensors and set-points."""
+    xyz = range(3)
+    acc_1g = float(header.get("acc_1G", _ACC_1G)) or _ACC_1G
+    return [
+        ChannelMap("rate_b", _numbered("gyroADC", xyz), "deg/s", scale=_gyro_scale(header)),
+        ChannelMap("acc_b", _numbered("accSmooth", xyz), "g", scale=1.0 / acc_1g, frame="body"),
+        ChannelMap("rate_setpoint_b", _numbered("setpoint", xyz), "deg/s", frame="body"),
+        ChannelMap("throttle", ("setpoint[3]",), "1/1000"),
+        ChannelMap("battery_voltage", ("vbatLatest",), "cV"),
+        ChannelMap("current", ("amperageLatest",), "cA"),
+    ]
+
+
+def _driven(table: Table, header: dict[str, str]) -> list[ChannelMap]:
+    """Return the channels of motors."""
+    low, high = (float(x) for x in header.get("motorOutput", _MOTOR_OUTPUT).split(","))
+    span = (high - low) or 1.0
+    count = sum(1 for name in table if re.fullmatch(r"motor\[\d\]", name))
+    if not count:
+        return []
+    order = MOTOR_ORDER if count == 4 else range(count)
+    motors = _numbered("motor", order)
+    entries = [ChannelMap("motor_command", motors, "1", scale=1.0 / span, offset=-low / span)]
+    if count == 4:
+        poles = float(header.get("motor_poles", 14)) or 14.0
+        rpm = _numbered("eRPM", order)
+        entries.append(ChannelMap("motor_speed", rpm, "rpm", scale=100.0 * 2.0 / poles))
+    return entries
 
 
 def _gyro_scale(header: dict[str, str]) -> float:
