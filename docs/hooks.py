@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from camera import field_bounds
-from visthrow import cli, config
+from visthrow import __version__, cli, config
 from visthrow.config import kinds, schema
 
 os.environ["COLUMNS"] = "88"
@@ -26,6 +26,12 @@ HELP, KEYS = "<!-- help -->", re.compile(r"<!-- keys: (\w+) (\w+) ?(\w*) -->")
 ACTION = re.compile(r"^    ([a-z]+)(?:  |$)", re.MULTILINE)
 SHIM, OWN_SHIM = "https://unpkg.com/iframe-worker/shim", "assets/iframe-worker.js"
 """What lets the search of a site work that is read from a folder."""
+
+
+def on_config(config: Any) -> Any:
+    """Name version and licence at the foot of every page."""
+    config.copyright = f"visthrow {__version__}, MIT licence"
+    return config
 
 
 def on_page_markdown(markdown: str, **_) -> str:

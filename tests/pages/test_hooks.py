@@ -1,10 +1,12 @@
 """The reference prints itself: every key of the shipped configurations, every command."""
 
+from types import SimpleNamespace
+
 from pytest import mark
 
 from docs import hooks
 from tests.pages.blocks import ROOT, pages
-from visthrow import cli, config
+from visthrow import __version__, cli, config
 from visthrow.config import kinds
 
 SHOWN = [
@@ -33,3 +35,8 @@ def test_every_command_is_shown():
     text = hooks.on_page_markdown((ROOT / "docs/reference/commands.md").read_text("utf-8"))
     assert all(f"usage: visthrow {command}" in text for command in cli.COMMANDS)
     assert "## hil check" in text
+
+
+def test_every_page_names_version_and_licence():
+    site = hooks.on_config(SimpleNamespace(copyright=None))
+    assert site.copyright == f"visthrow {__version__}, MIT licence"

@@ -212,6 +212,7 @@ def train(args: argparse.Namespace) -> int:
     if args.resume:
         fit.load(saved)
     folder.mkdir(parents=True, exist_ok=True)
+    print("rendering the first frames ...", flush=True)
     begin = time.monotonic()
     first = fit.step
 

@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
         seed=args.seed,
     )
     manoeuvres = [m for m in map(flown, chosen) if m is not None]
+    print(f"simulating {len(manoeuvres)} manoeuvres ...", flush=True)
     informed = [
         (m, aim.information(s.model))
         for m, s in zip(manoeuvres, simulate(manoeuvres))

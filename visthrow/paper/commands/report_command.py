@@ -95,20 +95,26 @@ def sections(thrown) -> list:
     """Return the sections, each followed by what somebody wrote beside its data."""
     from dataclasses import replace
 
+    from visthrow.common.workers import status
     from visthrow.paper.report import ablations, beyond, gap, throws, trade
     from visthrow.view.parts import Text
 
-    chapters = [
-        throws.throws_section(thrown),
-        throws.vision_section(thrown),
-        ablations.section(thrown),
-        trade.baseline_section(thrown),
-        trade.front_section(thrown),
-        gap.section(thrown),
-        beyond.section(thrown),
-        beyond.training_section(thrown),
-        beyond.origin_section(thrown),
-    ]
+    makers = (
+        throws.throws_section,
+        throws.vision_section,
+        ablations.section,
+        trade.baseline_section,
+        trade.front_section,
+        gap.section,
+        beyond.section,
+        beyond.training_section,
+        beyond.origin_section,
+    )
+    chapters = []
+    for make in makers:
+        status(f"section {len(chapters) + 1} of {len(makers)}")
+        chapters.append(make(thrown))
+    status("")
     return [
         replace(
             s,
