@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sim.torch_bridge import ReplayedGraph, on_torch_stream
 from visthrow.common.errors import ConfigError
-from visthrow.common.free_fall import GRAVITY, fall_time
+from visthrow.common.free_fall import fall_time, free_flight
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
@@ -164,8 +164,8 @@ class FirstOrder:
             torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
             * fall[..., None]
         )
-        path = (x.load_pos - x.pos)[:, :, None] + share[..., None] * x.load_vel[:, :, None]
-        path[..., 2] -= 0.5 * GRAVITY * share**2
+        offset = (x.load_pos - x.pos)[:, :, None]
+        path = free_flight(offset, x.load_vel[:, :, None], share[..., None])
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
         rows = [
             (torch.arange(count, device=fall.device) + (self.lag + node)).clamp(min=0)
