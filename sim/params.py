@@ -39,8 +39,8 @@ def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
             tables.setdefault(name, {})[inner] = value
         else:
             fields[name] = value
-    for name, inside in tables.items():
-        fields[name] = changed(getattr(owner, name), inside)
+    for name, fields_of in tables.items():
+        fields[name] = changed(getattr(owner, name), fields_of)
     return replace(owner, **fields)  # type: ignore[type-var]
 
 

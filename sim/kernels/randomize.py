@@ -36,7 +36,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     attached = int(hangs)
 
     @wp.func
-    def drawn(size: vec3, rng: wp.uint32):
+    def uniform(size: vec3, rng: wp.uint32):
         """Uniform numbers of at most these sizes, and the generator after them."""
         x = size[0] * real(wp.randf(rng, -1.0, 1.0))
         y = size[1] * real(wp.randf(rng, -1.0, 1.0))
@@ -102,11 +102,11 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             episode[env] = episode[env] + 1
             degree = real(0.017453292519943295)
             home = vec3(real(0.0), real(0.0), z.spawn_height)
-            offset, rng = drawn(z.position, rng)
+            offset, rng = uniform(z.position, rng)
             state.pos_w[env] = home + offset
-            vel, rng = drawn(z.velocity, rng)
+            vel, rng = uniform(z.velocity, rng)
             state.vel_w[env] = vel
-            angles, rng = drawn(z.attitude_deg, rng)
+            angles, rng = uniform(z.attitude_deg, rng)
             x_axis = vec3(real(1.0), real(0.0), real(0.0))
             y_axis = vec3(real(0.0), real(1.0), real(0.0))
             z_axis = vec3(real(0.0), real(0.0), real(1.0))
@@ -116,7 +116,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             q = quat(wp.quat_from_axis_angle(z_axis, yaw)) * wp.quat_from_axis_angle(y_axis, pitch)
             q = q * wp.quat_from_axis_angle(x_axis, roll)
             state.quat_wb[env] = q
-            rates, rng = drawn(z.rate_deg, rng)
+            rates, rng = uniform(z.rate_deg, rng)
             rate = rates * degree
             state.rate_b[env] = rate
             state.mass_scale[env] = real(1.0) + z.mass * real(wp.randf(rng, -1.0, 1.0))

@@ -150,14 +150,14 @@ class ReferencePlant:
         """
         count = self.count
         hanging = np.tile([0.0, 0.0, -1.0], (count, self.params.rope.segments, 1))
-        still = np.zeros_like(hanging)
+        zero = np.zeros_like(hanging)
         inputs = {
             "pos_w": (pos_w, (count, 3)),
             "quat_wb": (quat_wb, (count, 4)),
             "vel_w": (vel_w, (count, 3)),
             "rate_b": (rate_b, (count, 3)),
             "cable_dir_w": (hanging if cable_dir_w is None else cable_dir_w, hanging.shape),
-            "cable_vel_w": (still if cable_vel_w is None else cable_vel_w, hanging.shape),
+            "cable_vel_w": (zero if cable_vel_w is None else cable_vel_w, hanging.shape),
         }
         values = {name: _array(name, value, shape) for name, (value, shape) in inputs.items()}
         self._draw()
@@ -372,8 +372,8 @@ class ReferencePlant:
         """
         times = np.array(self._queue_times)
         commands = np.array(self._queue_commands)
-        now = np.full(self.count, self.time)
-        command = vehicle_blocks.command_queue(times, commands, now)
+        clock = np.full(self.count, self.time)
+        command = vehicle_blocks.command_queue(times, commands, clock)
         moving = np.ones(self.count, bool)
         with_rope = self._rates(self._state, command, self._wind, moving)[:, VEL]
         without = self._rates(self._state, command, self._wind, ~moving)[:, VEL]
@@ -455,8 +455,8 @@ class ReferencePlant:
         due = self._attached & (self._separation <= clock + vehicle_blocks.TIME_TOLERANCE)
         if np.any(due):
             pos, vel = self._upper_end(self._state)
-            along = self._rope_of(self._state)[0][:, -1]
-            vel = vel + vehicle_blocks.release_kick(self.params.release, along)
+            direction_w = self._rope_of(self._state)[0][:, -1]
+            vel = vel + vehicle_blocks.release_kick(self.params.release, direction_w)
             self._state[due, FREE] = np.hstack((pos, vel))[due]
             self._attached = self._attached & ~due
 

@@ -221,8 +221,8 @@ class HybridPlant:
 
         max_thrust = self._action.max_thrust
         rates = torch.tensor(self._action.max_rate, dtype=torch.float64)
-        wanted = torch.from_numpy(np.asarray(command, dtype=float))
-        action = act.action_from_command(wanted, max_thrust, rates)
+        undisturbed = torch.from_numpy(np.asarray(command, dtype=float))
+        action = act.action_from_command(undisturbed, max_thrust, rates)
         noise = self.noise.command_step * self._rng.standard_normal((self.count, 4))
         action = action + torch.from_numpy(self._command_bias + noise)
         return act.command_from_action(action, max_thrust, rates).numpy()

@@ -335,11 +335,11 @@ def build_replay(
                 knot_time = windows.first_knot[w] + real(float(m.knot)) * knot_spacing
                 if knot_time <= m.time + tiny:
                     if lanes.keep[lane] >= 0:
-                        kept = lanes.keep[lane] + m.knot
-                        write_knot(knots, kept, p, m, chain.pull(m.rope, stiffness, u))
-                        if kept < moments.shape[0]:
-                            moments[kept] = m
-                            store_rope(moment_ropes, kept, n, u, stiffness)
+                        knot_row = lanes.keep[lane] + m.knot
+                        write_knot(knots, knot_row, p, m, chain.pull(m.rope, stiffness, u))
+                        if knot_row < moments.shape[0]:
+                            moments[knot_row] = m
+                            store_rope(moment_ropes, knot_row, n, u, stiffness)
                     m.knot = m.knot + 1
                     knot_time = knot_time + knot_spacing
                 until = wp.min(until, wp.max(knot_time, m.time + tiny))
@@ -411,17 +411,17 @@ def build_replay(
                     m.at = sampling.sample(p, x, data, windows, w, k, m, last, m.at, out, lane)
                 for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
                     if last or marks[e].due <= k.t1:
-                        seen = sensings[lanes.plant[e]]
+                        sensing = sensings[lanes.plant[e]]
                         marks[e] = sampling.sample(
-                            p, seen, data, windows, w, k, m, last, marks[e], out, e
+                            p, sensing, data, windows, w, k, m, last, marks[e], out, e
                         )
                 m.before = k.quad.rate_b
             m.time = until
 
         if lanes.keep[lane] >= 0:
             if m.knot < windows.knots[w]:
-                kept = lanes.keep[lane] + m.knot
-                write_knot(knots, kept, p, m, chain.pull(m.rope, stiffness, u))
+                knot_row = lanes.keep[lane] + m.knot
+                write_knot(knots, knot_row, p, m, chain.pull(m.rope, stiffness, u))
             store_quad(ends, lane, m.quad)
             ends.payload_pos_w[lane] = m.pay
             ends.payload_vel_w[lane] = m.pay_vel
