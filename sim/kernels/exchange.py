@@ -12,7 +12,7 @@ from typing import Any
 import warp as wp
 
 from sim.kernels import state as st
-from sim.kernels.quadrotor.queue import held, push, split_delay
+from sim.kernels.quadrotor.queue import command_at, push, split_delay
 from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration
 from sim.kernels.rope.payload import LOADS
 from sim.kernels.step import StepKernels
@@ -194,7 +194,9 @@ def build_exchange(
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
         whole, switch = split_delay(p, plants.control_period)
-        active, _until = held(state.queue, env, whole, switch, time + half, plants.control_period)
+        active, _until = command_at(
+            state.queue, env, whole, switch, time + half, plants.control_period
+        )
         s = load(state, env)
         law_factors = laws.on(
             p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]

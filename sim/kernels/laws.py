@@ -118,13 +118,13 @@ up = _turned(vertical)
 
 
 @wp.func
-def along(a: Any):
+def speed_along(a: Any):
     return wp.dot(a.vel_w, up(a))
 
 
 @wp.func
-def across(a: Any):
-    return a.vel_w - along(a) * up(a)
+def vel_across(a: Any):
+    return a.vel_w - speed_along(a) * up(a)
 
 
 @wp.func
@@ -134,13 +134,13 @@ def swing(a: Any):
 
 
 @wp.func
-def under(a: Any):
+def cable_under_rotors(a: Any):
     return -wp.dot(a.cable_dir_w, up(a))
 
 
 @wp.func
-def aside(a: Any):
-    return a.cable_dir_w + under(a) * up(a)
+def sideways(a: Any):
+    return a.cable_dir_w + cable_under_rotors(a) * up(a)
 
 
 @wp.func
@@ -150,7 +150,7 @@ def abs_thrust_rate(a: Any):
 
 @wp.func
 def speed_across_squared(a: Any):
-    return wp.dot(across(a), across(a))
+    return wp.dot(vel_across(a), vel_across(a))
 
 
 @wp.func
@@ -188,16 +188,16 @@ SCALARS = {
     "thrust_rate": thrust_rate,
     "abs_thrust_rate": abs_thrust_rate,
     "speed": _size(vel),
-    "speed_across": _size(across),
+    "speed_across": _size(vel_across),
     "speed_across_squared": speed_across_squared,
-    "speed_along": along,
+    "speed_along": speed_along,
     "rate": _size(rate),
     "rate_yaw": rate_yaw,
     "inverse_height": inverse_height,
     "tension": tension,
     "payload_speed": _size(payload_vel),
     "swing_speed": _size(swing),
-    "cable_under_rotors": under,
+    "cable_under_rotors": cable_under_rotors,
     "joint_rate": _size(joint_rate),
 }
 """Scalars that a law may name."""
@@ -212,7 +212,7 @@ VECTORS = {
         "body_y": _turned(_axis(0.0, 1.0, 0.0)),
         "world_z": vertical,
         "vel": vel,
-        "vel_across": across,
+        "vel_across": vel_across,
         "axis_cross_vel": _crossed(up, vel),
         "rate_cross_vel": _crossed(_turned(rate), vel),
         "cable": cable,
@@ -238,7 +238,7 @@ VECTORS = {
         "swing_vel": swing,
         "cable_cross_swing": _crossed(cable, swing),
         "vel": vel,
-        "sideways": aside,
+        "sideways": sideways,
     },
     "rope joint": {
         "joint_rate": joint_rate,

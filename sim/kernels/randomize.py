@@ -44,7 +44,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         return vec3(x, y, z), rng
 
     @wp.func
-    def rest(plants: Plants, state: State, env: int, used: real):
+    def settle(plants: Plants, state: State, env: int, used: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
         p = plants.vehicles[env % plants.vehicles.shape[0]]
         rope = plants.ropes[env % plants.ropes.shape[0]]
@@ -78,7 +78,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     ):
         env = wp.tid()
         if mask[env] != 0:
-            rest(plants, state, env, used[env])
+            settle(plants, state, env, used[env])
 
     @wp.kernel(module="unique", enable_backward=False)
     def randomize_kernel(
@@ -135,6 +135,6 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             radius = z.goal_radius * wp.sqrt(real(wp.randf(rng)))
             angle = real(wp.randf(rng)) * real(6.283185307179586)
             goal_w[env] = vec3(radius * wp.cos(angle), radius * wp.sin(angle), real(0.0))
-            rest(plants, state, env, real(wp.randf(rng)) * z.battery_used)
+            settle(plants, state, env, real(wp.randf(rng)) * z.battery_used)
 
     return ResetKernels(place_kernel, randomize_kernel)

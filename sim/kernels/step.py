@@ -12,7 +12,7 @@ import warp as wp
 
 from sim.kernels import state as st
 from sim.kernels.laws import build_laws
-from sim.kernels.quadrotor.queue import held, push, split_delay
+from sim.kernels.quadrotor.queue import command_at, push, split_delay
 from sim.kernels.quadrotor.rigid_body import build_direct_flow, build_flow
 from sim.kernels.rope import release as rel
 from sim.kernels.rope.chain import build_chain
@@ -137,14 +137,14 @@ def build_parts(
         s: QuadState,
         pos: vec3,
         vel: vec3,
-        along: vec3,
+        direction_w: vec3,
         gravity: real,
         out: Output,
         env: int,
         elapsed: real,
     ):
         """Write what follows from the payload's state at separation, without the kick."""
-        vel = leaving.kick(r, vel, along)
+        vel = leaving.kick(r, vel, direction_w)
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
         out.payload_vel_w[env] = vel
@@ -303,7 +303,7 @@ def build_step(
             separate(rope, r, air, s, n, u, gravity, out, env, time)
             attached = int(0)
         while time < period - tiny:
-            active, until = held(state.queue, env, whole, switch, time, period)
+            active, until = command_at(state.queue, env, whole, switch, time, period)
             if attached != 0 and timer > time + tiny:
                 until = wp.min(until, timer)
             count = int(wp.ceil((until - time) / plants.substep - real(1.0e-3)))

@@ -335,8 +335,8 @@ class TeamEnv(VecEnv):
         }
         redraw(memory, spreads, rows)
         age = memory["pose_age"]
-        drawn = between(task.observation.latency, torch.rand_like(age))
-        torch.where(rows, drawn, age, out=age)
+        latency = between(task.observation.latency, torch.rand_like(age))
+        torch.where(rows, latency, age, out=age)
         age = memory["age"]
         part = (2.0 * torch.rand_like(age) - 1.0).clamp(min=0.0)
         torch.where(fresh, between(self.cfg.team.age, part), age, out=age)
@@ -349,8 +349,8 @@ class TeamEnv(VecEnv):
         draw = torch.rand(self.worlds, 4, device=self.device)
         heading = 2.0 * math.pi * draw[:, 0]
         distance = between(team.goal, draw[:, 1])
-        along = [distance * heading.cos(), distance * heading.sin(), torch.zeros_like(distance)]
-        goals = torch.stack(along, -1)
+        offsets = [distance * heading.cos(), distance * heading.sin(), torch.zeros_like(distance)]
+        goals = torch.stack(offsets, -1)
         if self._goal is not None:
             goals = self._goal.expand_as(goals)
             heading = torch.atan2(goals[:, 1], goals[:, 0])

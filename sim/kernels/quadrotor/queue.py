@@ -32,7 +32,9 @@ def split_delay(p: Any, period: Any):
 
 
 @wp.func
-def held(queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: Any, period: Any):
+def command_at(
+    queue: wp.array2d(dtype=Any), env: int, whole: int, switch: Any, time: Any, period: Any
+):
     """The command that acts at a time of a control period [s], and until when [s]; ``whole`` and
     ``switch`` are of `split_delay`.
     """

@@ -97,8 +97,8 @@ def build_chain(
         ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
         (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
         alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear
-        momentum relative to the mount), ``stretched(natural, now, stiffness, u, h)`` (the rope
-        under its pull, ``now`` what it was h seconds before; with h 0 it is at rest).
+        momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
+        under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
     """
     L = segments
     real = t.real
@@ -113,14 +113,14 @@ def build_chain(
     giving = "compliance" in extensions
 
     @wp.func
-    def with_load(i: int, at: vec3, arm: real, load: vec3):
+    def with_load(i: int, part: vec3, arm: real, load: vec3):
         """Force (arm 1) or moment (arm [m]) on rod i with what acts on the payload, at the last rod
         alone.
         """
         if wp.static(loaded):
             if i == last:
-                return at + arm * load
-        return at
+                return part + arm * load
+        return part
 
     @wp.func
     def upper_damping(rope: Rope, i: int):
@@ -442,17 +442,17 @@ def build_chain(
             )
 
     @wp.func
-    def stretched(natural: Rope, now: Rope, stiffness: Reals, u: Vectors, h: real):
+    def stretched(natural: Rope, before: Rope, stiffness: Reals, u: Vectors, h: real):
         if wp.static(giving):
             if natural.compliance != real(0.0):
                 out = natural
                 one = real(1.0)
-                tension = wp.max(pull(now, stiffness, u), real(0.0))
+                tension = wp.max(pull(before, stiffness, u), real(0.0))
                 out.strain = (
                     natural.compliance * tension / (natural.segment_length * real(float(L)))
                 )
                 if h > real(0.0):
-                    out.strain_rate = (out.strain - now.strain) / (h * (one + out.strain))
+                    out.strain_rate = (out.strain - before.strain) / (h * (one + out.strain))
                 out.segment_length = natural.segment_length * (one + out.strain)
                 longer = out.segment_length - natural.segment_length
                 rope_part = (
@@ -475,7 +475,7 @@ def build_chain(
                     + ball
                 )
                 return out
-        return now
+        return before
 
     return SimpleNamespace(
         up_first=up_first,
