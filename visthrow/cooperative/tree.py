@@ -20,6 +20,13 @@ from sim.solvers import World
 
 
 @wp.func
+def vehicle_of(vehicles: Any, state: Any, row: int):
+    p = vehicles[row % vehicles.shape[0]]
+    p.body.mass = p.body.mass * state.mass_scale[row]
+    return p
+
+
+@wp.func
 def diagonal(like: Any, x: Any):
     return wp.diag(type(like)(x, x, x))
 
@@ -43,19 +50,9 @@ def free(p: Any, rope: Any, rot: Any, w: Any, force_b: Any, torque_b: Any, g: An
 
 
 @wp.func
-def damped(c: Any, n: Any, u: Any, rod: int, above: bool, below: bool):
-    """Damping c of the joints to the neighbours that a rod has, as a force on its ``n'``, and its
-    rate.
-    """
-    out = u[rod] - u[rod]
-    rate = c - c
-    if above:
-        out += c * (viscous(n[rod], n[rod - 1], u[rod - 1]) - u[rod])
-        rate += c
-    if below:
-        out += c * (viscous(n[rod], n[rod + 1], u[rod + 1]) - u[rod])
-        rate += c
-    return out, rate
+def damping_of(c: Any, n: Any, u: Any, neighbour_n: Any, neighbour_u: Any):
+    """Damping c of the joint to a neighbouring rod, as a force on ``n'``."""
+    return c * (viscous(n, neighbour_n, neighbour_u) - u)
 
 
 class TreeSolver:
@@ -122,12 +119,6 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
             if mask[row] != 0 and state.attached[row] != 0:
                 load_pos[world] = bodies.payload_pos_w[row]
                 load_vel[world] = bodies.payload_vel_w[row]
-
-    @wp.func
-    def vehicle_of(vehicles: wp.array(dtype=Vehicle), state: State, row: int):
-        p = vehicles[row % vehicles.shape[0]]
-        p.body.mass = p.body.mass * state.mass_scale[row]
-        return p
 
     @wp.func
     def rotation_after(bodies: Bodies, row: int, time: real):
@@ -198,7 +189,15 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                     a1 = A * e1
                     a2 = A * e2
                     c = real(0.5) * length
-                    damping, friction = damped(rope.joint_damping, n, u, rod, i > 0, i < L - 1)
+                    joint = rope.joint_damping
+                    damping = vec3()
+                    friction = real(0.0)
+                    if i > 0:
+                        damping += damping_of(joint, n[rod], u[rod], n[rod - 1], u[rod - 1])
+                        friction += joint
+                    if i < L - 1:
+                        damping += damping_of(joint, n[rod], u[rod], n[rod + 1], u[rod + 1])
+                        friction += joint
                     tension = wp.max(wp.dot(wrench.pull_w[row], n[rod]), real(0.0))
                     J = (
                         m * length * length / real(3.0)
