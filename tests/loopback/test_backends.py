@@ -11,6 +11,7 @@ from hil.control.loop import Loop
 from hil.control.state_machine import OperatorInput
 from hil.links.backends.ardupilot import BRAKE
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT
+from hil.links.backends.betaflight import OPEN_TIME, STICKS
 from hil.links.pymav import mav
 from tests.fakes.fake_px4 import LAND as PX4_LAND
 from tests.fakes.fake_px4 import OFFBOARD, POSCTL, custom
@@ -427,6 +428,20 @@ def test_every_way_to_release(kind, overrides, parameters):
     desk.turn(1.5, HOVER)
     assert desk.status.release == "accepted"
     assert (desk.fake.witness.releases, desk.fake.witness.breaches) == (1, [])
+
+
+@mark.parametrize(("answer", "after"), [("accepted", OPEN_TIME), ("silent", 0.1)])
+def test_betaflights_mechanism_closes_again(answer, after):
+    """A while after it has opened, and where an unanswered release is stopped."""
+    desk = Desk("betaflight", answer=answer).follow()
+    channel = STICKS + desk.backend.params.release_channel - 1
+    desk.backend.release(desk.now)
+    desk.turn(0.3, HOVER)
+    assert desk.fake.channels[channel] > 1900
+    if answer == "silent":
+        desk.backend.stop_release()
+    desk.turn(after, HOVER)
+    assert desk.fake.channels[channel] < 1100
 
 
 def test_px4_says_in_progress_first_and_that_is_pending():

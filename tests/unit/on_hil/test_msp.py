@@ -6,7 +6,7 @@ import numpy as np
 from pytest import mark, raises
 
 from hil.links import msp
-from hil.links.backends.betaflight import Betaflight
+from hil.links.backends.betaflight import BOX_ARM, Betaflight, settings
 from tests.configs import load_run
 from tests.fuzz import EACH, SEEDS
 from tests.loopback.wire import pipe
@@ -31,6 +31,12 @@ def test_there_and_back_in_any_pieces(payload):
             found += parser.parse(data[at : at + size])
         assert frame in found
         assert all(f == frame for f in found), "nothing else is made of it"
+
+
+@mark.parametrize(("last", "aux"), [(48, 0.0), (49, 2.0)])
+def test_a_mode_whose_range_is_empty_has_no_switch(last, aux):
+    frame = msp.Frame(msp.MODE_RANGES, bytes([BOX_ARM, 1, 48, last]), msp.ANSWER)
+    assert settings(frame, PARAMS)["arm_aux"] == aux
 
 
 def test_a_flipped_bit_is_noticed():

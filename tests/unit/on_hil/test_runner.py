@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from pytest import approx, mark, raises
 
+from hil.control.hovering import Hovering
 from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import can_hand_over
@@ -191,6 +192,25 @@ def test_errors_are_not_integrated_while_the_vehicle_follows_another():
     pilot.parts.hovering.reset = lambda: resets.append(1)
     fly(pilot, 3.0, status=lambda time: Status(True, mode=HOLD))
     assert len(resets) > 50
+
+
+def test_a_payload_that_rolls_on_after_its_landing_keeps_no_vehicle_from_being_calm():
+    def roll(time, poses):
+        way = max(time - START, 0.0)
+        return [replace(p, pos=(p.pos[0] + way * (p.body == "payload"), *p.pos[1:])) for p in poses]
+
+    _, decisions = thrown(poses=roll, seconds=9.0)
+    assert "hovering again" in {reason for _, reason in changes(decisions)}
+
+
+def test_a_hover_has_a_share_after_a_second_and_descends_to_the_ground():
+    hovering = Hovering((0.0, 0.0, 0.01), 0.0, 14.0, TICK)
+    for _ in range(50):
+        assert hovering.share() is None
+        hovering.note(1.1)
+        hovering.descend()
+    assert hovering.share() == approx(1.1)
+    assert hovering.place_w == (0.0, 0.0, 0.0)
 
 
 def test_poses_at_5_hz_never_start_a_throw():
