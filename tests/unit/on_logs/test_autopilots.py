@@ -81,6 +81,7 @@ def test_a_reset_of_the_estimate_is_told(tmp_path):
         ({"SYS_AUTOSTART": 2100}, "plane"),
         ({"MAV_TYPE": 20}, "VTOL"),
         ({"CA_AIRFRAME": 2}, "VTOL"),
+        ({"CA_AIRFRAME": 5}, "rover"),
         ({"SYS_AUTOSTART": 50000}, "rover"),
         ({"SYS_AUTOSTART": 5001}, "quadrotor that is no X"),
     ],
