@@ -86,6 +86,24 @@ def measured(found):
     return gain.measure(found[1])
 
 
+def test_errors_grow_with_the_horizon(measured):
+    for channel in measured.channels:
+        floor = [row[3] for row in channel.horizons]
+        assert floor == sorted(floor)
+        assert channel.horizons[-1][1] > channel.horizons[0][1]
+
+
+def test_one_diverging_window_does_not_set_the_floor(found):
+    point = found[1].work.after
+    first = point.windows[0]
+    late = first.time > first.time.min() + forms.HEAD_SECONDS
+    wild = replace(first, nuisance=1e4 * first.nuisance * late[:, None])  # the head tells nothing
+    windows = [wild, *point.windows[1:]]
+    groups, residuals = [0] * len(windows), [w.residual for w in windows]
+    errors = forms.errors(windows, groups, point.noise, residuals, len(point.noise.scale))
+    assert np.all(errors.floor <= forms.FAR_ABOVE * errors.square)
+
+
 def test_prediction_does_not_look_at_what_it_predicts(found):
     _, diagnosis = found
     point = diagnosis.work.after
@@ -172,6 +190,19 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
     assert np.abs(r.pos_w[:, :2]).max() < 2.6
     assert np.linalg.norm(r.vel_w, axis=1).max() < 5.5
     assert len(r.csv().splitlines()) == 1 + len(r.time)
+
+
+@mark.parametrize("used", [0.0, 0.9, 1.2])
+def test_a_flight_that_nears_the_ground_has_no_model(used):
+    """It hovers 0.11 m high and is aborted at half of it."""
+    chosen = next(m for m in manoeuvres.catalogue() if m.name == "hover low without payload")
+    reference = chosen.reference()
+    assert reference.lowest == approx(0.055)
+    place = np.repeat(reference.pos_w, 4, axis=0) - [0.0, 0.0, used * reference.lowest]
+    flight = fly_manoeuvres.SimulatedFlight(chosen, reference, None, {"pos_w": place}, None, None)
+    simulated = flight.simulated(lambda _: "a model")
+    assert simulated.used == approx(used)
+    assert (simulated.model is None) == (used > 1.0)
 
 
 def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():

@@ -19,6 +19,7 @@ from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
+from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import landing
 from visthrow.diagnose.throw.initial_states import hover_state
@@ -256,10 +257,12 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
         assert abs(found - size) < 0.1 * size + 4.0 * sd, (name, found, sd)
         assert sd < 0.4 * size, name
     projected = [FlightLog(log.channels, {"config": {"keypoints": "projection"}}) for log in logs]
-    assert (
-        "keypoints"
-        not in ThrowModel(projected, paper_plant(), camera=camera, only=["plane_height"]).channels
+    blind = ThrowModel(
+        projected, paper_plant(), camera=camera, only=["plane_height", "camera_latency"]
     )
+    assert "keypoints" not in blind.channels
+    visible = Priors.of(blind.effects, tuple(blind.channels)).visible
+    assert {e.name for e, seen in zip(blind.effects, visible) if not seen} == {"camera_latency"}
 
 
 def test_mistakes_are_told(planted):

@@ -384,13 +384,24 @@ def test_a_payload_on_the_floor_is_not_frozen_and_not_on_the_cable():
     assert "stands still" in faults(log_of(dict(columns, payload_pos_w=payload)))
 
 
+EXPLAIN = ("diagnose", "explain", "--no-report")
+
+
 def test_explain_names_nothing_where_channels_contradict_each_other(tmp_path, capsys):
     columns = flight()
     columns["rate_b"] = columns["rate_b"] * 57.3
     log_of(columns).save(tmp_path / "a.npz")
     run_command(f"diagnose explain {tmp_path}/a.npz --no-report --json {tmp_path}/a.json")
     assert "DATA INCONSISTENT" in capsys.readouterr().out
-    assert json.loads((tmp_path / "a.json").read_text())["overall"] == "DATA INCONSISTENT"
+    said = json.loads((tmp_path / "a.json").read_text())
+    assert said["overall"] == "DATA INCONSISTENT"
+    bad = [row.name for row in check([log_of(columns)])[0].rows if row.verdict == "bad"]
+    assert all(any(f": {name}: " in reason for reason in said["reasons"]) for name in bad)
+    assert not contradictions(check([log_of(columns)]), frozenset(bad))
+    assert cli.main([*EXPLAIN, str(tmp_path / "a.npz"), "--overrule", "units nothing"]) == 2
+    error = capsys.readouterr().err
+    assert "no bad row 'units nothing' of check" in error
+    assert bad[0] in error
 
 
 def test_two_vehicles_with_one_payload_tell_their_clocks():

@@ -2,16 +2,17 @@
 
 import argparse
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from visthrow.common.arguments import WHOLE, add_common
-from visthrow.common.errors import ConfigError, DiagnoseError
+from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.check.rows import KnownVehicle
-from visthrow.logs.check.run import label
+from visthrow.logs.check.run import check, label
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_PLANT = "state"
@@ -47,6 +48,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "the configured value behind this effect was measured with this deviation, such as"
             " mass_quad=0.0003 from a scale"
         ),
+    )
+    parser.add_argument(
+        "--overrule",
+        metavar="ROW",
+        action="append",
+        default=[],
+        help="keep logs that this row of check would refuse, such as 'units command'",
     )
     parser.add_argument(
         "--without",
@@ -110,13 +118,18 @@ class Opened:
         """Return what is known of the vehicle."""
         from visthrow.diagnose.inputs import setup
 
-        return setup.known(self._args.config)
+        vehicle = setup.known(self._args.config)
+        return replace(vehicle, unread=vehicle.unread.union(self._args.overrule))
 
     def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
         """Diagnose the flights, as the arguments say."""
         from visthrow.diagnose.select.search import diagnose
 
         without = numbers(self._args.without, self.logs)
+        if self._args.overrule:
+            rows = [row for log in check(self.logs, self.known) for row in log.rows]
+            bad = [row.name for row in rows if row.verdict == "bad"]
+            expect_known(self._args.overrule, bad, "no bad row '{}' of check", DiagnoseError)
         return diagnose(
             self.logs,
             lambda: self.model,

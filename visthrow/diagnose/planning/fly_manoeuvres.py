@@ -59,7 +59,8 @@ class Simulated:
         # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
         # replayed
     )
-    used: float  # the largest part of ``HIGHEST`` or ``ASTRAY`` that was reached
+    # the largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was reached
+    used: float
 
 
 Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
@@ -200,10 +201,12 @@ class SimulatedFlight:
         """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
         it if it was not.
         """
-        places = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)]
+        off = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)] - self.reference.pos_w
+        height = self.reference.pos_w[:, 2] - self.reference.lowest
         used = max(
             self.swing / HIGHEST,
-            float(np.linalg.norm(places - self.reference.pos_w, axis=1).max()) / ASTRAY,
+            float(np.linalg.norm(off, axis=1).max()) / ASTRAY,
+            float((-off[:, 2] / height).max()),
         )
         used = min(used, LOST) if np.isfinite(used) else LOST
         try:

@@ -44,14 +44,19 @@ class Reference:
         """[m/s^2], shape (N, 3)."""
         return np.gradient(self.vel_w, PERIOD, axis=0)
 
+    @property
+    def lowest(self) -> float:
+        """Return the height at which a flight is aborted [m]."""
+        low = float(self.pos_w[:, 2].min())
+        return max(0.05, low - min(0.3, 0.5 * low))
+
     def limits(self) -> str:
         """Return when to abort, in words."""
         low, high = self.pos_w.min(0) - 0.5, self.pos_w.max(0) + 0.5
-        floor = max(0.05, self.pos_w[:, 2].min() - min(0.3, 0.5 * self.pos_w[:, 2].min()))
         speed = np.linalg.norm(self.vel_w, axis=1).max()
         return (
             f"x {low[0]:.1f}..{high[0]:.1f}, y {low[1]:.1f}..{high[1]:.1f}, z"
-            f" {floor:.2f}..{high[2]:.1f} m, {1.5 * speed + 0.5:.1f} m/s, 60 deg of tilt"
+            f" {self.lowest:.2f}..{high[2]:.1f} m, {1.5 * speed + 0.5:.1f} m/s, 60 deg of tilt"
         )
 
     def csv(self) -> str:

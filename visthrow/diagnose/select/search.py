@@ -80,7 +80,9 @@ def diagnose(
         for row in log.rows
         if (row.topic, row.verdict) == ("thrust", "warn")
     ]
-    notes += [f"check, of a channel that the model does not read: {text}" for text in unread]
+    notes += [
+        f"check, overruled or of a channel that the model does not read: {text}" for text in unread
+    ]
     if (why := model.lawless) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)

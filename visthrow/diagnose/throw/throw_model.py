@@ -531,7 +531,7 @@ def effects_for(
             continue
         if (e.block in ("release", "ballistic") and not releases) or not e.applies(setting):
             continue
-        if any(c in e.channels and c not in channels for c in ("rate_b", "keypoints", "landing")):
+        if any(c in e.channels and c not in channels for c in ("rate_b", "landing")):
             continue
         if (
             name.startswith(("payload_marker", "mocap_delay_payload"))

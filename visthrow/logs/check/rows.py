@@ -18,6 +18,11 @@ class Row:
     text: str
     figures: dict[str, Any] = field(default_factory=dict)  # with units in their names
 
+    @property
+    def name(self) -> str:
+        """Topic and channel, by which it is overruled."""
+        return f"{self.topic} {self.channel}".strip()
+
 
 def worst(rows: list[Row]) -> Verdict:
     """Return the worst verdict among rows; ``ok`` where there is none."""
@@ -34,7 +39,8 @@ class KnownVehicle:
     thrust_map: tuple[float, float, float] | None = (
         None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
     )
-    unread: frozenset[str] = frozenset()  # channels that the model does not read
+    # channels that the model does not read, and names of rows that are overruled
+    unread: frozenset[str] = frozenset()
 
 
 NOTHING = KnownVehicle()

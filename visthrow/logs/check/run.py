@@ -58,14 +58,15 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
     """Return the reasons not to name causes from logs: their channels contradict each other, or
     nothing moved.
 
-    ``unread``: channels that the model does not read; a bad row about one of them is no reason."""
+    ``unread``: channels that the model does not read, and rows that are overruled, each by topic
+    and channel; a bad row about one of them is no reason."""
     return [
-        f"{checked.name}: {row.channel + ': ' if row.channel else ''}{row.text}"
+        f"{checked.name}: {row.name}: {row.text}"
         for checked in results
         for row in checked.rows
         if row.verdict == "bad"
         and (row.topic in CONTRADICT or "never overlap" in row.text)
-        and not unread.intersection(re.findall(r"\w+", row.channel))
+        and not unread.intersection([row.name, *re.findall(r"\w+", row.channel)])
     ]
 
 
