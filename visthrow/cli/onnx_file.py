@@ -116,26 +116,21 @@ def _add_estimator(graph: _Graph, estimator: Estimator) -> str:
     x = scaled
     for name in ("encoder", *(f"inner{i}" for i in range(len(estimator.inner)))):
         x = graph.node("Elu", graph.linear(x, part[f"{name}_weight"], part[f"{name}_bias"]))
-    gates = []
-    for array in ("input", "memory"):
-        source = x if array == "input" else "memory"
-        weights = np.split(part[f"{array}_weight"], 3)
-        biases = np.split(part[f"{array}_bias"], 3)
-        gates.append([graph.linear(source, w, b) for w, b in zip(weights, biases)])
-    (reset_x, update_x, new_x), (reset_h, update_h, new_h) = gates
-    reset = graph.node("Sigmoid", graph.node("Add", reset_x, reset_h))
-    update = graph.node("Sigmoid", graph.node("Add", update_x, update_h))
-    new = graph.node("Tanh", graph.node("Add", new_x, graph.node("Mul", reset, new_h)))
-    kept_part = graph.node("Mul", update, graph.node("Sub", "memory", new))
-    memory = graph.node("Add", new, kept_part, output="next_memory")
-    zero = graph.constant(np.zeros((1, 1), np.float32))
-    ones = graph.node("Slice", "obs", *_first_column(graph))
-    padded = graph.node("Concat", "obs", graph.node("Mul", ones, zero), axis=1)
+    weights = [graph.constant(_gates(part[f"{name}_weight"])) for name in ("input", "memory")]
+    biases = [_gates(part[f"{name}_bias"]) for name in ("input", "memory")]
+    weights.append(graph.constant(np.concatenate(biases, axis=1)))
+    first = graph.constant(np.array([0]))
+    steps, begun = (graph.node("Unsqueeze", value, first) for value in (x, "memory"))
+    sizes = {"hidden_size": estimator.memory, "linear_before_reset": 1}
+    after = graph.node("GRU", steps, *weights, "", begun, **sizes)  # steps, directions, E, H
+    memory = graph.node("Squeeze", after, graph.constant(np.array([0, 1])), output="next_memory")
+    padded = graph.node("Pad", "obs", graph.constant(np.array([0, 0, 0, 1])))
     direct = graph.node("Gather", padded, graph.constant(part["kept"]), axis=1)
     correction = graph.linear(memory, part["output_weight"], part["output_bias"])
     return graph.node("Add", direct, correction)
 
 
-def _first_column(graph: _Graph) -> tuple[str, str, str]:
-    """Return starts, ends and axes that slice the first column."""
-    return tuple(graph.constant(np.array([i], np.int64)) for i in (0, 1, 1))
+def _gates(torch_gates: np.ndarray) -> np.ndarray:
+    """Return torch's gates (reset, update, new) in ONNX's order, with its axis of directions."""
+    reset, update, new = np.split(torch_gates, 3)
+    return np.concatenate([update, reset, new])[None]
