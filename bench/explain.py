@@ -30,7 +30,8 @@ REPORT_S = 120.0
 def measure(args: argparse.Namespace) -> dict[str, float]:
     """Seconds of each stage of one diagnosis, and what was looked at."""
     begun = time.perf_counter()
-    model, logs = opening.open_model(args)
+    source = opening.Opened(args)
+    model, logs = source.model, source.logs
     opened = time.perf_counter()
     diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without, logs))
     explained = time.perf_counter()

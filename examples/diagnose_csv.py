@@ -5,9 +5,9 @@ python examples/diagnose_csv.py tests/data/real/jugglebot_throws/session7.csv.gz
 
 import argparse
 
+from visthrow.diagnose import diagnose
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.reporting.diagnosis_report import summary
-from visthrow.diagnose.select.search import explain
 from visthrow.logs import read
 from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
 
@@ -25,8 +25,9 @@ def main() -> None:
     parser.add_argument("--tracks", type=int, default=4, help="that are used")
     args = parser.parse_args()
     logs = read(args.log, TABLE)
-    diagnosis = explain(BallModel(logs[: args.tracks], PARABOLA), laws=False)
-    print(f"{len(logs)} tracks, {args.tracks} used")
+    used = logs[: args.tracks]
+    diagnosis = diagnose(used, BallModel(used, PARABOLA), laws=False)
+    print(f"{len(logs)} tracks, {len(used)} used")
     print(summary(diagnosis))
 
 

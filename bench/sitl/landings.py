@@ -33,7 +33,7 @@ def errors(logs: list[str], plant: str, theta: dict[str, float] | None = None) -
     told = argparse.Namespace(
         logs=logs, plant=plant, overrides=[], config=None, only=None, measured=[], device="cpu"
     )
-    model, _ = opening.open_model(told)
+    model = opening.Opened(told).model
     return model.landings(theta or {}).errors
 
 

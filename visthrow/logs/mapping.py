@@ -2,7 +2,7 @@
 axes, on which clock.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
@@ -28,6 +28,8 @@ class TimeColumn(Bounded):
     offset: float = (
         0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
     )
+    # file's name -> the same of its flight alone, besides [s]: clocks that differ by flight
+    offsets: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -107,6 +107,32 @@ def test_units_and_axes_are_found_by_physics(tmp_path):
     assert "axes by physics" in found.why["rate_b"]
 
 
+def test_brackets_say_units_and_the_lean_says_the_order_of_a_quaternion():
+    columns = flight(20.0)
+    table = {"t[s]": columns["time"]}
+    for stem, name, unit in (("", "pos_w", "m"), ("v", "vel_w", "m/s"), ("w", "rate_b", "rad/s")):
+        table |= {f"{stem}{a}[{unit}]": c for a, c in zip("xyz", columns[name].T)}
+    scalar_first = columns["quat_wb"][:, [3, 0, 1, 2]]
+    found = propose(table | {f"q{i}": c for i, c in enumerate(scalar_first.T, 1)}, "a.csv")
+    by = {c.name: c for c in found.mapping.channels}
+    units = {name: by[name].unit for name in ("pos_w", "vel_w", "rate_b")}
+    assert units == {"pos_w": "m", "vel_w": "m/s", "rate_b": "rad/s"}
+    assert by["quat_wb"].order == "wxyz"
+    assert "by gravity" in found.why["quat_wb"]
+
+
+def test_the_input_that_the_force_follows_drives_the_vehicle():
+    columns = flight(20.0)
+    thrust = columns["command"][:, 0]
+    table = {"time": columns["time"]} | named("pos", columns["pos_w"])
+    table |= {f"q{a}": c for a, c in zip("xyzw", columns["quat_wb"].T)}
+    table |= named("acc", columns["acc_b"]) | {f"motor{i}": thrust for i in range(1, 5)}
+    other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
+    found = propose(table | {"thrust": other}, "a.csv")
+    assert found.flyer["input"] == "motor_command"
+    assert any("The force follows 'motor_command' best" in q for q in found.questions)
+
+
 def test_a_marker_in_millimetres_is_no_velocity_of_another():
     """On a turning body, a quarter of a turn apart, one goes as the other's derivative."""
     time = 0.01 * np.arange(500)

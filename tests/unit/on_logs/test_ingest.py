@@ -325,6 +325,7 @@ class TestTables:
             (TimeColumn("t", "ms", offset=0.5), [0.5, 0.51, 0.53]),
             (TimeColumn("t", "s", offset=-2.0), [-2.0, 8.0, 28.0]),
             (TimeColumn(row_period=0.02, offset=1.0), [1.0, 1.02, 1.04]),
+            (TimeColumn("t", offset=1.0, offsets={"a.csv": 0.5, "b.csv": 9.0}), [1.5, 11.5, 31.5]),
         ],
     )
     def test_clocks(self, clock, times, tmp_path):

@@ -141,14 +141,6 @@ class Opened:
         )
 
 
-def open_model(args: argparse.Namespace) -> tuple[Model, list[FlightLog]]:
-    """Read the logs and build the model.
-
-    Raises ConfigError, LogError, DiagnoseError: as :class:`Opened`."""
-    opened = Opened(args)
-    return opened.model, opened.logs
-
-
 def made_with(args: argparse.Namespace) -> dict[str, Any]:
     """Entries of a diagnosis' JSON that say what was diagnosed:
 

@@ -7,7 +7,9 @@ the derivative of a position, rates are those of the attitude, a payload keeps i
 none of them tells becomes a question."""
 
 import re
+import tomllib
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,42 +27,21 @@ from visthrow.logs.readers.table import Table, logs_of, lost_rows, make_channel
 from visthrow.logs.unit_names import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
-_TIME = re.compile(
-    r"(^|[._/: ])(t|ts|time|stamp|timestamp|secs?|seconds|millis|micros|frame)([._ \[(\d]|$)",
-    re.IGNORECASE,
-)
-_SUFFIX = {
-    **{
-        unit: unit
-        for unit in ("s", "ms", "us", "ns", "mm", "cm", "m", "deg", "rad", "g", "gf", "rpm")
-    },
-    "sec": "s",
-    "mv": "mV",
-    "v": "V",
-    "n": "N",
-    "dps": "deg/s",
-    "a": "A",
-    "ma": "mA",
-}
-_TARGET = re.compile(
-    r"target|setpoint|(^|[._])sp[._]|desired|des([._]|$)|ref|cmd|rpyd|omegar|goal|^sp_|residual",
-    re.IGNORECASE,
-)
-_NOT_VEHICLE = re.compile(r"payload|load|ball|(^|[._])l_|cam|object|tag|marker", re.IGNORECASE)
-_ESTIMATE = re.compile(r"est|ekf|kalman", re.IGNORECASE)
-_CAPTURE = re.compile(r"loc|mocap|vicon|opti|qualisys", re.IGNORECASE)
-_HINTS = (
-    ("acc_b", r"acc|imu.*a[xyz]?$|^a_rs"),
-    ("rate_b", r"gyro|omega|rate|angvel|angular|(^|[._])w$|^w_rs|(^|[._])r_rpy$"),
-    ("velocity", r"vel|(^|[._])v$|speed"),
-    ("euler", r"rpy|roll|pitch|euler|attitude|orient"),
-    (
-        "position",
-        r"pos|(^|[._])p$|loc|pose|translation|estimate|mocap|vicon|opti|uav|drone|quad|vehicle|copter|^$|(^|[._])t$|(^|[._])p_",
-    ),
-)
+_NAMES = tomllib.loads(Path(__file__).with_name("column_names.toml").read_text(encoding="utf-8"))
+_SUFFIX, _ENDINGS, _HINTS = _NAMES["units"], _NAMES["components"], _NAMES["hints"]
+
+
+def _pattern(name: str) -> re.Pattern[str]:
+    return re.compile(_NAMES["patterns"][name], re.IGNORECASE)
+
+
+_TIME, _TARGET, _NOT_VEHICLE = _pattern("time"), _pattern("target"), _pattern("not_vehicle")
+_ESTIMATE, _CAPTURE = _pattern("estimate"), _pattern("capture")
+_COMPONENT, _MOTOR = _pattern("component"), _pattern("motor")
 UPS = ("", "x,-z,y")
 """Axes of a world whose z is up, and of one whose y is, as Motive's."""
+_MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
+"""Unit of commands of motors by what they exceed."""
 _FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
 _REACH, _LATEST = 0.2, 0.15  # delays between them that are tried, and that count [s]
 _SPAN, _COARSE = 0.1, 0.02  # over which a path is differentiated; of the grid of many pairs [s]
@@ -234,30 +215,6 @@ def _split_unit(name: str) -> tuple[str, str]:
     return (match[1], unit_name) if unit_name or unit is not None else (name, "")
 
 
-_ENDINGS = {
-    **{letter: letter for letter in "xyzw"},
-    "north": "x",
-    "east": "y",
-    "down": "z",
-    "roll": "x",
-    "pitch": "y",
-    "yaw": "z",
-    "0": "x",
-    "1": "y",
-    "2": "z",
-    "3": "w",
-}
-_COMPONENT = re.compile(
-    r"^(.*?)[._\[ (]*(roll|pitch|yaw|north|east|down|[xyzw]|[0-3])[\])]?"
-    r"(?:[._ \[(]+(mm|cm|m|deg|rad|dps|g|mg|mps|body|world|vicon|mocap|si)[\])]?)?$",
-    re.IGNORECASE,
-)
-_MOTOR = re.compile(
-    r"^(.*?)(?:motor|pwm|rotor|rpm|m|esc|erpm|output|servo)[._\[]?(\d)\]?([._][a-z]+)?$",
-    re.IGNORECASE,
-)
-
-
 def _groups(numbers: Table) -> list[Group]:
     """Columns in threes (x, y, z or roll, pitch, yaw) and fours (a quaternion's, motors'), then
     single ones.
@@ -415,8 +372,10 @@ class _Chooser:
 
     def _hinted(self, group: Group, kind: str) -> bool:
         stem = group.stem.lower()
-        return bool(re.search(dict(_HINTS)[kind], stem)) and not any(
-            re.search(pattern, stem) for name, pattern in _HINTS if name not in (kind, "position")
+        return bool(re.search(_HINTS[kind], stem)) and not any(
+            re.search(pattern, stem)
+            for name, pattern in _HINTS.items()
+            if name not in (kind, "position")
         )
 
     def _quaternions(self) -> None:
@@ -516,7 +475,7 @@ class _Chooser:
         smooth = [g for g in smooth if g.unit not in ("deg", "rad")]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
         if not groups:  # no name speaks of a place
-            patterns = [pattern for name, pattern in _HINTS if name != "position"]
+            patterns = [pattern for name, pattern in _HINTS.items() if name != "position"]
             groups = [
                 g
                 for g in smooth
@@ -771,6 +730,13 @@ class _Chooser:
             return np.zeros((len(grid), group.values.shape[1]))
         return relations.on_grid(time, values, grid)
 
+    def _compared(
+        self, stamps: np.ndarray, derived: np.ndarray, group: Group
+    ) -> relations.Relation | None:
+        """Relate a group's columns to what was derived of other ones."""
+        good = np.all(np.isfinite(group.values), axis=1)
+        return relations.relate(stamps, derived, self.time[good], group.values[good], reach=0.2)
+
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
             if name not in self.made:
@@ -817,9 +783,7 @@ class _Chooser:
             good = np.all(np.isfinite(group.values), axis=1)
             if not self._hinted(group, "velocity") or np.sum(good) < 100:
                 continue
-            relation = relations.relate(
-                stamps, turned, self.time[good], group.values[good], reach=0.2
-            )
+            relation = self._compared(stamps, turned, group)
             if relation is None or relation.correlation < _FIRMLY:
                 continue
             clear = 0.5 * np.ptp(stamps) / relations.INDEPENDENT
@@ -870,9 +834,7 @@ class _Chooser:
             if attitude is not None and len(attitude.time) > 100:
                 stamps, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
-                relation = relations.relate(
-                    stamps, derived, self.time[good], group.values[good], reach=0.2
-                )
+                relation = self._compared(stamps, derived, group)
                 times = float(
                     np.sqrt(
                         np.mean(np.var(group.values[good], axis=0))
@@ -942,15 +904,7 @@ class _Chooser:
                 high = float(np.nanpercentile(group.values, 99))
                 if self._rotor_speeds(group, high):
                     continue
-                unit = (
-                    "1/65535"
-                    if high > 5000.0
-                    else "1/1000"
-                    if high > 150.0
-                    else "%"
-                    if high > 2.0
-                    else "1"
-                )
+                unit = next(unit for above, unit in _MOTOR_UNITS if high > above)
                 self._take("motor_command", group, unit, f"four motors up to {high:.5g}")
                 self.found.questions.append(
                     f"motors {', '.join(group.columns)}: order them front left, front right, rear"

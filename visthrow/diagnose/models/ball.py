@@ -120,17 +120,14 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
         horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
         horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
         flights.append(
-            Stretch(
+            Stretch.of(
                 number,
                 "ballistic",
-                np.repeat(time, 3),
-                np.zeros(3 * len(time), dtype=int),
-                pos.ravel(),
-                np.tile(sigma, len(time)),
-                np.concatenate([fit[0], fit[1]]),
-                np.array([0.1, 0.1, 0.1, 1.0, 1.0, 1.0]),
+                [(time, pos, sigma)],
                 {"time": time, "across": np.array([-horizontal[1], horizontal[0], 0.0])},
-                **latent_layout(time[0], time[-1], KNOTS, (2,)),
+                latent_layout(time[0], time[-1], KNOTS, (2,)),
+                [*fit[0], *fit[1]],
+                [0.1, 0.1, 0.1, 1.0, 1.0, 1.0],
             )
         )
     return flights

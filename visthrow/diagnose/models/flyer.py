@@ -191,7 +191,7 @@ class FlyerModel(NumericModel):
         motors = self._commanded.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
-        scales = np.stack([self.of(lanes, f"motor_{name}") for name in MOTORS], 1)
+        scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
         return scale[:, None] * (1.0 + scales)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
@@ -216,7 +216,7 @@ class FlyerModel(NumericModel):
                 value, rate = value + path[..., 6:9], rate + path[..., 9:12]
             pos = hermite(late, start, p.step, value, rate)
             if channel == 0 and "marker_z" in self.numbers:
-                lever = np.stack([self.of(lanes, f"marker_{axis}") for axis in "xyz"], 1)
+                lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
                 rate_index = np.clip(
                     ((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps
                 )
@@ -250,16 +250,15 @@ class _Dynamics:
             *["payload force"] * (p.cable is not None),
             *["vehicle torque"] * (p.torque is not None),
         )
-        self.turn = np.stack([get("marker_rot_x"), get("marker_rot_y"), 0.0 * mass[:, 0]], 1)
+        self.turn = model.stack(lanes, "marker_rot_x", "marker_rot_y", "")
         self.lean = get("estimator_lean")[:, None]
         self.turns, self.half = bool(np.any(self.turn) or np.any(self.lean)), -1
-        tilt = np.stack([get("frame_tilt_y"), -get("frame_tilt_x"), 0.0 * mass[:, 0] - 1.0], 1)
-        self.gravity = p.gravity * tilt
-        self.wind = np.stack([get("wind_x"), get("wind_y"), 0.0 * mass[:, 0]], 1)
+        tilt = model.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
+        self.gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
+        self.wind = model.stack(lanes, "wind_x", "wind_y", "")
         self.shift = model._spare + get("attitude_delay") / (0.5 * p.step)
-        self.drag = np.stack(
-            [p.drag_xy + get("rotor_drag_xy")] * 2 + [p.drag_z + get("rotor_drag_z")], 1
-        )
+        added = model.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
+        self.drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
         self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
         if p.cable is not None:
             self.length = (p.cable.length + get("rope_length"))[:, None]
@@ -267,10 +266,9 @@ class _Dynamics:
             self.payload_drag = get("payload_drag")[:, None]
             self.reduced = 1.0 / (1.0 / self.payload + 1.0 / self.mass)
         if p.torque is not None:
-            self.inertia = np.array(p.torque.inertia) * (
-                1.0 + np.stack([get("inertia_xy")] * 2 + [get("inertia_z")], 1)
-            )
-            self.com = np.stack([get("com_x"), get("com_y")], 1)
+            scale = 1.0 + model.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
+            self.inertia = np.array(p.torque.inertia) * scale
+            self.com = model.stack(lanes, "com_x", "com_y")
 
     def _turn_to(self, half: int) -> None:
         """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in
@@ -291,14 +289,11 @@ class _Dynamics:
         index = 6
         if self.p.cable is not None:
             down = self.model._direction[lanes.owner]
-            side = np.stack(
-                [lanes.nuisance[:, 6], lanes.nuisance[:, 7], 0.0 * lanes.nuisance[:, 6]], 1
-            )
+            level = ((0, 0), (0, 1))  # a third component of 0
+            side = np.pad(lanes.nuisance[:, 6:8], level)
             direction = down + side - down * np.sum(down * side, 1, keepdims=True)
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            swing = np.stack(
-                [lanes.nuisance[:, 8], lanes.nuisance[:, 9], 0.0 * lanes.nuisance[:, 6]], 1
-            )
+            swing = np.pad(lanes.nuisance[:, 8:10], level)
             swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
             parts += [self.length * direction, self.length * swing]
             index = 10

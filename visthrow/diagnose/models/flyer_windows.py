@@ -127,17 +127,10 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         *([2] if params.cable is not None else []),
         *([1] if params.torque is not None else []),
     ]
-    return Stretch(
+    return Stretch.of(
         number,
         "flight",
-        np.concatenate([np.repeat(time, 3) for time, _ in rows]),
-        np.concatenate([np.full(3 * len(time), i) for i, (time, _) in enumerate(rows)]),
-        np.concatenate([values.ravel() for _, values in rows]),
-        np.concatenate(
-            [np.tile(sigma[name], len(time)) for name, (time, _) in zip(channels, rows)]
-        ),
-        guess,
-        spread,
+        [(time, values, sigma[name]) for name, (time, values) in zip(channels, rows)],
         {
             "start": start,
             "rot": _attitudes(log[params.attitude], halves),
@@ -147,7 +140,9 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
             "lean": _lean(log, params.attitude, params.estimator_rate, halves),
             "since": start - float(log[params.input].time[0]),
         },
-        **latent_layout(start, end, KNOTS, blocks),
+        latent_layout(start, end, KNOTS, blocks),
+        guess,
+        spread,
     )
 
 

@@ -69,7 +69,7 @@ class GimbalModel(NumericModel):
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         tilt, lever, turn = (
-            np.stack([self.of(lanes, f"{what}_{a}") for a in "xyz"], 1)
+            self.stack(lanes, *(f"{what}_{axis}" for axis in "xyz"))
             for what in ("camera_tilt", "camera_lever", "marker_rot")
         )
         time, table = stretch.time.reshape(-1, 3)[:, 0], stretch.data["table"]
@@ -90,9 +90,7 @@ class GimbalModel(NumericModel):
             time, np.unique(stretch.latent_time)
         )  # what gimbal and detection err by, slowly
         point = point + np.einsum("bak,nk->bna", lanes.latent.reshape(len(late), 3, -1), weights)
-        scale = 1.0 + np.stack(
-            [self.of(lanes, f"{name}_scale") for name in ("focal", "focal", "range")], 1
-        )
+        scale = 1.0 + self.stack(lanes, "focal_scale", "focal_scale", "range_scale")
         return (point * scale[:, None]).reshape(len(lanes.owner), -1)
 
 
@@ -145,24 +143,11 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
         if np.sum(fits) < 10:
             continue
         time, point = time[fits], point[fits]
-        sigma = np.tile([params.sigma_across, params.sigma_across, params.sigma_along], len(time))
-        stretches.append(
-            Stretch(
-                number,
-                "view",
-                np.repeat(time, 3),
-                np.zeros(3 * len(time), dtype=int),
-                point.ravel(),
-                sigma,
-                np.zeros(0),
-                np.zeros(0),
-                {
-                    "table_time": table_time[in_table],
-                    "table": {k: v[in_table] for k, v in tables.items()},
-                },
-                **latent_layout(start, start + params.window, KNOTS, (2,)),
-            )
-        )
+        sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
+        near = {name: values[in_table] for name, values in tables.items()}
+        data = {"table_time": table_time[in_table], "table": near}
+        layout = latent_layout(start, start + params.window, KNOTS, (2,))
+        stretches.append(Stretch.of(number, "view", [(time, point, sigma)], data, layout))
     if rejected > MOST_APART * frames:
         raise LogError(
             f"the marker's distance is more than {params.largest:g} m from the payload's in "

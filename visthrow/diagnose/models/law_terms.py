@@ -14,9 +14,11 @@ what a pair of forces does,
 so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is
 conserved."""
 
+import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations_with_replacement
+from itertools import chain, combinations_with_replacement
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,22 +28,29 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import cross, rotate, rotate_back
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
-Unit = tuple[int, int, int]  # exponents of kg, m and s
-
 Knots = Mapping[str, np.ndarray]
 
 JOINT = (  # block of the torque between vehicle and rope, which acts in all latent blocks at once
     "rope joint"
 )
 BLOCKS = (*LATENT_BLOCKS, JOINT)  # what a term can act on
+SYMBOLS = dict(zip(BLOCKS, ("F", "M", "F_p", "M_j")))
+BASE_UNITS = ("kg", "m", "s")
 
 
 class KnotValues(dict):
     """Quantities at the knots, and what follows from them, computed when it is first asked for."""
 
     def __missing__(self, name: str) -> np.ndarray:
-        """Compute one of the quantities of ``DERIVED``."""
-        value = self[name] = DERIVED[name](self)
+        """Compute a size, a cross product, or one of the quantities of ``DERIVED``."""
+        first, crossed, second = name.partition(" x ")
+        if name.startswith("|"):
+            value = _size(self[name.strip("|")])
+        elif crossed:
+            value = cross(self[first], self[second])
+        else:
+            value = DERIVED[name](self)
+        self[name] = value
         return value
 
 
@@ -50,11 +59,19 @@ class Factor:
     """A scalar or a vector of the state."""
 
     symbol: str
-    unit: Unit
+    unit: str  # of BASE_UNITS with their exponents
+    quantity: str  # at the knots, (k,) for a scalar, (k, 3) for a vector, in the block's frame
     needs: tuple[str, ...]  # keys of Window.knots
-    read: Callable[
-        [KnotValues], np.ndarray
-    ]  # (k,) for a scalar, (k, 3) for a vector, in the block's frame
+
+    def read(self, values: KnotValues) -> np.ndarray:
+        """Return its values at the knots."""
+        return values[self.quantity]
+
+    @property
+    def exponents(self) -> np.ndarray:
+        """Return the exponents of kg, m and s."""
+        powers = dict(part.partition("^")[::2] for part in self.unit.split())
+        return np.array([int(powers[u] or 1) if u in powers else 0 for u in BASE_UNITS])
 
 
 @dataclass(frozen=True)
@@ -68,7 +85,12 @@ class Term:
     @property
     def depth(self) -> int:
         """Number of factors."""
-        return len(self.factors) + 1
+        return len(self.parts)
+
+    @property
+    def parts(self) -> list[Factor]:
+        """Scalars, then the vector."""
+        return [*(SCALARS[name] for name in self.factors), VECTORS[self.block][self.vector]]
 
     def law(self, coefficient: float) -> LawParams:
         """The law that it is with a coefficient."""
@@ -77,11 +99,7 @@ class Term:
     @property
     def needs(self) -> set[str]:
         """Keys of Window.knots that its factors are made of."""
-        return {
-            key
-            for factor in (*(SCALARS[f] for f in self.factors), VECTORS[self.block][self.vector])
-            for key in factor.needs
-        }
+        return {key for factor in self.parts for key in factor.needs}
 
     @property
     def unit(self) -> str:
@@ -89,25 +107,14 @@ class Term:
         in the joint, a torque [N m].
         """
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
-        parts = [SCALARS[f].unit for f in self.factors] + [VECTORS[self.block][self.vector].unit]
-        exponents = zip(
-            ("kg", "m", "s"), (t - sum(p[i] for p in parts) for i, t in enumerate(target))
-        )
-        return " ".join(name if n == 1 else f"{name}^{n}" for name, n in exponents if n) or "1"
+        left = np.array(target) - sum(factor.exponents for factor in self.parts)
+        powers = [u if n == 1 else f"{u}^{n}" for u, n in zip(BASE_UNITS, left) if n]
+        return " ".join(powers) or "1"
 
     @property
     def formula(self) -> str:
         """The right-hand side with coefficient c."""
-        symbols = [SCALARS[f].symbol for f in self.factors] + [
-            VECTORS[self.block][self.vector].symbol
-        ]
-        symbol = {
-            "vehicle force": "F",
-            "vehicle torque": "M",
-            "payload force": "F_p",
-            JOINT: "M_j",
-        }[self.block]
-        return f"{symbol} = c {' '.join(symbols)}"
+        return f"{SYMBOLS[self.block]} = c {' '.join(factor.symbol for factor in self.parts)}"
 
 
 def term_of(law: LawParams) -> Term:
@@ -157,7 +164,7 @@ def _axis(i: int) -> Callable[[KnotValues], np.ndarray]:
     return lambda k: rotate(k["quat_wb"], np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
 
 
-def _fixed(i: int) -> Callable[[KnotValues], np.ndarray]:
+def _unit(i: int) -> Callable[[KnotValues], np.ndarray]:
     return lambda k: np.tile(np.eye(3)[i], (len(k["time"]), 1))
 
 
@@ -186,21 +193,19 @@ def _joint_rate(k: KnotValues) -> np.ndarray:
 
 def _friction(k: KnotValues) -> np.ndarray:
     """Direction of that rate, and less than a unit vector where it is slow."""
-    return k["joint_rate_b"] / np.hypot(_size(k["joint_rate_b"]), SLOWEST)[:, None]
+    return k["joint_rate_b"] / np.hypot(k["|joint_rate_b|"], SLOWEST)[:, None]
 
 
 def _spring(k: KnotValues) -> np.ndarray:
     """Return the direction that turns the vehicle's axis against the rope, body frame; 0 where
     nothing hangs on it.
     """
-    return (k["tension"] > 0.0)[:, None] * cross(_EZ, k["cable_dir_b"])
+    return (k["tension"] > 0.0)[:, None] * k["unit_z x cable_dir_b"]
 
 
-def _size(vector: np.ndarray) -> np.ndarray:
-    return np.linalg.norm(vector, axis=1)
+def _size(value: np.ndarray) -> np.ndarray:
+    return np.abs(value) if value.ndim == 1 else np.linalg.norm(value, axis=1)
 
-
-_EZ = np.array([0.0, 0.0, 1.0])
 
 DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "quat_wb": (
@@ -209,6 +214,9 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "axis_x": _axis(0),
     "axis_y": _axis(1),
     "axis_z": _axis(2),
+    "unit_x": _unit(0),
+    "unit_y": _unit(1),
+    "unit_z": _unit(2),
     "slope": _slope,
     "swing": _swing,
     "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
@@ -218,122 +226,38 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "cable_dir_b": lambda k: rotate_back(k["quat_wb"], k["cable_dir_w"]),
     "reach_w": _reach,
     "joint_rate_b": _joint_rate,
+    "friction": _friction,
+    "spring": _spring,
+    "speed_across_squared": lambda k: k["|across|"] ** 2,
+    "rate_yaw": lambda k: k["rate_b"][:, 2],
+    "rate_w": lambda k: rotate(k["quat_wb"], k["rate_b"]),
+    "swing_b": lambda k: rotate_back(k["quat_wb"], k["swing"]),
+    "inverse_height": lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST),
+    "sideways": lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"],
 }
 """What :class:`KnotValues` computes of the quantities at the knots."""
 
-_POSE, _MOVES = ("quat_wb",), ("vel_w", "quat_wb")
-_PAIR = ("payload_vel_w", "vel_w", "cable_dir_w")
-JOINT_NEEDS = (
-    "payload_pos_w",
-    "payload_vel_w",
-    "pos_w",
-    "vel_w",
-    "quat_wb",
-    "rate_b",
-    "cable_dir_w",
-    "mount_b",
-    "tension",
-)
+_TABLES = tomllib.loads(Path(__file__).with_name("law_factors.toml").read_text(encoding="utf-8"))
 
-SCALARS: dict[str, Factor] = {
-    "thrust": Factor("T", (1, 1, -2), ("thrust",), lambda k: k["thrust"]),
-    "thrust_rate": Factor("dT/dt", (1, 1, -3), ("thrust", "time"), lambda k: k["slope"]),
-    "abs_thrust_rate": Factor(
-        "|dT/dt|", (1, 1, -3), ("thrust", "time"), lambda k: np.abs(k["slope"])
-    ),
-    "speed": Factor("|v|", (0, 1, -1), ("vel_w",), lambda k: _size(k["vel_w"])),
-    "speed_across": Factor("v_xy", (0, 1, -1), _MOVES, lambda k: _size(k["across"])),
-    "speed_across_squared": Factor("v_xy²", (0, 2, -2), _MOVES, lambda k: _size(k["across"]) ** 2),
-    "speed_along": Factor("v_z", (0, 1, -1), _MOVES, lambda k: k["along"]),
-    "rate": Factor("|ω|", (0, 0, -1), ("rate_b",), lambda k: _size(k["rate_b"])),
-    "rate_yaw": Factor("ω_z", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"][:, 2]),
-    "inverse_height": Factor(
-        "1/z", (0, -1, 0), ("pos_w",), lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST)
-    ),
-    "tension": Factor("S", (1, 1, -2), ("tension",), lambda k: k["tension"]),
-    "payload_speed": Factor(
-        "|v_p|", (0, 1, -1), ("payload_vel_w",), lambda k: _size(k["payload_vel_w"])
-    ),
-    "swing_speed": Factor("|v_s|", (0, 1, -1), _PAIR, lambda k: _size(k["swing"])),
-    "cable_under_rotors": Factor(
-        "(-n·e_z)", (0, 0, 0), ("cable_dir_w", "quat_wb"), lambda k: k["under"]
-    ),
-    "joint_rate": Factor("|Ω|", (0, 0, -1), JOINT_NEEDS, lambda k: _size(k["joint_rate_b"])),
-}
+
+def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
+    """Return the factors of a table of the file."""
+    factors = {}
+    for name, (symbol, unit, quantity, words) in rows.items():
+        groups = [_TABLES["groups"].get(word, [word]) for word in words.split()]
+        factors[name] = Factor(symbol, unit, quantity, tuple(chain.from_iterable(groups)))
+    return factors
+
+
+SCALARS = _factors(_TABLES["scalars"])
 """Scalars of a term."""
 
 ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
 
-VECTORS: dict[str, dict[str, Factor]] = {
-    "vehicle force": {
-        "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
-        "body_x": Factor("e_x", (0, 0, 0), _POSE, lambda k: k["axis_x"]),
-        "body_y": Factor("e_y", (0, 0, 0), _POSE, lambda k: k["axis_y"]),
-        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
-        "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
-        "vel_across": Factor("v_⊥", (0, 1, -1), _MOVES, lambda k: k["across"]),
-        "axis_cross_vel": Factor(
-            "(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(k["axis_z"], k["vel_w"])
-        ),
-        "rate_cross_vel": Factor(
-            "(ω x v)",
-            (0, 1, -2),
-            (*_MOVES, "rate_b"),
-            lambda k: cross(rotate(k["quat_wb"], k["rate_b"]), k["vel_w"]),
-        ),
-        "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
-        "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
-    },
-    "vehicle torque": {
-        "body_x": Factor("e_x", (0, 0, 0), ("time",), _fixed(0)),
-        "body_y": Factor("e_y", (0, 0, 0), ("time",), _fixed(1)),
-        "body_z": Factor("e_z", (0, 0, 0), ("time",), _fixed(2)),
-        "rate": Factor("ω", (0, 0, -1), ("rate_b",), lambda k: k["rate_b"]),
-        "axis_cross_rate": Factor(
-            "(e_z x ω)", (0, 0, -1), ("rate_b",), lambda k: cross(_EZ, k["rate_b"])
-        ),
-        "vel": Factor("v", (0, 1, -1), _MOVES, lambda k: k["vel_b"]),
-        "axis_cross_vel": Factor("(e_z x v)", (0, 1, -1), _MOVES, lambda k: cross(_EZ, k["vel_b"])),
-        "axis_cross_cable": Factor(
-            "(e_z x n)",
-            (0, 0, 0),
-            ("cable_dir_w", "quat_wb"),
-            lambda k: cross(_EZ, k["cable_dir_b"]),
-        ),
-        "axis_cross_swing": Factor(
-            "(e_z x v_s)",
-            (0, 1, -1),
-            (*_PAIR, "quat_wb"),
-            lambda k: cross(_EZ, rotate_back(k["quat_wb"], k["swing"])),
-        ),
-    },
-    "payload force": {
-        "payload_vel": Factor("v_p", (0, 1, -1), ("payload_vel_w",), lambda k: k["payload_vel_w"]),
-        "vertical_cross_vel": Factor(
-            "(z x v_p)", (0, 1, -1), ("payload_vel_w",), lambda k: cross(_EZ, k["payload_vel_w"])
-        ),
-        "world_z": Factor("z", (0, 0, 0), ("time",), _fixed(2)),
-        "body_z": Factor("e_z", (0, 0, 0), _POSE, lambda k: k["axis_z"]),
-        "cable": Factor("n", (0, 0, 0), ("cable_dir_w",), lambda k: k["cable_dir_w"]),
-        "swing_vel": Factor("v_s", (0, 1, -1), _PAIR, lambda k: k["swing"]),
-        "cable_cross_swing": Factor(
-            "(n x v_s)", (0, 1, -1), _PAIR, lambda k: cross(k["cable_dir_w"], k["swing"])
-        ),
-        "vel": Factor("v", (0, 1, -1), ("vel_w",), lambda k: k["vel_w"]),
-        "sideways": Factor(
-            "(n - (n·e_z) e_z)",
-            (0, 0, 0),
-            ("cable_dir_w", "quat_wb"),
-            lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"],
-        ),
-    },
-    JOINT: {
-        "joint_rate": Factor("Ω", (0, 0, -1), JOINT_NEEDS, lambda k: k["joint_rate_b"]),
-        "friction": Factor("Ω/|Ω|", (0, 0, 0), JOINT_NEEDS, _friction),
-        "axis_cross_cable": Factor("(e_z x n)", (0, 0, 0), JOINT_NEEDS, _spring),
-    },
-}
+VECTORS = {block: _factors(rows) for block, rows in _TABLES["vectors"].items()}
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
+
+JOINT_NEEDS = VECTORS[JOINT]["joint_rate"].needs
 
 MOST_SCALARS = 2
 

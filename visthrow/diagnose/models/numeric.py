@@ -55,6 +55,32 @@ class Stretch:
     latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
     latent_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
+    @staticmethod
+    def of(
+        flight: int,
+        phase: str,
+        channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        data: Mapping[str, Any],
+        layout: Mapping[str, np.ndarray],
+        nuisance: Sequence[float] = (),
+        nuisance_sd: Sequence[float] = (),
+    ) -> "Stretch":
+        """Lay out the samples of channels.
+
+        ``channels``: stamps, shape (n,), values, shape (n, C), and their deviations, which
+        broadcast to the values; ``layout``: of :func:`latent_layout`.
+        """
+        samples = [
+            (np.repeat(time, values.shape[1]), values, np.broadcast_to(sigma, values.shape))
+            for time, values, sigma in channels
+        ]
+        time, measured, sigma = (
+            np.concatenate([part.ravel() for part in parts]) for parts in zip(*samples)
+        )
+        number = np.repeat(np.arange(len(channels)), [values.size for _, values, _ in channels])
+        start = np.array(nuisance, dtype=float), np.array(nuisance_sd, dtype=float)
+        return Stretch(flight, phase, time, number, measured, sigma, *start, data, **layout)
+
 
 @dataclass(frozen=True)
 class Lanes:
@@ -192,6 +218,10 @@ class NumericModel(Model, ABC):
             else np.zeros(len(lanes.owner))
         )
 
+    def stack(self, lanes: Lanes, *names: str) -> np.ndarray:
+        """Sizes of several effects, shape (B, N); zeros for an empty name."""
+        return np.stack([self.of(lanes, name) for name in names], axis=1)
+
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         size = self.size(theta)
@@ -316,41 +346,24 @@ class NumericModel(Model, ABC):
         """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central
         differences; (N, directions) a stretch.
         """
-        stretches, first = len(self.stretches), self.stretches[0]
-        counts = {
-            "theta": len(self.numbers),
-            "nuisance": len(first.nuisance),
-            "latent": len(first.latent_block),
-        }
-        lanes_of = (
-            np.arange(counts[name])
-            if name != "theta"
-            else np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
-        )
-        count = len(lanes_of)
-        steps = np.broadcast_to(
-            {
-                "theta": np.array([EFFECT_STEP * effect.prior_sd for effect in self.effects]),
-                "nuisance": NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches]),
-                "latent": np.full(count, self.latent_step),
-            }[name],
-            (stretches, count),
-        )
-        moves = {key: np.zeros((stretches * count, n)) for key, n in counts.items()}
-        moves[name] = (steps[:, :, None] * np.eye(counts[name])[lanes_of]).reshape(
-            stretches * count, counts[name]
-        )
-        lanes_at_rest = Lanes(
-            np.repeat(np.arange(stretches), count), size, np.repeat(self._start, count, axis=0), 0.0
-        )
-        moved = [
-            Lanes(
-                lanes_at_rest.owner,
-                *(getattr(lanes_at_rest, key) + sign * move for key, move in moves.items()),
-            )
+        stretches, lanes = len(self.stretches), self._lanes(size)
+        width = getattr(lanes, name).shape[1]
+        axes = np.arange(width)
+        if name == "theta":
+            axes = np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
+            steps = EFFECT_STEP * np.array([effect.prior_sd for effect in self.effects])
+        elif name == "nuisance":
+            steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
+        else:
+            steps = np.full(width, self.latent_step)
+        count = len(axes)
+        steps = np.broadcast_to(steps, (stretches, count))
+        moves = (steps[:, :, None] * np.eye(width)[axes]).reshape(stretches * count, width)
+        at_rest = lanes.part(np.repeat(np.arange(stretches), count))
+        sides = [
+            self._run(replace(at_rest, **{name: getattr(at_rest, name) + sign * moves}))
             for sign in (1.0, -1.0)
         ]
-        sides = [self._run(lanes) for lanes in moved]
         slopes = [0.5 * (a - b) / step for a, b, step in zip(*sides, steps.ravel())]
         return [
             np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T

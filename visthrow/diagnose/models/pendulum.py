@@ -169,7 +169,7 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
             f" hangs ({params.hanging:.3g} rad); expected radians within a turn: degrees, or"
             " another zero?"
         )
-    sigma = float(sigma_of(channel, 1e-5)[0])
+    sigma = sigma_of(channel, 1e-5)
     stretches = []
     for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
         rows = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
@@ -177,18 +177,9 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
             continue
         t, y = time[rows], angle[rows]
         fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
+        layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
+        table = t, y[:, None], sigma
         stretches.append(
-            Stretch(
-                number,
-                "swing",
-                t,
-                np.zeros(len(t), dtype=int),
-                y,
-                np.full(len(t), sigma),
-                fit[:2],
-                np.array([0.2, 1.0]),
-                {"start": start},
-                **latent_layout(start, start + params.window, KNOTS, (2,), (0, 2)),
-            )
+            Stretch.of(number, "swing", [table], {"start": start}, layout, fit[:2], [0.2, 1.0])
         )
     return stretches

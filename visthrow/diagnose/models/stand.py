@@ -108,22 +108,13 @@ def _steps(log: FlightLog, number: int, params: StandParams) -> Stretch | None:
     if len(rows) < 4:
         return None
     speed, thrust, volts, current = rows.T
-    sigma = np.concatenate(
-        [
-            np.hypot(params.thrust_sd, params.thrust_share * thrust),
-            np.hypot(params.current_sd, params.current_share * current),
-        ]
-    )
     steps = np.arange(len(rows), dtype=float)
-    return Stretch(
-        number,
-        "steps",
-        np.tile(steps, 2),
-        np.repeat([0, 1], len(rows)),
-        np.concatenate([thrust, current]),
-        sigma,
-        np.zeros(0),
-        np.zeros(0),
-        {"speed": speed, "volts": volts},
-        **latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1)),
-    )
+    thrust_sd = np.hypot(params.thrust_sd, params.thrust_share * thrust)
+    current_sd = np.hypot(params.current_sd, params.current_share * current)
+    channels = [
+        (steps, values[:, None], sd[:, None])
+        for values, sd in ((thrust, thrust_sd), (current, current_sd))
+    ]
+    data = {"speed": speed, "volts": volts}
+    layout = latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1))
+    return Stretch.of(number, "steps", channels, data, layout)

@@ -157,18 +157,6 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
             "pos": np.mean(pos[window_rows], axis=0),
             "vel": np.mean(speeds, axis=0),
         }
-        stretches.append(
-            Stretch(
-                number,
-                "hover",
-                np.full(4, start),
-                np.zeros(4, dtype=int),
-                np.mean(sent[rows], axis=0),
-                np.full(4, params.spread),
-                np.zeros(0),
-                np.zeros(0),
-                data,
-                **_latent(start, start + window),
-            )
-        )
+        table = np.array([start]), np.mean(sent[rows], axis=0)[None], np.array(params.spread)
+        stretches.append(Stretch.of(number, "hover", [table], data, _latent(start, start + window)))
     return stretches

@@ -1,17 +1,13 @@
 """Effects hidden in the user's own noise: which sizes would have been named in these flights.
 
 The worlds are drawn from the statistics: scores of the flights' own residuals with random signs a
-flight, every effect somewhere within its floor, plus the score of the hidden effect.
-:class:`Hidden` hides an effect in the measurements themselves, for a full search with the
-simulation."""
+flight, every effect somewhere within its floor, plus the score of the hidden effect."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import STRONG, additions
-from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.select.result import Diagnosis
 
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
@@ -123,94 +119,3 @@ def _limit(size: np.ndarray, share: np.ndarray) -> float:
         return float("nan")
     part = (NAMED - share[last]) / (share[last + 1] - share[last])
     return float(np.exp(np.log(size[last]) + part * np.log(size[last + 1] / size[last])))
-
-
-class Hidden:
-    """A model whose flights hold one more effect: their measurements are shifted by what the
-    simulation says it does.
-    """
-
-    def __init__(self, model: Model, truth: Mapping[str, float]) -> None:
-        """Simulate twice and keep the difference; ``truth``: hidden sizes, in the
-        effects' units.
-        """
-        self.model, self.effects, self.channels = model, model.effects, model.channels
-        self._shift = [a - b for a, b in zip(model.residuals({}), model.residuals(truth))]
-
-    def windows(self, theta: Mapping[str, float]) -> list[Window]:
-        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
-        return [
-            replace(w, residual=w.residual + s)
-            for w, s in zip(self.model.windows(theta), self._shift)
-        ]
-
-    def residuals(
-        self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[np.ndarray]:
-        """See :class:`visthrow.diagnose.models.model_interface.Model`."""
-        return [r + s for r, s in zip(self.model.residuals(theta, linearised), self._shift)]
-
-
-@dataclass(frozen=True)
-class Trial:
-    """One effect hidden in the measurements and searched for with the simulation."""
-
-    name: str
-    size: float  # hidden [unit]
-    unit: str
-    expected: float  # what was found of it before, plus what was hidden [unit]
-    estimate: float  # [unit]; 0 where it was not named
-    verdict: str
-    named: tuple[str, ...]
-
-
-def verify(
-    diagnosis: Diagnosis,
-    count: int,
-    *,
-    floors: float = 10.0,
-    seed: int = 0,
-    only: Sequence[str] = (),
-) -> list[Trial]:
-    """Hide effects in the measurements and run the whole search on each.
-
-    ``floors``: size of what is hidden; ``only``: names to choose among; empty for all that can be
-    seen."""
-    from visthrow.diagnose.select.search import explain
-
-    rng, problem = np.random.default_rng(seed), diagnosis.work.problem
-    able = [
-        e
-        for e, v in zip(problem.model.effects, problem.priors.visible)
-        if v and (not only or e.name in only)
-    ]
-    trials = []
-    for effect in (able[i] for i in rng.permutation(len(able))[:count]):
-        signs = [
-            s
-            for s in (-1.0, 1.0)
-            if effect.bounds[0] <= s * floors * effect.floor <= effect.bounds[1]
-        ]
-        if not signs:
-            continue
-        size = float(rng.choice(signs)) * floors * effect.floor
-        verdicts = explain(
-            Hidden(problem.model, {effect.name: size}),
-            seed=seed,
-            without=diagnosis.events,
-            laws=False,
-        )
-        finding = verdicts[effect.name]
-        expected = diagnosis.theta.get(effect.name, 0.0) + size
-        trials.append(
-            Trial(
-                effect.name,
-                size,
-                effect.unit,
-                expected,
-                finding.estimate,
-                finding.verdict,
-                verdicts.named,
-            )
-        )
-    return trials

@@ -408,7 +408,7 @@ def _blind(blind: Blind, diagnosis: Diagnosis) -> Section:
         Picture(
             "completeness",
             pictures.completeness(blind, floors),
-            "Hidden effects named, over their size.",
+            "Sizes from which hidden effects are named.",
         ),
         Grid("Detection limits in these flights", ("effect", "limit", "unit"), rows, note),
     )

@@ -24,9 +24,6 @@ WIDTH = 9.2  # [inch]
 BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
-MOST_CURVES = (
-    24  # curves of the completeness picture; of more effects it shows where their curves rise
-)
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
 STEPS_ACROSS = 3
 NAMES_ACROSS = 26  # letters in a line of a set's names
@@ -316,42 +313,12 @@ def confusion(diagnosis: Diagnosis) -> bytes:
 
 
 def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
-    """Share of worlds in which a hidden effect is named, over its size in floors; of many effects
-    where it rises.
+    """Sizes from which each hidden effect is named in half and in nine tenths of worlds, in floors;
+    open to the right if never.
     """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
     last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
     pairs = sorted(pairs, key=lambda p: last[p[0].name])
-    if len(pairs) > MOST_CURVES:
-        return _rises(pairs)
-    half = (len(pairs) + 1) // 2
-    figure, axes = _figure(1, 2, 4.4, sharey=True)
-    for axis, group in zip(axes[0], (pairs[:half], pairs[half:])):
-        for i, (curve, floor) in enumerate(group):
-            look = {
-                "color": style.COLOURS[i % 6],
-                "marker": style.MARKERS[i % 6],
-                "ls": ("-", "--", ":", "-.")[i // 6 % 4],
-            }
-            axis.plot(
-                np.array(curve.sizes) / floor,
-                curve.up_to_class,
-                ms=3.5,
-                lw=1.1,
-                label=curve.name,
-                **look,
-            )
-        axis.axhline(0.9, color=style.FAINT)
-        axis.set(xscale="log", xlabel="hidden size [floors]", ylim=(-0.02, 1.02))
-        axis.legend(fontsize=6.5, ncol=2)
-    axes[0, 0].set_ylabel("named, up to its class")
-    return png_of(figure)
-
-
-def _rises(pairs: Sequence[tuple]) -> bytes:
-    """Sizes from which each effect is named in half and in nine tenths of worlds, in floors; open
-    to the right if never.
-    """
     figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
     axis = axes[0, 0]
     for y, (curve, floor) in enumerate(pairs[::-1]):

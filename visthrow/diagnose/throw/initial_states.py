@@ -40,6 +40,16 @@ A wider prior invents bends of 0.02 rad out of noise; they whip, and tell of the
 payload's mass what is not so.
 """
 
+RIGID = (
+    ("pos_w", 0.1, 1e-4),
+    ("quat_wb", 0.1, 1e-4),
+    ("vel_w", 1.0, 1e-3),
+    ("rate_b", 3.0, 1e-3),
+)
+"""Fields of a body with their vague priors and the steps of their derivatives."""
+
+ROPE = ("cable_dir_w", "cable_vel_w")
+
 States = dict[str, np.ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
 MOVED = "moved"
 """Beside the fields: how far a fit moved each state along the directions from where their prior has
@@ -76,25 +86,19 @@ class Direction:
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
     """Directions, vague in whatever a sensing effect can move."""
-    hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
-    gain = plant.vehicle.controller.i_gain
-    listed = [Direction("pos_w", i, 0.1, 1e-4) for i in range(3)]
-    listed += [Direction("quat_wb", i, 0.1, 1e-4) for i in range(3)]
-    listed += [Direction("vel_w", i, 1.0, 1e-3) for i in range(3)]
-    listed += [Direction("rate_b", i, 3.0, 1e-3) for i in range(3)]
-    if plant.vehicle.controller.kind != "geometric":
-        listed += [
-            Direction("integral", i, INTEGRAL * gain[i], 1e-3 * gain[i])
-            for i in range(3)
-            if gain[i] > 0.0
-        ]
+    controller = plant.vehicle.controller
+    rows = [(field, range(3), sd, step) for field, sd, step in RIGID]
+    if controller.kind != "geometric":
+        gains = [(i, gain) for i, gain in enumerate(controller.i_gain) if gain > 0.0]
+        rows += [("integral", [i], INTEGRAL * gain, 1e-3 * gain) for i, gain in gains]
     if plant.vehicle.motor.kind != "instant":
-        listed += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
-    listed += [Direction("cable_dir_w", i, 0.1, 1e-4, "all") for i in range(2)]
-    listed += [Direction("cable_vel_w", i, 1.5, 1e-3, "all") for i in range(2)]
-    for part in ("last", *range(1, MODES + 1))[: plant.rope.segments - 1]:
-        listed += [Direction("cable_dir_w", i, SHAKEN[0], 1e-4, part, BENT[0]) for i in range(2)]
-        listed += [Direction("cable_vel_w", i, SHAKEN[1], 1e-3, part, BENT[1]) for i in range(2)]
+        hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
+        rows.append(("motor_speed", range(4), 0.15 * hover, 1e-4 * hover))
+    listed = [Direction(field, i, sd, step) for field, axes, sd, step in rows for i in axes]
+    for part in ("all", *("last", *range(1, MODES + 1))[: plant.rope.segments - 1]):
+        deviations = zip(SHAKEN, BENT) if part != "all" else [(0.1, None), (1.5, None)]
+        for field, step, (sd, calm) in zip(ROPE, (1e-4, 1e-3), deviations):
+            listed += [Direction(field, i, sd, step, part, calm) for i in range(2)]
     listed += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
     return (*listed, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 

@@ -133,45 +133,39 @@ class ReplayedFlights:
         )
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
-        self.windows = {name: np.zeros(len(self.cuts)) for name in WINDOW_FIELDS}
-        parts: dict[str, list[ChannelSamples]] = {
-            "vehicle": [],
-            "attitude": [],
-            "payload": [],
-            "gyro": [],
-        }
-        counts = dict.fromkeys(parts, 0)
+        names = ("vehicle", "attitude", "payload", "gyro")
+        parts: dict[str, list[ChannelSamples]] = {name: [] for name in names}
+        rows = []
         for w, c in enumerate(self.cuts):
             f = self.flights[c.flight]
-            arrays = {
-                "start": c.start,
-                "end": c.end,
-                "first_knot": c.start,
-                "knots": self.knots[w],
-                "payload": c.payload,
-                "latch": f.latch if c.payload == ATTACHED else NEVER,
-                "clock_zero": f.start,
-                "command_first": lengths[c.flight],
-                "command_last": lengths[c.flight + 1],
-            }
-            sources = (
-                f.vehicle,
-                f.attitude,
-                f.payload if c.payload in (ATTACHED, LOOSE) else None,
-                f.gyro,
-            )
-            for name, source, delay in zip(parts, sources, (delays[0], *delays)):
+            payload = f.payload if c.payload in (ATTACHED, LOOSE) else None
+            sources = (f.vehicle, f.attitude, payload, f.gyro)
+            for name, source, delay in zip(names, sources, (delays[0], *delays)):
                 samples = source or ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
                 span = samples.between(c.start + delay + EARLY, c.end + delay)
                 parts[name].append(
                     ChannelSamples(samples.time[span], samples.values[span], samples.sigma)
                 )
-                arrays |= {f"{name}_first": counts[name], f"{name}_count": len(samples.time[span])}
-                counts[name] += len(samples.time[span])
-            for name in self.windows:
-                self.windows[name][w] = arrays[name]
+            rows.append(
+                {
+                    "start": c.start,
+                    "end": c.end,
+                    "first_knot": c.start,
+                    "knots": self.knots[w],
+                    "payload": c.payload,
+                    "latch": f.latch if c.payload == ATTACHED else NEVER,
+                    "clock_zero": f.start,
+                    "command_first": lengths[c.flight],
+                    "command_last": lengths[c.flight + 1],
+                }
+            )
+        fields = {name: np.array([row[name] for row in rows]) for name in rows[0]}
+        for name, pieces in parts.items():
+            counts = np.array([len(piece.time) for piece in pieces])
+            fields |= {f"{name}_first": np.cumsum(counts) - counts, f"{name}_count": counts}
         self.windows = {
-            k: v.astype(int) if WINDOW_FIELDS[k] == "int" else v for k, v in self.windows.items()
+            name: fields[name].astype(int if kind[0] == "int" else float)
+            for name, kind in WINDOW_FIELDS.items()
         }
         self.samples = parts
         data = {

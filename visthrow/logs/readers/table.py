@@ -213,9 +213,10 @@ def _numbers(table: Table, name: str, source: str) -> np.ndarray:
 
 
 def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
+    offset = clock.offset + clock.offsets.get(Path(source).name, 0.0)
     if not clock.column:
-        return clock.row_period * np.arange(len(next(iter(table.values())))) + clock.offset
-    return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + clock.offset
+        return clock.row_period * np.arange(len(next(iter(table.values())))) + offset
+    return _numbers(table, clock.column, source) * to_si(clock.unit, "time")[1] + offset
 
 
 def _parts(
