@@ -125,7 +125,6 @@ def test_ball_has_drag_and_sideways_forces_cannot_be_told_apart():
     assert rms(diagnosis.theta) < 0.5 * rms({})
 
 
-@mark.slow
 def test_a_cut_propeller_is_found_and_tape_is_not():
     folder = REAL / "crazypad_faults"
     diagnosis, named, _ = explained(
@@ -192,7 +191,6 @@ def test_a_motor_idles_and_a_hundred_motors_are_not_one():
     assert "thrust_voltage" not in named
 
 
-@mark.slow
 def test_the_camera_sees_the_load_nearer_the_axis():
     diagnosis, named, rms = explained(
         "slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz"))
