@@ -220,6 +220,12 @@ def test_quaternion_turned_around_is_caught():
     assert "frames" in faults(log_of(columns))
 
 
+def test_quaternions_without_length_are_told():
+    columns = flight()
+    columns["quat_wb"][::2] = 0.0
+    assert "values quat_wb: holds quaternions of length 0" in faults(log_of(columns))
+
+
 def test_scrambled_commands_are_caught():
     columns = flight(40.0)
     columns["command"] = flight(40.0, seed=5)["command"]

@@ -102,6 +102,10 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
         for name, channel in log.channels.items()
         if np.sum(channel.valid) >= signals.FEW_SAMPLES
     }
+    for name in [name for name in full if name.endswith("quat_wb")]:
+        if not np.all(np.any(full[name].samples()[1], axis=1)):
+            rows.append(Row("values", name, "bad", "holds quaternions of length 0"))
+            del full[name]
     usable = FlightLog(full, log.meta)
     kind = str(log.meta.get("vehicle", ""))
     if kind and not Vehicle(kind).rotors_alone:
