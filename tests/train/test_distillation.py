@@ -94,6 +94,7 @@ def test_every_seed_learns(seed):
     assert losses[-1] < 0.5 * losses[0]
 
 
+@mark.slow
 def test_it_learns_to_throw():
     """A dozen rollouts of 48 throws teach it."""
     summary = trained(14)[0].throw(2.0, 64).summary()
