@@ -211,7 +211,7 @@ class PPOParams(Bounded):
     learning_rate: Positive
     schedule: Literal["adaptive", "fixed"]
     desired_kl: Positive  # at the first iteration
-    final_kl: Positive  # at the last one; linear between
+    final_kl: Positive  # once settled; linear between
     discount: Share
     gae_lambda: Share
     clip: Positive
@@ -221,6 +221,7 @@ class PPOParams(Bounded):
     products: Literal["float32", "bfloat16"] = (
         "float32"  # of the hidden layers; weights are float32 either way
     )
+    settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
     # rope segments at most, and least substep [s], of the simulator that is trained in: 0 for the
     # plant's own, in which throws are measured
     segments: Annotated[int, Bound(0)] = 0

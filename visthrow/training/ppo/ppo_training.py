@@ -116,7 +116,8 @@ class PPOTraining:
 
     def learn(self, done: float) -> dict[str, float]:
         p = self.experiment.ppo
-        self.alg.desired_kl = (1.0 - done) * p.desired_kl + done * p.final_kl
+        settled = min(done / p.settled, 1.0)
+        self.alg.desired_kl = (1.0 - settled) * p.desired_kl + settled * p.final_kl
         self._warm_up(round(done * p.iterations))
         figures = self.alg.update()
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
