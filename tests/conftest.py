@@ -2,9 +2,9 @@
 
 from pytest import fixture
 
-from visthrow.diagnose.likelihood.threads import single
+from visthrow.diagnose.likelihood.threads import limit_to_one_thread
 
-single()
+limit_to_one_thread()
 
 
 @fixture

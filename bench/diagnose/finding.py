@@ -30,7 +30,7 @@ import numpy as np
 from bench.diagnose.cases import size_is
 from bench.diagnose.sealed import LAWS, MEASURED, TERMS, hand_over, judge, model_of
 from bench.worlds.world import FLOORS, Recipe, draw
-from visthrow.diagnose.likelihood.threads import single
+from visthrow.diagnose.likelihood.threads import limit_to_one_thread
 
 Tool = Callable[[Path, list[str]], dict]
 """Folder of logs, overrides that state the model -> verdict, as ``explain --json`` writes it."""
@@ -286,7 +286,7 @@ def exchanged(one: str, other: str, real: Tool = explain) -> Tool:
 
 def main() -> None:
     """Print the share of right answers by kind."""
-    single()
+    limit_to_one_thread()
     count, first = int(sys.argv[1]), int.from_bytes(os.urandom(4), "little")
     print(f"first seed {first}")
     asked_of, good = Counter(), Counter()

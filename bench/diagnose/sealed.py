@@ -40,7 +40,7 @@ from bench.worlds.world import (
     recorded,
 )
 from visthrow.common.errors import VisthrowError
-from visthrow.diagnose.likelihood.threads import single
+from visthrow.diagnose.likelihood.threads import limit_to_one_thread
 from visthrow.logs.flightlog import Channel, FlightLog
 
 WITHOUT_TESTS = """
@@ -580,7 +580,7 @@ def main() -> None:
         "--small", action="store_true", help="short flights, as the default tests have them"
     )
     args = parser.parse_args()
-    single()
+    limit_to_one_thread()
     if args.warm:
         warm(args.warm)
         return

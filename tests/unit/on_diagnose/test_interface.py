@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from sim.params import GRAVITY
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.select.search import put_right
+from visthrow.diagnose.select.search import correct_interface_mistakes
 from visthrow.diagnose.throw import command_mistakes as interface
 from visthrow.diagnose.throw.command_mistakes import suspected
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -117,7 +117,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
             "suspected",
             lambda *_: [interface.Mistake("rate_sign", "c", "e", 0.0, 2, 48, turned)],
         )
-    model, logs = put_right(wrong, PLANT, simulated)
+    model, logs = correct_interface_mistakes(wrong, PLANT, simulated)
     assert [m.name for m in model.mistakes] == names
     assert all(m.nats > 100.0 for m in model.mistakes)
     assert len(json.dumps([asdict(m) for m in model.mistakes])) >= 2

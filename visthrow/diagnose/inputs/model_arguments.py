@@ -165,12 +165,12 @@ def throw_model(
     """
     from visthrow import config
     from visthrow.diagnose.likelihood import threads
-    from visthrow.diagnose.select.search import put_right
+    from visthrow.diagnose.select.search import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
     from visthrow.training.compute_device import resolve
 
-    threads.keep()
+    threads.keep_freed_memory()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
     only = args.only.split(",") if args.only is not None else None
     measured = {
@@ -180,7 +180,7 @@ def throw_model(
     }
     measured |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)
-    return put_right(
+    return correct_interface_mistakes(
         [log.measured() for log in logs], plant, lambda logs: ThrowModel(logs, plant, **measured)
     )
 

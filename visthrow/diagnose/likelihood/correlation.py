@@ -24,7 +24,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
-from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram, left_of
+from visthrow.diagnose.likelihood.marginal import correlated_of, hidden_gram, residual_after_fit
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.model_interface import Window
 
@@ -117,7 +117,7 @@ def correlations(
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = parallel_map(lambda window: hidden_gram(window, channels), free)
     residuals = parallel_map(
-        lambda pair: left_of(*pair), zip(free, noise.widely_fitted(free, bare, "cpu"))
+        lambda pair: residual_after_fit(*pair), zip(free, noise.widely_fitted(free, bare, "cpu"))
     )
     suspects = {
         c: scale for c in range(channels) if (scale := _suspected(free, residuals, c)) is not None

@@ -347,7 +347,7 @@ def _unwhitened(window: Window, white: np.ndarray) -> np.ndarray:
     return out
 
 
-def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
+def residual_after_fit(window: Window, fit: np.ndarray) -> np.ndarray:
     """Return the residual after a fit of initial state in prior deviations and latents at the
     knots, shape (D + L,); shape (N,).
     """
@@ -357,7 +357,7 @@ def left_of(window: Window, fit: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class Share:
+class WindowStatistics:
     """One window's share of :class:`Statistics`."""
 
     information: np.ndarray  # shape (K, K)
@@ -366,7 +366,7 @@ class Share:
 
 
 @dataclass(frozen=True)
-class WindowStatistics(Share):
+class LatentStatistics(WindowStatistics):
     """A window's statistics, with those of its latent forces as if they were effects."""
 
     latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
@@ -374,7 +374,9 @@ class WindowStatistics(Share):
     latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
 
 
-def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> Statistics:
+def gather(
+    grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: np.ndarray
+) -> Statistics:
     """Add up windows by flight.
 
     ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out
@@ -408,7 +410,10 @@ def gather(grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray) -> 
 
 
 def rescored(
-    statistics: Statistics, grams: Sequence[Gram], parts: Sequence[Share], theta: np.ndarray
+    statistics: Statistics,
+    grams: Sequence[Gram],
+    parts: Sequence[WindowStatistics],
+    theta: np.ndarray,
 ) -> Statistics:
     """Return statistics of windows with other residuals: their information stays.
 

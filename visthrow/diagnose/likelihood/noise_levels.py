@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.sparse import bsr_array, csr_array
 
 from visthrow.diagnose.likelihood.marginal import (
     TAIL,
@@ -18,7 +19,7 @@ from visthrow.diagnose.likelihood.marginal import (
     Noise,
     correlated_of,
     hidden_gram,
-    left_of,
+    residual_after_fit,
     without_effects,
 )
 from visthrow.diagnose.likelihood.stack import Stack
@@ -157,51 +158,35 @@ class _Layout:
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
     phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
     seen: np.ndarray  # channels with samples
-    # of each entry of the windows' own gradients that counts: its place there, and its parameter,
-    # shape (2, E)
-    slopes: np.ndarray
-    curvatures: np.ndarray  # the same of their own curvatures, and pairs of parameters
+    # 1 where a parameter moves a window's own level of a block, or scale of a channel; shape
+    # (P, W (B + C))
+    moves: csr_array
 
     @staticmethod
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters."""
-        samples = sum(gram.count for gram in grams)
-        measured, count = np.flatnonzero(samples > 0), len(samples)
-        names = [gram.phase for gram in grams]
         keys = tuple(sorted(noise.latent_sd))
-        index, blocks = {key: i for i, key in enumerate(keys)}, len(LATENT_BLOCKS)
-        present = [
-            [b for b in np.unique(gram.latent_block).tolist() if (b, gram.phase) in index]
-            for gram in grams
-        ]
-        pairs = np.array(
-            [(w, b) for w, levels_of in enumerate(present) for b in levels_of], dtype=int
-        ).reshape(-1, 2)
-        phases = np.array(
-            [index[b, name] for name, levels_of in zip(names, present) for b in levels_of],
-            dtype=int,
+        index, pairs, phases = {key: i for i, key in enumerate(keys)}, [], []
+        for w, gram in enumerate(grams):
+            for block in np.unique(gram.latent_block).tolist():
+                if (block, gram.phase) in index:
+                    pairs.append((w, block))
+                    phases.append(index[block, gram.phase])
+        pairs, phases = np.array(pairs, dtype=int).reshape(-1, 2), np.array(phases, dtype=int)
+        samples = sum(gram.count for gram in grams)
+        measured = np.flatnonzero(samples > 0)
+        blocks = len(LATENT_BLOCKS)
+        width, shares = blocks + len(samples), len(keys) + np.arange(len(pairs))
+        levels = pairs @ [width, 1]
+        scales = blocks + measured + width * np.arange(len(grams))[:, None]
+        scale_parameters = np.tile(len(keys) + len(pairs) + np.arange(len(measured)), len(grams))
+        parameters = np.concatenate((phases, shares, scale_parameters))
+        places = np.concatenate((levels, levels, scales.ravel()))
+        moves = csr_array(
+            (np.ones(len(places)), (parameters, places)),
+            shape=(len(keys) + len(pairs) + len(measured), width * len(grams)),
         )
-        first = len(keys) + len(pairs)
-        size, width, position = first + len(measured), blocks + count, len(keys)
-        slopes, curvatures = [], []
-        for w, (name, levels_of) in enumerate(zip(names, present)):
-            shared = [index[b, name] for b in levels_of]
-            places = np.array(
-                [*shared, *range(position, position + len(levels_of)), *range(first, size)],
-                dtype=int,
-            )
-            part = np.array(
-                [*levels_of, *levels_of, *(blocks + measured)], dtype=int
-            )  # levels and shares of the blocks, scales
-            slopes.append((w * width + part, places))
-            curvatures.append(
-                [
-                    (w * width * width + np.add.outer(width * part, part)).ravel(),
-                    np.add.outer(size * places, places).ravel(),
-                ]
-            )
-            position += len(levels_of)
-        return _Layout(keys, pairs, phases, measured, np.hstack(slopes), np.hstack(curvatures))
+        return _Layout(keys, pairs, phases, measured, moves)
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
@@ -320,17 +305,16 @@ def _likelihood(
     """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
     expected curvature.
     """
-    size = len(layout.keys) + len(layout.pairs) + len(layout.seen)
-    value, slope, curvature = noise.log_prior, np.zeros(size), np.zeros((size, size))
-    place = np.arange(len(layout.keys), len(layout.keys) + len(layout.pairs))
-    inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
-    slope[place] = TAIL * (inverse - 1.0)
-    curvature[place, place] = 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
     values, slopes, curvatures = stack.look(noise)
-    (place, target), (places, pair) = layout.slopes, layout.curvatures
-    slope += np.bincount(target, slopes.ravel()[place], size)
-    curvature += np.bincount(pair, curvatures.ravel()[places], size * size).reshape(size, size)
-    return value + float(values.sum()), slope, curvature
+    windows = np.arange(len(curvatures) + 1)
+    curved = bsr_array((curvatures, windows[:-1], windows))
+    slope = layout.moves @ slopes.ravel()
+    curvature = (layout.moves @ curved @ layout.moves.T).toarray()
+    place = len(layout.keys) + np.arange(len(layout.pairs))
+    inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
+    slope[place] += TAIL * (inverse - 1.0)
+    curvature[place, place] += 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
+    return noise.log_prior + float(values.sum()), slope, curvature
 
 
 def without_outliers(
@@ -350,7 +334,7 @@ def without_outliers(
     for cleaning in range(CLEANINGS):
         where = "cpu" if cleaning else device  # few are looked at once more
         fits = widely_fitted(starts, bare, where)
-        residuals = parallel_map(lambda pair: left_of(*pair), zip(starts, fits))
+        residuals = parallel_map(lambda pair: residual_after_fit(*pair), zip(starts, fits))
         distances = {
             w: _outlier_distances(windows[w], residual)
             for w, residual in zip(windows_left, residuals)

@@ -4,9 +4,8 @@ where the simulation runs.
 The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one
 size: on a GPU in one batch, on a CPU in batches that fit its cache."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -16,8 +15,8 @@ from scipy.linalg import lapack
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.marginal import (
     Gram,
+    LatentStatistics,
     Noise,
-    Share,
     Statistics,
     WindowStatistics,
 )
@@ -35,49 +34,6 @@ BATCH = 8  # windows of a batch on the CPU
 BLOCKS = len(LATENT_BLOCKS)
 
 
-class _HiddenColumns:
-    """Inner products of the columns of W windows, n hidden ones [X, G] at most, K effects; padded
-    columns are 0.
-    """
-
-    def __init__(self, inner: Sequence[np.ndarray], sizes: Sequence[int], device: str):
-        """Keep them; ``inner``: of each window, shape (C, P, P); ``sizes``: of each window, its
-        hidden columns.
-        """
-        self._inner, self._sizes, self._device = inner, sizes, device
-        self._channels, self._effects = len(inner[0]), inner[0].shape[1] - sizes[0]
-
-    @cached_property
-    def hidden(self) -> torch.Tensor:
-        """Shape (W, C, n, n)."""
-        n = max(self._sizes)
-        return self._moved(n, n, lambda inner, w: inner[:, : self._sizes[w], : self._sizes[w]])
-
-    @cached_property
-    def hidden_by_effects(self) -> torch.Tensor:
-        """Return inner products of hidden columns with effects, shape (W, C, n, K)."""
-        return self._moved(
-            max(self._sizes),
-            self._effects,
-            lambda inner, w: inner[:, : self._sizes[w], self._sizes[w] :],
-        )
-
-    @cached_property
-    def among_effects(self) -> torch.Tensor:
-        """Return inner products of effects, shape (W, C, K, K)."""
-        return self._moved(
-            self._effects,
-            self._effects,
-            lambda inner, w: inner[:, self._sizes[w] :, self._sizes[w] :],
-        )
-
-    def _moved(
-        self, height: int, width: int, part: Callable[[np.ndarray, int], np.ndarray]
-    ) -> torch.Tensor:
-        parts = [[part(inner, w)] for w, inner in enumerate(self._inner)]
-        return side_by_side(parts, (self._channels, height, width), self._device)
-
-
 @dataclass(frozen=True)
 class _Batch:
     """W windows, of n columns [X, G] at most; padded columns are 0."""
@@ -85,7 +41,7 @@ class _Batch:
     windows: np.ndarray  # rows of the noise's shares, shape (W,)
     phases: tuple[list[str], np.ndarray]  # that occur, and each window's among them
     grams: list[Gram]
-    columns: _HiddenColumns
+    hidden: torch.Tensor  # inner products of the columns, shape (W, C, n, n)
     cross: torch.Tensor  # shape (W, C, n)
     square: torch.Tensor  # shape (W, C)
     count: torch.Tensor  # shape (W, C)
@@ -104,33 +60,30 @@ class _Shape:
     log_det: torch.Tensor  # of V, shape (W,)
 
 
-@dataclass(frozen=True)
-class _Solved:
-    """A shape with the batch's residuals."""
+def integrals(
+    grams: Sequence[Gram], noise: Noise, device: str = "cpu", *, latents: bool = False
+) -> "Integrals":
+    """Integrate initial states out of windows, and latent forces unless they are asked for.
 
-    mean: torch.Tensor  # of [b, a] in prior deviations, shape (W, n)
-    value: torch.Tensor  # log-likelihood of the residuals, but for the powers of 2 pi, shape (W,)
-
-
-def integrals(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> "Integrals":
-    """Integrate initial states and latent forces out of windows."""
-    return Stack(grams, device).integrals(noise)
+    Raises DiagnoseError: as :meth:`Stack.values`.
+    """
+    return Stack(grams, device).integrals(noise, latents)
 
 
-def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[WindowStatistics]:
+def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list[LatentStatistics]:
     """Return the statistics of windows, with those of their latent forces at the knots as if they
     were effects.
     """
-    whole = Stack(grams, device).integrals(noise, latents=True)
+    whole = integrals(grams, noise, device, latents=True)
     return parallel_map(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
 
 
-def _of_latents(share: Share, gram: Gram) -> WindowStatistics:
+def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:
     latents, whole = gram.latents, share.information
     inverse = (
         lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor
     )  # from unit latents to knots
-    return WindowStatistics(
+    return LatentStatistics(
         whole[latents:, latents:],
         share.score[latents:],
         share.square,
@@ -158,7 +111,6 @@ class Stack:
         self._batches = parallel_map(
             lambda members: self._padded([grams[w] for w in members], rows[members]), self._order
         )
-        self._count = len(grams)
 
     def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
         sizes = [gram.nuisances + gram.latents for gram in grams]
@@ -177,23 +129,18 @@ class Stack:
             torch.from_numpy(a).to(self.device)
             for a in (cross, square, counts, log_sigma, member, initial)
         ]
-        columns = _HiddenColumns([gram.inner for gram in grams], sizes, self.device)
+        parts = [[gram.inner[:, :size, :size]] for gram, size in zip(grams, sizes)]
+        hidden = side_by_side(parts, (channels, n, n), self.device)
         phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
-        return _Batch(windows, (phases.tolist(), phase), list(grams), columns, *arrays)
+        return _Batch(windows, (phases.tolist(), phase), list(grams), hidden, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
         Raises DiagnoseError: the normal equations are not positive definite, which only broken
         derivatives can cause."""
-        return self._in_order(
-            [
-                part
-                for (part,) in self._of_batches(
-                    lambda batch: (_solved(_shape(batch, noise), batch).value,)
-                )
-            ]
-        )
+        parts = self._of_batches(lambda batch: (_solved(_shape(batch, noise), batch)[1],))
+        return np.array(_by_window(self._order, [values for (values,) in parts]))
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
         """Most probable initial state and unit latent forces of each window, shape (D + L,).
@@ -203,14 +150,10 @@ class Stack:
 
         def fit(batch: _Batch) -> tuple[torch.Tensor]:
             at = _shape(batch, noise)
-            return (at.level * _solved(at, batch).mean,)
+            return (at.level * _solved(at, batch)[0],)
 
-        by_window = {
-            w: row
-            for members, (rows,) in zip(self._order, self._of_batches(fit))
-            for w, row in zip(members, rows)
-        }
-        return [by_window[w][:size] for w, size in enumerate(self._sizes)]
+        rows = _by_window(self._order, [rows for (rows,) in self._of_batches(fit)])
+        return [row[:size] for row, size in zip(rows, self._sizes)]
 
     def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
@@ -220,26 +163,21 @@ class Stack:
         blocks' deviations and the C channels' scales; curvatures (W, B + C, B + C). What the
         scales share with the fitted columns is given to the channels by their part in them."""
         parts = self._of_batches(lambda batch: _looked(batch, noise))
-        return tuple(self._in_order([part[i] for part in parts]) for i in range(3))
+        return tuple(np.array(_by_window(self._order, column)) for column in zip(*parts))
 
-    def integrals(self, noise: Noise, *, latents: bool = False) -> "Integrals":
-        """Integrate initial states out of each window, and latent forces unless they are asked for.
-
-        Raises DiagnoseError: as :meth:`values`.
-        """
-        return Integrals(
-            self._order,
-            parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches),
-        )
+    def integrals(self, noise: Noise, latents: bool) -> "Integrals":
+        """See :func:`integrals`."""
+        parts = parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches)
+        return Integrals(self._order, parts)
 
     def _of_batches(self, function) -> list[tuple[np.ndarray, ...]]:
         return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self._batches)
 
-    def _in_order(self, parts: Sequence[np.ndarray]) -> np.ndarray:
-        out = np.empty((self._count, *parts[0].shape[1:])) if parts else np.empty(0)
-        for members, part in zip(self._order, parts):
-            out[members] = part
-        return out
+
+def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> list[T]:
+    """Return values of batches in the order of their windows."""
+    values = {w: value for members, part in zip(order, parts) for w, value in zip(members, part)}
+    return [values[w] for w in sorted(values)]
 
 
 def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
@@ -256,7 +194,7 @@ def _shape(batch: _Batch, noise: Noise) -> _Shape:
     level = batch.initial + (batch.member @ by_block[:, :, None])[..., 0]
     scale = batch.square.new_tensor(noise.scale)
     weight = scale**-2.0
-    normal = _weighed(weight, batch.columns.hidden)
+    normal = _weighed(weight, batch.hidden)
     normal *= level[:, :, None]
     normal *= level[:, None]
     normal.diagonal(dim1=1, dim2=2).add_(1.0)
@@ -276,14 +214,15 @@ def _shape(batch: _Batch, noise: Noise) -> _Shape:
     return _Shape(weight, level, factor, log_det)
 
 
-def _solved(shape: _Shape, batch: _Batch) -> _Solved:
-    """A shape with the residuals of a batch of the same derivatives."""
+def _solved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the mean of [b, a] in prior deviations under a batch's residuals, shape (W, n), and
+    their log-likelihood but for the powers of 2 pi, shape (W,).
+    """
     right = (shape.level * (shape.weight @ batch.cross))[:, :, None]
     projected = torch.linalg.solve_triangular(shape.factor, right, upper=False)
     mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)[..., 0]
-    return _Solved(
-        mean, -0.5 * (batch.square @ shape.weight - projected.square().sum((1, 2)) + shape.log_det)
-    )
+    square = batch.square @ shape.weight - projected.square().sum((1, 2))
+    return mean, -0.5 * (square + shape.log_det)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
@@ -314,7 +253,7 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2).clone(), batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
-    spread = (batch.columns.hidden * scaled[:, None]).sum(
+    spread = (batch.hidden * scaled[:, None]).sum(
         (2, 3)
     )  # as products of matrices they take ten times as long on a GPU
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
@@ -342,12 +281,12 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
     """Value, gradient and curvature by [blocks, scales]."""
     shape = _shape(batch, noise)
     variance, spread, curvature = _curved(shape, batch)
-    solved = _solved(shape, batch)
-    by_block = (batch.member.mT @ (variance + solved.mean**2 - 1.0)[:, :, None])[..., 0]
-    moved = shape.level * solved.mean
-    bent = ((moved[:, None, None] @ batch.columns.hidden)[:, :, 0] @ moved[:, :, None])[..., 0]
+    mean, value = _solved(shape, batch)
+    by_block = (batch.member.mT @ (variance + mean**2 - 1.0)[:, :, None])[..., 0]
+    moved = shape.level * mean
+    bent = ((moved[:, None, None] @ batch.hidden)[:, :, 0] @ moved[:, :, None])[..., 0]
     square = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
-    return solved.value, torch.cat((by_block, square * shape.weight - batch.count), -1), curvature
+    return value, torch.cat((by_block, square * shape.weight - batch.count), -1), curvature
 
 
 @dataclass(frozen=True)
@@ -360,7 +299,7 @@ class _Integrated:
     half: torch.Tensor
     information: list[np.ndarray]  # of each window
 
-    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
         weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
         hidden, effects = np.zeros((count, n)), np.zeros((count, columns))
@@ -378,7 +317,9 @@ class _Integrated:
         )
         explained, taken = all_to_host(results)
         return [
-            Share(information, score[kept_columns], float(weight @ gram.square + square_of))
+            WindowStatistics(
+                information, score[kept_columns], float(weight @ gram.square + square_of)
+            )
             for gram, kept_columns, information, score, square_of in zip(
                 grams, self.left, self.information, effects - explained, taken
             )
@@ -401,50 +342,42 @@ class Integrals:
     @property
     def log_dets(self) -> list[float]:
         """Return the log determinant of each window's V."""
-        return self._by_window([part.at.log_det.tolist() for part in self._parts])
+        return _by_window(self._order, [part.at.log_det.tolist() for part in self._parts])
 
-    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[Share]:
+    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives;
         ``noise`` is what they were integrated with.
         """
-        return self._by_window(
-            [
-                part.shares([grams[w] for w in members], noise)
-                for members, part in zip(self._order, self._parts)
-            ]
-        )
-
-    def _by_window(self, parts: Sequence[Sequence[T]]) -> list[T]:
-        values = {
-            w: value for members, part in zip(self._order, parts) for w, value in zip(members, part)
-        }
-        return [values[w] for w in sorted(values)]
+        parts = [
+            part.shares([grams[w] for w in members], noise)
+            for members, part in zip(self._order, self._parts)
+        ]
+        return _by_window(self._order, parts)
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
-    shape, columns = _shape(batch, noise), batch.columns
-    right, effects = (
-        _weighed(shape.weight, columns.hidden_by_effects),
-        _weighed(shape.weight, columns.among_effects),
-    )
-    n = right.shape[1]
+    shape, (_, channels, n) = _shape(batch, noise), batch.cross.shape
+    sizes = [gram.nuisances + gram.latents for gram in batch.grams]
+    inner, width = [gram.inner for gram in batch.grams], len(batch.grams[0].inner[0]) - sizes[0]
+
+    def weighed(parts: Sequence[np.ndarray], height: int) -> torch.Tensor:
+        rows = [[part] for part in parts]
+        device = str(batch.square.device)
+        return _weighed(shape.weight, side_by_side(rows, (channels, height, width), device))
+
+    right = weighed([products[:, :size, size:] for products, size in zip(inner, sizes)], n)
+    effects = weighed([products[:, size:, size:] for products, size in zip(inner, sizes)], width)
     if latents:
-        hidden = _weighed(shape.weight, columns.hidden)
-        effects = torch.cat(
-            (torch.cat((hidden, right), 2), torch.cat((right.transpose(1, 2), effects), 2)), 1
-        )
+        hidden = _weighed(shape.weight, batch.hidden)
+        effects = torch.cat((torch.cat((hidden, right), 2), torch.cat((right.mT, effects), 2)), 1)
         right = effects[:, :n]
     half = torch.linalg.solve_triangular(shape.factor, shape.level[:, :, None] * right, upper=False)
-    reduced = effects - half.transpose(1, 2) @ half
-    whole = (0.5 * (reduced + reduced.transpose(1, 2))).cpu().numpy()
-    sizes, width = (
-        [(gram.nuisances, gram.nuisances + gram.latents) for gram in batch.grams],
-        whole.shape[1],
-    )
-    kept_columns = [
-        np.r_[begin:end, n:width] if latents else np.arange(width) for begin, end in sizes
-    ]
-    information = [
-        effects[np.ix_(columns, columns)] for effects, columns in zip(whole, kept_columns)
-    ]
-    return _Integrated(kept_columns, shape, half, information)
+    reduced = effects - half.mT @ half
+    whole = (0.5 * (reduced + reduced.mT)).cpu().numpy()
+    columns = [np.arange(width)] * len(sizes)
+    if latents:
+        columns = [
+            np.r_[gram.nuisances : size, n : n + width] for gram, size in zip(batch.grams, sizes)
+        ]
+    information = [values[np.ix_(kept, kept)] for values, kept in zip(whole, columns)]
+    return _Integrated(columns, shape, half, information)

@@ -37,7 +37,7 @@ _aside = Event()
 
 
 @cache
-def keep() -> None:
+def keep_freed_memory() -> None:
     """Let this process keep what it frees for what it takes next, and look for garbage among new
     objects alone.
 
@@ -53,12 +53,12 @@ def keep() -> None:
     mallopt(TRIM_THRESHOLD, BYTES_KEPT)
 
 
-def aside() -> None:
+def limit_threads_beside_gpu() -> None:
     """Limit this process's small work to the threads that it needs beside a GPU."""
     _aside.set()
 
 
-def single() -> None:
+def limit_to_one_thread() -> None:
     """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this
     process has loaded.
     """
@@ -69,7 +69,7 @@ def single() -> None:
 
 @cache
 def _pool(name: str, threads: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(threads, name, single)
+    return ThreadPoolExecutor(threads, name, limit_to_one_thread)
 
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:

@@ -10,7 +10,7 @@ from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
 from visthrow.diagnose.likelihood.marginal import finite
-from visthrow.diagnose.likelihood.threads import keep, parallel_map
+from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
@@ -112,7 +112,7 @@ def explain(
     catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
     Raises DiagnoseError: the model gives no window, or contradicts itself."""
     begun, say = time.monotonic(), progress or (lambda _: None)
-    keep()
+    keep_freed_memory()
     windows = model.windows({})
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
@@ -149,7 +149,7 @@ def explain(
     return replace(diagnosis, seconds=time.monotonic() - begun, seed=seed)
 
 
-def put_right(
+def correct_interface_mistakes(
     logs: Sequence[FlightLog], plant: PlantParams, build: Callable[[Sequence[FlightLog]], Model]
 ) -> tuple[Model, list[FlightLog]]:
     """A model of logs whose commands are as the simulation takes them: without each suspected

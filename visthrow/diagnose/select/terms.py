@@ -17,7 +17,7 @@ from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
-from visthrow.diagnose.likelihood.marginal import Gram, WindowStatistics, gather
+from visthrow.diagnose.likelihood.marginal import Gram, LatentStatistics, gather
 from visthrow.diagnose.likelihood.stack import BATCH, statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
@@ -80,7 +80,7 @@ def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
     return levels_of[(len(levels_of) - 1) // 2]
 
 
-def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
+def calmed(point: Point) -> tuple[Point, list[LatentStatistics]]:
     """The point as if no phase were much rougher than is usual in its block, and the statistics of
     its windows.
 
@@ -98,7 +98,7 @@ def calmed(point: Point) -> tuple[Point, list[WindowStatistics]]:
 
 
 def screen(
-    point: Point, parts: Sequence[WindowStatistics], block: str, quantities: Sequence[KnotValues]
+    point: Point, parts: Sequence[LatentStatistics], block: str, quantities: Sequence[KnotValues]
 ) -> Screen | None:
     """Gather what each term of a block says; None where the windows carry no knots for any."""
     carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
@@ -150,7 +150,7 @@ def _summed(values: Sequence[np.ndarray], row_of: np.ndarray, rows: int) -> np.n
 
 
 def _exerted(
-    point: Point, part: WindowStatistics, w: int, block: str, values: KnotValues, latent_block: int
+    point: Point, part: LatentStatistics, w: int, block: str, values: KnotValues, latent_block: int
 ) -> tuple[np.ndarray, ...]:
     """Return square and information, score and cross information of what is exerted at a window's
     knots.

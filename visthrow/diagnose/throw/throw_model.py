@@ -19,7 +19,7 @@ from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.likelihood.threads import aside, parallel_map
+from visthrow.diagnose.likelihood.threads import limit_threads_beside_gpu, parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
@@ -99,7 +99,7 @@ class ThrowModel(Model):
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
         self.device, self.substep = device, substep
         if device != "cpu":
-            aside()
+            limit_threads_beside_gpu()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
