@@ -24,7 +24,7 @@ from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import Window
 
 TAIL = 6.0
 """Degrees of freedom of the latent forces' scale mixture: from window to window their deviation
@@ -73,12 +73,6 @@ class Gram:
         """Number of latent-force coefficients."""
         return len(self.latent_block)
 
-    @cached_property
-    def hidden(self) -> np.ndarray:
-        """``inner`` of nuisances and latents alone, a row a channel, shape (C, (D + L)^2)."""
-        size = self.nuisances + self.latents
-        return np.ascontiguousarray(self.inner[:, :size, :size]).reshape(len(self.inner), -1)
-
 
 @dataclass(frozen=True)
 class Noise:
@@ -89,14 +83,6 @@ class Noise:
     correlation_time: float  # of the latent forces [s]
     # latent deviation of each window and block in its phase's, shape (windows, 3)
     share: np.ndarray
-
-    def deviation(self, gram: Gram, window: int) -> np.ndarray:
-        """Prior deviation of the columns [X, G] of a window, shape (D + L,)."""
-        shared = np.array(
-            [self.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))]
-        )
-        by_block = shared * self.share[window]
-        return np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
 
     @property
     def log_prior(self) -> float:
@@ -173,7 +159,8 @@ def hidden_gram(window: Window, channels: int) -> Gram:
 def without_effects(gram: Gram) -> Gram:
     """Return a Gram matrix of nuisances and latents alone."""
     size = gram.nuisances + gram.latents
-    return replace(gram, inner=gram.hidden.reshape(-1, size, size), cross=gram.cross[:, :size])
+    inner = np.ascontiguousarray(gram.inner[:, :size, :size])
+    return replace(gram, inner=inner, cross=gram.cross[:, :size])
 
 
 def whitened(window: Window, values: np.ndarray) -> np.ndarray:
