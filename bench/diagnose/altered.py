@@ -44,7 +44,8 @@ def with_values(
 
 def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
     """The same flight in a hall whose axes are turned about the vertical [rad] and moved [m]."""
-    c, s = np.cos(angle), np.sin(angle)
+    c = np.cos(angle)
+    s = np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     a, b = np.sin(0.5 * angle), np.cos(0.5 * angle)
 
@@ -103,7 +104,9 @@ class Flipped(Model):
 
     def __init__(self, model, seed: int) -> None:
         """Draw the flights' signs, as many of each as there can be."""
-        self.model, self.effects, self.channels = model, model.effects, model.channels
+        self.model = model
+        self.effects = model.effects
+        self.channels = model.channels
         flights = sorted({w.flight for w in model.windows({})})
         signs = np.resize([1.0, -1.0], len(flights))
         self._sign = dict(zip(flights, np.random.default_rng(seed).permutation(signs)))

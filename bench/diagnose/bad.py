@@ -76,7 +76,8 @@ def frozen(log: FlightLog) -> FlightLog:
 def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> FlightLog:
     """A vehicle that does not move, for so long: noise about one place, one command."""
     rng = np.random.default_rng(1)
-    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    sent = np.arange(0.0, seconds, 0.02)
     turn = 5e-4 * rng.standard_normal((len(t), 3))
     command = np.column_stack((np.full(len(sent), thrust), np.zeros((len(sent), 3))))
     place = np.array([0.0, 0.0, height])
@@ -95,7 +96,8 @@ def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
     whose blades do not flap.
     """
     rng = np.random.default_rng(1)
-    t, sent = np.arange(0.0, seconds, 1.0 / rate), np.arange(0.0, seconds, 0.02)
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    sent = np.arange(0.0, seconds, 0.02)
     speed, phase = (
         np.array([0.31, 0.47]),
         np.array([0.3, 1.1]),

@@ -37,7 +37,8 @@ def world(seed: int) -> tuple[dict[str, float], np.ndarray, np.ndarray]:
         "ball_drag": float(rng.uniform(0.03, 0.12)),
         **{name: float(rng.uniform(-0.6, 0.6)) for name in NAMES[1:]},
     }
-    stamps, paths = np.arange(0.0, SECONDS, 1.0 / RATE), []
+    stamps = np.arange(0.0, SECONDS, 1.0 / RATE)
+    paths = []
     for heading in rng.uniform(0.0, 2.0 * np.pi, THROWS):
         speed = rng.uniform(3.0, 6.0)
         start = [0.0, 0.0, 1.5, speed * np.cos(heading), speed * np.sin(heading), 2.5]

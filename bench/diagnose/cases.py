@@ -145,7 +145,8 @@ def size_is(verdict: dict, name: str, size: float) -> bool:
 
 def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: theta) -> bool:
     """Whether two verdicts name the same effects with the same sizes, and say the same overall."""
-    expected, came = sizes(one.get("theta") or {}), other.get("theta") or {}
+    expected = sizes(one.get("theta") or {})
+    came = other.get("theta") or {}
     sd = {f["name"]: max(f["sd"], f["floor"]) for f in other["findings"]}
     return (
         one["overall"] == other["overall"]
@@ -245,7 +246,8 @@ def _twice(
     sizes=lambda theta: theta,
 ) -> dict:
     logs = logs_of(recipe)
-    first, second = explained(folder, logs, recipe), explained(folder, change(logs), recipe)
+    first = explained(folder, logs, recipe)
+    second = explained(folder, change(logs), recipe)
     found = any(
         is_right(first, name) for name in recipe.effects
     )  # what is missed here must be missed alike

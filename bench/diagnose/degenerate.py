@@ -54,7 +54,8 @@ class Pair:
         logs = [flight_log(record) for record in follow(recipe, tables, 0)]
         about = ("--about", self.effect) if not self.alike else ()
         said = first = explained(folder, logs, recipe, action="plan", more=about)
-        done, measured = [], []
+        done = []
+        measured = []
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 said = explained(folder, logs, recipe, action="plan", more=(*about, *measured))
@@ -133,7 +134,9 @@ itself has 10 to 15.
 More than that they tell at once, for gusts make the payload swing: 8 mm of rope stand out from 8 mm
 of a marker by 2 to 4 nats on a string and by 13 on a rod, 6 g of payload by 2 to 4 nats from what
 lifts or weighs as much."""
-HOVER, BARE, DOUBLETS = ("hover",), ("hover without payload",), ("rate doublets",)
+HOVER = ("hover",)
+BARE = ("hover without payload",)
+DOUBLETS = ("rate doublets",)
 TILTED = frozenset({"wind_x", "frame_tilt_y", "marker_rot_y", "com_x"})
 LONGER = frozenset({"payload_marker_z", "payload_offset", "marker_off_z", "mount_z", "frame_scale"})
 HEAVIER = frozenset({"rope_mass", "downwash", "mass_quad", "thrust_gain", "air_density", "wind_z"})

@@ -287,9 +287,11 @@ def exchanged(one: str, other: str, real: Tool = explain) -> Tool:
 def main() -> None:
     """Print the share of right answers by kind."""
     limit_to_one_thread()
-    count, first = int(sys.argv[1]), int.from_bytes(os.urandom(4), "little")
+    count = int(sys.argv[1])
+    first = int.from_bytes(os.urandom(4), "little")
     print(f"first seed {first}")
-    asked_of, good = Counter(), Counter()
+    asked_of = Counter()
+    good = Counter()
     for suite in range(count):
         seed = first + 10_000 * suite
         for i, kind in enumerate(kinds(np.random.default_rng(seed))):

@@ -58,7 +58,9 @@ def fly(
     level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
 
     def slope(i, state):
-        p, v, thrust = state[:3], state[3:6], state[6]
+        p = state[:3]
+        v = state[3:6]
+        thrust = state[6]
         body = rot[i].T @ (v - [wind, 0.0, 0.0])
         force = rot[i] @ np.array([-drag * body[0], -drag * body[1], thrust * level[i]]) - [
             0,

@@ -149,7 +149,10 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> FlightLog:
     """One flight along a Lissajous figure, as its owner records it."""
-    M, m, L, J = world["body"], world["ball"], world["cable"], world["J"]
+    M = world["body"]
+    m = world["ball"]
+    L = world["cable"]
+    J = world["J"]
     swing, beat, turned = (
         rng.uniform(0.4, 0.9, 3) * [1.0, 1.0, 0.35],
         rng.uniform(0.9, 2.2, 3),
@@ -158,7 +161,8 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
 
     def wanted(t: float) -> np.ndarray:
         """Place, speed and acceleration, shape (3, 3)."""
-        a, fade = beat * t + turned[:3], 1.0 - np.exp(-t * t)
+        a = beat * t + turned[:3]
+        fade = 1.0 - np.exp(-t * t)
         return fade * swing * np.array([np.sin(a), beat * np.cos(a), -beat * beat * np.sin(a)]) + [
             [0.0, 0.0, 2.0],
             [0.0] * 3,
@@ -166,18 +170,17 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
         ]
 
     def slope(t: float, y: np.ndarray, sent: np.ndarray, torque: np.ndarray) -> np.ndarray:
-        r, p, v, u, q, w, f, past = (
-            y[:3],
-            y[3:6],
-            y[6:9],
-            y[9:12],
-            y[12:16],
-            y[16:19],
-            y[19],
-            y[20:23],
-        )
+        r = y[:3]
+        p = y[3:6]
+        v = y[6:9]
+        u = y[9:12]
+        q = y[12:16]
+        w = y[16:19]
+        f = y[19]
+        past = y[20:23]
         turn = Rotation.from_quat(q).as_matrix()
-        air, ball_air = v - [world["wind"], 0.0, 0.0], u - [world["wind"], 0.0, 0.0]
+        air = v - [world["wind"], 0.0, 0.0]
+        ball_air = u - [world["wind"], 0.0, 0.0]
         across = turn.T @ air * [1.0, 1.0, 0.0]
         push = (
             turn @ (np.array([0.0, 0.0, world["gain"] * f]) - world["drag"] * across)
@@ -227,7 +230,9 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
     y = np.concatenate(
         [start, start - [0, 0, L], np.zeros(6), [0, 0, 0, 1.0], np.zeros(3), [hold], np.zeros(3)]
     )
-    times, sent, path = TICK * np.arange(round(seconds / TICK)), [], [y]
+    times = TICK * np.arange(round(seconds / TICK))
+    sent = []
+    path = [y]
     for t in times:
         place, speed, pushed = wanted(t)
         force = (M + m) * (4.0 * (place - y[:3]) + 3.5 * (speed - y[6:9]) + pushed + [0.0, 0.0, G])
@@ -268,10 +273,8 @@ def recorded(
     from scipy.spatial.transform import Slerp
 
     shots = np.arange(0.05, clock[-1] - 0.05, SHOT) + 0.002 * rng.uniform()
-    spline, slerp = (
-        CubicSpline(clock, path[:, :6]),
-        Slerp(clock, Rotation.from_quat(path[:, 12:16])),
-    )
+    spline = CubicSpline(clock, path[:, :6])
+    slerp = Slerp(clock, Rotation.from_quat(path[:, 12:16]))
     tilt = Rotation.from_rotvec([0.0, world["tilt"], 0.0])
     turn = slerp(shots)
     seen = tilt.apply(
@@ -294,7 +297,8 @@ def recorded(
 def asked(seed: int) -> dict:
     """A world, and what the tool says of it."""
     name, hidden, world = drawn(seed)
-    line, begin = {"seed": seed, "vehicle": name, "hidden": hidden}, time.process_time()
+    line = {"seed": seed, "vehicle": name, "hidden": hidden}
+    begin = time.process_time()
     try:
         logs = [flown(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
         said = search.explain(FlyerModel(logs, known(name)), seed=seed)

@@ -57,7 +57,8 @@ HARM, HARM_NATS = 1.01, 3.0
 likelihood, that count as harm.
 """
 NINE, DECADE = math.log(9.0), math.log(10.0)
-WIDTHS, GRID = (0.05, 3.0), 160
+WIDTHS = (0.05, 3.0)
+GRID = 160
 """From 50 to 90 % in log size: what is possible; points of the grid of curves."""
 FEWEST, BINNED = 6, 30
 """Worlds of an effect for a curve of its own, and for counts in bins."""
@@ -69,10 +70,8 @@ def wilson(k: int, n: int, level: float = 0.95) -> tuple[float, float, float]:
     if n == 0:
         return math.nan, math.nan, math.nan
     z = NormalDist().inv_cdf(0.5 + 0.5 * level)
-    centre, half = (
-        (k + 0.5 * z * z) / (n + z * z),
-        z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z),
-    )
+    centre = (k + 0.5 * z * z) / (n + z * z)
+    half = z / (n + z * z) * math.sqrt(k * (n - k) / n + 0.25 * z * z)
     return k / n, max(centre - half, 0.0), min(centre + half, 1.0)
 
 
@@ -140,7 +139,8 @@ def within(found: tuple[float, float, float], size: np.ndarray, scale: float = 1
     """A size and its interval as text, times ``scale``; what lies outside the sizes that were flown
     is told as that alone.
     """
-    least, most = size.min(), size.max()
+    least = size.min()
+    most = size.max()
     told = []
     for x in found:
         sign = "<" if x < least else ">" if x > most else ""
@@ -162,7 +162,8 @@ def truth_of(world: dict) -> set[str]:
 
 def names(world: dict) -> tuple[int, int, int, int]:
     """Names given, right up to class, right and alone, and hidden effects that were found."""
-    truth, groups = truth_of(world), [set(g) for g in world.get("named", ())]
+    truth = truth_of(world)
+    groups = [set(g) for g in world.get("named", ())]
     stands_for = matched(groups, truth)
     right = sum(map(bool, stands_for))
     return (
@@ -277,7 +278,8 @@ def completeness(worlds: Sequence[dict]) -> list[str]:
         row += [share(int(named.sum()), len(size)), unit]
         if len(size) >= FEWEST:
             fitted = curve(size, named)
-            half, most = fitted.size(0.5), fitted.size(0.9)
+            half = fitted.size(0.5)
+            most = fitted.size(0.9)
             row += [within(x, size, floor * factor) for x in (half, most)]
             row += [asked, met(most, limit / floor)]
         else:
@@ -490,8 +492,11 @@ def right(world: dict) -> bool:
     Nothing hidden: NO EFFECT. A law: UNKNOWN and no name. Lost commands, and what differs from
     flight to flight or from day to day: KNOWN for it, and no name. Effects: KNOWN, each up to
     class, and no other name."""
-    recipe, overall, named = world["recipe"], world.get("overall"), world.get("named")
-    varies, told = recipe.get("varies") or {}, world.get("varies", ())
+    recipe = world["recipe"]
+    overall = world.get("overall")
+    named = world.get("named")
+    varies = recipe.get("varies") or {}
+    told = world.get("varies", ())
     if recipe.get("lost"):
         return overall == "KNOWN" and not named and "dropped_commands" in told
     if recipe.get("days"):

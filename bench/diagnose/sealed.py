@@ -167,7 +167,8 @@ def flight_log(record: dict, day: int | None = None) -> FlightLog:
         asked[record["sent_time"] >= record["release"] - 1e-9] = 1.0
     channels["release_command"] = Channel(record["sent_time"], asked, "1")
     if "look" in record:
-        kept, stamps = ~record["look_lost"], record["look_time"]
+        kept = ~record["look_lost"]
+        stamps = record["look_time"]
         channels["keypoints"] = Channel(stamps, record["look"], "1", "image", kept)
         channels["keypoints_valid"] = Channel(stamps, record["look_seen"], "bool")
         channels["goal_w"] = Channel(np.zeros(1), record["goal"][None], "m", "world")
@@ -301,7 +302,8 @@ def matched(groups: list[set[str]], truth: set[str]) -> list[str]:
 
     Those that are hidden stand for themselves before what flights hardly tell from others stands
     for these."""
-    out, left = [""] * len(groups), set(truth)
+    out = [""] * len(groups)
+    left = set(truth)
     for meant in (set.intersection, near):
         for i in sorted(range(len(groups)), key=lambda i: len(groups[i])):
             if not out[i] and (possible := meant(groups[i], left)):
@@ -322,7 +324,8 @@ def judge(recipe: Recipe, verdict: dict) -> dict:
     own = all(any(n in group for group in groups) for n in truth) and len(groups) == len(truth)
     stands_for = matched(groups, truth)
     exact = sum(group == {name} for group, name in zip(groups, stands_for))
-    hits, wrong = set(stands_for) - {""}, stands_for.count("")
+    hits = set(stands_for) - {""}
+    wrong = stands_for.count("")
     return {
         "exact": exact == len(truth) == len(groups),
         "class": hits == truth and not wrong,
@@ -369,7 +372,8 @@ def run_world(
         until: when the verdict must be there, by ``time.time()`` [s].
     """
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
-        folder, held = Path(name), Path(apart)
+        folder = Path(name)
+        held = Path(apart)
         sealed = recipe.digest()
         begin = time.perf_counter()
         logs = hand_over(recipe, folder, held)
@@ -509,7 +513,8 @@ def _alone(numbers) -> None:
     """Give a worker a core of its own: what it starts counts that one only."""
     cores = sorted(os.sched_getaffinity(0))
     with numbers.get_lock():
-        mine, numbers.value = numbers.value, numbers.value + 1
+        mine = numbers.value
+        numbers.value = numbers.value + 1
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 

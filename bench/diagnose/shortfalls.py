@@ -19,7 +19,8 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     Returns:
         Nats by which each likelihood falls short of the last one, and the number of samples.
     """
-    channels, priors = len(model.channels), Priors.of(model.effects, model.channels)
+    channels = len(model.channels)
+    priors = Priors.of(model.effects, model.channels)
     told = [model.windows(theta) for theta in sizes]
     raw = [[gram_of(w, priors.floor, channels) for w in windows] for windows in told]
     noise, _ = levels.fit(told[-1], raw[-1])

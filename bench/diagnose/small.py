@@ -65,7 +65,8 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
     force = PULLS[law][1] if law else lambda v, down, pull: 0.0 * v
 
     def slope(t: float, y: np.ndarray) -> np.ndarray:
-        r, v = y[:2], y[2:]
+        r = y[:2]
+        v = y[2:]
         n = r / ROD
         free = np.array([0.0, -G]) - GREASE * v
         tie = (
@@ -81,7 +82,8 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
             ]
         )
 
-    begin, stamps = rng.uniform(1.2, 2.2) * rng.choice([-1.0, 1.0]), np.arange(0.0, seconds, 0.005)
+    begin = rng.uniform(1.2, 2.2) * rng.choice([-1.0, 1.0])
+    stamps = np.arange(0.0, seconds, 0.005)
     start = [ROD * np.sin(begin), -ROD * np.cos(begin), 0.0, 0.0]
     path = solve_ivp(slope, (0.0, seconds), start, "DOP853", stamps, rtol=1e-10, atol=1e-12).y
     angle = np.arctan2(path[0], -path[1]) + rng.laplace(0.0, 1e-4, len(stamps))
@@ -91,21 +93,18 @@ def swung(law: str, rng: np.random.Generator, seconds: float = 20.0) -> FlightLo
 def hovered(law: str, rng: np.random.Generator, seconds: float = 25.0) -> FlightLog:
     """One slow flight up and down, as its motors and a capture log it."""
     stamps = np.arange(0.0, seconds, 0.02)
-    low, high, turn = (
-        rng.uniform(0.2, 0.35),
-        rng.uniform(1.0, 1.6),
-        rng.uniform(0.0, 2.0 * np.pi, 2),
-    )
+    low = rng.uniform(0.2, 0.35)
+    high = rng.uniform(1.0, 1.6)
+    turn = rng.uniform(0.0, 2.0 * np.pi, 2)
     height = low + 0.5 * (high - low) * (1.0 + np.cos(0.25 * stamps + turn[0]))
     place = np.column_stack(
         [0.3 * np.sin(0.4 * stamps + turn[1]), 0.2 * np.cos(0.3 * stamps), height]
     )
-    speed, carried = (
-        np.gradient(place, 0.02, axis=0),
-        0.25 * CRAFT["mass"] * (G + np.gradient(np.gradient(height, 0.02), 0.02)),
-    )
+    speed = np.gradient(place, 0.02, axis=0)
+    carried = 0.25 * CRAFT["mass"] * (G + np.gradient(np.gradient(height, 0.02), 0.02))
     helped = 1.0 / (1.0 - (CRAFT["disc"] / (4.0 * height)) ** 2) if law else 1.0
-    a, b = CRAFT["map"][2], CRAFT["map"][1]
+    a = CRAFT["map"][2]
+    b = CRAFT["map"][1]
     wanted = np.tile((carried / helped)[:, None], (1, 4)) * (
         1.0 + rng.normal(0.0, 0.1, (len(stamps), 4))
     )

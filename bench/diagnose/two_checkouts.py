@@ -116,7 +116,8 @@ def answer_sealed(kind: str, recipe: Recipe, trees: list[str], until: float) -> 
     """Answer a sealed world; its throws held back say what both answers are worth."""
     line = {"bank": "sealed", "kind": kind, "recipe": asdict(recipe)}
     with tempfile.TemporaryDirectory() as name, tempfile.TemporaryDirectory() as apart:
-        folder, held = Path(name), Path(apart)
+        folder = Path(name)
+        held = Path(apart)
         logs = sealed.hand_over(recipe, folder, held)
         explain = [sealed.WITHOUT_TESTS, "diagnose", "explain", *(p.name for p in logs)]
         explain += ["--device", "cpu", "--json", "verdict.json", "--out", "report", "--no-report"]
@@ -177,7 +178,8 @@ def worlds_of(banks: Iterable[str], foreign_lists: Iterable[str]) -> list[tuple]
     rng = random.Random(first)
     rng.shuffle(worlds)
     kinds = [kind_of(world) for world in worlds]
-    sizes, placed = Counter(kinds), Counter()
+    sizes = Counter(kinds)
+    placed = Counter()
     places = []
     for kind in kinds:
         places.append((placed[kind] + rng.random()) / sizes[kind])

@@ -97,7 +97,8 @@ def with_correlations(
 
 
 def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
-    factors, sigma = [], window.sigma.copy()
+    factors = []
+    sigma = window.sigma.copy()
     for channel, correlation in correlations_of.items():
         rows = components(window, channel)
         if rows is not None:

@@ -96,10 +96,12 @@ class Priors:
 
 def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """Logarithm of a normal distribution's mass within bounds, accurate far in the tails."""
-    a, b = (low - mean) / sd, (high - mean) / sd
+    a = (low - mean) / sd
+    b = (high - mean) / sd
     flip = a > 0.0  # use the tail that does not round to 1
     a, b = np.where(flip, -b, a), np.where(flip, -a, b)
-    upper, lower = log_ndtr(b), log_ndtr(a)
+    upper = log_ndtr(b)
+    lower = log_ndtr(a)
     return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
 
 
@@ -132,7 +134,8 @@ def log_evidence(
 ) -> float:
     """log Z of one set of named effects."""
     deviation = priors.deviation(active)
-    factor, half = _factor(information, deviation), score * deviation
+    factor = _factor(information, deviation)
+    half = score * deviation
     mean = lapack.dpotrs(factor, half, lower=1)[0]
     value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
     if len(active):
@@ -140,8 +143,10 @@ def log_evidence(
         spread = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0][
             columns
         ].diagonal()
-        mean, spread = mean[columns] * deviation[columns], np.sqrt(spread) * deviation[columns]
-        low, high = priors.low[columns], priors.high[columns]
+        mean = mean[columns] * deviation[columns]
+        spread = np.sqrt(spread) * deviation[columns]
+        low = priors.low[columns]
+        high = priors.high[columns]
         value += (
             _log_mass(mean, spread, low, high)
             - _log_mass(np.zeros(len(columns)), deviation[columns], low, high)
@@ -185,8 +190,10 @@ def _naming(
     shape (P, m).
     """
     sigma = covariance(information, priors.deviation(active))
-    mean, change = (score @ sigma)[..., sets], (priors.slab**-2.0 - SPIKE**-2.0)[sets]
-    variance, unit = sigma[sets[:, :, None], sets[:, None]], np.eye(sets.shape[1])
+    mean = (score @ sigma)[..., sets]
+    change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
+    variance = sigma[sets[:, :, None], sets[:, None]]
+    unit = np.eye(sets.shape[1])
     taken = np.linalg.inv(variance + unit / change[:, None])
     wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
     wide_sd = np.sqrt(
@@ -197,7 +204,9 @@ def _naming(
         - 0.5 * np.linalg.slogdet(unit + change[..., None] * variance)[1]
     )
     gain = gain - 0.5 * np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
-    low, high, slab = priors.low[sets], priors.high[sets], priors.slab[sets]
+    low = priors.low[sets]
+    high = priors.high[sets]
+    slab = priors.slab[sets]
     gain = gain + (
         _log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)
     ).sum(-1)

@@ -104,7 +104,8 @@ def predicted(
     scale = noise.scale[window.channel]
     states = window.nuisance * window.nuisance_sd / sigma[:, None]
     off = (residual.T / sigma).T
-    begin, length = window.time.min(), np.ptp(window.time)
+    begin = window.time.min()
+    length = np.ptp(window.time)
     fits = states.shape[1] > 0
     horizon_time = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
     head = (horizon_time <= 0.0) & fits

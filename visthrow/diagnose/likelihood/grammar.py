@@ -82,7 +82,8 @@ def forces(window: Window, effects: Sequence[TermEffect]) -> np.ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
     T).
     """
-    out, quantities = np.zeros((len(window.latent_block), len(effects))), KnotValues(window.knots)
+    out = np.zeros((len(window.latent_block), len(effects)))
+    quantities = KnotValues(window.knots)
     for i, effect in enumerate(effects):
         if carries(window.latent_block, effect.term.block):
             values = TermLayout.of([effect.term]).table(quantities).ravel()

@@ -175,13 +175,16 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
     z = whitened(window, z / window.sigma[:, None])
     r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
     inner = np.zeros((channels, z.shape[1], z.shape[1]))
-    cross, square = np.zeros((channels, z.shape[1])), np.zeros(channels)
+    cross = np.zeros((channels, z.shape[1]))
+    square = np.zeros(channels)
     for c in np.unique(window.channel):
         rows = window.channel == c
-        white, residual = z[rows], r[rows]
+        white = z[rows]
+        residual = r[rows]
         inner[c], cross[c], square[c] = white.T @ white, residual @ white, residual @ residual
     count = np.bincount(window.channel, minlength=len(square)).astype(float)
-    blocks, states = np.asarray(window.latent_block, dtype=int), window.nuisance.shape[1]
+    blocks = np.asarray(window.latent_block, dtype=int)
+    states = window.nuisance.shape[1]
     turned = sum(
         rows.shape[1] * float(np.log(np.diag(factor)).sum()) for rows, factor in window.correlated
     )
@@ -250,7 +253,8 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     if not gram.latents:
         return gram
     factor = knot_factor(window, time)
-    knots, groups = len(factor), gram.latents // len(factor)
+    knots = len(factor)
+    groups = gram.latents // len(factor)
     part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
     inner = gram.inner.copy()
     inner[:, part] = (factor.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
@@ -282,7 +286,8 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
     count = int(np.count_nonzero(group == group[0]))
     if len(group) % count:
         return len(group)
-    groups, times = group.reshape(-1, count), time.reshape(-1, count)
+    groups = group.reshape(-1, count)
+    times = time.reshape(-1, count)
     return count if np.all(groups == groups[:, :1]) and np.all(times == times[0]) else len(group)
 
 
@@ -369,7 +374,8 @@ def gather(
     ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out
     negative beyond rounding."""
     flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
-    size, count = len(theta), len(flights)
+    size = len(theta)
+    count = len(flights)
     information, score, square, samples = (
         np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ())
     )
@@ -408,7 +414,8 @@ def rescored(
     """
     row = {flight: i for i, flight in enumerate(statistics.flights.tolist())}
     which = [row[gram.flight] for gram in grams]
-    score, square = np.zeros_like(statistics.score), np.zeros_like(statistics.square)
+    score = np.zeros_like(statistics.score)
+    square = np.zeros_like(statistics.square)
     np.add.at(score, which, [part.score for part in parts])
     np.add.at(square, which, [part.square for part in parts])
     score[:, np.diagonal(statistics.information.sum(0)) == 0.0] = 0.0

@@ -78,7 +78,8 @@ def fit(
     identity; ``start``: an earlier estimate: its correlation time is kept, its levels are where the
     search starts. Returns the levels, and the grams with correlated latent forces that belong to
     them."""
-    noise, time = start, CORRELATION_TIMES[0] if start is None else start.correlation_time
+    noise = start
+    time = CORRELATION_TIMES[0] if start is None else start.correlation_time
     if start is None and any(gram.latents for gram in grams):
         noise = _likeliest(windows, grams, device)
         time = noise.correlation_time
@@ -91,7 +92,8 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
     """Rough levels with the likeliest correlation time: from the middle uphill, for the likelihood
     has one maximum over it.
     """
-    bare, levels_of = [without_effects(gram) for gram in grams], {}
+    bare = [without_effects(gram) for gram in grams]
+    levels_of = {}
 
     def likely(i: int, noise: Noise | None) -> float:
         if i not in levels_of:
@@ -166,17 +168,21 @@ class _Layout:
     def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters."""
         keys = tuple(sorted(noise.latent_sd))
-        index, pairs, phases = {key: i for i, key in enumerate(keys)}, [], []
+        index = {key: i for i, key in enumerate(keys)}
+        pairs = []
+        phases = []
         for w, gram in enumerate(grams):
             for block in np.unique(gram.latent_block).tolist():
                 if (block, gram.phase) in index:
                     pairs.append((w, block))
                     phases.append(index[block, gram.phase])
-        pairs, phases = np.array(pairs, dtype=int).reshape(-1, 2), np.array(phases, dtype=int)
+        pairs = np.array(pairs, dtype=int).reshape(-1, 2)
+        phases = np.array(phases, dtype=int)
         samples = sum(gram.count for gram in grams)
         measured = np.flatnonzero(samples > 0)
         blocks = len(LATENT_BLOCKS)
-        width, shares = blocks + len(samples), len(keys) + np.arange(len(pairs))
+        width = blocks + len(samples)
+        shares = len(keys) + np.arange(len(pairs))
         levels = pairs @ [width, 1]
         scales = blocks + measured + width * np.arange(len(grams))[:, None]
         scale_parameters = np.tile(len(keys) + len(pairs) + np.arange(len(measured)), len(grams))
@@ -197,8 +203,10 @@ class _Layout:
 
     def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""
-        first, last = len(self.keys), len(self.keys) + len(self.pairs)
-        share, scale = noise.share.copy(), noise.scale.copy()
+        first = len(self.keys)
+        last = len(self.keys) + len(self.pairs)
+        share = noise.share.copy()
+        scale = noise.scale.copy()
         share[tuple(self.pairs.T)], scale[self.seen] = np.exp(x[first:last]), np.exp(x[last:])
         return replace(
             noise,
@@ -251,7 +259,10 @@ def maximised(
             step = step / 3.0
         else:
             break
-        x, value, slope, curvature = x + step, tried, its_slope, expected
+        x = x + step
+        value = tried
+        slope = its_slope
+        curvature = expected
     return layout.unpack(x, noise), value
 
 
@@ -286,10 +297,8 @@ def _scoring_step(
     _, solution, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
     step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else solution) / size
     promised = float(slope @ step)
-    shares, turned = (
-        slice(len(layout.keys), len(layout.keys) + len(layout.pairs)),
-        _logarithms(step),
-    )
+    shares = slice(len(layout.keys), len(layout.keys) + len(layout.pairs))
+    turned = _logarithms(step)
     turned[shares] = _logarithms(step[shares] + step[layout.phases]) - turned[layout.phases]
     return np.clip(x + turned, low, high) - x, promised
 
@@ -326,11 +335,9 @@ def without_outliers(
     Latent forces have a wide prior here, so that a missing effect is followed and only what no
     force can do stands out. ``grams``: of the windows, with ``factor`` the identity."""
     sigmas = [window.sigma for window in windows]
-    windows_left, starts, bare = (
-        list(range(len(windows))),
-        list(windows),
-        [without_effects(gram) for gram in grams],
-    )
+    windows_left = list(range(len(windows)))
+    starts = list(windows)
+    bare = [without_effects(gram) for gram in grams]
     for cleaning in range(CLEANINGS):
         where = "cpu" if cleaning else device  # few are looked at once more
         fits = widely_fitted(starts, bare, where)

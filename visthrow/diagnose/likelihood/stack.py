@@ -79,7 +79,8 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
 
 
 def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:
-    latents, whole = gram.latents, share.information
+    latents = gram.latents
+    whole = share.information
     inverse = (
         lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor
     )  # from unit latents to knots
@@ -114,9 +115,12 @@ class Stack:
 
     def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
         sizes = [gram.nuisances + gram.latents for gram in grams]
-        count, channels, n = len(grams), len(grams[0].count), max(sizes)
+        count = len(grams)
+        channels = len(grams[0].count)
+        n = max(sizes)
         cross = np.zeros((count, channels, n))
-        member, initial = np.zeros((count, n, BLOCKS)), np.zeros((count, n))
+        member = np.zeros((count, n, BLOCKS))
+        initial = np.zeros((count, n))
         for w, (gram, size) in enumerate(zip(grams, sizes)):
             cross[w, :, :size] = gram.cross[:, :size]
             member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
@@ -302,9 +306,11 @@ class _Integrated:
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
         weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
-        hidden, effects = np.zeros((count, n)), np.zeros((count, columns))
+        hidden = np.zeros((count, n))
+        effects = np.zeros((count, columns))
         for w, (gram, kept_columns) in enumerate(zip(grams, self.left)):
-            cross, size = weight @ gram.cross, gram.nuisances + gram.latents
+            cross = weight @ gram.cross
+            size = gram.nuisances + gram.latents
             hidden[w, :size], effects[w, kept_columns] = (
                 cross[:size],
                 cross[len(cross) - len(kept_columns) :],
@@ -337,7 +343,8 @@ class Integrals:
 
     def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
         """Keep it; ``order``: numbers of each batch's windows."""
-        self._order, self._parts = order, batches
+        self._order = order
+        self._parts = batches
 
     @property
     def log_dets(self) -> list[float]:
@@ -358,7 +365,8 @@ class Integrals:
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     shape, (_, channels, n) = _shape(batch, noise), batch.cross.shape
     sizes = [gram.nuisances + gram.latents for gram in batch.grams]
-    inner, width = [gram.inner for gram in batch.grams], len(batch.grams[0].inner[0]) - sizes[0]
+    inner = [gram.inner for gram in batch.grams]
+    width = len(batch.grams[0].inner[0]) - sizes[0]
 
     def weighed(parts: Sequence[np.ndarray], height: int) -> torch.Tensor:
         rows = [[part] for part in parts]

@@ -45,7 +45,9 @@ def side_by_side(
     rows = out.numpy()
 
     def lay(i: int) -> None:
-        row, offset, heights = rows[i], 0, (0,) * (len(shape) - 1)
+        row = rows[i]
+        offset = 0
+        heights = (0,) * (len(shape) - 1)
         for values in parts[i]:
             if values.size:
                 *heights, width = values.shape

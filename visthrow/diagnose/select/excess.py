@@ -38,7 +38,8 @@ def levels(problem: Problem, before: Point, after: Point, threshold: float) -> t
 
     ``threshold``: nats from which a level would count as excessive if it were the only one; of
     many, one is higher by chance."""
-    levels_found, threshold = [], threshold + np.log(max(len(after.noise.latent_sd), 1))
+    levels_found = []
+    threshold = threshold + np.log(max(len(after.noise.latent_sd), 1))
     blocks = sorted({block for block, _ in after.noise.latent_sd})
     phases = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
     floors = floors_of(problem, after)
@@ -51,7 +52,8 @@ def levels(problem: Problem, before: Point, after: Point, threshold: float) -> t
         quiet = min(limits.values())
         for phase in limits:
             level = after.noise.latent_sd[block, phase]
-            nats, limit = 0.0, max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
+            nats = 0.0
+            limit = max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
             if level > limit:
                 nats = phases[phase].likelihood(block, level) - phases[phase].likelihood(
                     block, limit
@@ -82,7 +84,8 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
     within the median window.
     """
-    channels, moves = problem.model.channels, {}
+    channels = problem.model.channels
+    moves = {}
     positions = [
         c
         for c, name in enumerate(channels)
@@ -140,12 +143,11 @@ def acts_on(
     consider the torque between vehicle and rope as well; ``free_effects``: effects that may take
     any size: what they can stand in for is left out."""
     weight = point.noise.scale**-2.0
-    total, by_block = (
-        np.zeros(len(effects)),
-        {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)},
-    )
+    total = np.zeros(len(effects))
+    by_block = {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)}
     for gram, window in zip(point.grams, point.windows):
-        inner, size = np.tensordot(weight, gram.inner, 1), gram.nuisances + gram.latents
+        inner = np.tensordot(weight, gram.inner, 1)
+        size = gram.nuisances + gram.latents
         free = np.array([*range(gram.nuisances), *(size + k for k in free_effects)], dtype=int)
         columns = size + np.asarray(effects, dtype=int)
         explained_free = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])

@@ -83,7 +83,8 @@ def select(
         threshold: threshold [nats].
         begin: a set to begin from; causes that hide each other are not found one by one.
     """
-    active, new = list(begin), []
+    active = list(begin)
+    new = []
     while True:
         whole = log_evidence(information, score, priors, [*active, *new])
         for j in list(active):  # without those that the others make superfluous
@@ -92,7 +93,8 @@ def select(
                 whole - (reduced := log_evidence(information, score, priors, [*remaining, *new]))
                 < threshold
             ):
-                active, whole = remaining, reduced
+                active = remaining
+                whole = reduced
         active += new
         gain = additions(information, score, priors, active)
         best = int(np.argmax(gain))
@@ -122,22 +124,23 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     """Repeat a search without each of the flights, by statistics; what an effect that varies has of
     its own there is integrated out.
     """
-    work, threshold = diagnosis.work, diagnosis.threshold
-    point, priors = work.after, work.problem.priors
+    work = diagnosis.work
+    threshold = diagnosis.threshold
+    point = work.after
+    priors = work.problem.priors
     groups, left_out = groups_of(point, work.problem.kept)
     varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
     statistics = freed(regrouped(point, groups), varies.by_flight)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
-    trained, named = np.zeros((count, len(priors.floor))), Counter()
+    trained = np.zeros((count, len(priors.floor)))
+    named = Counter()
     for fold in folds:
         training = np.setdiff1d(np.arange(count), fold)
         if not len(training):
             continue
-        information, score = (
-            statistics.information[training].sum(0),
-            statistics.absolute[training].sum(0),
-        )
+        information = statistics.information[training].sum(0)
+        score = statistics.absolute[training].sum(0)
         anew, active = (
             select(information, score, priors, threshold, begin=begin)
             for begin in ((), work.active)
@@ -167,13 +170,12 @@ def borne_out(
     sizes that all flights gave, shape (K,)."""
     promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
     quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
-    brought, total = (
-        np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic,
-        promised.sum(),
-    )
+    brought = np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic
+    total = promised.sum()
     if total <= 0.0:
         return 0.0, float("nan"), float("nan")
-    value, n = brought.sum() / total, int((promised > TELLING * promised.mean()).sum())
+    value = brought.sum() / total
+    n = int((promised > TELLING * promised.mean()).sum())
     if n < 2:
         return float(value), float("nan"), float("nan")
     scatter = np.sqrt(n / (n - 1.0) * ((brought - value * promised) ** 2).sum()) / total
@@ -188,7 +190,9 @@ def channel_gains(
 
     ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C,
     H)."""
-    before, after, names = work.before, work.after, work.problem.model.channels
+    before = work.before
+    after = work.after
+    names = work.problem.model.channels
     change = (after.theta - cross.trained)[
         np.unique(cross.groups, return_inverse=True)[1]
     ] * work.problem.priors.floor
@@ -212,7 +216,8 @@ def _channel(
     before: np.ndarray,
     box: np.ndarray | None,
 ) -> ChannelGain:
-    error, count = errors_named.square[:, c], errors_named.count[:, c].sum()
+    error = errors_named.square[:, c]
+    count = errors_named.count[:, c].sum()
     sigma = after.sigma(c)
 
     def rms(square: np.ndarray) -> float:
@@ -267,7 +272,8 @@ def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, flo
 
 def measure(diagnosis: Diagnosis) -> HeldOut:
     """Ask held-out flights about the names of a search."""
-    work, cross = diagnosis.work, crossed(diagnosis)
+    work = diagnosis.work
+    cross = crossed(diagnosis)
     sizes = (
         np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
         / work.problem.priors.floor
@@ -291,7 +297,8 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             return _unconfirmed(diagnosis, None, spanning, reason)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    measured, uncompared = measure(diagnosis), not compares_phases(diagnosis.work.after)
+    measured = measure(diagnosis)
+    uncompared = not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
     if measured.share <= 0.0 or harmed:
@@ -363,7 +370,8 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
 
     Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
     """
-    work, point = diagnosis.work, diagnosis.work.after
+    work = diagnosis.work
+    point = diagnosis.work.after
     if compares_phases(point):
         return diagnosis
     groups, left_out = groups_of(point, work.problem.kept)
@@ -371,7 +379,8 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     errors_of = errors(
         point.windows, groups, point.noise, [w.residual for w in point.windows], len(names)
     )
-    error, limit = errors_of.square.sum(2), UNKNOWN_RATIO**2 * errors_of.floor.sum(2)
+    error = errors_of.square.sum(2)
+    limit = UNKNOWN_RATIO**2 * errors_of.floor.sum(2)
     firm = [name for c, name in enumerate(names) if jackknifed(limit[:, c], error[:, c])[2] < 0.0]
     if not firm:
         return diagnosis
@@ -429,7 +438,8 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
         )
         for f in diagnosis.findings
     )
-    work, effect_names = diagnosis.work, [e.name for e in diagnosis.work.problem.effects]
+    work = diagnosis.work
+    effect_names = [e.name for e in diagnosis.work.problem.effects]
     active = [effect_names.index(name) for name in remaining]
     theta, spread, _ = sized(work.problem, work.after, active)
     work = (
@@ -448,7 +458,8 @@ def sized(
 
     Returns both in the effects' units, and the variance that effects may have among flights,
     in what is allowed, see :func:`visthrow.diagnose.select.scatter.between_flights`."""
-    priors, named = problem.priors, list(active)
+    priors = problem.priors
+    named = list(active)
     theta = estimate(point.information, point.score, priors, named)
     unlike, mean_part = between_flights(point.statistics, priors, named, theta)
     spread = covariance(point.information, priors.deviation(named)) + np.diag(
@@ -500,7 +511,10 @@ def _kind(work: Work, channel: int) -> str:
     time in the flight.
     """
     point = work.after
-    by_axis, by_flight, late, spans = np.zeros(3), Counter(), [], {}
+    by_axis = np.zeros(3)
+    by_flight = Counter()
+    late = []
+    spans = {}
     for window in point.windows:
         spans.setdefault(window.flight, []).append(window.time.mean())
     for window in point.windows:
@@ -510,13 +524,16 @@ def _kind(work: Work, channel: int) -> str:
         )
         if not rows.any():
             continue
-        square, times = np.where(horizon < 0, 0.0, innovation**2)[rows], window.time[rows]
+        square = np.where(horizon < 0, 0.0, innovation**2)[rows]
+        times = window.time[rows]
         if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())
-        first, last = min(spans[window.flight]), max(spans[window.flight])
+        first = min(spans[window.flight])
+        last = max(spans[window.flight])
         late.append((window.time.mean() - first > 0.5 * (last - first), square.sum(), len(square)))
-    total, parts = sum(by_flight.values()), []
+    total = sum(by_flight.values())
+    parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
         parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
     if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * total:

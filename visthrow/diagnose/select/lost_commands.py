@@ -60,7 +60,8 @@ class CommandStatistics:
             columns: of each window's commands, shape (N, T).
             rows: numbers of the windows among the point's.
         """
-        longest, effect_count = max(columns_of.shape[1] for columns_of in columns), len(point.theta)
+        longest = max(columns_of.shape[1] for columns_of in columns)
+        effect_count = len(point.theta)
         wide = [
             np.hstack(
                 (
@@ -100,17 +101,24 @@ class CommandStatistics:
         ) - self._evidence(0.0, priors, active)
 
     def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
-        e, c = (slice(0, -self.commands), slice(-self.commands, None))
-        information, score, value = self.information[:, e, e], self.score[:, e], 0.0
+        e = slice(0, -self.commands)
+        c = slice(-self.commands, None)
+        information = self.information[:, e, e]
+        score = self.score[:, e]
+        value = 0.0
         if share > 0.0:
-            variance, crossed = share * (1.0 - share), self.information[:, c, e]
-            command_information, mean = self.information[:, c, c], np.full(self.commands, share)
-            remaining, moved = self.score[:, c] - command_information @ mean, score - mean @ crossed
+            variance = share * (1.0 - share)
+            crossed = self.information[:, c, e]
+            command_information = self.information[:, c, c]
+            mean = np.full(self.commands, share)
+            remaining = self.score[:, c] - command_information @ mean
+            moved = score - mean @ crossed
             factor = np.linalg.cholesky(variance * command_information + np.eye(self.commands))
             half = np.linalg.solve(
                 factor, np.sqrt(variance) * np.concatenate((remaining[..., None], crossed), axis=2)
             )
-            tells, transfer = half[..., 0], half[..., 1:]
+            tells = half[..., 0]
+            transfer = half[..., 1:]
             value = float((mean @ (self.score[:, c] + remaining).T).sum() + (tells**2).sum()) / 2.0
             value -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
             information = information - transfer.transpose(0, 2, 1) @ transfer
@@ -126,11 +134,9 @@ def verdict(
 
     ``threshold``: nats that a finding needs.
     """
-    v, priors, sizes = (
-        next(v for v in random_effects() if v.name == NAME),
-        problem.priors,
-        problem.sizes(point.theta),
-    )
+    v = next(v for v in random_effects() if v.name == NAME)
+    priors = problem.priors
+    sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
     windows_all = range(len(problem.kept))
@@ -162,14 +168,13 @@ def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
         point.commands,
         range(len(problem.kept)),
     )
-    information, score = (
-        statistics.information[:, -statistics.commands :, -statistics.commands :],
-        statistics.score[:, -statistics.commands :],
-    )
+    information = statistics.information[:, -statistics.commands :, -statistics.commands :]
+    score = statistics.score[:, -statistics.commands :]
     spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)
     off = (spread @ (score - EITHER * information.sum(2))[..., None])[..., 0]  # from half way
     clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
-    count, lost_commands = np.count_nonzero(clear), np.count_nonzero(clear & (off > 0.0))
+    count = np.count_nonzero(clear)
+    lost_commands = np.count_nonzero(clear & (off > 0.0))
     if not count:
         return scatter
     size, low, high = (

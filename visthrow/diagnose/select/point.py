@@ -209,7 +209,8 @@ def linearise(
 
     ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
     model gave there, if it was asked already."""
-    sizes, channels = problem.sizes(theta), len(problem.model.channels)
+    sizes = problem.sizes(theta)
+    channels = len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
@@ -230,14 +231,16 @@ def linearise(
         if not commands
         else [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     )
-    device, floors = problem.model.device, problem.priors.floor
+    device = problem.model.device
+    floors = problem.priors.floor
     first = grams_of(extended, floors, channels)
     cleaned = levels.without_outliers(extended, first, device)
     mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]
     recomputed = dict(zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)))
     raw = [recomputed.get(w, gram) for w, gram in enumerate(first)]
     noise, grams = levels.fit(cleaned, raw, start, device)
-    integrals, position = stack.integrals(grams, noise, device), np.array(theta, dtype=float)
+    integrals = stack.integrals(grams, noise, device)
+    position = np.array(theta, dtype=float)
     linearised = Linearised(
         sizes,
         {
@@ -301,7 +304,8 @@ def lost(point: Point) -> list[int]:
 
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
     lost, but something is missing."""
-    shares, log_dets = point.integrals.shares(point.grams, point.noise), point.integrals.log_dets
+    shares = point.integrals.shares(point.grams, point.noise)
+    log_dets = point.integrals.log_dets
     misfit = [
         (share.square - log_det) / max(gram.count.sum(), 1.0)
         for share, log_det, gram in zip(shares, log_dets, point.grams)
@@ -323,7 +327,8 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     count = len(
         problem.model.effects
     )  # a term's column stays that of the place where derivatives were taken
-    sizes, change = problem.priors.floor * theta, problem.priors.floor * (theta - point.theta)
+    sizes = problem.priors.floor * theta
+    change = problem.priors.floor * (theta - point.theta)
     if (flown := problem.flown(theta)) is not None:
         residuals_of = flown.residuals(problem.sizes(theta), linearised)
         residuals = [residuals_of[i] for i in problem.kept]
@@ -512,7 +517,8 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     for _ in range(TURNS):
         if to_gain(problem, point, active) < TURNED:
             break
-        before, point = point, fitted(problem, point, active)
+        before = point
+        point = fitted(problem, point, active)
         if np.array_equal(point.theta, before.theta):
             break
         point = with_fitted_noise(point)

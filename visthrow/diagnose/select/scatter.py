@@ -34,7 +34,8 @@ FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
 # random effects
 FORM = "_by_"
 LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
-REACH, LOOK = np.geomspace(0.02, 6.0, 25), 5
+REACH = np.geomspace(0.02, 6.0, 25)
+LOOK = 5
 """Deviations that are tried, in their prior's; every which of them, where flights are left out."""
 UNRELIABLE_FLOORS = (
     3.0  # floors of a flight's own estimate from which its derivative is not relied upon
@@ -143,7 +144,9 @@ def varying(
         active: effects that are named.
         days: of each flight, by its number; none where nobody told.
     """
-    effect_names, verdicts, selected = list(names), {}, Varies(days)
+    effect_names = list(names)
+    verdicts = {}
+    selected = Varies(days)
     may_vary = [*(v for v in random_effects() if v.of), *further]
     columns = {
         v.name: [
@@ -235,27 +238,28 @@ def straightened(
     ``theta``: sizes found, in floors; ``simulate``: see :func:`varying`.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
-    diagonal, score = statistics.information[:, j, j], statistics.score[:, j] - shift
+    diagonal = statistics.information[:, j, j]
+    score = statistics.score[:, j] - shift
     reach = np.abs(
         np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
     ).max(initial=0.0)
     if reach < UNRELIABLE_FLOORS:
         return statistics
-    sizes, simulated = [], []
+    sizes = []
+    simulated = []
     for size in np.unique(
         np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]
     ):
         statistics_moved = simulate(np.where(np.arange(len(theta)) == j, theta + size, theta))
         if statistics_moved is not None:
-            sizes, simulated = [*sizes, size], [*simulated, statistics_moved]
+            sizes = [*sizes, size]
+            simulated = [*simulated, statistics_moved]
     if len(sizes) < len(SIZES) // 2:
         return statistics
     squares = np.array([statistics_moved.square for statistics_moved in simulated])
-    curve, best, scores = (
-        CubicSpline(sizes, squares),
-        np.argmin(squares, axis=0),
-        statistics.score.copy(),
-    )
+    curve = CubicSpline(sizes, squares)
+    best = np.argmin(squares, axis=0)
+    scores = statistics.score.copy()
     for f in np.flatnonzero(diagonal > 0.0):
         grid = np.linspace(
             sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE
@@ -263,7 +267,8 @@ def straightened(
         position = np.where(
             np.arange(len(theta)) == j, theta + grid[np.argmin(curve(grid)[:, f])], theta
         )
-        information, misfit = statistics.information[f], simulated[best[f]].score[f]
+        information = statistics.information[f]
+        misfit = simulated[best[f]].score[f]
         scores[f] = (
             misfit
             - information[:, j] * misfit[j] / diagonal[f]
@@ -299,7 +304,8 @@ def _verdict(
     """The verdict on one quantity, at the level that says more; None where too few flights say
     something of it.
     """
-    reach, verdicts = REACH * v.prior_sd, []
+    reach = REACH * v.prior_sd
+    verdicts = []
     for group in selected.levels(statistics):
         groups = by_day(statistics, selected.days) if group == DAY else statistics
         informed = np.count_nonzero((groups.information[:, columns, columns] > 0.0).any(axis=1))
@@ -347,10 +353,8 @@ def judged(
     density = np.exp(value - best) * weight
     share = np.cumsum(density) / density.sum()
     low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    nats, mode = (
-        float(np.log(density.sum()) + best),
-        float(size[np.argmax(density / np.gradient(size))]),
-    )
+    nats = float(np.log(density.sum()) + best)
+    mode = float(size[np.argmax(density / np.gradient(size))])
     return Scatter(
         v.name,
         v.cause,
@@ -519,20 +523,18 @@ def freed_beside(
     for shares in (varies.flights, varies.drifts):
         if shares is varies.drifts and shares:
             member = _members(rows, varies.days)[1]
-            information, score, cross = (
-                member @ information,
-                member @ score,
-                np.tensordot(member, cross, 1),
-            )
+            information = member @ information
+            score = member @ score
+            cross = np.tensordot(member, cross, 1)
             rows = by_day(rows, varies.days)
         for j, size in shares.items():
-            column, cross_column = rows.information[:, :, j], cross[:, :, j]
+            column = rows.information[:, :, j]
+            cross_column = cross[:, :, j]
             part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * cross_column
-            information, score = (
-                information - part * cross_column,
-                score - part * rows.score[:, j, None],
-            )
-            cross, rows = cross - part[..., None] * column[:, None], _integrated(rows, {j: size})
+            information = information - part * cross_column
+            score = score - part * rows.score[:, j, None]
+            cross = cross - part[..., None] * column[:, None]
+            rows = _integrated(rows, {j: size})
     return information.sum(0), score.sum(0), cross.sum(0)
 
 
@@ -560,7 +562,8 @@ def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Stati
     floors.
     """
     for j, size in deviation.items():
-        column, score = statistics.information[:, :, j], statistics.score
+        column = statistics.information[:, :, j]
+        score = statistics.score
         diagonal = column[:, j]
         part = size**2 / (1.0 + size**2 * diagonal)
         explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
@@ -596,7 +599,8 @@ def _shares(
     statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]
 ) -> np.ndarray:
     """Most probable shares of each row, beside its sizes ``theta`` (F, K)."""
-    shares, columns = np.zeros(statistics.score.shape), list(deviation)
+    shares = np.zeros(statistics.score.shape)
+    columns = list(deviation)
     if columns:
         score = (
             statistics.score
@@ -615,7 +619,8 @@ def deviations(
     """Return the random effects that were found, of effects of these names; ``days`` are the
     flights'.
     """
-    effect_names, selected = list(names), Varies(days)
+    effect_names = list(names)
+    selected = Varies(days)
     for s in scatter:
         if s.found:
             selected = selected.also(

@@ -53,7 +53,8 @@ def diagnose(
     window, or contradicts itself."""
     say = progress or (lambda _: None)
     checked = check(flights, vehicle)
-    refused, reasons = refused_of(checked, vehicle), contradictions(checked, vehicle.unread)
+    refused = refused_of(checked, vehicle)
+    reasons = contradictions(checked, vehicle.unread)
     unread = [text for text in contradictions(checked) if text not in reasons]
     if len(refused) > MOST_REFUSED * len(flights):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
@@ -111,7 +112,8 @@ def explain(
     worlds that the threshold is calibrated on; ``laws``: whether to look for laws outside the
     catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
     Raises DiagnoseError: the model gives no window, or contradicts itself."""
-    begun, say = time.monotonic(), progress or (lambda _: None)
+    begun = time.monotonic()
+    say = progress or (lambda _: None)
     keep_freed_memory()
     windows = model.windows({})
     if not windows:
@@ -180,7 +182,8 @@ def correct_interface_mistakes(
                 replace(k, nats=nats) if k is mistake else k for k in suspected_mistakes
             ]
         else:
-            suspected_mistakes, current = remaining, alternative
+            suspected_mistakes = remaining
+            current = alternative
     current[0].mistakes = (*certain, *suspected_mistakes)
     return current
 

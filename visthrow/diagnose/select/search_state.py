@@ -129,7 +129,8 @@ class SearchState:
 
         ``charge``: whether those that act in a law's block, and may be a part of its form, cost
         more."""
-        prices, lawful = self.prices, [j for j in active if self.is_term(j)] if charge else []
+        prices = self.prices
+        lawful = [j for j in active if self.is_term(j)] if charge else []
         charged = [j for j in active if j not in lawful and self._acts_beside(j, lawful)]
         return float(
             prices[list(active)].sum()
@@ -203,7 +204,8 @@ class SearchState:
 
         ``varies``: what differs among flights.
         """
-        statistics, theta = self.point.plain, self.sizes(active)
+        statistics = self.point.plain
+        theta = self.sizes(active)
         for j in sorted(set(varies.effects) & set(active)):
             statistics = straightened(statistics, theta, self.priors, j, self._resimulated)
         return freed(statistics, varies)
@@ -220,7 +222,8 @@ class SearchState:
             or self.varied[0][0] is not self.point
             or self.varied[0][1:] != key[1:]
         ):
-            effects, sizes = self.problem.effects, self.sizes(active)
+            effects = self.problem.effects
+            sizes = self.sizes(active)
             further = by_flight(
                 [
                     e
@@ -309,7 +312,8 @@ class SearchState:
             return point
         for _ in range(ROUNDS):
             self.origin = linearise(self.problem, point.theta, point.noise)
-            before, point = point, fitted(self.problem, self.origin, active)
+            before = point
+            point = fitted(self.problem, self.origin, active)
             if doubted is not None and not self.sure(point, active, doubted):
                 break
             if (
@@ -345,7 +349,8 @@ class SearchState:
         Names that act in a law's block may be a part of its form. A name acts there by its column
         or by what the other names cannot stand in for, as two delays that differ by a force. What
         is worth nothing without those is not told either."""
-        effects, names = self.problem.effects, self.names
+        effects = self.problem.effects
+        names = self.names
         blocks = {effects[j].block for j in self.terms}
         joint = grammar.JOINT in blocks
         same_block = {
@@ -376,10 +381,8 @@ class SearchState:
         """Return the laws of the set, then others one by one in their place, best first."""
         if not self.terms:
             return []
-        point, listed = (
-            self.point,
-            [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()],
-        )
+        point = self.point
+        listed = [(*self.names, j) for j in np.flatnonzero(self.term_columns).tolist()]
         value = {
             s: point.evidence(self.priors, s) - self.price(s) for s in {*listed, tuple(self.active)}
         }

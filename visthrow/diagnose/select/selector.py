@@ -113,7 +113,8 @@ class Selector(SearchState):
 
     def _add(self) -> bool:
         """Add the best candidate; False where none is good enough."""
-        free, usable = with_all_effects_noise(self.problem, self.point), self._usable()
+        free = with_all_effects_noise(self.problem, self.point)
+        usable = self._usable()
         screened, under_free = (self._additions(point, usable) for point in (self.point, free))
         worth = (
             self.least - STRONG * ~self.problem.switches
@@ -163,7 +164,8 @@ class Selector(SearchState):
         statistics alone they are selected."""
         if self.problem.terms:
             return []
-        active, plain = tuple(self.active), usable[~self.problem.switches[usable]]
+        active = tuple(self.active)
+        plain = usable[~self.problem.switches[usable]]
         while (
             len(active) < MOST_NAMES
             and (gain := self._additions(free, plain, active)).max() > self.least
@@ -171,10 +173,8 @@ class Selector(SearchState):
             active = (*active, int(np.argmax(gain)))
         while len(active) > len(self.active) + 1 and frozenset(active) not in self.visited:
             (move,) = self._tried(free, [active])
-            sizes, faked = (
-                np.abs(move.point.theta),
-                np.abs(bend(self.problem, self.origin, move.point, active)),
-            )
+            sizes = np.abs(move.point.theta)
+            faked = np.abs(bend(self.problem, self.origin, move.point, active))
             straight = tuple(
                 j for j in active if j in self.active or faked[j] <= INEXACT * sizes[j]
             )
@@ -200,7 +200,9 @@ class Selector(SearchState):
 
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing."""
-        j, origin, point = move.active[-1], self.origin, move.point
+        j = move.active[-1]
+        origin = self.origin
+        point = move.point
         if self.problem.switches[j]:  # it was linearised where it leads already
             return False
         if abs(point.theta[j]) < 1.0:
@@ -266,18 +268,23 @@ class Selector(SearchState):
 
     def _rivals(self) -> list[SetMove]:
         """Sets within reach of one move, by the linear statistics, best first."""
-        singles, pairs, active = {}, {}, self.active
-        usable, present = self._usable(), self.linear(active, self.point)
+        singles = {}
+        pairs = {}
+        active = self.active
+        usable = self._usable()
+        present = self.linear(active, self.point)
         for subset in self._rests():
             state = self.point.information, self.point.score, self.priors, subset
-            base, single = self.linear(subset, self.point) - present, additions(*state)
+            base = self.linear(subset, self.point) - present
+            single = additions(*state)
             singles[subset] = base
             new = (
                 usable if len(subset) < len(active) else usable[self.term_columns[usable]]
             )  # other additions were tried already
             singles |= {(*subset, k): base + single[k] - self.prices[k] for k in new.tolist()}
             plain = usable[~self.problem.switches[usable]]
-            gain, single_gain = pair_additions(*state)[np.ix_(plain, plain)], single[plain]
+            gain = pair_additions(*state)[np.ix_(plain, plain)]
+            single_gain = single[plain]
             reached = np.triu(
                 gain - np.maximum.outer(single_gain, single_gain) > self.least - STRONG
             )  # worth a name beside the other
@@ -429,11 +436,9 @@ class Selector(SearchState):
         """Whether flights disagree on an addition, which is then refused, or is an event of the one
         flight that is left out.
         """
-        verdict, origin, point = (
-            self.disagreement_on(move.point, move.active, j),
-            self.origin,
-            move.point,
-        )
+        verdict = self.disagreement_on(move.point, move.active, j)
+        origin = self.origin
+        point = move.point
         if verdict is not None:
             point = self.settle(point, move.active)
             if point is not move.point:
@@ -470,7 +475,9 @@ class Selector(SearchState):
         origin, point = (
             only(terms.bare(self.problem, p)[1], remaining) for p in (self.origin, self.point)
         )
-        self.problem, self.nominal, self.least = problem, nominal, least
+        self.problem = problem
+        self.nominal = nominal
+        self.least = least
         self.origin, self.point = origin, candidate(problem, point, self.active)
         self.refused, self.visited, self.proposed = {}, set(), set()
         worth = self.worth()
@@ -526,10 +533,8 @@ class Selector(SearchState):
         """
         if self.dropped is not None or self.terms or self.came is self.point:
             return False
-        verdict, self.came = (
-            dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least),
-            self.point,
-        )
+        verdict = dropped.verdict(*terms.bare(self.problem, self.point), self.active, self.least)
+        self.came = self.point
         if (
             verdict is None
             or not verdict.found
@@ -552,10 +557,8 @@ class Selector(SearchState):
         """Make the terms that say most candidates, beside the set and instead of its names; False
         where that brings no new one.
         """
-        strongest, present = (
-            terms.strongest_forces(self.nominal) if self.laws else {},
-            frozenset(self.active),
-        )
+        strongest = terms.strongest_forces(self.nominal) if self.laws else {}
+        present = frozenset(self.active)
         if not strongest or present in self.proposed or len(self.terms) > 1:
             return False
         self.proposed.add(present)

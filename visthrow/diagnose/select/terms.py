@@ -184,7 +184,8 @@ def _products(
     for which in layout.scalar:
         values *= scalars[:, :, None, torch.from_numpy(which).to(device)]
     values = values.reshape(len(windows), 3 * longest, -1)
-    flat, cross = values.reshape(-1, values.shape[-1]), cross.reshape(-1, cross.shape[-1])
+    flat = values.reshape(-1, values.shape[-1])
+    cross = cross.reshape(-1, cross.shape[-1])
     squares = [((inner @ values) * values).sum((0, 1)) for inner in (square, information)]
     return tuple(all_to_host((*squares, score.reshape(-1) @ flat, flat.T @ cross)))
 
@@ -285,7 +286,9 @@ def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
     """A gram's inner products with G columns as further effects; ``columns`` are in the gram's own
     latents, shape (L, T).
     """
-    part, size, count = _latents(gram), gram.inner.shape[1], columns.shape[1]
+    part = _latents(gram)
+    size = gram.inner.shape[1]
+    count = columns.shape[1]
     products = gram.inner[:, :, part] @ columns
     inner = np.empty((len(products), size + count, size + count))
     inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = (
@@ -303,7 +306,8 @@ def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """
     if not problem.terms:
         return problem, point
-    plain, count = replace(problem, terms=()), len(problem.model.effects)
+    plain = replace(problem, terms=())
+    count = len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
     term_count = len(problem.terms)
     grams = [
@@ -413,7 +417,8 @@ def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = covariance(point.information, problem.priors.deviation(list(active)))
-    mean, effects = sigma @ point.score, problem.effects
+    mean = sigma @ point.score
+    effects = problem.effects
     columns = [j for j in active if isinstance(effects[j], TermEffect)]
     floor = np.array([effects[j].floor for j in columns])
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
@@ -443,10 +448,9 @@ def unexplained_nats(
     same only because the name lies at its bound, or is larger than was expected."""
     deviation = priors.deviation([k for k in active if k != term])
     deviation[[name, term]] = priors.slab[name] / NARROW, 0.0
-    information, score = point.information, point.score
+    information = point.information
+    score = point.score
     solved = covariance(information, deviation) @ np.column_stack((information[:, term], score))
-    precision, remaining = (
-        information[term, term] - information[term] @ solved[:, 0],
-        score[term] - information[term] @ solved[:, 1],
-    )
+    precision = information[term, term] - information[term] @ solved[:, 0]
+    remaining = score[term] - information[term] @ solved[:, 1]
     return float(0.5 * remaining**2 / max(precision, 1e-300))

@@ -45,7 +45,8 @@ less than a bit about it.
 
 def conclude(search: Selector) -> Diagnosis:
     """Turn a finished search into verdicts."""
-    point, model = search.point, search.problem.model
+    point = search.point
+    model = search.problem.model
     scatter = (*search.scatter(search.active), *([search.dropped] if search.dropped else []))
     varies = deviations(
         scatter, search.priors, [e.name for e in model.effects], search.problem.varies.days
@@ -64,17 +65,20 @@ def conclude(search: Selector) -> Diagnosis:
     mistakes = tuple(model.mistakes)
     if overall == result.NO_EFFECT and (any(s.found for s in scatter) or mistakes):
         besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
-        overall, reasons = result.KNOWN, [f"besides {' and '.join(besides)}, {reasons[0]}"]
+        overall = result.KNOWN
+        reasons = [f"besides {' and '.join(besides)}, {reasons[0]}"]
     forms = [s.name for s in scatter if s.found and s.name.endswith(f"{FORM}{s.by}")]
     if len(forms) > 1 and overall == result.KNOWN:
         reasons = [f"flights differ in {', '.join(forms)} at once; the form is another"]
-        overall, block = result.UNKNOWN, next(s.block for s in scatter if s.name == forms[0])
+        overall = result.UNKNOWN
+        block = next(s.block for s in scatter if s.name == forms[0])
     explanations = (
         search.explanations() if overall == result.UNKNOWN else []
     )  # a term that is weaker than the names says nothing
     search, without_terms = _without_laws(search, point), not search.terms
     active = [j for j in search.active if j not in withdrawn]
-    point, model = search.point, search.problem.model
+    point = search.point
+    model = search.problem.model
     if not without_terms:
         active = _sure(point, search.priors, active)
         withdrawn = set(search.active) - set(active)
@@ -216,7 +220,8 @@ def _overall(
     """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for
     it.
     """
-    point, all_names = search.point, set(search.active)
+    point = search.point
+    all_names = set(search.active)
     strong = too_strong(
         point, INEXACT
     )  # what no missing cause explains: the channels do not belong together
@@ -294,7 +299,8 @@ def _on_bound(search: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the
     threshold.
     """
-    point, priors = search.point, search.priors
+    point = search.point
+    priors = search.priors
     on_bound = (
         min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
     )
@@ -309,7 +315,8 @@ def _on_bound(search: Selector, j: int) -> bool:
 def _finding(
     search: Selector, point: Point, j: int, active: list[int], unlike: float, withdrawn: set[int]
 ) -> Finding:
-    effect, priors = search.problem.effects[j], search.priors
+    effect = search.problem.effects[j]
+    priors = search.priors
     blank = _blank(effect)
     if not priors.visible[j]:
         missing = tuple(c for c in effect.channels if c not in search.problem.model.channels)
@@ -323,7 +330,8 @@ def _finding(
     sigma = covariance(
         point.information, priors.deviation([*remaining, j])
     )  # as if it were named beside the others
-    mean, sd = float(sigma[j] @ point.score), float(np.sqrt(sigma[j, j]))
+    mean = float(sigma[j] @ point.score)
+    sd = float(np.sqrt(sigma[j, j]))
     deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
     nats = point.evidence(priors, [*remaining, j]) - point.evidence(priors, remaining)
     differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
@@ -385,7 +393,8 @@ def _class_of(
 
     Partners are a named effect and the new ones of sets of as many that do without it.
     """
-    named, alike = set(active), [set(m.active) for m in search.sets if len(m.active) == len(active)]
+    named = set(active)
+    alike = [set(m.active) for m in search.sets if len(m.active) == len(active)]
     for home in active:
         rivals = [members for members in alike if home not in members]
         partners = {home}.union(*rivals) - (named - {home})
@@ -407,12 +416,11 @@ def _named(
     """The verdict on a cause that the flights ask for; ``mean`` is in floors, ``members`` are those
     of its class.
     """
-    low, high = blank.low, blank.high
+    low = blank.low
+    high = blank.high
     size = float(np.clip(mean * blank.floor, low, high)) + 0.0  # no -0
-    low, high = (
-        max(low, size - NORMAL_95 * blank.sd) + 0.0,
-        min(high, size + NORMAL_95 * blank.sd) + 0.0,
-    )
+    low = max(low, size - NORMAL_95 * blank.sd) + 0.0
+    high = min(high, size + NORMAL_95 * blank.sd) + 0.0
     text = f"{size:.3g} ± {blank.sd:.2g} {blank.unit}"
     blank = replace(blank, estimate=size, low=low, high=high)
     if len(members) < 2:
@@ -434,9 +442,11 @@ def _joint(search: Selector, point: Point, members: list[int], named: list[int])
     """The best known combination of a class: first eigenvector of its members' information in prior
     deviations.
     """
-    priors, effects = search.priors, search.problem.effects
+    priors = search.priors
+    effects = search.problem.effects
     nuisances = np.setdiff1d(np.arange(len(effects)), members)
-    information, slab = point.information, priors.slab[members]
+    information = point.information
+    slab = priors.slab[members]
     nuisance = information[np.ix_(nuisances, nuisances)] + np.diag(
         priors.deviation(named)[nuisances] ** -2.0
     )
@@ -450,9 +460,11 @@ def _joint(search: Selector, point: Point, members: list[int], named: list[int])
     mean = float(
         np.linalg.lstsq(schur * np.outer(slab, slab), score * slab, rcond=1e-8)[0] @ vectors[:, -1]
     )
-    unit, parts = effects[members[first]].unit, [effects[members[first]].name]
+    unit = effects[members[first]].unit
+    parts = [effects[members[first]].name]
     for i in (i for i in range(len(members)) if i != first):
-        effect, coefficient = effects[members[i]], vector[i] / priors.floor[members[i]] / scale
+        effect = effects[members[i]]
+        coefficient = vector[i] / priors.floor[members[i]] / scale
         parts.append(
             f"{'+' if coefficient > 0 else '-'} {abs(coefficient):.3g} {unit}/({effect.unit})"
             f" {effect.name}"
