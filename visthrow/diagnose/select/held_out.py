@@ -513,38 +513,28 @@ def _kind(work: Work, channel: int) -> str:
     point = work.after
     by_axis = np.zeros(3)
     by_flight = Counter()
-    late = []
+    halves = np.zeros((2, 2))  # squares and samples of the first and the second half of flights
     spans = {}
     for window in point.windows:
         spans.setdefault(window.flight, []).append(window.time.mean())
     for window in point.windows:
-        rows, (innovation, _, horizon) = (
-            window.channel == channel,
-            predicted(window, point.noise, window.residual),
-        )
+        rows = window.channel == channel
         if not rows.any():
             continue
+        innovation, _, horizon = predicted(window, point.noise, window.residual)
         square = np.where(horizon < 0, 0.0, innovation**2)[rows]
         times = window.time[rows]
         if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())
-        first = min(spans[window.flight])
-        last = max(spans[window.flight])
-        late.append((window.time.mean() - first > 0.5 * (last - first), square.sum(), len(square)))
-    total = sum(by_flight.values())
+        middle = 0.5 * (min(spans[window.flight]) + max(spans[window.flight]))
+        halves[int(window.time.mean() > middle)] += square.sum(), len(square)
     parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
         parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
-    if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * total:
+    if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * sum(by_flight.values()):
         parts.append(f"mostly in flight {max(by_flight, key=by_flight.get)}")
-    halves = [
-        np.sqrt(
-            sum(s for h, s, _ in late if h == half)
-            / max(sum(n for h, _, n in late if h == half), 1)
-        )
-        for half in (0, 1)
-    ]
-    if min(halves) > 0.0 and halves[1] > 1.5 * halves[0]:
+    first, second = np.sqrt(halves[:, 0] / np.maximum(halves[:, 1], 1.0))
+    if second > 1.5 * first > 0.0:
         parts.append("growing within the flight")
     return ", ".join(parts)
