@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.stack import Stack, statistics
-from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
 EFFECTS = catalogue(6)
 
@@ -42,7 +42,9 @@ def fitted():
 
 def dense(window, gram, levels, floors, at):
     """V and S of a window, written out."""
-    deviation = levels.deviation(gram, at)
+    shared = [levels.latent_sd.get((b, gram.phase), 0.0) for b in range(len(LATENT_BLOCKS))]
+    by_block = shared * levels.share[at]
+    deviation = np.concatenate((np.ones(gram.nuisances), by_block[gram.latent_block]))
     columns = marginal.columns(window, floors)
     states = columns[:, : gram.nuisances] * deviation[: gram.nuisances]
     latents = (

@@ -218,19 +218,12 @@ def linearise(
     commands = [
         np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, windows_of)
     ]  # nothing behind replayed samples
-    extended = (
-        windows_of
-        if not problem.terms
-        else parallel_map(
-            lambda w: with_terms(w, problem.terms, theta if flown is None else 0.0 * theta),
-            windows_of,
-        )
-    )
-    extended = (
-        extended
-        if not commands
-        else [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
-    )
+    extended = windows_of
+    if problem.terms:
+        sizes_of = theta if flown is None else 0.0 * theta
+        extended = parallel_map(lambda w: with_terms(w, problem.terms, sizes_of), windows_of)
+    if commands:
+        extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     device = problem.model.device
     floors = problem.priors.floor
     first = grams_of(extended, floors, channels)
@@ -241,13 +234,10 @@ def linearise(
     noise, grams = levels.fit(cleaned, raw, start, device)
     integrals = stack.integrals(grams, noise, device)
     position = np.array(theta, dtype=float)
-    linearised = Linearised(
-        sizes,
-        {
-            i: w if extended is windows_of else replace(o, sigma=w.sigma)
-            for i, w, o in zip(problem.kept, cleaned, windows_of)
-        },
-    )
+    plain = cleaned
+    if extended is not windows_of:
+        plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
+    linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
     statistics = _statistics(grams, integrals, noise, position)
     return Point(
         position,
