@@ -199,7 +199,7 @@ def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
     listed = ", ".join(f"{i} ({label(log, i)})" for i, log in enumerate(logs))
     for number in flights:
         if not 0 <= number < len(logs):
-            raise DiagnoseError(f"--without {text}: no flight {number}; there are {listed}")
+            raise DiagnoseError(f"--without {text}: no flight {number}; the logs are {listed}")
     if len(set(flights)) == len(logs):
-        raise DiagnoseError(f"--without {text} leaves no flight; there are {listed}")
+        raise DiagnoseError(f"--without {text} leaves no flight; the logs are {listed}")
     return flights
