@@ -195,28 +195,32 @@ def calibrate_from_boards(
         views = [view for i in used if (view := boards[i]) is not None]
         try:
             lens = _solved(views, width, height, fov_deg)
-            estimates = {
-                i: _residual(Fisheye(lens), view, board_pose(Fisheye(lens), view))
-                for i, view in zip(used, views)
-            }
+            fisheye = Fisheye(lens)
+            residuals = [_residual(fisheye, view, board_pose(fisheye, view)) for view in views]
         except (cv2.error, ValueError) as error:
-            centre = np.array([width - 1.0, height - 1.0]) / 2.0
-            reach = [float(np.linalg.norm(v.pixels - centre, axis=1).max()) for v in views]
-            worst = int(np.argmax(reach))
+            worst, reach = _farthest(views, width, height)
             reason = str(error).strip().splitlines()[-1]
             left_out[used[worst]] = (
-                f"reaches {reach[worst]:.0f} px from the image's centre, and OpenCV's model, which"
+                f"reaches {reach:.0f} px from the image's centre, and OpenCV's model, which"
                 f" ends 90 deg off the axis, cannot be fitted with it ({reason})"
             )
             continue
-        sizes = {i: float(np.sqrt(2.0 * np.mean(estimates[i] ** 2))) for i in used}
-        limit = WRONG_BOARD * float(np.median(list(sizes.values())))
-        wrong = max(sizes, key=sizes.__getitem__)
-        if sizes[wrong] <= limit:
+        sizes = [float(np.sqrt(2.0 * np.mean(residual**2))) for residual in residuals]
+        usual = float(np.median(sizes))
+        worst = int(np.argmax(sizes))
+        if sizes[worst] <= WRONG_BOARD * usual:
             break
-        left_out[wrong] = f"is {sizes[wrong]:.2f} px off, the others {limit / WRONG_BOARD:.2f} px"
-    poses = [estimates.get(i) for i in range(len(boards))]
-    return replace(lens, fov_deg=fov_deg), replace(_report(poses), left_out=left_out)
+        left_out[used[worst]] = f"is {sizes[worst]:.2f} px off, the others {usual:.2f} px"
+    estimates = dict(zip(used, residuals))
+    report = _report([estimates.get(i) for i in range(len(boards))])
+    return replace(lens, fov_deg=fov_deg), replace(report, left_out=left_out)
+
+
+def _farthest(views: list[View], width: int, height: int) -> tuple[int, float]:
+    """Return the board that reaches farthest from the image's centre, and how far [px]."""
+    centre = np.array([width - 1.0, height - 1.0]) / 2.0
+    reach = [float(np.linalg.norm(view.pixels - centre, axis=1).max()) for view in views]
+    return int(np.argmax(reach)), max(reach)
 
 
 def _solved(views: list[View], width: int, height: int, fov_deg: float) -> FisheyeParams:

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -206,10 +207,7 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
     if isinstance(tree, list):
         named = [(str(i), entry) for i, entry in enumerate(tree)]
     elif isinstance(tree, dict):
-        if isinstance(tree.get("intrinsics"), list) and "resolution" in tree:
-            tree = _unzipped(tree)
-        if {"model", "fx", "cols"} <= tree.keys():
-            tree = {f"Camera.{key}": entry for key, entry in tree.items()}
+        tree = _uniform(tree)
         keys = {str(key) for key in tree}
         box = next((box for box, (matches, _) in BOXES.items() if matches(keys)), "")
         if box:
@@ -224,15 +222,17 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
     ]
 
 
-def _unzipped(tree: Node) -> Node:
-    """Basalt's cameras, whose intrinsics and resolutions stand in two lists."""
-    if not tree["intrinsics"] or not isinstance(tree["intrinsics"][0], dict):
-        return tree
-    sizes = tree["resolution"]
-    return {
-        f"cam{i}": {**entry, "resolution": sizes[i] if i < len(sizes) else None}
-        for i, entry in enumerate(tree["intrinsics"])
-    }
+def _uniform(tree: Node) -> Node:
+    """Put basalt's cameras, whose intrinsics and resolutions stand in two lists, one beside the
+    other, and ``Camera.`` before the keys of stella_vslam.
+    """
+    lenses = tree.get("intrinsics") if "resolution" in tree else None
+    if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
+        pairs = zip_longest(lenses, tree["resolution"][: len(lenses)])
+        return {f"cam{i}": {**lens, "resolution": size} for i, (lens, size) in enumerate(pairs)}
+    if {"model", "fx", "cols"} <= tree.keys():
+        return {f"Camera.{key}": entry for key, entry in tree.items()}
+    return tree
 
 
 # Numbers in it
@@ -255,19 +255,17 @@ def _any(node: Node, *names: str) -> Any:
 def _floats(value: Any, name: str, counts: tuple[int, ...] | None = None) -> list[float]:
     """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
     flat = value.get("data", value) if isinstance(value, dict) else value
-    if isinstance(flat, list) and flat and all(isinstance(row, list) for row in flat):
-        flat = [cell for row in flat for cell in row]
+    if isinstance(flat, list) and all(isinstance(row, list) for row in flat):
+        flat = list(chain.from_iterable(flat))
     try:
         numbers = [float(cell) for cell in flat if not isinstance(cell, bool)]
         if isinstance(flat, str) or (counts and len(numbers) not in counts):
             raise ValueError
     except (TypeError, ValueError):
+        expected = " or ".join(map(str, counts or ("some",)))
         text = repr(value)
-        expected = " or ".join(map(str, counts)) if counts else "some"
-        raise ValueError(
-            f"{name} is {text if len(text) <= 80 else text[:77] + '...'}; expected {expected}"
-            " numbers"
-        ) from None
+        text = text if len(text) <= 80 else text[:77] + "..."
+        raise ValueError(f"{name} is {text}; expected {expected} numbers") from None
     return numbers
 
 

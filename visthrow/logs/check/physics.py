@@ -309,43 +309,46 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
 
     Without an accelerometer the push is a multirotor's thrust, along body z; then a payload must
     not pull as well."""
-    if path not in log or ("acc_b" not in log and "payload_pos_w" in log and "attached" not in log):
+    sensed = "acc_b" in log
+    if path not in log or (not sensed and "payload_pos_w" in log and "attached" not in log):
         return []
-    (time_p, p) = log[path].samples()
-    (time_q, q) = log[quat].samples()
-    if len(time_p) < 50 or len(time_q) < 50:
+    time_p, p = log[path].samples()
+    time_q, q = log[quat].samples()
+    if min(len(time_p), len(time_q)) < 50:
         return []
     time, acc = accelerations(time_p, p, log[path].unit)
     if len(time) < 50 or float(np.sqrt(np.sum(np.var(acc, axis=0)))) < _PUSHED:
         return []
     turn = relations.attitude_at(time_q, q, time)
-    if "acc_b" in log:
-        time_a, force_b = log["acc_b"].samples()
-        if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
-            return []
-        pushed = rotate(relations.attitude_at(time_q, q, time_a), force_b) - [0.0, 0.0, GRAVITY]
-        pushed = relations.mean_over(time_a, pushed, time, _SPAN)
-        name = "acc_b"
-    else:
-        up = matrix_of_quat(turn)[:, :, 2]
-        pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * [1.0, 1.0, 0.0]
-        acc = acc * [1.0, 1.0, 0.0]
-        name = "thrust along z"
-        force_b = None
+    if not sensed:
+        return _leaning(time, acc, turn, f"d({path})/dt, {quat} thrust along z")
+    time_a, force_b = log["acc_b"].samples()
+    if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
+        return []
+    gravity = np.array([0.0, 0.0, GRAVITY])
+    pushed = rotate(relations.attitude_at(time_q, q, time_a), force_b) - gravity
+    pushed = relations.mean_over(time_a, pushed, time, _SPAN)
     relation = relations.relate(time, acc, time, pushed)
     if relation is None:
         return []
-    channels = f"d({path})/dt, {quat} {name}"
-    wrong = _exchanged(time, acc, pushed, turn, relation.axes_delay, channels, force_b is not None)
-    if wrong is None and force_b is not None:
-        wrong = _exchanged_body(
-            time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY]), time_a, force_b, channels
-        )
-    return (
-        [wrong]
-        if wrong is not None
-        else _pushed(relation, acc, pushed, channels, force_b is not None)
-    )
+    channels = f"d({path})/dt, {quat} acc_b"
+    wrong = _exchanged(time, acc, pushed, turn, relation.axes_delay, channels, True)
+    if wrong is None:
+        expected_b = rotate_back(turn, acc + gravity)
+        wrong = _exchanged_body(time, expected_b, time_a, force_b, channels)
+    return [wrong] if wrong is not None else _pushed(relation, acc, pushed, channels, True)
+
+
+def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> list[Row]:
+    """Hold the level push of a thrust along body z against accelerations [m/s^2]."""
+    level = np.array([1.0, 1.0, 0.0])
+    up = matrix_of_quat(turn)[:, :, 2]
+    pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * level
+    relation = relations.relate(time, acc * level, time, pushed)
+    if relation is None:
+        return []
+    wrong = _exchanged(time, acc * level, pushed, turn, relation.axes_delay, channels, False)
+    return [wrong] if wrong is not None else _pushed(relation, acc * level, pushed, channels, False)
 
 
 def sparse(time: np.ndarray) -> bool:

@@ -316,35 +316,28 @@ def _turning(log: FlightLog) -> list[Row]:
         return []
     time_d, turning = relations.derivative(time_w, rate, 0.03)
     front_left, front_right, rear_left, rear_right = motors.T
-    torque = np.column_stack(
-        [
-            front_left + rear_left - front_right - rear_right,
-            rear_left + rear_right - front_left - front_right,
-        ]
-    )
-    if len(time_d) < 50 or np.max(np.std(torque, axis=0)) <= 0.0:
+    roll = front_left + rear_left - front_right - rear_right
+    pitch = rear_left + rear_right - front_left - front_right
+    if len(time_d) < 50 or max(np.std(roll), np.std(pitch)) <= 0.0:
         return []
     rows = []
-    for axis, word in enumerate(("roll", "pitch")):
+    for axis, (word, torque) in enumerate((("roll", roll), ("pitch", pitch))):
         relation = relations.relate(
-            time_m, torque[:, axis : axis + 1], time_d, turning[:, axis : axis + 1], 0.2
+            time_m, torque[:, None], time_d, turning[:, axis : axis + 1], 0.2
         )
-        if relation is None or relation.axes_correlation < 0.2:
-            continue
-        channels = f"{name}, rate_b"
-        figures = {
-            "correlation": relation.correlation,
-            "delay_s": relation.delay,
-        }
-        wrong = (
-            relation.axes.startswith("-")
-            and relation.axes_correlation > relation.correlation + CLEARLY
-        )
-        text = (
-            f"{word} turns {'against' if wrong else 'with'} the motors,"
-            f" {1e3 * relation.delay:.1f} ms later"
-        )
-        text += f", correlation {relation.axes_correlation if wrong else relation.correlation:.2f}"
-        text += ": order of the motors, or a sign" if wrong else ""
-        rows.append(Row("frames", channels, "bad" if wrong else "ok", text, figures))
+        if relation is not None and relation.axes_correlation >= 0.2:
+            rows.append(_turned_by(word, relation, f"{name}, rate_b"))
     return rows
+
+
+def _turned_by(word: str, relation: relations.Relation, channels: str) -> Row:
+    """Report whether an axis turns as the motors drive it."""
+    figures = {"correlation": relation.correlation, "delay_s": relation.delay}
+    clear = relation.axes_correlation > relation.correlation + CLEARLY
+    wrong = clear and relation.axes.startswith("-")
+    correlation = relation.axes_correlation if wrong else relation.correlation
+    text = f"{word} turns {'against' if wrong else 'with'} the motors,"
+    text += f" {1e3 * relation.delay:.1f} ms later, correlation {correlation:.2f}"
+    if wrong:
+        text += ": order of the motors, or a sign"
+    return Row("frames", channels, "bad" if wrong else "ok", text, figures)

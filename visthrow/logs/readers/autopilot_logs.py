@@ -207,11 +207,7 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     sources = {_pose_part(tap): (tap, data) for tap in reversed(taps) if _fits(tap, message, data)}
     together = [*sources]
     if "quat_wb" not in sources:
-        for tap in taps:
-            fields = log.first(tap.message)
-            turns = tap.channel in ("quat_wb", "rate_b")
-            if turns and fields is not None and _fits(tap, tap.message, fields):
-                sources.setdefault(tap.channel, (tap, fields))
+        sources = _own_attitude(taps, log) | sources
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
     channels = {name: _of_pose(name, *source, str(path)) for name, source in sources.items()}
@@ -243,6 +239,17 @@ def _pose_part(tap: Tap) -> str:
 def _fits(tap: Tap, message: str, fields: Fields) -> bool:
     """Return whether a tap is of a message with these fields."""
     return tap.message == message and all(column in fields for column in tap.columns.split())
+
+
+def _own_attitude(taps: list[Tap], log: Messages) -> dict[str, tuple[Tap, Fields]]:
+    """Return where the vehicle's own attitude and rates stand."""
+    sources: dict[str, tuple[Tap, Fields]] = {}
+    for tap in taps:
+        fields = log.first(tap.message)
+        turns = tap.channel in ("quat_wb", "rate_b")
+        if turns and fields is not None and _fits(tap, tap.message, fields):
+            sources.setdefault(tap.channel, (tap, fields))
+    return sources
 
 
 def _of_pose(part: str, tap: Tap, fields: Fields, source: str) -> Channel:

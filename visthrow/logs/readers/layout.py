@@ -162,19 +162,28 @@ def _separator(lines: list[str]) -> str:
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
     best, separator = 0.0, ","
     for mark in MARKS:
-        cells = [next(csv.reader([line.strip()], delimiter=mark)) for line in sample]
-        if mark == " ":
-            cells = [[cell for cell in row if cell] for row in cells]
-        width, count = Counter(map(len, cells)).most_common(1)[0] if cells else (0, 0)
-        if width < 2:
-            continue
-        whole = [cell for row in cells if len(row) == width for cell in row if cell.strip()]
-        numbers = sum(map(is_number, whole)) / max(len(whole), 1)
-        score = numbers * count / len(cells) + 1e-3 * (mark == ";")
+        score = _regularity(sample, mark)
         if score > best + 1e-6:
             best = score
             separator = mark
     return separator
+
+
+def _regularity(sample: list[str], mark: str) -> float:
+    """Return the share of lines that a mark cuts into the usual number of cells, times the share of
+    numbers in them; 0 where it cuts none.
+    """
+    rows = [next(csv.reader([line.strip()], delimiter=mark)) for line in sample]
+    if mark == " ":
+        rows = [[cell for cell in row if cell] for row in rows]
+    if not rows:
+        return 0.0
+    width, count = Counter(map(len, rows)).most_common(1)[0]
+    if width < 2:
+        return 0.0
+    whole = [cell for row in rows if len(row) == width for cell in row if cell.strip()]
+    numbers = sum(map(is_number, whole)) / max(len(whole), 1)
+    return numbers * count / len(rows) + 1e-3 * (mark == ";")
 
 
 def _holds_numbers(cells: list[str]) -> bool:
@@ -208,22 +217,27 @@ def _sorted_head(
     rate = 0.0
     for i, (_, cells) in enumerate(head):
         cells = _uncommented(cells, width)
-        filled = [cell for cell in cells if cell]
-        if not filled:
+        if not any(cells):
             continue
-        if len(filled) == 1 and is_number(filled[0]):
-            rate = float(filled[0])
+        if cells.count("") == len(cells) - 1 and is_number("".join(cells)):
+            rate = float("".join(cells))
         elif blank and len(cells) != width:
             settings[cells[0]] = " ".join(cells[1:])  # a sentence
         elif "NO_OF_FRAMES" in settings and _KEY.fullmatch(cells[0]):
             settings[cells[0]] = "\t".join(cells[1:])
-        elif i >= cut and len(cells) <= width and (len(filled) > width / 2 or not cells[0]):
+        elif i >= cut and _names_columns(cells, width):
             named.append(cells + [""] * (width - len(cells)))
         else:
             settings |= dict(zip(cells[::2], cells[1::2]))
-            settings.setdefault(cells[0], "\t".join(cells[1:]))
+            settings.setdefault(cells[0], "")
     stated = (float(settings[key]) for key in RATES if is_number(settings.get(key, "")))
     return named, settings, rate or next(stated, 0.0)
+
+
+def _names_columns(cells: list[str], width: int) -> bool:
+    """Whether a line is as wide as the table, and fills more than half of it or starts blank."""
+    count = sum(map(bool, cells))
+    return len(cells) <= width and (count > width / 2 or not cells[0])
 
 
 def _uncommented(cells: list[str], width: int) -> list[str]:
@@ -239,6 +253,21 @@ def _uncommented(cells: list[str], width: int) -> list[str]:
 def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list[str]:
     """Names of columns, of all lines that name them, unlike each other."""
     several = len(named) > 1
+    units, parts = _units_and_words(named, width)
+    final = next((row for row in reversed(named) if not _all_units(row)), named[-1])
+    names = []
+    for i, (last, words) in enumerate(zip(final, parts)):
+        name = last if i == 0 or _FRAME.fullmatch(last) else ".".join(words)
+        name = name.replace(":", ".") if several else name
+        names.append(_joined(name, units[i], settings))
+    if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings:
+        names = _prefixed(names)
+    return [name or f"column {i}" for i, name in enumerate(names, start=1)]
+
+
+def _units_and_words(named: list[list[str]], width: int) -> tuple[list[str], list[list[str]]]:
+    """Return each column's unit, "" where no line says it, and the words that name it."""
+    several = len(named) > 1
     units = [""] * width
     parts: list[list[str]] = [[] for _ in range(width)]
     for row in named:
@@ -246,16 +275,7 @@ def _names(named: list[list[str]], width: int, settings: dict[str, str]) -> list
             units = [unit_of(cell) or "" for cell in row]
         elif not _identifies(row, several):
             _add_names(parts, row)
-    final = next((row for row in reversed(named) if not _all_units(row)), named[-1])
-    names = []
-    for i, part in enumerate(parts):
-        alone = _FRAME.fullmatch(final[i]) or i == 0
-        name = final[i] if alone else ".".join(part)
-        name = name.replace(":", ".") if several else name
-        names.append(_joined(name, units[i], settings))
-    if "BODY_NAMES" in settings or "DATA_INCLUDED" in settings:
-        names = _prefixed(names)
-    return [name or f"column {i}" for i, name in enumerate(names, start=1)]
+    return units, parts
 
 
 def _all_units(row: list[str]) -> bool:

@@ -29,7 +29,7 @@ from visthrow.common.storage import require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
-from visthrow.logs.readers.layout import is_number, layout_of
+from visthrow.logs.readers.layout import TextTable, is_number, layout_of
 from visthrow.logs.unit_names import to_si
 
 Table = dict[str, np.ndarray]
@@ -76,43 +76,53 @@ def read_table(path: str | Path) -> Columns:
         path: ``.csv``, ``.csv.gz``, ``.csv.xz``, ``.tsv``, ``.txt`` or ``.parquet``.
     """
     path = Path(path)
-    try:
-        if path.suffix == ".parquet":
-            return Columns(_parquet(path))
-        packed = _OPENERS.get(path.suffix)
-        data = unpack(path, packed, LogError) if packed else path.read_bytes()
-        layout = layout_of(data.decode("utf-8-sig"), str(path))
-    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
-        raise LogError(
-            f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
-        ) from error
-    header = layout.names
-    body = layout.rows
-    if len(header) < 2:
-        raise LogError(f"{path}: no header line with the columns' names; expected a CSV table")
-    if body and len(body[-1][1]) < len(header):  # cut short while it was written
-        body.pop()
-    if not body:
-        raise LogError(f"{path}: a header of {len(header)} columns and no rows below it")
-    wrong = next(((line, row) for line, row in body if len(row) != len(header)), None)
-    if wrong is not None:
-        raise LogError(
-            f"{path}: line {wrong[0]} has {len(wrong[1])} cells; the header has {len(header)}"
-        )
-    counts: Counter[str] = Counter()
-    for i, name in enumerate(header):
-        counts[name] += 1
-        header[i] = name if counts[name] == 1 else f"{name} ({counts[name]})"
+    if path.suffix == ".parquet":
+        return Columns(_parquet(path))
+    layout = _layout_of_file(path)
+    names = _distinct(layout.names)
     table = Columns()
     table.settings = layout.settings
     table.left_out = layout.left_out
-    for name, cells in zip(header, zip(*(row for _, row in body))):
+    for name, cells in zip(names, zip(*(row for _, row in layout.rows))):
         if any(cells):
             table |= _lists(name, cells) or {name: _column(cells, layout.comma)}
         elif not name.startswith("column "):  # of a separator
             table.left_out.append(f"{name}: blank throughout")
     _add_time(table, layout.rate)
     return table
+
+
+def _layout_of_file(path: Path) -> TextTable:
+    """Lay out a text table whose rows are all as wide as its header."""
+    packed = _OPENERS.get(path.suffix)
+    try:
+        data = unpack(path, packed, LogError) if packed else path.read_bytes()
+        layout = layout_of(data.decode("utf-8-sig"), str(path))
+    except (OSError, EOFError, UnicodeDecodeError, lzma.LZMAError, zlib.error, csv.Error) as error:
+        raise LogError(
+            f"{path}: cannot be read: {error}; expected a CSV table, plain, .gz or .xz"
+        ) from error
+    count = len(layout.names)
+    if count < 2:
+        raise LogError(f"{path}: no header line with the columns' names; expected a CSV table")
+    if layout.rows and len(layout.rows[-1][1]) < count:  # cut short while it was written
+        layout.rows.pop()
+    if not layout.rows:
+        raise LogError(f"{path}: a header of {count} columns and no rows below it")
+    for line, row in layout.rows:
+        if len(row) != count:
+            raise LogError(f"{path}: line {line} has {len(row)} cells; the header has {count}")
+    return layout
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Return names of columns with a number behind each that stands again."""
+    counts: Counter[str] = Counter()
+    distinct = []
+    for name in names:
+        counts[name] += 1
+        distinct.append(name if counts[name] == 1 else f"{name} ({counts[name]})")
+    return distinct
 
 
 def _add_time(table: Columns, rate: float) -> None:

@@ -137,35 +137,20 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
         missing.append(TITLES["moving"])
     lines = []
     rows = []
-    for plant in ("hybrid", "reference-realistic"):
-        for policy, points in _speeds(thrown, [*names, *SHIPPED], plant).items():
-            if policy in SHIPPED and plant == "hybrid":
-                reference = thrown.shipped(policy, plant, TARGET)
-                if reference is not None and points[0][0] > 0.0:
-                    points = [(0.0, reference), *points]
-                else:
-                    points = points
-            if plant == "hybrid" and len(points) > 1:
-                label = f"{policy}, {TITLES['full']}" if policy in SHIPPED else policy
-                lines.append(
-                    figures.Line(
-                        label,
-                        [x for x, _ in points],
-                        [st.mean(r.of("error")) for _, r in points],
-                        len(lines),
-                    )
-                )
-            rows += [
-                (
-                    policy,
-                    SHORT[plant],
-                    f"{speed:g}",
-                    str(len(r.good)),
-                    landed(r),
-                    st.mean(r.of("error")).text(),
-                )
-                for speed, r in points
-            ]
+    for policy, points in _speeds(thrown, [*names, *SHIPPED], "hybrid").items():
+        label = policy
+        if policy in SHIPPED:
+            label = f"{policy}, {TITLES['full']}"
+            reference = thrown.shipped(policy, "hybrid", TARGET)
+            if reference is not None and points[0][0] > 0.0:
+                points = [(0.0, reference), *points]
+        if len(points) > 1:
+            speeds = [speed for speed, _ in points]
+            intervals = [st.mean(r.of("error")) for _, r in points]
+            lines.append(figures.Line(label, speeds, intervals, len(lines)))
+        rows += [_moving_row(policy, *point) for point in points]
+    for policy, points in _speeds(thrown, [*names, *SHIPPED], "reference-realistic").items():
+        rows += [_moving_row(policy, *point) for point in points]
     content: list = []
     if lines:
         panel = figures.Panel(
@@ -182,6 +167,12 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
         head = ("policy", "plant", "speed [m/s]", "throws", "landed", "landing error [m]")
         content.append(Grid("Moving targets", head, tuple(rows)))
     return content
+
+
+def _moving_row(policy: str, speed: float, result: Result) -> tuple[str, ...]:
+    error = st.mean(result.of("error")).text()
+    plant = SHORT[result.unit["plant"]]
+    return (policy, plant, f"{speed:g}", str(len(result.good)), landed(result), error)
 
 
 def training_section(thrown: ResultSet) -> Section:

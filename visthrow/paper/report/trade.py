@@ -223,40 +223,42 @@ def _front_table(sums: Sequence[tuple]) -> Grid:
     return Grid("Fronts in figures", head, tuple(sums), note, heads=2)
 
 
+def _panel_of(
+    thrown: ResultSet, row: tuple, names: Sequence[str], sentences: list, sums: list, missing: list
+) -> figures.Trade:
+    """Return the panel of a row of :data:`PANELS`; add its sentences, its sums, what it lacks."""
+    heading, plant, kinds, policies_on = row
+    title = SHORT[plant]
+    shipped = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
+    policies = [(name, result) for name, result in shipped if result and result.good.any()]
+    charts = []
+    for compensation, bounds in kinds:
+        selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
+        label = f"TO+MPC, bounds on {bounds}"
+        if plant != thrower.IDEAL:
+            label += f", {thrower.MADE_UP[compensation]}"
+        if selected:
+            charts.append(((compensation, bounds), selected))
+            sums.append(_summed(title, label, selected))
+            sentences += _verdicts(title, label, selected, policies, policies_on)
+        elif (plant, bounds) != ("reference-realistic", BOUNDS[1]):
+            missing.append(f"{title}, {label}")
+    sums += [_policy_sum(title, name, result) for name, result in policies]
+    return _panel(heading, plant, kinds, policies, charts)
+
+
 def front_section(
     thrown: ResultSet, rows_of_panels: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
 ) -> Section:
     """Return the sweep on each plant, as in :data:`PANELS`, with the policies of these names on it,
     and who beats whom.
     """
-    panels = []
-    sentences = []
-    sums = []
-    missing = []
+    sentences: list = []
+    sums: list = []
+    missing: list = []
     picture = None
     table = None
-    for heading, plant, kinds, policies_on in rows_of_panels:
-        title = SHORT[plant]
-        policies = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
-        policies = [
-            (name, result) for name, result in policies if result is not None and result.good.any()
-        ]
-        charts = []
-        for compensation, bounds in kinds:
-            selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
-            label = f"TO+MPC, bounds on {bounds}" + (
-                "" if plant == thrower.IDEAL else f", {thrower.MADE_UP[compensation]}"
-            )
-            if not selected:
-                if (plant, bounds) != ("reference-realistic", BOUNDS[1]):
-                    missing.append(f"{title}, {label}")
-                continue
-            charts.append(((compensation, bounds), selected))
-            sums.append(_summed(title, label, selected))
-            sentences += _verdicts(title, label, selected, policies, policies_on)
-        for name, result in policies:
-            sums.append(_policy_sum(title, name, result))
-        panels.append(_panel(heading, plant, kinds, policies, charts))
+    panels = [_panel_of(thrown, row, names, sentences, sums, missing) for row in rows_of_panels]
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting"
         " counts where all its throws landed. Plans bound the payload's path alone, as the paper's"

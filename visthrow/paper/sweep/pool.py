@@ -120,16 +120,16 @@ def tasks(work: SweepWork, out: Path, done: set[str]) -> Iterator[Task]:
 
     for source in work.sources:
         units = work.throws.get(source.id, ())
-        untrained = bool(source.config) and remaining(source)
-        mine = [
-            unit.id
-            for unit in units
-            if unit.params.plant == "hybrid" and (untrained or remaining(unit))
-        ]
-        if untrained or mine:
-            yield Task(source.id, (*([source.id] if untrained else []), *mine), gpu=True)
-        for unit in () if untrained else units:
-            if unit.params.plant != "hybrid" and remaining(unit):
+        in_training = [unit.id for unit in units if unit.params.plant == "hybrid"]
+        if source.config and remaining(source):
+            yield Task(source.id, (source.id, *in_training), gpu=True)
+            continue
+        units = [unit for unit in units if remaining(unit)]
+        mine = [unit.id for unit in units if unit.id in in_training]
+        if mine:
+            yield Task(source.id, tuple(mine), gpu=True)
+        for unit in units:
+            if unit.id not in in_training:
                 yield Task(unit.id, (unit.id,), gpu=False)
 
 

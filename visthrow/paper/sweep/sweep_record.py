@@ -4,6 +4,7 @@ throws.
 
 import csv
 import json
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -69,33 +70,29 @@ def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
     counts. Raises StorageError: nothing is done, and nothing stands there."""
     training = records / "training" / f"{work.name}.json"
     throws = records / "throws" / f"{work.name}.json"
-    runs = {run["name"]: run for run in (runs_of(training) if training.exists() else ())} | {
-        source.name: _run(source, out)
-        for source in work.sources
-        if source.config and source.done(out)
-    }
-    if (
-        not runs
-        and not any(unit.done(out) for units in work.throws.values() for unit in units)
-        and not throws.exists()
-    ):
+    runs = _runs(work, out, training)
+    units = chain.from_iterable(work.throws.values())
+    thrown = [unit for unit in units if unit.done(out)]
+    if not runs and not thrown and not throws.exists():
         raise StorageError(
             f"{out}: nothing of the list '{work.name}' is done there; expected what 'visthrow sweep"
             f" run {work.name}' made"
         )
-    order = {source.name: i for i, source in enumerate(work.sources)}
-    listed = sorted(
-        (run for run in runs.values() if run["name"] in order), key=lambda run: order[run["name"]]
-    )
-    results.write_line(training, {"runs": listed})
+    names = dict.fromkeys(source.name for source in work.sources)
+    results.write_line(training, {"runs": [runs[name] for name in names if name in runs]})
     recorded = {_question(result): result for result in results.load_all([throws]).values()}
-    for units in work.throws.values():
-        for unit in units:
-            if unit.done(out):
-                path = throws_folder(out) / f"{results.key_of(unit.unit(out))}.json"
-                recorded |= {_question(result): result for result in results.load(path)}
+    for unit in thrown:
+        path = throws_folder(out) / f"{results.key_of(unit.unit(out))}.json"
+        recorded |= {_question(result): result for result in results.load(path)}
     results.pack(recorded.values(), throws)
     return [training, throws]
+
+
+def _runs(work: SweepWork, out: Path, record: Path) -> dict[str, dict[str, Any]]:
+    """Return the finished trainings of a record and of a folder by name."""
+    runs = {run["name"]: run for run in runs_of(record)} if record.exists() else {}
+    trained = [source for source in work.sources if source.config and source.done(out)]
+    return runs | {source.name: _run(source, out) for source in trained}
 
 
 def _question(result: results.Result) -> str:

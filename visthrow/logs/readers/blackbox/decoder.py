@@ -209,15 +209,7 @@ class _Decoder:
         start = reader.pos
         reader.pos += 1
         if kind == "E":
-            event = _event(reader)
-            if event is None:
-                return None
-            log.events.append(event)
-            log.complete = event[0] == "end of log"
-            if event[0] == "logging resumes":
-                self.last_iteration = int(event[1][0])
-                self.last_time = int(event[1][1])
-            return [1]
+            return self._noted(log)
         if kind not in self.plans:
             return None
         base = self.history if kind == "P" else []
@@ -225,16 +217,29 @@ class _Decoder:
         ended = reader.pos >= reader.end or reader.data[reader.pos] in FRAMES
         if not ended or reader.pos - start > _LONGEST_FRAME:
             return None
-        if kind in "IP":
-            if (kind == "P" and not base) or not self._continuous(values, kind):
-                self.history = []
-                return []
-            self.history = [values, values] if kind == "I" else [values, self.history[0]]
-            if self.at_time is not None:
-                self.last_time = values[self.at_time]
-            if self.at_iteration is not None:
-                self.last_iteration = values[self.at_iteration]
+        if kind not in "IP":
+            return values
+        if (kind == "P" and not base) or not self._continuous(values, kind):
+            self.history = []
+            return []
+        self.history = [values, values] if kind == "I" else [values, self.history[0]]
+        if self.at_time is not None:
+            self.last_time = values[self.at_time]
+        if self.at_iteration is not None:
+            self.last_iteration = values[self.at_iteration]
         return values
+
+    def _noted(self, log: BlackboxLog) -> list[int] | None:
+        """Note the next event; None: no event."""
+        event = _event(self.reader)
+        if event is None:
+            return None
+        log.events.append(event)
+        log.complete = event[0] == "end of log"
+        if event[0] == "logging resumes":
+            self.last_iteration = int(event[1][0])
+            self.last_time = int(event[1][1])
+        return [1]
 
     def _values(self, kind: str, base: list[list[int]]) -> list[int]:
         definition = self.fields[kind]
