@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import torch
 from torch import Tensor
@@ -33,10 +34,11 @@ from camera.detectors.learnt import (
 )
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
-from visthrow.config.bounds import Bounded, Positive, Share
+from visthrow.config.bounds import Bound, Bounded, Positive, Share
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
+Count = Annotated[int, Bound(1.0)]
 MATCH_RADIUS = 0.5  # a finding within this many sizes of the thing is of it
 
 
@@ -47,37 +49,24 @@ class FitParams(Bounded):
     Raises ValueError: a count below 1, or more fresh frames than the pool holds.
     """
 
-    steps: int
-    batch: int  # frames a step
-    patches: int  # of each kind a step
-    fresh: int  # frames rendered at a time
-    reuse: int  # steps between two renderings
-    pool: int  # frames that are kept
-    samples: int  # rays a pixel
+    steps: Count
+    batch: Count  # frames a step
+    patches: Count  # of each kind a step
+    fresh: Count  # frames rendered at a time
+    reuse: Count  # steps between two renderings
+    pool: Count  # frames that are kept
+    samples: Count  # rays a pixel
     learning_rate: Positive  # at its highest; one cycle
     lenses: Share  # share of rendered batches with another lens than the camera's
-    calibration: int  # frames that confidences are calibrated on
+    calibration: Count  # frames that confidences are calibrated on
     seed: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        counts = {
-            name: getattr(self, name)
-            for name in (
-                "steps",
-                "batch",
-                "patches",
-                "fresh",
-                "reuse",
-                "pool",
-                "samples",
-                "calibration",
-            )
-        }
-        if min(counts.values()) < 1 or self.fresh > self.pool:
+        if self.fresh > self.pool:
             raise ValueError(
-                f"detector: {counts}; expected 1 or more of each, and no more fresh frames than the"
-                " pool holds"
+                f"detector: {self.fresh} fresh frames; expected no more than the pool holds,"
+                f" {self.pool}"
             )
 
 

@@ -3,8 +3,9 @@ picture.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+import tomllib
+from dataclasses import dataclass, fields
+from pathlib import Path
 
 import torch
 from scipy.spatial.transform import Rotation
@@ -12,7 +13,7 @@ from torch import Tensor
 
 from camera.fisheye import Fisheye
 from camera.keypoints import ball_extremes_c, goal_corners_w
-from camera.mount import rotation_from_vector
+from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
 
 THINGS = 10  # most things on the ground and about the hall
@@ -133,24 +134,32 @@ def random_scenes(
         nuisances: of the pictures; left out, all.
     """
     d = Draw(count, seed)
-    n = nuisances or Nuisances()
-    pos = torch.cat([d.uniform(-0.4, 1.0, 1), d.uniform(-0.4, 0.4, 1), d.uniform(0.8, 2.3, 1)], -1)
+    ahead = d.uniform(-0.4, 1.0, 1)
+    lateral = d.uniform(-0.4, 0.4, 1)
+    pos = torch.cat([ahead, lateral, d.uniform(0.8, 2.3, 1)], -1)
     lean = d.uniform(0.0, 1.0, 1).square() * math.radians(65.0)
-    rot_wb = rotation_from_vector(torch.cat([lean * d.way(), d.uniform(-0.5, 0.5, 1)], -1))
-    goal = pos[:, :2] + d.uniform(0.0, 2.3, 1) * d.way()
+    tilt = lean * d.way()
+    rot_wb = rotation_from_vector(torch.cat([tilt, d.uniform(-0.5, 0.5, 1)], -1))
+    distance = d.uniform(0.0, 2.3, 1)
+    goal = pos[:, :2] + distance * d.way()
     swing = d.uniform(0.0, 1.0, 1).square() * math.radians(80.0)
     way = torch.cat([swing.sin() * d.way(), -swing.cos()], -1)
     thrown = d.chance(0.25, 1)
-    reach = torch.where(thrown, d.uniform(0.4, 2.0, 1), d.uniform(0.33, 0.42, 1))
-    ball = pos + way * reach
+    flown = d.uniform(0.4, 2.0, 1)
+    hanging = d.uniform(0.33, 0.42, 1)
+    ball = pos + way * torch.where(thrown, flown, hanging)
     ball[:, 2].clamp_(min=params.payload_radius)
     scenes = posed_scenes(params, pos, rot_wb, ball, goal, ~thrown[:, 0])
-    scenes = replace(
-        scenes, pose=torch.cat([scenes.pose[:, :7], d.normal(1.2, 3), d.normal(2.5, 3)], -1)
-    )
-    scenes.ball[:, 4:7] = scenes.pose[:, 7:10] + d.normal(1.5, 3)
+    vel = d.normal(1.2, 3)
+    rates = d.normal(2.5, 3)
+    scenes.pose[:, 7:] = torch.cat([vel, rates], -1)
+    scenes.ball[:, 4:7] = vel + d.normal(1.5, 3)
     scenes.goal[:, 3] = d.normal(0.05)
-    return dressed(scenes, d, textures, n)
+    return dressed(scenes, d, textures, nuisances or Nuisances())
+
+
+PLAIN = tomllib.loads(Path(__file__).with_name("plain.toml").read_text(encoding="utf-8"))
+"""Numbers of plain scenes: rows of :class:`Scenes`, or what follows a scene's own numbers there."""
 
 
 def posed_scenes(
@@ -170,48 +179,28 @@ def posed_scenes(
         ball_w: [m], shape (E, 3). goal_w: [m], shape (E, 2) or (E, 3). hangs: whether the ball is
             on its rope, shape (E,).
     """
-    from camera.mount import nominal_rot_cb
-
     count = len(pos_w)
-
-    def make(row: Sequence[float]) -> Tensor:
-        return torch.tensor(row).float().repeat(len(pos_w), 1)
-
+    plain = {name: torch.tensor(row).float().repeat(count, 1) for name, row in PLAIN.items()}
+    size = torch.ones(count, 1)
     rot_wb = rot_wb.float()
     lens_b = torch.tensor(params.mount.position_b)
     eye = pos_w.float() + rot_wb @ lens_b
     rot_wc = rot_wb @ nominal_rot_cb(params.mount).float().T
     mount = rot_wb @ (torch.tensor([0.0, 0.0, -0.02]) - lens_b)
-    rope = torch.cat([mount, 0.0012 * hangs.float()[:, None], make([0.2, 0.2, 0.2])], -1)
-    ball = torch.cat(
-        [
-            ball_w.float(),
-            make(
-                [params.payload_radius, 0, 0, 0, 0, 0, 0, 1.0, 0.80, 0.88, 0.20, 0.95, 0.95, 0.92]
-            ),
-        ],
-        -1,
-    )
-    goal = torch.cat(
-        [
-            goal_w[:, :2].float(),
-            make([params.goal_side, 0, 0.02, 0, 0.16, 0.55, 0.26, 0.93, 0.93, 0.90, 0.1, 0.1, 0.1]),
-        ],
-        -1,
-    )
+    radius = 0.0012 * hangs.float()
     light = torch.nn.functional.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
     return Scenes(
-        lens_row(params.fisheye, 0.0).repeat(count, 1),
-        torch.cat([eye, _quat(rot_wc), torch.zeros(count, 6)], -1),
-        torch.zeros(count, 3),
-        ball,
-        goal,
-        make([-1.0, 1.0, 0, 0, 0, 0.55, 0.55, 0.55]),
-        make([-1.0, 8.0, 6.0, 4.0, 0.5]),
-        torch.cat([light.repeat(count, 1), make([0.45, 1, 1, 1, 0.0])], -1),
-        rope,
-        make([1.0, 0, 0, 1.0, 0, 0]),
-        torch.zeros(count, THINGS, 12),
+        lens=lens_row(params.fisheye, 0.0).repeat(count, 1),
+        pose=_flat(eye, _quat(rot_wc), torch.zeros(count, 6)),
+        shutter=torch.zeros(count, 3),
+        ball=_flat(ball_w.float(), params.payload_radius * size, plain["ball"]),
+        goal=_flat(goal_w[:, :2].float(), params.goal_side * size, plain["goal"]),
+        ground=plain["ground"],
+        walls=plain["walls"],
+        light=_flat(light.repeat(count, 1), plain["light"]),
+        rope=_flat(mount, radius, plain["rope"]),
+        sensor=plain["sensor"],
+        things=torch.zeros(count, THINGS, 12),
     )
 
 
@@ -223,22 +212,14 @@ def _flat(*columns: Tensor) -> Tensor:
 def _exposed(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     """Return sensors and shutters drawn at random."""
     gain = torch.exp2(n.light * d.uniform(-1.2, 0.9))
-    noise = n.noise * d.uniform(0.0, 1.0, 1).square()
+    noise = n.noise * d.uniform(0.0, 1.0).square()
     seed = torch.arange(count) * 7919.0 + d.one_of(1000)
-    sensor = _flat(
-        gain,
-        0.06 * noise[:, 0],
-        0.04 * noise[:, 0],
-        1.0 + n.light * d.uniform(-0.45, 0.1),
-        torch.zeros(count),
-        seed,
-    )
-    shutter = _flat(
-        n.motion * d.uniform(0.0, 0.012),
-        n.motion * d.uniform(0.0, 0.012),
-        n.blur * d.uniform(0.0, 1.0).square() * 1.6,
-    )
-    return sensor, shutter
+    gamma = 1.0 + n.light * d.uniform(-0.45, 0.1)
+    sensor = _flat(gain, 0.06 * noise, 0.04 * noise, gamma, torch.zeros(count), seed)
+    exposure = n.motion * d.uniform(0.0, 0.012)
+    readout = n.motion * d.uniform(0.0, 0.012)
+    defocus = n.blur * d.uniform(0.0, 1.0).square() * 1.6
+    return sensor, _flat(exposure, readout, defocus)
 
 
 def _coloured(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
@@ -246,75 +227,66 @@ def _coloured(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     ball = scenes.ball.clone()
     goal = scenes.goal.clone()
     ball[:, 7:11] = torch.nn.functional.normalize(d.normal(1.0, 4), dim=-1)
-    ball[:, 11:14] = (
-        ball[:, 11:14] + n.look * (d.uniform(-0.18, 0.12, 1) + d.uniform(-0.08, 0.08, 3))
-    ).clamp(0.02, 1.0)
-    ball[:, 14:17] = (ball[:, 14:17] + n.look * d.uniform(-0.3, 0.05, 1)).clamp(0.02, 1.0)
-    goal[:, 6:9] = (
-        goal[:, 6:9] + n.look * (d.uniform(-0.08, 0.12, 1) + d.uniform(-0.08, 0.08, 3))
-    ).clamp(0.02, 1.0)
-    goal[:, 9:12] = (goal[:, 9:12] + n.look * d.uniform(-0.25, 0.07, 1)).clamp(0.02, 1.0)
+    shade = d.uniform(-0.18, 0.12, 1)
+    hue = shade + d.uniform(-0.08, 0.08, 3)
+    ball[:, 11:14] = (ball[:, 11:14] + n.look * hue).clamp(0.02, 1.0)
+    seam = d.uniform(-0.3, 0.05, 1)
+    ball[:, 14:17] = (ball[:, 14:17] + n.look * seam).clamp(0.02, 1.0)
+    shade = d.uniform(-0.08, 0.12, 1)
+    hue = shade + d.uniform(-0.08, 0.08, 3)
+    goal[:, 6:9] = (goal[:, 6:9] + n.look * hue).clamp(0.02, 1.0)
+    rim = d.uniform(-0.25, 0.07, 1)
+    goal[:, 9:12] = (goal[:, 9:12] + n.look * rim).clamp(0.02, 1.0)
     goal[:, 4] = goal[:, 4] + n.look * d.uniform(-0.008, 0.012)
-    goal[:, 5] = torch.where(d.chance(0.6 * n.look), d.one_of(4), goal[:, 5])
+    marked = d.chance(0.6 * n.look)
+    goal[:, 5] = torch.where(marked, d.one_of(4), goal[:, 5])
     return ball, goal
+
+
+def _hall(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> tuple[Tensor, Tensor]:
+    """Return grounds and walls, some of them plain, the others with photographs at random."""
+    pictured = d.chance(n.ground)[:, None]
+    brightness = d.uniform(0.45, 1.1, 1)
+    tint = brightness * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
+    texture = d.one_of(textures)
+    tile = d.uniform(0.4, 3.0)
+    yaw = d.uniform(0.0, 6.28)
+    ground = _flat(texture, tile, yaw, d.uniform(0.0, 2.0, 2), tint)
+    texture = d.one_of(textures)
+    half = d.uniform(3.0, 9.0)
+    height = d.uniform(3.0, 7.0)
+    tile = d.uniform(1.5, 6.0)
+    walls = _flat(texture, half, height, tile, d.uniform(0.3, 1.0))
+    return torch.where(pictured, ground, scenes.ground), torch.where(pictured, walls, scenes.walls)
+
+
+def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
+    """Return lights drawn at random."""
+    slope = d.normal(0.5, 2)
+    direction = _flat(slope, torch.ones(len(slope)))
+    direction = torch.nn.functional.normalize(direction, dim=-1)
+    colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
+    drawn = d.chance(n.light)[:, None]
+    direction = torch.where(drawn, direction, scenes.light[:, :3])
+    ambient = d.uniform(0.3, 0.7)
+    return _flat(direction, ambient, colour, d.uniform(0.2, 0.8))
 
 
 def dressed(scenes: Scenes, d: Draw, textures: int, n: Nuisances) -> Scenes:
     """Scenes with a hall, colours, light, a lens and a sensor drawn at random."""
-    count = scenes.count
-    ground = scenes.ground.clone()
-    walls = scenes.walls.clone()
-    pictured = d.chance(n.ground)
-    tint = d.uniform(0.45, 1.1, 1) * (1.0 + d.uniform(-0.25, 0.25, 3) * n.light)
-    ground = torch.where(
-        pictured[:, None],
-        _flat(
-            d.one_of(textures),
-            d.uniform(0.4, 3.0),
-            d.uniform(0.0, 6.28),
-            d.uniform(0.0, 2.0, 2),
-            tint,
-        ),
-        ground,
-    )
-    dressed_walls = _flat(
-        d.one_of(textures),
-        d.uniform(3.0, 9.0),
-        d.uniform(3.0, 7.0),
-        d.uniform(1.5, 6.0),
-        d.uniform(0.3, 1.0),
-    )
-    walls = torch.where(pictured[:, None], dressed_walls, walls)
+    ground, walls = _hall(scenes, d, textures, n)
     ball, goal = _coloured(scenes, d, n)
-    direction = torch.nn.functional.normalize(
-        torch.cat([d.normal(0.5, 2), torch.ones(count, 1)], -1), dim=-1
-    )
-    colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
-    light = _flat(
-        torch.where(d.chance(n.light)[:, None], direction, scenes.light[:, :3]),
-        d.uniform(0.3, 0.7),
-        colour,
-        d.uniform(0.2, 0.8),
-    )
+    light = _lit(scenes, d, n)
     rope = scenes.rope.clone()
-    rope[:, 3] = rope[:, 3] * d.chance(n.parts) * d.uniform(0.6, 1.5)
+    rope[:, 3] = rope[:, 3] * d.chance(n.parts)
+    rope[:, 3] = rope[:, 3] * d.uniform(0.6, 1.5)
     rope[:, 4:7] = d.uniform(0.05, 0.9, 1)
     lens = scenes.lens.clone()
     lens[:, 9] = n.light * d.uniform(0.0, 2.0)
-    sensor, shutter = _exposed(count, d, n)
+    sensor, shutter = _exposed(scenes.count, d, n)
     things = _things(scenes, d, n)
-    return replace(
-        scenes,
-        ground=ground,
-        walls=walls,
-        ball=ball,
-        goal=goal,
-        light=light,
-        rope=rope,
-        lens=lens,
-        sensor=sensor,
-        shutter=shutter,
-        things=things,
+    return Scenes(
+        lens, scenes.pose, shutter, ball, goal, ground, walls, light, rope, sensor, things
     )
 
 

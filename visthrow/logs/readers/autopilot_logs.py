@@ -207,7 +207,8 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     sources = {_pose_part(tap): (tap, data) for tap in reversed(taps) if _fits(tap, message, data)}
     together = [*sources]
     if "quat_wb" not in sources:
-        sources = _own_attitude(taps, log) | sources
+        for name, source in _own_attitude(taps, log).items():
+            sources.setdefault(name, source)
         if "quat_wb" not in sources:
             raise LogError(f"{log.path}: {message} gives no attitude, and the log holds none")
     channels = {name: _of_pose(name, *source, str(path)) for name, source in sources.items()}
