@@ -49,7 +49,8 @@ class Fisheye:
         t2 = self.half_fov**2
         self.edge_radius = self.half_fov * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
         self._edge_slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
-        reach_x, reach_y = params.fx * self.edge_radius, params.fy * self.edge_radius
+        reach_x = params.fx * self.edge_radius
+        reach_y = params.fy * self.edge_radius
         slack = 1e-9
         self._bounds = (
             -0.5 - slack,
@@ -196,7 +197,8 @@ class Fisheye:
             return radius
         with torch.no_grad():
             theta = radius * (self.half_fov / self.edge_radius)
-            low, high = torch.zeros_like(theta), torch.full_like(theta, self.half_fov)
+            low = torch.zeros_like(theta)
+            high = torch.full_like(theta, self.half_fov)
             for _ in range(NEWTON_STEPS):
                 excess = self.radius_from_angle(theta) - radius
                 low = torch.where(excess < 0.0, theta, low)

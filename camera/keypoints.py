@@ -173,13 +173,12 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     Returns:
         Midpoints of the left, top, right and bottom edge, shape (E, 4, 2).
     """
-    low, top, right, bottom = (
-        extremes[:, 0, 0],
-        extremes[:, 1, 1],
-        extremes[:, 2, 0],
-        extremes[:, 3, 1],
-    )
-    u, v = (low + right) * 0.5, (top + bottom) * 0.5
+    low = extremes[:, 0, 0]
+    top = extremes[:, 1, 1]
+    right = extremes[:, 2, 0]
+    bottom = extremes[:, 3, 1]
+    u = (low + right) * 0.5
+    v = (top + bottom) * 0.5
     middles: torch.Tensor = torch.stack([low, v, u, top, right, v, u, bottom], -1).unflatten(
         -1, (4, 2)
     )

@@ -67,7 +67,9 @@ def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
         Rotated row vectors, shape (..., K, 3).
     """
     rot = rot.unsqueeze(-3)
-    x, y, z = vectors[..., 0:1], vectors[..., 1:2], vectors[..., 2:3]
+    x = vectors[..., 0:1]
+    y = vectors[..., 1:2]
+    z = vectors[..., 2:3]
     return x * rot[..., 0] + y * rot[..., 1] + z * rot[..., 2]
 
 

@@ -51,9 +51,13 @@ def draw_overlay(
     _draw_body_axes(canvas, camera, thick)
     pixels = lens.denormalize(keypoints.detach().cpu().double()).numpy()
     visible = valid.detach().cpu().numpy().astype(bool)
-    goal, box = pixels[:GOAL_KEYPOINTS], pixels[GOAL_KEYPOINTS:]
+    goal = pixels[:GOAL_KEYPOINTS]
+    box = pixels[GOAL_KEYPOINTS:]
     _draw_group(canvas, goal, visible[:GOAL_KEYPOINTS], goal, GREEN, thick)
-    low, top, right, bottom = box[0, 0], box[1, 1], box[2, 0], box[3, 1]
+    low = box[0, 0]
+    top = box[1, 1]
+    right = box[2, 0]
+    bottom = box[3, 1]
     rectangle = np.array([[low, top], [right, top], [right, bottom], [low, bottom]])
     _draw_group(canvas, box, visible[GOAL_KEYPOINTS:], rectangle, RED, thick)
     return canvas

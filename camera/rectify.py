@@ -28,7 +28,8 @@ class ViewParams:
 
 def view_rotation(view: ViewParams) -> torch.Tensor:
     """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
-    yaw, pitch = math.radians(view.yaw_deg), math.radians(view.pitch_deg)
+    yaw = math.radians(view.yaw_deg)
+    pitch = math.radians(view.pitch_deg)
     turns = torch.tensor([[0.0, yaw, 0.0], [pitch, 0.0, 0.0]], dtype=torch.float64)
     about_y, about_x = rotation_from_vector(turns)
     return about_y @ about_x

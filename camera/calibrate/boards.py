@@ -126,9 +126,9 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
         success, centres = cv2.findCirclesGrid(
             grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID
         )
-        return (
-            View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64)) if success else None
-        )
+        if success:
+            return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64))
+        return None
     # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes
     # second.
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):

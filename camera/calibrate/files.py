@@ -115,10 +115,12 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
         raise ValueError(f"{path}: {key} is {node[key]!r}; expected a 4 x 4 matrix") from None
     if np.abs(matrix[:3, :3] @ matrix[:3, :3].T - np.eye(3)).max() > NOT_A_ROTATION:
         raise ValueError(f"{path}: {key} has no rotation in its first three rows and columns")
-    rot_cb, place_c = matrix[:3, :3], matrix[:3, 3]
+    rot_cb = matrix[:3, :3]
+    place_c = matrix[:3, 3]
     position_b = -rot_cb.T @ place_c
     if key == "T_imu_cam":
-        rot_cb, position_b = matrix[:3, :3].T, place_c
+        rot_cb = matrix[:3, :3].T
+        position_b = place_c
     turn = (rot_cb.T @ np.array(DOWNWARD_ROT_CB)).tolist()
     roll = math.atan2(turn[2][1], turn[2][2])
     pitch = math.asin(max(-1.0, min(1.0, -turn[2][0])))
@@ -290,7 +292,9 @@ def _label(node: Node, *names: str) -> str:
 def _model(core: str, distortion: str, values: Values, coefficients: list[float]) -> Camera:
     """Model of a core and its distortion; coefficients beyond those of the model must be zero."""
     if core == "pinhole" and distortion == "kb4":
-        core, distortion, names = "kb4", "none", KB4.split()[4:]
+        core = "kb4"
+        distortion = "none"
+        names = KB4.split()[4:]
     elif distortion == "kb4":
         raise ValueError(f"model '{core}' with equidistant distortion; no tool writes that")
     else:
@@ -399,7 +403,10 @@ def _vikit(node: Node) -> Camera:
     fx, fy, cx, cy = _floats([_any(node, f"cam_{k}") for k in KB4.split()[:4]], "cam_fx ...")
     if fx < 10.0:  # shares of the image, which count from its corner
         width, height = _size(node) or (0, 0)
-        fx, fy, cx, cy = fx * width, fy * height, cx * width - 0.5, cy * height - 0.5
+        fx = fx * width
+        fy = fy * height
+        cx = cx * width - 0.5
+        cy = cy * height - 0.5
     coefficients = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
     values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
     return _model(

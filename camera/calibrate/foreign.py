@@ -51,13 +51,15 @@ def _ucm(values: Values, side2: Array, z: Array) -> Array:
 
 def _eucm(values: Values, side2: Array, z: Array) -> Array:
     """Khomutenko, Garcia, Martinet, "An Enhanced Unified Camera Model", RA-L 1(1), 2016, eq. 3."""
-    alpha, beta = values["alpha"], values["beta"]
+    alpha = values["alpha"]
+    beta = values["beta"]
     return alpha * np.sqrt(beta * side2 + z * z) + (1.0 - alpha) * z
 
 
 def _ds(values: Values, side2: Array, z: Array) -> Array:
     """Usenko, Demmel, Cremers, "The Double Sphere Camera Model", 3DV 2018, eqs. 40 to 42."""
-    xi, alpha = values["xi"], values["alpha"]
+    xi = values["xi"]
+    alpha = values["alpha"]
     shifted = xi * np.sqrt(side2 + z * z) + z
     return alpha * np.sqrt(side2 + shifted**2) + (1.0 - alpha) * shifted
 
@@ -77,7 +79,8 @@ DENOMINATORS: dict[str, tuple[str, Callable[[Values, Array, Array], Array]]] = {
 def _radtan(values: Values, plane: Array) -> Array:
     """Brown's radial and tangential distortion, with OpenCV's rational part."""
     k = [0.0] + [values.get(f"k{i}", 0.0) for i in range(1, 7)]
-    p1, p2 = values.get("p1", 0.0), values.get("p2", 0.0)
+    p1 = values.get("p1", 0.0)
+    p2 = values.get("p2", 0.0)
     x, y = plane.T
     r2 = x * x + y * y
     below = 1.0 + r2 * (k[4] + r2 * (k[5] + r2 * k[6]))
@@ -220,7 +223,9 @@ def fit_fisheye(
     samples = _sample(model, values, width, height)
     limit = samples.fold if fov_deg is None else min(math.radians(fov_deg) / 2.0, samples.fold)
     used = samples.theta <= limit
-    theta, direction, pixels = samples.theta[used], samples.direction[used], samples.pixels[used]
+    theta = samples.theta[used]
+    direction = samples.direction[used]
+    pixels = samples.pixels[used]
     if len(theta) < 50 * TURNS / 8:
         raise ValueError(
             f"the image of this {model} lens shows {len(theta)} of {ANGLES * TURNS} rays that were"
@@ -288,13 +293,15 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     stops growing and to 360.
     """
     limit = min(monotonic_limit(fisheye.coefficients), math.pi) * (1.0 - 1e-9)
-    right, low = fisheye.width - 0.5, fisheye.height - 0.5
+    right = fisheye.width - 0.5
+    low = fisheye.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
     radius = np.linalg.norm(
         (corners - [fisheye.cx, fisheye.cy]) / [fisheye.fx, fisheye.fy], axis=1
     ).max()
     values = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
-    low_angle, high_angle = 0.0, limit
+    low_angle = 0.0
+    high_angle = limit
     for _ in range(80):  # bisection, to the last bit
         middle = 0.5 * (low_angle + high_angle)
         below = float(_kb4_radius(values, np.array([middle]))[0]) < radius

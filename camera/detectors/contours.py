@@ -132,8 +132,10 @@ class Detector:
             payload_radius: [m]. goal_side: with the rim [m].
             params: colours and limits.
         """
-        self.lens, self.params = lens, params or DetectorParams()
-        self.radius, self.side = payload_radius, goal_side
+        self.lens = lens
+        self.params = params or DetectorParams()
+        self.radius = payload_radius
+        self.side = goal_side
         shape = (lens.params.height, lens.params.width)
         v, u = np.mgrid[: shape[0], : shape[1]]
         edge = self.lens.edge_radius
@@ -150,7 +152,8 @@ class Detector:
             known: narrows what is looked for.
         """
         self.check(image)
-        p, prior = self.params, prior or Prior()
+        p = self.params
+        prior = prior or Prior()
         colours = colours_of(image)
         ball = colour_maps(
             colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow"
@@ -175,9 +178,9 @@ class Detector:
         where the ball is expected.
         """
         best = self._best_cone(circles_of(mask), level, prior)
-        return (
-            self._expected(level, prior) if best is None and prior.ball_ray_c is not None else best
-        )
+        if best is None and prior.ball_ray_c is not None:
+            return self._expected(level, prior)
+        return best
 
     def _best_cone(
         self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, prior: Prior
@@ -330,12 +333,14 @@ def detected_keypoints(
         rot_wc = rot_wb @ camera.rot_cb.double().numpy().T
         rays = ordered_corners(detections.goal.rays_c, rot_wc)
         corners, ok = camera.fisheye.project_normalized(torch.from_numpy(rays).float(), clip=True)
-        points[:GOAL_KEYPOINTS], valid[:GOAL_KEYPOINTS] = corners, ok
+        points[:GOAL_KEYPOINTS] = corners
+        valid[:GOAL_KEYPOINTS] = ok
     if detections.ball is not None:
         ball_c = detections.ball.ray_c * (
             camera.params.payload_radius / math.sin(detections.ball.half_angle)
         )
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
-        points[GOAL_KEYPOINTS:], valid[GOAL_KEYPOINTS:] = box[0], ok[0]
+        points[GOAL_KEYPOINTS:] = box[0]
+        valid[GOAL_KEYPOINTS:] = ok[0]
     points, valid = by_rule(camera, points[None], valid[None])
     return points[0], valid[0]

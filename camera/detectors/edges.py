@@ -115,7 +115,8 @@ def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
     single = [(np.array(centre), float(radius)) for centre, radius in circles]
     pairs = []
     for i, j in combinations(range(min(len(single), MOST_PAIRED)), 2):
-        (first, one), (second, two) = single[i], single[j]
+        first, one = single[i]
+        second, two = single[j]
         if np.linalg.norm(first - second) < one + two:
             joined = np.concatenate([outlines[i], outlines[j]]).astype(np.float32)
             centre, radius = cv2.minEnclosingCircle(joined)
@@ -161,7 +162,9 @@ def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
         half-angles, and their share.
     """
     good = np.ones(len(rays), bool)
-    axis, half_angle, off = rays.mean(axis=0), 0.0, np.zeros(len(rays))
+    axis = rays.mean(axis=0)
+    half_angle = 0.0
+    off = np.zeros(len(rays))
     for width in (0.4, 0.2, 0.1, 0.07, 0.07):
         # About the mean ray the plane is nearly across; in its basis the least squares are well
         # conditioned.
@@ -176,7 +179,8 @@ def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
         size = float(np.linalg.norm(normal))
         if not size > 1.0:
             return axis / np.linalg.norm(axis), 0.0, math.inf, 0.0
-        axis, half_angle = normal / size, math.acos(1.0 / size)
+        axis = normal / size
+        half_angle = math.acos(1.0 / size)
         off = (
             np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis) / half_angle - 1.0
         )
@@ -256,7 +260,9 @@ def _refined(
     """Corners by lines through the edges near each side; with the misfit over the side's length and
     the share found.
     """
-    lines, misfit, share = [], [], []
+    lines = []
+    misfit = []
+    share = []
     middle = corners.mean(axis=0)
     for first, second in zip(corners, np.roll(corners, -1, axis=0)):
         side = second - first
@@ -344,13 +350,12 @@ def _rim_contrast(
             [a + part * (b - a) for a, b in zip(ring, np.roll(ring, -1, axis=0))]
         )
         pixels = _pixels(lens, points, frame)
-        return (
-            np.full(len(points), math.nan)
-            if pixels is None
-            else _sample(bright, pixels[:, 0], pixels[:, 1])
-        )
+        if pixels is None:
+            return np.full(len(points), math.nan)
+        return _sample(bright, pixels[:, 0], pixels[:, 1])
 
-    rim, surroundings = around(0.5 * (1.0 + 1.0 / share)), around(1.0 / share + 0.25)
+    rim = around(0.5 * (1.0 + 1.0 / share))
+    surroundings = around(1.0 / share + 0.25)
     if np.isnan(rim).any() or np.isnan(surroundings).any():
         return 0.0
     readable = surroundings < OVEREXPOSED
@@ -409,11 +414,9 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
     falls = bright[:, :-1] & ~bright[:, 1:]
     last = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
     hit = falls.any(axis=1) & (plateau > LEAST_LEVEL) & ~bright[:, -1]
-    start, rows, peak = (
-        round(BLUR_WIDTH / STEP),
-        np.arange(len(values))[:, None],
-        values.shape[1] - 1,
-    )
+    start = round(BLUR_WIDTH / STEP)
+    rows = np.arange(len(values))[:, None]
+    peak = values.shape[1] - 1
     distances = np.arange(start, 2 * start)
     high = np.quantile(values[rows, np.clip(last[:, None] - distances, 0, peak)], 0.75, axis=1)
     low = np.median(values[rows, np.clip(last[:, None] + distances, 0, peak)], axis=1)
@@ -442,6 +445,7 @@ def _between(
 ) -> np.ndarray:
     """Place between two samples where a level is crossed."""
     rows = np.arange(len(values))
-    high, low = values[rows, index], values[rows, index + 1]
+    high = values[rows, index]
+    low = values[rows, index + 1]
     part = np.clip((high - level) / np.maximum(high - low, 1e-9), 0.0, 1.0)
     return reach[index] + part * (reach[index + 1] - reach[index])

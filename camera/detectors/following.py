@@ -60,7 +60,9 @@ class BallTrack:
         """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis
         of it [rad] and its rate [rad/s].
         """
-        self.ray_w, self.rate_w, self.stamp = ray_w, np.zeros(3), stamp
+        self.ray_w = ray_w
+        self.rate_w = np.zeros(3)
+        self.stamp = stamp
         self._covariance = np.diag([spread**2, rate**2])
 
     @property
@@ -72,8 +74,10 @@ class BallTrack:
         """Turn on to a time [s]; ``driven_w``: acceleration of the direction [rad/s^2],
         shape (3,).
         """
-        dt, self.stamp = stamp - self.stamp, stamp
-        moved, push = np.array([[1.0, dt], [0.0, 1.0]]), np.array([0.5 * dt * dt, dt])
+        dt = stamp - self.stamp
+        self.stamp = stamp
+        moved = np.array([[1.0, dt], [0.0, 1.0]])
+        push = np.array([0.5 * dt * dt, dt])
         self.ray_w = _unit(self.ray_w + dt * self.rate_w + push[0] * driven_w)
         self.rate_w = _perpendicular(self.rate_w + dt * driven_w, self.ray_w)
         self._covariance = moved @ self._covariance @ moved.T + DRIVEN**2 * np.outer(push, push)
@@ -105,10 +109,15 @@ class BallGoalTracker:
         """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
         lens [m], shape (3,), or with none.
         """
-        self._radius, self._side, self._half_angle, self._begin = radius, side, 0.0, ball_w
+        self._radius = radius
+        self._side = side
+        self._half_angle = 0.0
+        self._begin = ball_w
         self._ball: BallTrack | None = None
         self._squares: list[Square] = []
-        self._eye_w, self._stamp, self._weight = np.zeros(3), math.inf, 0.0
+        self._eye_w = np.zeros(3)
+        self._stamp = math.inf
+        self._weight = 0.0
 
     def prior(
         self,
@@ -147,7 +156,8 @@ class BallGoalTracker:
         self._weight = -math.expm1(-max(stamp - self._stamp, 0.0) / MEMORY)
         for square in self._squares:
             square.log_odds *= 1.0 - self._weight
-        self._eye_w, self._stamp = eye_w, stamp
+        self._eye_w = eye_w
+        self._stamp = stamp
         if self._squares:
             offset = np.append(self._likeliest().place_w, 0.0) - eye_w
             where |= {
@@ -165,7 +175,8 @@ class BallGoalTracker:
         Without an attitude nothing is followed.
         """
         if rot_wc is None:
-            self._ball, self._squares = None, []
+            self._ball = None
+            self._squares = []
             return detections
         detections = replace(detections, goal=self._goal(detections, rot_wc))
         if detections.ball is not None:
@@ -199,12 +210,11 @@ class BallGoalTracker:
                 continue
             if i == len(self._squares):
                 self._squares.append(Square(place_w, self._stamp))
-            square, sure, squares[i] = (
-                self._squares[i],
-                min(max(one.score, 1.0 - SUREST), SUREST),
-                one,
-            )
-            square.place_w, square.stamp = place_w, self._stamp
+            square = self._squares[i]
+            sure = min(max(one.score, 1.0 - SUREST), SUREST)
+            squares[i] = one
+            square.place_w = place_w
+            square.stamp = self._stamp
             square.log_odds += self._weight * math.log(sure / (1.0 - sure))
         return squares.get(self._squares.index(self._likeliest())) if self._squares else None
 

@@ -104,11 +104,9 @@ class Networks(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.search, self.ball, self.goal = (
-            FrameNetwork(),
-            PatchNetwork(PATCH["ball"], 5),
-            PatchNetwork(PATCH["goal"], 10),
-        )
+        self.search = FrameNetwork()
+        self.ball = PatchNetwork(PATCH["ball"], 5)
+        self.goal = PatchNetwork(PATCH["goal"], 10)
         self.calibration = {kind: (1.0, 0.0, 1.0) for kind in KINDS}
         self.made_by: dict = {}
 
@@ -211,9 +209,12 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
     rays = views.rays(grid.expand(len(index), -1, -1))
     pixels, _ = lens.project(rays)
     height, width = frames.shape[1:3]
-    u, v = pixels[..., 0].clamp(0.0, width - 1.001), pixels[..., 1].clamp(0.0, height - 1.001)
-    i, j = u.long(), v.long()
-    a, b = (u - i)[..., None], (v - j)[..., None]
+    u = pixels[..., 0].clamp(0.0, width - 1.001)
+    v = pixels[..., 1].clamp(0.0, height - 1.001)
+    i = u.long()
+    j = v.long()
+    a = (u - i)[..., None]
+    b = (v - j)[..., None]
     e = index[:, None]
     top = frames[e, j, i] * (1 - a) + frames[e, j, i + 1] * a
     low = frames[e, j + 1, i] * (1 - a) + frames[e, j + 1, i + 1] * a
@@ -283,7 +284,8 @@ class LearntDetector(Detector):
             probability, things[:, :3], prior.ball_ray_c, prior.ball_within
         )
         for i in probability.argsort(descending=True).tolist():
-            ray, half_angle = things[i, :3].double().numpy(), float(things[i, 3])
+            ray = things[i, :3].double().numpy()
+            half_angle = float(things[i, 3])
             if probability[i] >= LEAST_PROBABILITY and self._in_place(ray, half_angle, prior):
                 return BallSeen(ray, half_angle, float(probability[i]))
         return None
@@ -314,7 +316,8 @@ class LearntDetector(Detector):
         in the view's solid angle."""
         if expected_c is None:
             return probability
-        cosine, variance = rays @ torch.from_numpy(expected_c).float(), (tolerance / GATE) ** 2
+        cosine = rays @ torch.from_numpy(expected_c).float()
+        variance = (tolerance / GATE) ** 2
         likelier = (
             (1.0 - math.cos(self.lens.params.half_fov))
             / variance
@@ -388,7 +391,8 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
             .topk(PLACES)
             .indices
         )
-        j, i = best // logits.shape[1], best % logits.shape[1]
+        j = best // logits.shape[1]
+        i = best % logits.shape[1]
         du, dv, size = grids[0, k, 1:, j, i]
         pixels = torch.stack(
             [(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1

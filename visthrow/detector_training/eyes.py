@@ -145,7 +145,8 @@ class RenderedEyes:
                 picture, e, measured.pos_w[e], rots[e], bool(carried[e]), float(measured.time)
             )
             one, ok = detected_keypoints(self.camera, detections, rots[e])
-            points[e], valid[e] = one.numpy(), ok.numpy()
+            points[e] = one.numpy()
+            valid[e] = ok.numpy()
             if e == 0 and self._keep:
                 self.frames.append((picture, one, ok))
         self.seen = points, valid

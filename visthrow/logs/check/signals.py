@@ -252,7 +252,8 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
 
 
 def _railed(name: str, values: np.ndarray) -> list[Row]:
-    worst, where = 0.0, ""
+    worst = 0.0
+    where = ""
     for column in values.T:
         low = np.min(column)
         high = np.max(column)
@@ -303,9 +304,9 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[R
                 {"jumps": int(np.sum(jumped))},
             )
         )
-    return (
-        rows + _jumps_across(name, values, time, np.flatnonzero(~adjacent)) if unit == "m" else rows
-    )
+    if unit == "m":
+        return rows + _jumps_across(name, values, time, np.flatnonzero(~adjacent))
+    return rows
 
 
 def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray) -> list[Row]:

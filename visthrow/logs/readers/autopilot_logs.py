@@ -276,11 +276,13 @@ def _in_world(vel: np.ndarray, odometry: Fields) -> np.ndarray:
 
 def _from_globe(data: Fields, origins: Fields | None) -> Fields:
     """Return north, east and down [m] from the estimator's origin, else from the first position."""
-    lat, lng = data["Lat"][0], data["Lng"][0]
+    lat = data["Lat"][0]
+    lng = data["Lng"][0]
     if origins is not None and "Type" in origins:
         index = np.flatnonzero(origins["Type"] == 0.0)
         if len(index):
-            lat, lng = origins["Lat"][index[-1]], origins["Lng"][index[-1]]
+            lat = origins["Lat"][index[-1]]
+            lng = origins["Lng"][index[-1]]
     return {
         "N": np.radians(data["Lat"] - lat) * EARTH_RADIUS,
         "E": np.radians(data["Lng"] - lng) * EARTH_RADIUS * math.cos(math.radians(lat)),

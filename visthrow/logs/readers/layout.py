@@ -97,7 +97,8 @@ def layout_of(text: str, name: str = "") -> TextTable:
         return TextTable(rows[0][1] if rows else [], [], False)
     width = widths.most_common(1)[0][0]
     start = _first_row(rows, width)
-    head, body = rows[:start], rows[start:]
+    head = rows[:start]
+    body = rows[start:]
     named, settings, rate = _sorted_head(head, _names_start(rows, start), width, blank)
     unnamed = width > len(named[-1] if named else [])
     if unnamed and len(body) > 1 and all(cells[-1] == "" for _, cells in body):
@@ -160,7 +161,8 @@ def _section(rows: Rows) -> tuple[Rows, list[str]]:
 def _separator(lines: list[str]) -> str:
     """Return the mark that cuts most lines into the same number of cells, most of them numbers."""
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
-    best, separator = 0.0, ","
+    best = 0.0
+    separator = ","
     for mark in MARKS:
         score = _regularity(sample, mark)
         if score > best + 1e-6:

@@ -85,7 +85,8 @@ class MPC:
         self._solver = piqp.SparseSolver()
         settings = self._solver.settings
         settings.kkt_solver = piqp.KKTSolver.sparse_multistage
-        settings.eps_abs, settings.eps_rel = 1e-6, 1e-8
+        settings.eps_abs = 1e-6
+        settings.eps_rel = 1e-8
         settings.check_duality_gap = False
         self._solved = piqp.PIQP_SOLVED
         self.reset()
