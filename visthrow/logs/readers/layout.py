@@ -10,8 +10,10 @@ Manager (TSV, 3D and 6D); trajectories of TUM (blank-separated) and EuRoC."""
 import csv
 import io
 import re
+import tomllib
 from collections import Counter
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -19,31 +21,7 @@ from visthrow.common.storage import counted
 
 MARKS = (",", ";", "\t", " ")
 SAMPLED = 60  # lines of numbers by which the separator is told
-_UNIT_WORDS = {
-    "meters": "m",
-    "metres": "m",
-    "millimeters": "mm",
-    "centimeters": "cm",
-    "seconds": "s",
-    "degrees": "deg",
-    "radians": "rad",
-    "sec": "s",
-    "hz": "Hz",
-    "mm/s^2": "mm/s^2",
-    "m/s²": "m/s^2",
-    "m/s2": "m/s^2",
-    "mm/s²": "mm/s^2",
-    "rad/s": "rad/s",
-    "rad s^-1": "rad/s",
-    "m s^-2": "m/s^2",
-    "deg/s": "deg/s",
-    "°": "deg",
-    "": "",
-    "-": "",
-    "1": "1",
-}
-_UNITS = {"m", "mm", "cm", "s", "ms", "us", "ns", "deg", "rad", "g", "n", "v", "a", "m/s", "mm/s"}
-_UNITS |= {"rpm", "pwm", "%", "count", "frames", "quaternion", "m s^-1", "ft", "in"}
+_UNIT_WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 _WORDS = ("true", "false")
 _FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*", re.I)
@@ -79,10 +57,7 @@ def is_number(cell: str) -> bool:
 
 def unit_of(word: str) -> str | None:
     """Our spelling of a unit, "" for what has none; None for a word that is no unit."""
-    word = word.strip().strip("[]()").strip().lower()
-    if word in _UNIT_WORDS:
-        return _UNIT_WORDS[word]
-    return word if word in _UNITS else None
+    return _UNIT_WORDS.get(word.strip().strip("[]()").strip().lower())
 
 
 def layout_of(text: str, name: str = "") -> TextTable:
