@@ -65,8 +65,8 @@ class FitParams(Bounded):
         super().__post_init__()
         if self.fresh > self.pool:
             raise ValueError(
-                f"detector: {self.fresh} fresh frames; expected no more than the pool holds,"
-                f" {self.pool}"
+                f"detector: fresh is {self.fresh}; expected no more fresh frames than the pool"
+                f" holds, {self.pool}"
             )
 
 
