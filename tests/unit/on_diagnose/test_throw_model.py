@@ -3,6 +3,7 @@ effects recovered.
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -20,6 +21,8 @@ from visthrow import config
 from visthrow.common.errors import DiagnoseError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
+from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.throw import landing
 from visthrow.diagnose.throw.initial_states import hover_state
@@ -263,6 +266,19 @@ def test_camera_and_landing_plane_are_told_beside_the_poses(planted):
     assert "keypoints" not in blind.channels
     visible = Priors.of(blind.effects, tuple(blind.channels)).visible
     assert {e.name for e, seen in zip(blind.effects, visible) if not seen} == {"camera_latency"}
+
+
+def test_a_manoeuvre_is_planned_beside_a_camera(planted):
+    camera = config.load(CameraParams, config.find("camera", "fisheye"))
+    model = ThrowModel(planted[0][:1], paper_plant(), camera=camera, only=["com_x", "camera_focal"])
+    after = SimpleNamespace(
+        sigma=lambda channel: 1e-3, noise=SimpleNamespace(scale=np.ones(len(model.channels)))
+    )
+    work = SimpleNamespace(after=after, problem=SimpleNamespace(model=model))
+    simulate, _ = simulator_of(model, SimpleNamespace(theta={}, work=work))
+    hover = next(m for m in catalogue_of_manoeuvres() if m.name == "hover")
+    (flown,) = simulate([hover])
+    assert {e.name for e in flown.model.effects} == {"com_x", "camera_focal"}
 
 
 def test_mistakes_are_told(planted):

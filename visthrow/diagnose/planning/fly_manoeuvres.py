@@ -95,6 +95,7 @@ def simulator_of(
                 [log],
                 model.setting.plant,
                 sensing=model.setting.sensing,
+                camera=model.setting.camera,
                 device=device,
                 substep=COARSE * model.substep,
                 only=[n for n in effects if n in requested],
