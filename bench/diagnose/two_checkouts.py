@@ -28,6 +28,7 @@ import numpy as np
 from scipy.stats import beta
 
 from bench.diagnose import foreign, sealed
+from bench.diagnose.ledger import RANDOM
 from bench.worlds.world import Recipe
 from visthrow.common.errors import VisthrowError
 
@@ -257,8 +258,8 @@ def varies_right(line: dict, side: str) -> bool:
         return not answer["named"] and "dropped_commands" in answer["varies"]
     if line["kind"].startswith(sealed.DRIFTING):
         return not answer["named"] and any(wanted in of for of in answer["drifts"])
-    stated = any(wanted in name or name in wanted for name in answer["varies"])
-    return not answer["named"] and (stated or (wanted == "wind_x" and bool(answer["varies"])))
+    stated = any(wanted in name or name == RANDOM.get(wanted) for name in answer["varies"])
+    return not answer["named"] and stated
 
 
 def covered(lines: Iterable[dict], side: str) -> list[bool]:

@@ -2,7 +2,7 @@
 
 import json
 
-from bench.diagnose.two_checkouts import compare, worlds_of
+from bench.diagnose.two_checkouts import compare, varies_right, worlds_of
 
 ANSWER = {"named": [], "overall": "NO EFFECT", "seconds": 2.0, "error": "", "errors": []}
 
@@ -24,3 +24,9 @@ def test_the_order_of_worlds_is_fixed_by_the_seeds():
     worlds = worlds_of(*arguments)
     assert worlds == worlds_of(*arguments)
     assert [world[0] for world in worlds[:30]].count("foreign") > 0
+
+
+def test_the_catalogues_random_effect_is_the_right_answer_of_what_differs():
+    world = {"kind": "varies:release_lag", "old": ANSWER | {"varies": ["lag_jitter"]}}
+    assert varies_right(world, "old")
+    assert not varies_right(world | {"kind": "varies:cmd_delay"}, "old")
