@@ -194,11 +194,7 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     taps = _pose_taps(kind)
     log = READERS[f".{kind}"][0](path, {tap.message for tap in taps} | {"ORGN"})
     if message not in log.names:
-        available = ", ".join(name for name in pose_messages(kind) if name in log.names)
-        raise LogError(
-            f"{log.path}: no {message} in this log; of the messages with poses it has:"
-            f" {available or 'none'}"
-        )
+        raise _missing(message, kind, log)
     data = log.fields.get((message, instance))
     if data is None:
         return FlightLog({})
@@ -218,6 +214,14 @@ def log_of_poses(path: str | Path, kind: str, message: str, instance: int = 0) -
     for entry, values in (arrival, resets):
         channels[entry.name] = make_channel(data["time"], values[:, None], entry, str(path))[0]
     return FlightLog(channels, {"source": str(path), "together": together})
+
+
+def _missing(message: str, kind: str, log: Messages) -> LogError:
+    available = ", ".join(name for name in pose_messages(kind) if name in log.names)
+    return LogError(
+        f"{log.path}: no {message} in this log; of the messages with poses it has:"
+        f" {available or 'none'}"
+    )
 
 
 def pose_messages(kind: str) -> list[str]:
