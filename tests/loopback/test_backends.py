@@ -555,6 +555,9 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     found, text = check.results(desk.now, desk.runner.mass)[-1]
     assert found == good, text
     assert check.meter.share == approx(hover, rel=0.01)
+    desk.turn(1.0)
+    if good:
+        assert desk.status.thrust == approx(2.668, rel=0.02)
 
 
 def test_betaflight_is_read_back_from_its_channel_where_outputs_are_forwarded():

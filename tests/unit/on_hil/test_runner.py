@@ -203,6 +203,14 @@ def test_a_payload_that_rolls_on_after_its_landing_keeps_no_vehicle_from_being_c
     assert "hovering again" in {reason for _, reason in changes(decisions)}
 
 
+def test_a_vehicle_that_the_autopilot_holds_is_calm_away_from_its_hover_point():
+    pilot = runner(NEVER)
+    fly(pilot, 2.0)
+    pilot.parts.params = replace(pilot.parts.params, home_w=(0.5, 0.0, 1.333))
+    estimate = pilot.estimator.estimate(2.0)
+    assert [pilot.parts.is_calm(estimate, holding) for holding in (True, False)] == [True, False]
+
+
 def test_a_hover_has_a_share_after_a_second_and_descends_to_the_ground():
     hovering = Hovering((0.0, 0.0, 0.01), 0.0, 14.0, TICK)
     for _ in range(50):

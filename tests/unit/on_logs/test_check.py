@@ -21,6 +21,7 @@ from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import excitation
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, contradictions, table
+from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.81
@@ -565,3 +566,8 @@ def test_delays_of_pieces_that_noise_hides_are_no_drift():
     noisy = [pos + rng.normal(0.0, 0.3, pos.shape) * [1.0, 1.0, 0.0] for _ in range(2)]
     assert physics._drift(time, pos, time, pos, "")
     assert physics._drift(time, noisy[0], time, noisy[1], "") == []
+
+
+def test_values_in_steps_are_as_noisy_as_their_rounding():
+    values = np.round(np.linspace(0.0, 1.0, 400)[:, None], 1)
+    assert noise(Channel(0.01 * np.arange(400), values, "m")) == approx([0.1 / np.sqrt(12.0)])
