@@ -65,7 +65,8 @@ def sample(
         x,
         y,
         z,
-        *[0.0] * 6,  # velocity and position
+        *(0.0, 0.0, 0.0),  # velocity
+        *(0.0, 0.0, 0.0),  # position
         SEA_LEVEL,
     )
 
