@@ -199,6 +199,15 @@ def test_px4_gives_the_vehicle_back_in_position_mode_where_the_config_says_so():
     assert not desk.status.connected, "unasked it is the pilot's"
 
 
+def test_px4_in_position_mode_is_the_pilots_where_its_own_hold_was_asked_for():
+    desk = Desk("px4").follow()
+    desk.turn(0.5, HOVER, HOLD)
+    assert desk.status.mode == HOLD
+    desk.fake.mode, desk.fake._next_beat = POSCTL, 0.0
+    desk.turn(0.1, HOVER)
+    assert desk.status.mode != HOLD
+
+
 def test_px4_left_without_a_stream_is_not_asked():
     desk = Desk("px4")
     desk.turn(2.0, None, FOLLOW)
