@@ -149,21 +149,6 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     assert ranked[1].repeats == 0
 
 
-def test_what_was_not_confirmed_is_flown_once_more(found):
-    diagnosis = found[1]
-    new = diagnosis.work.after.information
-    doubted = [
-        replace(f, verdict=result.CANDIDATE) if f.name == "effect_03" else f
-        for f in diagnosis.findings
-    ]
-    known, open_one = (
-        plan.PlanningGoal(replace(diagnosis, findings=tuple(findings)), ["effect_03"])
-        for findings in (diagnosis.findings, doubted)
-    )
-    assert known.settled(new) == ([], 0)
-    assert open_one.settled(new) == ([(open_one.names.index("effect_03"),)], 1)
-
-
 def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     """Weighed and found right, one member of a class is out, and the other has the name."""
     floor = {e.name: e.floor for e in EFFECTS}

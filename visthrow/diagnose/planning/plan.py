@@ -74,8 +74,6 @@ class PlanningGoal:
             if not names or {f.name, partner} & set(names)
         ]
         unclear = [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
-        # what held-out flights did not confirm needs one more flight, however small its deviation
-        self.candidates = [f.name for f in diagnosis.findings if f.verdict == result.CANDIDATE]
         graded = [
             e.name
             for e, visible in zip(work.problem.model.effects, self.priors.visible)
@@ -109,8 +107,7 @@ class PlanningGoal:
                 len(self.pairs),
             )
         able = np.array([self.priors.slab[j] for j in self.vague]) * NAMEABLE
-        doubted = np.array([self.names[j] in self.candidates for j in self.vague])
-        unknown = doubted | (able < self._deviations(0.0 * new))
+        unknown = able < self._deviations(0.0 * new)
         return _fewest_flights(
             lambda count: [
                 (j,)
