@@ -47,12 +47,14 @@ block back.
 COMMITTED = Path(__file__).parent / "loops" / "ablations" / "record.json"
 """Record of the last round that is told of."""
 
-SETTLED, AFTERWARDS = 2.4, 0.7
+SETTLED = 2.4
+AFTERWARDS = 0.7
 """Hover before the policy takes over, of which a log keeps the last part; flown on after the last
 landing [s].
 """
 
-NEAR, FAR = 1.0, 1.9
+NEAR = 1.0
+FAR = 1.9
 """Distances of the targets, which lie all around [m]."""
 
 
@@ -110,7 +112,8 @@ class Ablations:
         if all(path.exists() for path in paths):
             return paths
         rng = np.random.default_rng(0)
-        angle, distance = rng.uniform(-np.pi, np.pi, count), rng.uniform(NEAR, FAR, count)
+        angle = rng.uniform(-np.pi, np.pi, count)
+        distance = rng.uniform(NEAR, FAR, count)
         goals = np.column_stack(
             (distance * np.cos(angle), distance * np.sin(angle), np.zeros(count))
         )
@@ -124,10 +127,12 @@ class Ablations:
         return paths
 
     def _one(self, name: str, logs: Sequence[Path], say: Callable[[str], None]) -> dict[str, Any]:
-        base, own = f"state_{name}", self.folder / name
+        base = f"state_{name}"
+        own = self.folder / name
         own.mkdir(parents=True, exist_ok=True)
         verdict = explained(logs[: self.flights], base, own / "verdict.json", self.device, say)
-        theta, findings = named(verdict), verdict.get("findings", ())
+        theta = named(verdict)
+        findings = verdict.get("findings", ())
         record = {
             "model": base,
             "lacks": LACKS[name],
@@ -168,14 +173,13 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
     Raises:
         DiagnoseError: A throw failed.
     """
-    plant, rng = (
-        make_plant(plant_name, loaded.experiment, len(goals_w), seed),
-        np.random.default_rng(seed),
-    )
+    plant = make_plant(plant_name, loaded.experiment, len(goals_w), seed)
+    rng = np.random.default_rng(seed)
     home = place_in_hover(plant, loaded.experiment, rng)
     meta = {"policy": loaded.name, "plant": plant.name}
     recording = LogRecorder(("pos_w", "quat_wb", "payload_pos_w"), len(goals_w), meta)
-    flight, landed = Flight(plant, Policies([loaded], goals_w), recording, home), 0
+    flight = Flight(plant, Policies([loaded], goals_w), recording, home)
+    landed = 0
 
     def over(flight: Flight) -> bool:
         nonlocal landed
@@ -188,7 +192,8 @@ def throws(loaded: Loaded, plant_name: str, goals_w: np.ndarray, seed: int) -> l
             f"throws {np.flatnonzero(flight.failed)} did not come down"
             f" ({', '.join({c for c in flight.failures if c})}); can the policy fly this plant?"
         )
-    landing, end = plant.landing, plant.time - plant.period
+    landing = plant.landing
+    end = plant.time - plant.period
     for recorder, point, when in zip(recording.recorders, landing.point_w, landing.time):
         recorder.add(float(when), landing=point)
         recorder.meta["times"] = {"policy_start": flight.begin, "landing": float(when), "end": end}

@@ -32,7 +32,9 @@ from visthrow.training import compute_device
 from visthrow.training.protocol import throw
 from visthrow.training.trainer import ADAPTATION, Trainer, fitted
 
-TARGET, THROWS, SEED = 2.0, 1000, 12345
+TARGET = 2.0
+THROWS = 1000
+SEED = 12345
 STAGES = ("home", "before", "after")
 
 
@@ -42,7 +44,8 @@ def adapted(
     """The policy after a training in full, or what the seconds allow of it; its seconds, building
     left out, and its iterations.
     """
-    trainer, spent = Trainer(fitted(experiment, policy), args.device, args.seed), 0.0
+    trainer = Trainer(fitted(experiment, policy), args.device, args.seed)
+    spent = 0.0
     trainer.algorithm.take_up(policy)
     while trainer.iteration < trainer.algorithm.iterations and spent < args.seconds:
         begin = time.perf_counter()
@@ -59,10 +62,8 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
     kept = folder / "errors.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    own, shipped = (
-        config.load(Experiment, config.find("train", "state"), [ADAPTATION, *args.changes]),
-        Policy.load(find_policy("state")),
-    )
+    own = config.load(Experiment, config.find("train", "state"), [ADAPTATION, *args.changes])
+    shipped = Policy.load(find_policy("state"))
     altered = extended(own, hidden)
     policy, figures = adapted(altered, shipped, args)
     found = {"hidden": dict(hidden), **figures}
@@ -79,7 +80,8 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
 
 def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
     """Table of the alterations."""
-    rows, figures = [], []
+    rows = []
+    figures = []
     for f in found:
         errors = {stage: 1e3 * np.array(f[stage]) for stage in STAGES}
         mean = {stage: float(e.mean()) for stage, e in errors.items()}
@@ -127,7 +129,8 @@ def report(found: Sequence[Mapping[str, Any]], where: str) -> records.Report:
 
 def run(args: argparse.Namespace) -> int:
     """Measure every alteration and report."""
-    args.device, found = compute_device.resolve(args.device), []
+    args.device = compute_device.resolve(args.device)
+    found = []
     for hidden in [record["hidden"] for record in loop.read()]:
         if not args.only or set(hidden) & set(args.only):
             found.append(

@@ -51,8 +51,10 @@ class Views:
         )
         pos_w = uniform(count, 3) * torch.tensor([0.5, 0.5, 0.5]) + torch.tensor([0.0, 0.0, 1.5])
         self.camera = KeypointCamera(params, device)
-        self.pos_w, self.rot_wb = to(pos_w), to(torch.linalg.matrix_exp(angle * skew))
-        self.goal_w, self.payload_w = to(uniform(count, 2) * 2.5), to(pos_w + 0.38 * rope)
+        self.pos_w = to(pos_w)
+        self.rot_wb = to(torch.linalg.matrix_exp(angle * skew))
+        self.goal_w = to(uniform(count, 2) * 2.5)
+        self.payload_w = to(pos_w + 0.38 * rope)
         corners = self.goal_w.new_zeros(count, 4, 3)
         corners[..., :2] = self.goal_w[:, None]
         around = torch.cat(

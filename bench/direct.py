@@ -53,7 +53,8 @@ class Direct:
         """Begin at the plant's start, with a policy on the CPU and the run's estimator, autopilot
         and goal; ``seed``: of noise and loss.
         """
-        self.plant, self.params = plant, params
+        self.plant = plant
+        self.params = params
         self.pilot = Pilot(policy, params.camera)
         self.mocap = Mocap(mocap, seed)
         self._tracks = {
@@ -61,14 +62,13 @@ class Direct:
         }
         share = round(1.0 / (mocap.rate * plant.period))
         draw = np.random.default_rng([seed, 1])
-        self._phase, self._in_time = int(draw.integers(max(share, 1))), bool(draw.integers(2))
+        self._phase = int(draw.integers(max(share, 1)))
+        self._in_time = bool(draw.integers(2))
         self._aim = 0.5 * sum(policy.contract["observation"]["latency"])
         self._latency = mocap.latency
         states = params.states
-        self._taken, self._start = (
-            states.check_hold,
-            states.check_hold + states.armed_least + SETTLED,
-        )
+        self._taken = states.check_hold
+        self._start = states.check_hold + states.armed_least + SETTLED
         place = tuple(plant.state["pos_w"].astype(float).tolist())
         self._hover = Hovering(place, 0.0, plant.max_thrust, self.pilot.period)
         kind = KINDS.get(params.backend)
@@ -100,7 +100,8 @@ class Direct:
         """Hover where the vehicle is, as in other hands, then at the hover point, throw, wait for
         the landing; its report.
         """
-        latch, start = None, None
+        latch = None
+        start = None
         tick = self._phase * self.plant.period
         level = np.array([self.plant.mass[0] * GRAVITY, 0.0, 0.0, 0.0])
         while self.plant.time < MOST:
@@ -130,7 +131,8 @@ class Direct:
     def _decide(
         self, now: float, throwing: bool, latch: float | None
     ) -> tuple[np.ndarray | None, bool]:
-        vehicle, payload = self._state(VEHICLE, now), self._state(PAYLOAD, now)
+        vehicle = self._state(VEHICLE, now)
+        payload = self._state(PAYLOAD, now)
         if vehicle is None or payload is None:
             return None, False
         apart = latch is not None and now - latch >= self.pilot.lag - SLACK
@@ -150,7 +152,8 @@ def scored(report: dict[str, Any], params: HilParams, start: float | None) -> di
     """Return the error [m] and duration [s] of a plant's true landing; both None where there is
     none.
     """
-    landed, when = report["landing_w"], report["landing_time"]
+    landed = report["landing_w"]
+    when = report["landing_time"]
     if landed is None:
         return {"error": None, "duration": None}
     error = math.hypot(landed[0] - params.goal_w[0], landed[1] - params.goal_w[1])

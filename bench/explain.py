@@ -31,7 +31,8 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     """Seconds of each stage of one diagnosis, and what was looked at."""
     begun = time.perf_counter()
     source = opening.Opened(args)
-    model, logs = source.model, source.logs
+    model = source.model
+    logs = source.logs
     opened = time.perf_counter()
     diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without, logs))
     explained = time.perf_counter()

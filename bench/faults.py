@@ -27,7 +27,9 @@ from visthrow.common.errors import VisthrowError, suggest
 from visthrow.onboard.actions import hover_action
 from visthrow.onboard.hover import GRAVITY
 
-MOCAP, AUTOPILOT, OWN = "Motion capture", "The autopilot", "The runner itself"
+MOCAP = "Motion capture"
+AUTOPILOT = "The autopilot"
+OWN = "The runner itself"
 
 START = 2.5
 """When a fault begins [s]."""
@@ -241,7 +243,10 @@ class Deed:
 
     def __init__(self, act: Act, folder: Path, speed: float) -> None:
         """Wait to be called; see `Pair.fly`."""
-        self._act, self._folder, self._speed, self.at = act, folder, speed, float("nan")
+        self._act = act
+        self._folder = folder
+        self._speed = speed
+        self.at = float("nan")
         self._thread: threading.Thread | None = None
 
     def __call__(self, pid: int) -> None:
@@ -251,7 +256,8 @@ class Deed:
             self._thread.start()
 
     def _wait(self, pid: int) -> None:
-        poses, end = self._folder / "poses.jsonl", time.monotonic() + ENDED
+        poses = self._folder / "poses.jsonl"
+        end = time.monotonic() + ENDED
         while not (poses.is_file() and poses.stat().st_size) and time.monotonic() < end:
             time.sleep(0.01)
         time.sleep(START / self._speed)
@@ -299,7 +305,8 @@ def faults(args: argparse.Namespace) -> Report:
         names = [name for name in cases if name in (args.faults or flown)]
         done = dict(_announced(side_by_side(inject, names, own_cores(args.jobs))))
         for name in names:
-            case, found = cases[name], done[name]
+            case = cases[name]
+            found = done[name]
             figures[name] = found
             row = (name, case.text, _told(found["states"]), _told(found["events"]) or "-")
             counts = tuple(str(found[key]) for key in ("missed", "commands", "releases")) + (
@@ -355,7 +362,8 @@ def _one(
     speed: float,
     kind: str,
 ) -> dict[str, Any]:
-    length, clock = LENGTHS[case.group], ("--speed", str(speed))
+    length = LENGTHS[case.group]
+    clock = ("--speed", str(speed))
     run = [*clock, "--set", f'policy="{policy}"']
     for setting in (*(f"{key}={value}" for key, value in QUICK.items()), *case.run):
         run += ["--set", setting]

@@ -29,7 +29,8 @@ from visthrow.paper.measurements import body
 TARGETS = (1.5, 2.0, 2.5)
 NAMED = ("paper", "crazyflie_brushless", "five_inch", "x500")
 RIVAL = "state_fast"
-DRAWN, OWN = "drawn", "its own"
+DRAWN = "drawn"
+OWN = "its own"
 """What tables call all drawn vehicles, and a policy that was trained for one vehicle."""
 THROWS = 1200
 """Throws at each target on one vehicle."""
@@ -56,7 +57,9 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.throws.loading import trained_in
     from visthrow.training.compute_device import resolve
 
-    device, folder, rows = resolve(args.device), Path(args.out), []
+    device = resolve(args.device)
+    folder = Path(args.out)
+    rows = []
     paths = {
         (path.stem if path.stem != "policy" else path.resolve().parent.name): path
         for path in map(find_policy, args.policies)
@@ -117,10 +120,8 @@ def _named(experiment: Any, name: str) -> Any:
     from visthrow import config
 
     vehicle = config.load(VehicleParams, config.find("vehicle", name))
-    rope, fleet = (
-        config.load(RopeParams, config.find("rope", name)),
-        replace(experiment.fleet, count=0),
-    )
+    rope = config.load(RopeParams, config.find("rope", name))
+    fleet = replace(experiment.fleet, count=0)
     return replace(experiment, vehicle=vehicle, rope=rope, fleet=fleet)
 
 
@@ -138,7 +139,8 @@ def _thrown(
 
     ropes = experiment.task.start.tether_variants
     count = len(vehicles) * ropes * max(round(each / ropes), 1)
-    on, rows = policy.to(device), []
+    on = policy.to(device)
+    rows = []
     number = np.arange(count) % (len(vehicles) * ropes) // ropes
     for target in TARGETS:
         thrown = throw(experiment, on.actor(count), target, count, device, seed)
@@ -170,16 +172,16 @@ def _rivals(
     task = replace(
         experiment.task, observation=replace(experiment.task.observation, setup="none", response=0)
     )
-    base, begin = replace(experiment, ppo=ppo, task=task), time.monotonic()
-    wanted, longest = (
-        [
-            *map(str, range(args.rivals)),
-            *(args.named if args.named_rivals else ()),
-        ],
-        0.0,
-    )
+    base = replace(experiment, ppo=ppo, task=task)
+    begin = time.monotonic()
+    wanted = [
+        *map(str, range(args.rivals)),
+        *(args.named if args.named_rivals else ()),
+    ]
+    longest = 0.0
     for vehicle in wanted:
-        path, start = folder / f"{vehicle}.npz", time.monotonic()
+        path = folder / f"{vehicle}.npz"
+        start = time.monotonic()
         if path.exists() or start - begin + longest > 60.0 * args.minutes:
             continue
         status(f"training for {_label(vehicle)}, of {len(wanted)}")
@@ -199,7 +201,8 @@ def _trained(experiment: Any, device: str) -> Any:
     from visthrow.task import contract_of
     from visthrow.training.trainer import Trainer
 
-    start, trainer = time.monotonic(), Trainer(experiment, device, 1)
+    start = time.monotonic()
+    trainer = Trainer(experiment, device, 1)
     while trainer.iteration < trainer.algorithm.iterations:
         trainer.step()
     told = {**provenance.collect(), "seconds": time.monotonic() - start}

@@ -60,9 +60,12 @@ def main() -> int:
         choices=sorted(LEFT),
         help="follow these all the same",
     )
-    args, rows = parser.parse_args(), []
+    args = parser.parse_args()
+    rows = []
     for page in args.pages:
-        begin, spent, stumbled = time.perf_counter(), sum(os.times()[2:4]), []
+        begin = time.perf_counter()
+        spent = sum(os.times()[2:4])
+        stumbled = []
         for block in blocks_of(page.resolve(), Path.cwd()):
             start = time.perf_counter()
             if block.reason in LEFT - set(args.reasons):
@@ -70,7 +73,8 @@ def main() -> int:
             if not follow(block):
                 stumbled.append(block.place)
             print(f"-- {block.place}: {time.perf_counter() - start:.1f} s", flush=True)
-        wall, own = time.perf_counter() - begin, sum(os.times()[2:4]) - spent
+        wall = time.perf_counter() - begin
+        own = sum(os.times()[2:4]) - spent
         rows.append(
             f"{page}: {wall / 60:.1f} min, {own / 60:.1f} of a processor; "
             + (f"STUMBLED at {stumbled}" if stumbled else "well")

@@ -34,7 +34,8 @@ from tests.loopback.wire import cut, peers
 from tests.motive import FRAME, frame, message, server_info
 from visthrow.onboard.actions import hover_action
 
-HOST, STRANGER = ("127.0.0.1", 1511), ("127.0.0.9", 1511)
+HOST = ("127.0.0.1", 1511)
+STRANGER = ("127.0.0.9", 1511)
 IDS = {VEHICLE: 7, PAYLOAD: 8}
 NUMBERS = {body: str(number) for body, number in IDS.items()}
 AT_ONCE = 400
@@ -71,7 +72,8 @@ class NatNet:
                 pass
 
         class Package:
-            NatNetClient, packet_buffer = Quiet, natnet.packet_buffer
+            NatNetClient = Quiet
+            packet_buffer = natnet.packet_buffer
 
         self.source: MocapSource = NatNetSource(
             MocapParams("natnet", HOST[0], multicast=False), _bodies(), clock, module=Package
@@ -86,7 +88,8 @@ class NatNet:
 
     def attack(self, rng: np.random.Generator) -> None:
         """Hand over one hostile item."""
-        kind, good = rng.integers(5), self._good[-100:]
+        kind = rng.integers(5)
+        good = self._good[-100:]
         if kind == 0:
             self.source.take(noise(rng), HOST)
         elif kind == 1:  # cut
@@ -135,8 +138,10 @@ class MotionCapture:
         self.source._params = MocapParams("mock", HOST[0])
         self.source._names = {name: body for body, name in NUMBERS.items()}
         self.source._ready = SimpleNamespace(is_set=lambda: False, set=lambda: None)
-        self.source._module, self._system = ended, Silent()
-        self.source._process, self.source._heard = None, math.inf
+        self.source._module = ended
+        self._system = Silent()
+        self.source._process = None
+        self.source._heard = math.inf
 
     def _flush(self) -> None:
         listen(
@@ -155,8 +160,10 @@ class MotionCapture:
 
     def attack(self, rng: np.random.Generator) -> None:
         """As of `NatNet`."""
-        kind, name = rng.integers(5), NUMBERS[(VEHICLE, PAYLOAD)[rng.integers(2)]]
-        pos, quat = rng.uniform(50.0, 1e6, 3).tolist(), (0.0, 0.0, 0.0, 1.0)
+        kind = rng.integers(5)
+        name = NUMBERS[(VEHICLE, PAYLOAD)[rng.integers(2)]]
+        pos = rng.uniform(50.0, 1e6, 3).tolist()
+        quat = (0.0, 0.0, 0.0, 1.0)
         if kind == 0:
             item: Any = RuntimeError("occluded")
         elif kind == 1:
@@ -208,9 +215,11 @@ class Ros2:
 
     def attack(self, rng: np.random.Generator) -> None:
         """As of `NatNet`."""
-        kind, body = rng.integers(3), (VEHICLE, PAYLOAD)[rng.integers(2)]
+        kind = rng.integers(3)
+        body = (VEHICLE, PAYLOAD)[rng.integers(2)]
         stamp = SimpleNamespace(sec=int(rng.integers(1 << 31)), nanosec=0)
-        pos, quat = rng.uniform(-9.0, 9.0, 3).tolist(), (0.0, 0.0, 0.0, 1.0)
+        pos = rng.uniform(-9.0, 9.0, 3).tolist()
+        quat = (0.0, 0.0, 0.0, 1.0)
         if kind == 0:  # another publisher
             self._take(body, stamp, pos, quat, int(rng.integers(2, 99)))
         elif kind == 1:  # fields that lack
@@ -233,8 +242,12 @@ def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
     runner, source, clock, fake = peers(
         LevelPlant(), loaded=simple_policy((hover, 0, 0, 0, 1.0)), overrides=QUICK
     )
-    reader, rng, decisions, sent = READERS[kind](clock.now), np.random.default_rng(seed), [], [0]
-    poll, tick = source.poll, runner.tick
+    reader = READERS[kind](clock.now)
+    rng = np.random.default_rng(seed)
+    decisions = []
+    sent = [0]
+    poll = source.poll
+    tick = runner.tick
 
     def polled(now: float) -> list[Pose]:
         flying = runner.machine.state in (State.THROW, State.RECOVER)
@@ -254,7 +267,8 @@ def flown(kind: str, seed: int, count: int) -> tuple[list[Any], Any, Any, int]:
         decisions.append(tick(now, *args))
         return decisions[-1]
 
-    source.poll, runner.tick = polled, ticked
+    source.poll = polled
+    runner.tick = ticked
     cut(runner, source, clock, AutoOperator(), None, 8.0, lambda decision: None)
     counted = reader.source.roster.refused
     counted += sum(track.gate.refused.get("finite", 0) for track in runner.tracks.values())

@@ -28,7 +28,9 @@ from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import hover_start
 
 DRAWN = ["camera.mount.rotation_error_std=0.0524", "camera.noise.scale_std=0.03"]
-TILT_DEG, LATENCY, SCALE = 0.2, 0.004, 0.005
+TILT_DEG = 0.2
+LATENCY = 0.004
+SCALE = 0.005
 """What is asked of tilt about each axis [deg], latency [s] and focal length [-]; of tilt on the
 reference plant half of it.
 """
@@ -64,13 +66,16 @@ def on_reference(
     """The same on a reference plant."""
     plant, rng = batch_plant(flown, name, GOAL[0], 0, count, seed)
     home = place_in_hover(plant, flown, rng)
-    camera, goal = KeypointCamera(flown.camera), torch.tensor([GOAL]).expand(count, 3)
+    camera = KeypointCamera(flown.camera)
+    goal = torch.tensor([GOAL]).expand(count, 3)
     turn = flown.camera.mount.rotation_error_std * rng.standard_normal((count, 3))
     scale = flown.camera.noise.scale_std * rng.standard_normal(count)
     mounts = camera.extrinsics(torch.from_numpy(turn).float(), torch.zeros(count, 3))
-    controller, rows = HoverController(HoverParams(), plant.period, count), []
+    controller = HoverController(HoverParams(), plant.period, count)
+    rows = []
     for k in range(round((HOVER_TIME + HOVER + SWAY) / plant.period)):
-        seen, now = plant.measured(), plant.exposed
+        seen = plant.measured()
+        now = plant.exposed
         command = controller.step(
             seen.pos_w, seen.quat_wb, seen.vel_w, home, plant_of(flown).total_mass
         )
@@ -120,17 +125,13 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="of the training simulator (default: cpu)")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    flown, asked = (
-        hover_start(config.load(Experiment, config.find("train", "vision_ideal"), DRAWN)),
-        TILT_DEG,
-    )
+    flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), DRAWN))
+    asked = TILT_DEG
     if args.plant == "hybrid":
         found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
-        (found, turn, scale), asked = (
-            on_reference(flown, args.plant, args.count, args.seed),
-            0.5 * TILT_DEG,
-        )
+        (found, turn, scale) = on_reference(flown, args.plant, args.count, args.seed)
+        asked = 0.5 * TILT_DEG
     known = [i for i, one in enumerate(found) if one is not None]
     off = np.degrees([np.array(found[i].turn_b) - turn[i] for i in known])
     sigma = np.degrees([found[i].turn_sigma for i in known])
@@ -138,10 +139,8 @@ def main() -> None:
     scaled = np.array([found[i].scale - scale[i] for i in known])
     print(f"{len(known)} of {args.count} hovers gave an answer")
     for axis, name in enumerate(("roll", "pitch", "yaw")):
-        rms, held = (
-            np.sqrt(np.mean(off[:, axis] ** 2)),
-            np.mean(np.abs(off[:, axis]) < 2.0 * sigma[:, axis]),
-        )
+        rms = np.sqrt(np.mean(off[:, axis] ** 2))
+        held = np.mean(np.abs(off[:, axis]) < 2.0 * sigma[:, axis])
         within = np.sum(np.abs(off[:, axis]) < asked)
         print(
             f"{name}: {within} of {len(known)} within {asked} deg, rms {rms:.3f} deg,"

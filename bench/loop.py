@@ -52,7 +52,8 @@ PLANT = "reference"
 NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 """Of the recordings: motion capture [m], [rad], [m]."""
 
-BEFORE, AFTER = 1.5, 0.6
+BEFORE = 1.5
+AFTER = 0.6
 """What is kept of a flight before the policy starts and after the landing [s]."""
 
 BATCH = 20
@@ -70,7 +71,9 @@ COMMITTED = Path(__file__).parent / "loops"
 WHO = ("before", "after", "oracle")
 """The policies that are compared."""
 
-POLICY, CHECKPOINT, SUMMARY = "policy.npz", "checkpoint.pt", "summary.json"
+POLICY = "policy.npz"
+CHECKPOINT = "checkpoint.pt"
+SUMMARY = "summary.json"
 """Of a training's folder, as :mod:`visthrow.training.trainer` names them; that one is heavy to
 import.
 """
@@ -118,7 +121,8 @@ class Loop:
         truth = extended(nominal, self.hidden)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._config("hidden", truth)
-        begin, seconds = time.perf_counter(), {}
+        begin = time.perf_counter()
+        seconds = {}
 
         def told(line: str) -> None:
             say(f"{time.perf_counter() - begin:4.0f} s: {line}")
@@ -341,7 +345,8 @@ def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> Non
     shipped = load_policy(policy, base)
     truth = config.loads(Experiment, text, (), name="the hidden world")
     rng = np.random.default_rng(number)
-    angle, distance = rng.uniform(-np.pi, np.pi), rng.uniform(1.0, 1.9)
+    angle = rng.uniform(-np.pi, np.pi)
+    distance = rng.uniform(1.0, 1.9)
     goal = np.array([distance * np.cos(angle), distance * np.sin(angle), 0.0])
     recorded(fly(Loaded(shipped.name, shipped.policy, truth), goal, PLANT, number), rng).save(path)
 

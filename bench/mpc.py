@@ -41,7 +41,8 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
     from visthrow.paper.baseline import fly_plan as fly
     from visthrow.paper.baseline import thrower
 
-    rows, figures = [], []
+    rows = []
+    figures = []
     for target in TARGETS:
         unit = thrower.unit("hybrid", "both", target, throws)
         plan = thrower.plan_of(

@@ -40,11 +40,10 @@ def started(
         step: [s]. integrator: RK4 or implicitfast. armature: of the hinges [kg m^2].
     """
     model = build_attached(*vehicle_and_rope(scene), "universal", armature)
-    model.opt.timestep, model.opt.integrator = (
-        step,
-        getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}"),
-    )
-    data, first = initial_data(model, scene), scene.schedule[0]
+    model.opt.timestep = step
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    data = initial_data(model, scene)
+    first = scene.schedule[0]
     data.ctrl[:] = (*first.force_b, *first.torque_b)
     return model, data
 
@@ -55,13 +54,17 @@ def timed_scene(
     """A rope that runs in C; arguments as of :func:`started`."""
     model, data = started(scene, step, integrator, armature)
     start = data.qpos.copy(), data.qvel.copy()
-    length, done = round(scene.duration / step), 0
+    length = round(scene.duration / step)
+    done = 0
 
     def advance(count: int) -> None:
         nonlocal done
         while count > 0:
             if done == length:
-                data.qpos[:], data.qvel[:], data.time, done = start[0], start[1], 0.0, 0
+                data.qpos[:] = start[0]
+                data.qvel[:] = start[1]
+                data.time = 0.0
+                done = 0
             stretch = min(count, length - done)
             mujoco.mj_step(model, data, stretch)
             done += stretch

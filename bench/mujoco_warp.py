@@ -35,7 +35,8 @@ class Worlds:
     def __init__(self, count: int, device: str):
         import mujoco_warp
 
-        self.count, self.device = count, device
+        self.count = count
+        self.device = device
         model, data = _model()
         with wp.ScopedDevice(device):
             self._model = mujoco_warp.put_model(model)
@@ -89,7 +90,8 @@ def measure(
             return {"why_not": MISSING.format(package=package.replace("_", "-"))}
     model, _ = _model()
     substeps = control_period / model.opt.timestep
-    rows, off = [], float("nan")
+    rows = []
+    off = float("nan")
     for count in batches:
         worlds = Worlds(count, device)
         off = worlds.off_from_c(min(stretch, 5))

@@ -67,7 +67,9 @@ def side_by_side(
 
     After an error nothing more is begun.
     """
-    free, todo, running = list(reversed(places)), iter(items), {}
+    free = list(reversed(places))
+    todo = iter(items)
+    running = {}
     with ThreadPoolExecutor(len(places)) as pool:
         while True:
             while free and (item := next(todo, None)) is not None:
@@ -118,11 +120,9 @@ class Pair:
             VisthrowError: one of them did not start, or did not end; the message holds what it
                 said.
         """
-        port, msp, report = (
-            free_port(),
-            free_port(socket.SOCK_STREAM),
-            folder.with_suffix(".fake.json"),
-        )
+        port = free_port()
+        msp = free_port(socket.SOCK_STREAM)
+        report = folder.with_suffix(".fake.json")
         folder.parent.mkdir(parents=True, exist_ok=True)
         run = [
             *COMMAND,

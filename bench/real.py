@@ -462,7 +462,8 @@ def run(task: tuple[Case, Path]) -> dict:
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     with tempfile.TemporaryDirectory() as folder:
         name = _setup_file(case.setup, Path(folder))
-        setup, known = setups.load(name), setups.known(name)
+        setup = setups.load(name)
+        known = setups.known(name)
         logs = case.change(_read(case.files, data, name))
         try:
             diagnosis = diagnose(logs, setups.model_of(setup, logs), vehicle=known)
@@ -549,7 +550,8 @@ def agreement(rows: Sequence[dict]) -> list[tuple[str, str, str, bool]]:
 
 
 def _one_size(a: Sequence, b: Sequence) -> bool:
-    apart, width = abs(a[1] + a[2] - b[1] - b[2]), float(np.hypot(a[2] - a[1], b[2] - b[1]))
+    apart = abs(a[1] + a[2] - b[1] - b[2])
+    width = float(np.hypot(a[2] - a[1], b[2] - b[1]))
     return apart <= width
 
 

@@ -29,7 +29,8 @@ from visthrow.training.compute_device import resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import throw
 
-TARGET, COUNT = 2.0, 200  # as the throws of the ablations [m], and how many
+TARGET = 2.0
+COUNT = 200  # as the throws of the ablations [m], and how many
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ class _Watched(ThrowEnv):
         return reward, done
 
     def _keep(self, done: torch.Tensor) -> None:
-        state, out, lengths = self.views.state, self.views.out, self.lengths
+        state = self.views.state
+        out = self.views.out
+        lengths = self.lengths
         links = state["cable_dir_w"] * (lengths / len(state["cable_dir_w"]))[None, :, None]
         joints = torch.cat([torch.zeros_like(links[:1]), links.cumsum(0)])
         chord = joints[-1].norm(dim=-1)
@@ -135,7 +138,8 @@ def row(name: str, where: str, found: Releases) -> str:
     """A line of the table of :data:`HEAD`."""
     points = (found.ball_w, found.ball_vel_w, found.vehicle_w, found.landing_w)
     ball, vel, vehicle, landing = (np.nanmean(point, axis=0) for point in points)
-    bow, slack = 1e3 * found.bow, 1e3 * found.slack
+    bow = 1e3 * found.bow
+    slack = 1e3 * found.slack
     return (
         f"| {name} | {where} | {np.nanmean(found.time):.3f} s | {ball[0]:.3f}, {ball[2]:.3f} m |"
         f" {vel[0]:.2f}, {vel[2]:.2f} m/s | {vehicle[0]:.3f}, {vehicle[2]:.3f} m | {landing[0]:.3f}"
@@ -151,11 +155,9 @@ HEAD = (
 
 def run(args: argparse.Namespace) -> None:
     """Throw with the policies of a list, where they were trained and on the full plant."""
-    work, out, device = (
-        load_list(args.list, tuple(args.overrides)),
-        Path(args.out),
-        resolve(args.device),
-    )
+    work = load_list(args.list, tuple(args.overrides))
+    out = Path(args.out)
+    device = resolve(args.device)
     known = {source.name: source for source in work.sources if source.config and source.done(out)}
     print(HEAD)
     for name in (args.units or ",".join(known)).split(","):

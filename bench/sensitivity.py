@@ -31,7 +31,9 @@ from visthrow.task import Experiment, plant_of
 from visthrow.throws.loading import load_policy
 from visthrow.training import protocol
 
-TARGET, THROWS, SEED = 2.0, 200, 11
+TARGET = 2.0
+THROWS = 200
+SEED = 11
 MISS = 0.10
 """Mean landing error of the paper's vehicle at this target [m]."""
 
@@ -47,7 +49,9 @@ AXES = ("body", "world")
 
 BLOCKS = ("sensing", "integrator")
 """Blocks whose effects change logs or numerics, not the plant."""
-FIRST, GROWTH, LAST = 0.5, 2.0, 64.0
+FIRST = 0.5
+GROWTH = 2.0
+LAST = 64.0
 """Sizes that are tried: from, by and up to so many prior deviations."""
 
 Point = dict[str, Any]
@@ -125,7 +129,8 @@ class Points:
 def run(args: argparse.Namespace) -> int:
     """Throw, print, write."""
     torch.set_num_threads(1)
-    points, figures = Points(Path(args.out) / "points.jsonl"), {}
+    points = Points(Path(args.out) / "points.jsonl")
+    figures = {}
     for name in args.policies:
         loaded = load_policy(name)
         figures[name] = {

@@ -64,7 +64,8 @@ class Batch:
     """The full model: a batch of plants with all blocks under drawn commands."""
 
     def __init__(self, experiment: Experiment, count: int, kind: str, threads: int = 1):
-        self.plant, self.spreads = plant_of(experiment), experiment.task.start
+        self.plant = plant_of(experiment)
+        self.spreads = experiment.task.start
         self.sim = HybridSim(
             self.plant, count, ropes=tether_lengths(experiment.rope, self.spreads), threads=threads
         )
@@ -74,7 +75,8 @@ class Batch:
         """Wall time [s] a simulated second and environment, measured for about ``seconds``, starts
         left out.
         """
-        spent, steps = 0.0, 0
+        spent = 0.0
+        steps = 0
         while spent < seconds:
             self.sim.randomize(self.spreads)
             for command in self.commands:
@@ -91,7 +93,8 @@ def cost_in_c(scene: Any, seconds: float) -> float:
     ``seconds``.
     """
     chunk = round(0.5 / scene.step)
-    spent, steps = 0.0, 0
+    spent = 0.0
+    steps = 0
     while spent < seconds:
         start = time.perf_counter()
         scene.advance(chunk)
@@ -121,7 +124,8 @@ def longest_accurate_step(
     Raises:
         VisthrowError: even 0.1 ms is too long.
     """
-    wrong, right = round(duration / 2.0e-3), round(duration / 1.0e-4)
+    wrong = round(duration / 2.0e-3)
+    right = round(duration / 1.0e-4)
     if not error(duration / right) <= tolerance:
         raise VisthrowError("the step search starts from 0.1 ms, which is too long already")
     while right - wrong > 1:
@@ -139,7 +143,8 @@ def contenders(plant: Any) -> tuple[dict[str, Any], dict[str, tuple[float, float
     """
     from bench import mujoco_c
 
-    hard, numerics = mujoco_c.HARD_THROW, plant.sim
+    hard = mujoco_c.HARD_THROW
+    numerics = plant.sim
     truth = converged(hard)
 
     def off(ball_w: np.ndarray, pos_w: np.ndarray) -> tuple[float, float]:
@@ -199,7 +204,8 @@ def measure(
             ours["hover"].cost(seconds) for _ in range(repeats)
         ]
     hover = statistics.median(alone)
-    period, segments = plant.sim.control_period, plant.rope.segments
+    period = plant.sim.control_period
+    segments = plant.rope.segments
     rows = [
         _row(
             f"visthrow, all blocks, {plant.sim.substep * 1e3:g} ms, hover",

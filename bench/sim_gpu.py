@@ -28,7 +28,9 @@ class Graph:
         self, experiment: Experiment, count: int, kind: str, device: str, steps: int = GRAPH_STEPS
     ):
         plant = plant_of(experiment)
-        self.spreads, self.steps, self.device = experiment.task.start, steps, device
+        self.spreads = experiment.task.start
+        self.steps = steps
+        self.device = device
         self.sim = HybridSim(
             plant, count, device, ropes=tether_lengths(experiment.rope, self.spreads)
         )

@@ -18,7 +18,8 @@ from visthrow.common.errors import VisthrowError
 STILL = ("--plant", "tests.level:make")
 """A vehicle without a simulator: it takes no time from the runner."""
 
-P50, P99 = 1.0, 3.0
+P50 = 1.0
+P99 = 3.0
 """Bars of the whole way from the look for messages to the command's bytes [ms]."""
 
 WARM = 0.2
@@ -36,7 +37,9 @@ class Progress(Memory):
     def __init__(self, path: Path, minutes: float) -> None:
         """Begin the file; ``minutes`` are what is to come."""
         super().__init__()
-        self._path, self._minutes, self._told = path, minutes, -TELL
+        self._path = path
+        self._minutes = minutes
+        self._told = -TELL
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
 
@@ -117,8 +120,10 @@ def never_releasing(name: str, path: Path) -> Path:
     from visthrow.onboard.policy import Policy, find_policy
 
     policy = Policy.load(find_policy(name))
-    weights, biases = policy.weights[-1].clone(), policy.biases[-1].clone()
-    weights[-1], biases[-1] = 0.0, -1.0
+    weights = policy.weights[-1].clone()
+    biases = policy.biases[-1].clone()
+    weights[-1] = 0.0
+    biases[-1] = -1.0
     changed = {"weights": (*policy.weights[:-1], weights), "biases": (*policy.biases[:-1], biases)}
     dataclasses.replace(policy, **changed).save(path)
     return path
@@ -147,7 +152,9 @@ def _stages(latency: dict[str, dict[str, float]], title: str) -> Table:
 def _report(
     summary: dict, report: dict, progress: Progress, size: int, args: argparse.Namespace
 ) -> Report:
-    grown, samples, early = slope(progress.samples), progress.samples, summary["interrupted"]
+    grown = slope(progress.samples)
+    samples = progress.samples
+    early = summary["interrupted"]
     seconds = progress.seconds if early else 60.0 * args.minutes
     ends = [f"{s / 1e6:.1f} MB" for _, s in (samples[0], samples[-1])] if samples else ["?", "?"]
     counts = (

@@ -17,7 +17,8 @@ from bench.report import Report, Table
 from visthrow.common import statistics
 from visthrow.common.errors import VisthrowError
 
-MEAN, RATIO = 0.10, 1.3
+MEAN = 0.10
+RATIO = 1.3
 """Bars: mean landing error [m]; the 90 % upper bound of the ratio of mean errors."""
 
 AFTER = 1.0
@@ -173,7 +174,8 @@ def _report(pairs: list[tuple[dict, dict]], args: argparse.Namespace) -> Report:
         raise VisthrowError(f"{len(good)} of {len(pairs)} pairs landed; nothing to compare")
     errors = np.array([(wire["error"], direct["error"]) for wire, direct in good])
     ratio, upper = bootstrap_upper(errors)
-    rows, figures = [], {}
+    rows = []
+    figures = {}
     for column, way in enumerate(("over the wire", "without it")):
         mean = statistics.mean(errors[:, column])
         duration = np.array(

@@ -11,7 +11,8 @@ from bench.report import Report, Table, device_name, rate
 
 TARGET = 2.0  # [m]
 
-THROWS, IN_A_ROW = 400, 3
+THROWS = 400
+IN_A_ROW = 3
 """Throws of an evaluation, and evaluations in a row within an error that hold it for good."""
 
 
@@ -42,7 +43,8 @@ def train(
     from visthrow.training.session import EVALUATION_SHARE, Regularly
     from visthrow.training.trainer import Trainer
 
-    trainer, evaluations = Trainer(experiment, device, seed), Regularly(every, EVALUATION_SHARE)
+    trainer = Trainer(experiment, device, seed)
+    evaluations = Regularly(every, EVALUATION_SHARE)
     last = trainer.algorithm.iterations
     curve: list[tuple[float, int, float]] = []
     reached: dict[str, Any] = {f"{error:g}": None for error in errors}
@@ -100,7 +102,8 @@ def measure(
             found = [run["reached"][f"{error:g}"] for run in trained]
             times = sorted(hit[0] if hit else math.inf for hit in found)
             steps = sorted(hit[1] if hit else math.inf for hit in found)
-            middle, least = statistics.median(times), statistics.median(steps)
+            middle = statistics.median(times)
+            least = statistics.median(steps)
             rows.append(
                 (
                     name,

@@ -50,7 +50,8 @@ def seconds(
     """
     import torch
 
-    settle, times = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None), []
+    settle = torch.cuda.synchronize if device.startswith("cuda") else (lambda: None)
+    times = []
     function()
     if device.startswith("cuda"):
         from sim.torch_bridge import captured
@@ -85,12 +86,10 @@ def alone(trainer: Any, repeats: int) -> dict[str, float]:
 
     from sim.torch_bridge import on_torch_stream
 
-    env, alg, steps, device = (
-        trainer.algorithm.env,
-        trainer.algorithm.alg,
-        trainer.experiment.ppo.steps,
-        trainer.device,
-    )
+    env = trainer.algorithm.env
+    alg = trainer.algorithm.alg
+    steps = trainer.experiment.ppo.steps
+    device = trainer.device
     observations = env.get_observations()
     with torch.inference_mode():
         actions = alg.act(observations).clone()
@@ -197,7 +196,8 @@ def measure(experiment: Any, name: str, device: str, iterations: int, repeats: i
     runs = whole(trainer, iterations)
     total = {key: statistics.median(values) for key, values in runs.items()}
     parts = split(total, alone(trainer, repeats))
-    samples, wall = trainer.algorithm.samples, sum(total.values())
+    samples = trainer.algorithm.samples
+    wall = sum(total.values())
     rows = [
         (
             f"{part}: {PARTS[part]}",

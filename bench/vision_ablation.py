@@ -24,7 +24,8 @@ from bench.vision_throws import conditions
 from visthrow import config
 from visthrow.common.storage import write_json
 
-LOCATED, RESPONSE = "task.observation.located", "task.observation.response"
+LOCATED = "task.observation.located"
+RESPONSE = "task.observation.response"
 SHORT = ("ppo.iterations=509",)  # 2.0e8 environment steps, the paper's number
 VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
     "memory": ("vision", ()),
@@ -40,16 +41,20 @@ VARIANTS: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 """Variant -> configuration of ``configs/train`` and what it changes."""
 
-SEED, THROWS = 7, 1600
+SEED = 7
+THROWS = 1600
 LIMIT = 230.0
 """Longest that a training takes unless stated otherwise [s]; a longer schedule is shortened."""
-LEAST, RESERVE = 45.0, 15.0
+LEAST = 45.0
+RESERVE = 15.0
 """Time that a training must have to be begun, and what is kept for its throws [s]."""
 
 
 def trained(trainer: Any, seconds: float) -> dict[str, Any]:
     """Train to the last iteration, or faster through the schedule so that it ends in time."""
-    begin, planned, rows = time.perf_counter(), trainer.algorithm.iterations, []
+    begin = time.perf_counter()
+    planned = trainer.algorithm.iterations
+    rows = []
     while True:
         done = max(trainer.iteration / planned, (time.perf_counter() - begin) / seconds)
         if done >= 1.0:
@@ -71,7 +76,8 @@ def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
     from visthrow.throws.loading import trained_in
     from visthrow.training import protocol
 
-    policy, rows = policy.to(device), {}
+    policy = policy.to(device)
+    rows = {}
     layout = policy.contract["observation"]["layout"]
     for name, (target, change) in conditions(layout).items():
         flown = trained_in(policy, "policy", change)
@@ -85,7 +91,9 @@ def job(args: argparse.Namespace) -> int:
     from visthrow.task import Experiment
     from visthrow.training.trainer import Trainer, finish
 
-    name, seed, folder = args.job, args.seed, Path(args.work) / f"{args.job}-{args.seed}"
+    name = args.job
+    seed = args.seed
+    folder = Path(args.work) / f"{args.job}-{args.seed}"
     base, changes = VARIANTS[name]
     limit = min(args.longest, args.deadline - time.time() - RESERVE)
     experiment = config.load(Experiment, config.find("train", base), [*changes, *args.overrides])
@@ -102,7 +110,8 @@ def run(args: argparse.Namespace) -> int:
     """Run all trainings, several on each device, and pack what came of them."""
     if args.job:
         return job(args)
-    work, begin = Path(args.work), time.time()
+    work = Path(args.work)
+    begin = time.time()
     work.mkdir(parents=True, exist_ok=True)
     path = work / "seeds.json"
     if not path.exists():
@@ -120,7 +129,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _work_off(jobs: list[tuple[str, int]], args: argparse.Namespace, deadline: float) -> None:
     """Keep ``slots`` trainings running on each device until none is left or the time is over."""
-    work, running = Path(args.work), {}
+    work = Path(args.work)
+    running = {}
     free = [device for _ in range(args.slots) for device in args.devices]
     while (jobs or running) and time.time() < deadline + 5.0:
         for process, (name, seed, device, begin) in list(running.items()):

@@ -28,9 +28,13 @@ from visthrow.task import Experiment
 from visthrow.throws.loading import load_policy
 from visthrow.training import protocol
 
-TARGETS, FAULT_TARGET = (1.5, 2.0, 2.5), 2.0  # [m]
-THROWS, SEEDS = 200, 8
-RIVAL, LOCATED, TOLD = "rival", "vision_located", "state"
+TARGETS = (1.5, 2.0, 2.5)
+FAULT_TARGET = 2.0  # [m]
+THROWS = 200
+SEEDS = 8
+RIVAL = "rival"
+LOCATED = "vision_located"
+TOLD = "state"
 """The plain rival, the policy whose estimator it has, and the one that it flies."""
 
 FAULTS = {
@@ -58,8 +62,10 @@ class Rival:
     """
 
     def __init__(self, experiment: Experiment, policy: Policy, count: int) -> None:
-        self.policy, self.layout = policy, ob.layout_of(experiment.task.observation)
-        self.camera, rope = KeypointCamera(experiment.camera), experiment.rope
+        self.policy = policy
+        self.layout = ob.layout_of(experiment.task.observation)
+        self.camera = KeypointCamera(experiment.camera)
+        rope = experiment.rope
         self.lens_b = self.camera.position_b.reshape(1, 1, 3)
         self.mount_b = torch.tensor(rope.mount).reshape(1, 1, 3)
         self.reach = rope.length + rope.payload_offset
@@ -69,7 +75,9 @@ class Rival:
     def __call__(self, obs: Tensor) -> Tensor:
         """Action, shape (E, 5), for observations of the located layout, shape (E, D)."""
         at = self.layout.dimension - self.layout.response * ob.RESPONSE - self.layout.located
-        goal, ray, attached = obs[:, at : at + 2], obs[:, at + 2 : at + 5], obs[:, at - 9]
+        goal = obs[:, at : at + 2]
+        ray = obs[:, at + 2 : at + 5]
+        attached = obs[:, at - 9]
         rot_wb = ob.rotation_in(obs)
         lens = rotate(rot_wb, self.lens_b.expand(len(obs), -1, -1))[:, 0]
         mount = rotate(rot_wb, self.mount_b.expand(len(obs), -1, -1))[:, 0]
@@ -97,7 +105,8 @@ def thrown(
     from visthrow.training.env import ThrowEnv
 
     loaded = load_policy(LOCATED if name == RIVAL else name, None, overrides)
-    experiment, flown = loaded.experiment, loaded.policy
+    experiment = loaded.experiment
+    flown = loaded.policy
     if name == RIVAL:
         flown = Policy.load(find_policy(TOLD))
     begin: Callable = calibrated_start(experiment) if calibrate else ThrowEnv.reset

@@ -30,7 +30,8 @@ class WorldHeldChain(ChainSolver):
 
 def _turn_back(world: World) -> wp.Kernel:
     """Kernel that turns force and torque back by what the body turns in some time."""
-    real, vec3 = world.types.real, world.types.vec3
+    real = world.types.real
+    vec3 = world.types.vec3
 
     @wp.kernel(module="unique", enable_backward=False)
     def turn_back(
@@ -55,7 +56,8 @@ def _turn_back(world: World) -> wp.Kernel:
 @contextlib.contextmanager
 def held_in_world() -> Iterator[None]:
     """Let ``sim.solver`` "exchanged_chain" mean :class:`WorldHeldChain`."""
-    name, usual = "exchanged_chain", solvers.SOLVERS["exchanged_chain"]
+    name = "exchanged_chain"
+    usual = solvers.SOLVERS["exchanged_chain"]
     solvers.SOLVERS[name] = f"{__name__}:{WorldHeldChain.__name__}"
     try:
         yield

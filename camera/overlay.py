@@ -11,7 +11,10 @@ from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
 
 # BGR, OpenCV's order.
-GREEN, RED, WHITE, GREY = (80, 200, 60), (60, 60, 230), (255, 255, 255), (150, 150, 150)
+GREEN = (80, 200, 60)
+RED = (60, 60, 230)
+WHITE = (255, 255, 255)
+GREY = (150, 150, 150)
 # fractional bits of the coordinates that OpenCV draws with: lines lie where the numbers say, to
 # 1/16 px
 SHIFT = 4

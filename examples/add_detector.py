@@ -38,7 +38,8 @@ class Mine(Detector):
             goal = GoalSeen(self.rays(corners), score=1.0)
         if box is not None:
             left, top, right, bottom = box
-            u, v = (left + right) / 2, (top + bottom) / 2
+            u = (left + right) / 2
+            v = (top + bottom) / 2
             sides = self.rays([[left, v], [u, top], [right, v], [u, bottom]])
             middle = sides.sum(axis=0) / np.linalg.norm(sides.sum(axis=0))
             half_angle = float(np.arccos(sides @ middle).mean())

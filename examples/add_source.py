@@ -24,7 +24,8 @@ FRAMES = ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')  # of this s
 class Still(Source):
     """A source that reports bodies at rest 100 times a second."""
 
-    period, _next = 0.01, 0.0
+    period = 0.01
+    _next = 0.0
 
     def poll(self, now: float) -> list[Pose]:
         if now < self._next:
@@ -41,7 +42,8 @@ def main() -> None:
     params = config.load(HilParams, config.find("hil", "dry_run"), changes)
     policy = Policy.load(find_policy(params.policy))
     backend = make_backend(params, None)
-    runner, source = Runner(params, policy, backend), Still()
+    runner = Runner(params, policy, backend)
+    source = Still()
     for now in np.arange(0.0, args.seconds, runner.pilot.period):
         decision = runner.tick(now, source.poll(now), backend.status(now), OperatorInput())
     print(f"after {args.seconds:g} s: {decision.state}; the policy's command is {decision.command}")

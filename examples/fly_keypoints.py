@@ -12,9 +12,14 @@ from visthrow.throws.loading import load_policy
 
 # What a detector found in one picture [px]: corners of the goal, and the box of the ball
 CORNERS = [[293.5, 152.1], [313.5, 151.1], [313.1, 160.8], [291.8, 162.0]]
-LEFT, TOP, RIGHT, BOTTOM = 304.4, 318.1, 334.6, 348.4
+LEFT = 304.4
+TOP = 318.1
+RIGHT = 334.6
+BOTTOM = 348.4
 # The poses of that moment [m]
-VEHICLE, BALL, GOAL = [0.0, 0.0, 1.333], [0.0, 0.0, 0.95], [2.0, 0.2, 0.0]
+VEHICLE = [0.0, 0.0, 1.333]
+BALL = [0.0, 0.0, 0.95]
+GOAL = [2.0, 0.2, 0.0]
 LEVEL = [0.0, 0.0, 0.0, 1.0]  # xyzw
 MOST_OFF = 1.0  # between what was detected and what the poses say [px]
 
@@ -24,7 +29,8 @@ def main() -> None:
     lens = Fisheye(loaded.experiment.camera.fisheye)
     pilot = Pilot(loaded.policy, loaded.experiment.camera)
 
-    u, v = (LEFT + RIGHT) / 2, (TOP + BOTTOM) / 2
+    u = (LEFT + RIGHT) / 2
+    v = (TOP + BOTTOM) / 2
     pixels = torch.tensor([*CORNERS, [LEFT, v], [u, TOP], [RIGHT, v], [u, BOTTOM]])
     keypoints = lens.normalize(pixels)[None].numpy()  # shape (1, 8, 2)
     valid = np.ones((1, 8), dtype=bool)

@@ -31,9 +31,11 @@ def main() -> None:
     changes = [f'link.device="udp:127.0.0.1:{args.port}"']
     params = config.load(HilParams, config.find("hil", args.config), changes)
     camera_params = config.load(CameraParams, config.find("camera", "fisheye"))
-    camera, lens = KeypointCamera(camera_params), Fisheye(camera_params.fisheye)
+    camera = KeypointCamera(camera_params)
+    lens = Fisheye(camera_params.fisheye)
     frames = {body: Frames(of) for body, of in params.frames.items()}
-    clock, newest = MonotonicClock(), {}
+    clock = MonotonicClock()
+    newest = {}
     source, _, _ = open_source(params, Path(tempfile.mkdtemp()), clock)
     end = clock.now() + args.seconds
     while clock.now() < end:

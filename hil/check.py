@@ -97,7 +97,9 @@ def _listen(args: argparse.Namespace) -> int:
             DryRun(),
         )
         autopilot = AutopilotCheck(params, make_backend(params, link))
-        begin, seconds, poses = clock.now(), args.seconds or LISTEN, []
+        begin = clock.now()
+        seconds = args.seconds or LISTEN
+        poses = []
         last: list[str] = []
         while clock.now() - begin < seconds and not source.ended:
             time = clock.now()
@@ -121,7 +123,8 @@ def _listen(args: argparse.Namespace) -> int:
         + unit_problems(poses, params.frames)
         + [text for good, text in results if not good]
     )
-    lasted, required = runner.machine.lasting(time), params.states.check_hold
+    lasted = runner.machine.lasting(time)
+    required = params.states.check_hold
     if not problems and lasted < required:
         problems = [
             f"all was well for the last {lasted:.1f} s; expected {required:g} s:"
@@ -147,10 +150,8 @@ def _not_taken(rosters: list[Roster], seconds: float) -> list[str]:
 
 def _body_line(name: str, track: Track, time: float, seconds: float, stamped: bool) -> str:
     flow = track.stream.flow(time)
-    state, refused = (
-        track.state(time),
-        (json.dumps(track.gate.refused) if track.gate.refused else "none"),
-    )
+    state = track.state(time)
+    refused = json.dumps(track.gate.refused) if track.gate.refused else "none"
     if state is None:
         return f"{name}: no pose; refused by the gate: {refused}"
     x, y, z = state.pos
@@ -215,7 +216,8 @@ class AutopilotCheck:
         """Return what was found with a mass [kg] that hovers: whether it is good, and in words."""
         if self.meter is None:
             return []
-        audit, status = self.backend.audit, self.backend.status(time)
+        audit = self.backend.audit
+        status = self.backend.status(time)
         if audit.rules:
             print(audit.table())
         out = [] if audit.fault() is None else [(False, audit.fault())]
@@ -239,7 +241,8 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
             " autopilot"
         )
     mass = Policy.load(folder / POLICY).total_mass
-    thrusts, hovering = [], 0
+    thrusts = []
+    hovering = 0
     for line in lines(folder / TICKS):
         mode = Status(*line["status"]).mode
         follows = line["state"] in (State.READY, State.ARMED) and line["command"] and mode == FOLLOW
@@ -253,7 +256,8 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
             " states.armed_least=3.0"
         )
     thrust = getattr(params, params.backend).thrust
-    commanded, weight = sum(thrusts) / len(thrusts), mass * GRAVITY
+    commanded = sum(thrusts) / len(thrusts)
+    weight = mass * GRAVITY
     ratio = commanded / weight
     text = (
         f"hover took {ratio:.3f} times the weight by the config's calibration: the hover share is"

@@ -70,7 +70,8 @@ def fly(args: argparse.Namespace) -> int:
     """Fly, or run dry, and write the run's folder; return 1 for a run that was aborted or in which
     something raised, else 0.
     """
-    start, params = time.monotonic(), run_params(args)
+    start = time.monotonic()
+    params = run_params(args)
     folder = Path(args.out or f"runs/hil/{time.strftime('%Y%m%d-%H%M%S')}")
     console = Console()
     with begun(folder):
@@ -79,10 +80,12 @@ def fly(args: argparse.Namespace) -> int:
     print(f"ready after {delay:.2f} s; waiting for poses", file=sys.stderr, flush=True)
     viewer = start_viewer(folder) if args.view else None
     if loop.runner.calibrating is not None:
-        policy, spreads = loop.runner.pilot.policy, params.calibration.spreads
+        policy = loop.runner.pilot.policy
+        spreads = params.calibration.spreads
         loop.solver = CalibrationSolver(params.camera, policy.contract, spreads)
     summary = loop.fly(args.seconds or float("inf"))
-    backend, source = loop.runner.backend, loop.source
+    backend = loop.runner.backend
+    source = loop.source
     rosters = [*source.rosters, *filter(None, [getattr(backend, "roster", None)])]
     summary |= {
         "speed": args.speed,
@@ -178,7 +181,8 @@ def autopilot_record(backend: Any, link: Any) -> dict[str, Any]:
     """
     out: dict[str, Any] = {"backend": backend.name}
     if hasattr(backend, "audit"):
-        audit, release = backend.audit, backend.release_record
+        audit = backend.audit
+        release = backend.release_record
         out["parameters"] = {
             "found": audit.found,
             "written": audit.written,

@@ -98,9 +98,12 @@ class Terminal:
         """Take over the signals; ``say`` never waits. ``auto_arm``: the word is given whenever the
         run is ready, to a vehicle that has said that it is simulated and to no other.
         """
-        self._auto, self._simulated, self._say = auto_arm, simulated, say
+        self._auto = auto_arm
+        self._simulated = simulated
+        self._say = say
         self._why = ""
-        self._typed, self._warned = b"", False
+        self._typed = b""
+        self._warned = False
         try:
             self._file = sys.stdin.fileno()
         except (AttributeError, OSError, ValueError):  # there is no terminal

@@ -166,7 +166,8 @@ class HilParams(Bounded):
 
     def _missing_parts(self) -> tuple[tuple[bool, str], ...]:
         """Return rules on tables and their combinations: whether each is broken, and its error."""
-        kind, detects = self.source.kind, self.keypoints == "detector"
+        kind = self.source.kind
+        detects = self.keypoints == "detector"
         return (
             (
                 detects and self.images is None,
@@ -198,7 +199,9 @@ class HilParams(Bounded):
 
     def _misplaced(self) -> tuple[tuple[bool, str], ...]:
         """Return rules on places and fences: whether each is broken, and its error."""
-        fence, low, high = self.fence, self.fence.payload_low, self.fence.payload_high
+        fence = self.fence
+        low = self.fence.payload_low
+        high = self.fence.payload_high
         goal_moves = GOAL in self.frames
         return (
             (

@@ -38,7 +38,8 @@ def train_and_throw(args: argparse.Namespace) -> None:
     experiment = config.load(TeamExperiment, path, args.overrides)
     training = TeamTraining(experiment, args.device, args.seed, args.eager)
     name = f"{args.config}-{args.seed}"
-    policy, report = args.out / f"{name}.npz", args.reports / f"{name}.json"
+    policy = args.out / f"{name}.npz"
+    report = args.reports / f"{name}.json"
     made_by = {"seed": args.seed, "config": config.to_dict(experiment, defaults=False)}
     result = {"config": args.config, "seed": args.seed, "built_s": time.time() - begin}
     result |= {"provenance": provenance.collect(), "curve": [], "throws": []}

@@ -47,7 +47,8 @@ def turned(log: FlightLog, angle: float, shift: Sequence[float]) -> FlightLog:
     c = np.cos(angle)
     s = np.sin(angle)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    a, b = np.sin(0.5 * angle), np.cos(0.5 * angle)
+    a = np.sin(0.5 * angle)
+    b = np.cos(0.5 * angle)
 
     def quat(q: np.ndarray) -> np.ndarray:
         x, y, z, w = q.T

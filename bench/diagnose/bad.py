@@ -21,7 +21,9 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]
 HOURS = 2.0
-GRAVITY, MASS, DRAG = 9.81, 0.21, 0.06
+GRAVITY = 9.81
+MASS = 0.21
+DRAG = 0.06
 """[m/s^2]; of configs/vehicle/paper.toml: [kg], rotor drag [kg/s]."""
 WANDER = 0.15
 """Of a hover, to either side [m]."""
@@ -98,10 +100,8 @@ def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
     rng = np.random.default_rng(1)
     t = np.arange(0.0, seconds, 1.0 / rate)
     sent = np.arange(0.0, seconds, 0.02)
-    speed, phase = (
-        np.array([0.31, 0.47]),
-        np.array([0.3, 1.1]),
-    )  # of the wander along x and y [rad/s], [rad]
+    speed = np.array([0.31, 0.47])
+    phase = np.array([0.3, 1.1])  # of the wander along x and y [rad/s], [rad]
 
     def lean(time: np.ndarray, rate: bool = False) -> np.ndarray:
         """Lean along x and y that the wander and the rotors' drag take, or its rate."""

@@ -25,7 +25,11 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 NAMES = ("ball_drag", "wind_x", "wind_y")
 COLOURS = ("", "coloured")
-GRAVITY, RATE, SECONDS, THROWS, SIGMA = 9.81, 200.0, 0.7, 4, 5e-4
+GRAVITY = 9.81
+RATE = 200.0
+SECONDS = 0.7
+THROWS = 4
+SIGMA = 5e-4
 REST = 60  # samples after which a log's ball lies still
 ASSUMED = BallParams(GRAVITY, 0.0, 0.0, 0.3)
 

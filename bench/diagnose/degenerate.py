@@ -127,7 +127,8 @@ LATE = (1.0,)
 """The only sign in which a delay of commands and one of stamps are a pair: nothing is measured
 before it happens, so that commands that act sooner have no partner.
 """
-MILLIMETRES, GRAMS = 3e-3, 4e-3
+MILLIMETRES = 3e-3
+GRAMS = 4e-3
 """Sizes that two short hovers hardly tell from other causes, up to 3 nats apart where the cause
 itself has 10 to 15.
 

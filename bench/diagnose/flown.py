@@ -42,7 +42,9 @@ def fly(
     integrator of the test's own.
     """
     rng = np.random.default_rng(seed)
-    mass, payload, step = 0.03, 0.008, 0.005
+    mass = 0.03
+    payload = 0.008
+    step = 0.005
     load = mass + (payload if cable else 0.0)
     phases = rng.uniform(0, 6, 2)
     half = np.arange(0.0, seconds + step, 0.5 * step)

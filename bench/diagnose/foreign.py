@@ -31,12 +31,10 @@ from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
-G, TICK, STEP, SHOT = (
-    9.80665,
-    0.01,
-    5e-3,
-    1.0 / 120.0,
-)  # [m/s^2]; of commands, integration, pictures [s]
+G = 9.80665
+TICK = 0.01
+STEP = 5e-3
+SHOT = 1.0 / 120.0  # [m/s^2]; of commands, integration, pictures [s]
 # configs/vehicle and configs/rope; body [kg, kg m^2], full thrust [N], lag [s], rotor drag [kg/s],
 # cable [m], ball [kg]
 CRAFT = {
@@ -84,9 +82,11 @@ did; to the left or right by its way.
 """
 STRENGTH = {"swirl": 0.25, "beat": 0.2, "wake": 0.25, "side": 0.15}
 """In the whole mass: [1/s], [m/s^2], [1/s], [m/s^2]."""
-REMEMBERS, BEATS = 0.5, 4.5  # [s], [rad/s]
+REMEMBERS = 0.5
+BEATS = 4.5  # [s], [rad/s]
 ONE_SIDED = ("cmd_delay", "parasitic", "payload_drag")
-FLIGHTS, FLOORS = 4, 10.0
+FLIGHTS = 4
+FLOORS = 10.0
 
 
 def drawn(seed: int) -> tuple[str, str, dict[str, float]]:
@@ -153,11 +153,9 @@ def flown(world: dict, rng: np.random.Generator, seconds: float = 12.0) -> Fligh
     m = world["ball"]
     L = world["cable"]
     J = world["J"]
-    swing, beat, turned = (
-        rng.uniform(0.4, 0.9, 3) * [1.0, 1.0, 0.35],
-        rng.uniform(0.9, 2.2, 3),
-        rng.uniform(0.0, 2.0 * np.pi, 4),
-    )
+    swing = rng.uniform(0.4, 0.9, 3) * [1.0, 1.0, 0.35]
+    beat = rng.uniform(0.9, 2.2, 3)
+    turned = rng.uniform(0.0, 2.0 * np.pi, 4)
 
     def wanted(t: float) -> np.ndarray:
         """Place, speed and acceleration, shape (3, 3)."""

@@ -52,15 +52,18 @@ RANDOM = {"release_lag": "lag_jitter", "cmd_delay": "cmd_jitter", "wind_x": "gus
 LEVELS = (50, 80, 95)
 MATTERS = 5.0
 """Nats on unseen throws that the truth must be worth for a gain to be counted."""
-HARM, HARM_NATS = 1.01, 3.0
+HARM = 1.01
+HARM_NATS = 3.0
 """Growth of the error on unseen throws, per sample in its deviations, and fall of their log
 likelihood, that count as harm.
 """
-NINE, DECADE = math.log(9.0), math.log(10.0)
+NINE = math.log(9.0)
+DECADE = math.log(10.0)
 WIDTHS = (0.05, 3.0)
 GRID = 160
 """From 50 to 90 % in log size: what is possible; points of the grid of curves."""
-FEWEST, BINNED = 6, 30
+FEWEST = 6
+BINNED = 30
 """Worlds of an effect for a curve of its own, and for counts in bins."""
 SEEN = ", camera"
 

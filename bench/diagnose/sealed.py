@@ -132,19 +132,26 @@ SMALL = dict(free=2, free_seconds=4.0, throws=6)
 """Flights of worlds that take seconds."""
 LOST = (0.05, 0.15)
 """Share of commands that never arrive."""
-DUSTY, DUST = "+dust", 0.5
+DUSTY = "+dust"
+DUST = 0.5
 """End of the kinds whose worlds have some of every other effect, and its deviation in floors."""
-SMALLEST, LARGEST = 3.0, 30.0
+SMALLEST = 3.0
+LARGEST = 30.0
 """Sizes of the completeness curves [floors]."""
-NEAREST, NEXT = 3.0, 8.0
+NEAREST = 3.0
+NEXT = 8.0
 """Those about the limits themselves, which lie at 4 to 9 floors."""
-LIMIT, NULL, VARYING, DRIFTING = "limit:", "null:", "varies:", "drifts:"
+LIMIT = "limit:"
+NULL = "null:"
+VARYING = "varies:"
+DRIFTING = "drifts:"
 """Begin of the kinds that hide one effect, by its name, about its limit; nothing; one that differs
 from flight to flight, or by day.
 """
 DAYS = 4
 """Of worlds with effects that drift."""
-FAINTEST, PLAINEST = 1.0, 15.0
+FAINTEST = 1.0
+PLAINEST = 15.0
 """Those of the curves with a camera, whose limits lie at 5 or 6 floors."""
 
 

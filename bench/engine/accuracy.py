@@ -35,7 +35,8 @@ COLUMNS = ("hard_throw_ball", "hard_throw_vehicle", "pendulum_ball_most", "whip_
 def fly(scene: Scene, solver: str, substep: float) -> dict[str, np.ndarray]:
     """Ball and vehicle [m] after each control period, shape (T, 3), NaN where the solver failed;
     the rope's rates at the end."""
-    sim, rows = scene_sim(scene, substep, "float32", PERIOD, solver), []
+    sim = scene_sim(scene, substep, "float32", PERIOD, solver)
+    rows = []
     for k in range(round(scene.duration / PERIOD)):
         wrench = wrench_at(scene, PERIOD * k)
         sim.set_command(np.array([[wrench.force_b[2], *wrench.torque_b]]))
@@ -50,7 +51,8 @@ def fly(scene: Scene, solver: str, substep: float) -> dict[str, np.ndarray]:
 def pendulum() -> Scene:
     """The hard throw's rope at 57 degrees below a vehicle of 100 kg that is held up."""
     scene = load_scene(SCENES / "hard_throw.toml")
-    mass, angle = 100.0, np.radians(57.0)
+    mass = 100.0
+    angle = np.radians(57.0)
     lift = GRAVITY * (mass - scene.mass + scene.total_mass)
     still = {"vel_w": (0.0, 0.0, 0.0), "cable_rate_w": (0.0, 0.0, 0.0), "duration": 3.0}
     direction = (float(np.sin(angle)), 0.0, float(-np.cos(angle)))
@@ -77,7 +79,9 @@ def reference(scene: Scene) -> OracleRun:
 
 def distances(scene: Scene, name: str, solver: str, substep: float) -> dict[str, float]:
     """How far ball and vehicle end from MuJoCo's converged run, and the most on the way [m]."""
-    truth, flown, row = reference(scene), fly(scene, solver, substep), {}
+    truth = reference(scene)
+    flown = fly(scene, solver, substep)
+    row = {}
     for part, true in (("ball", truth.ball_pos_w), ("vehicle", truth.pos_w)):
         off = np.linalg.norm(flown[part] - true, axis=1)
         row |= {f"{name}_{part}": float(off[-1]), f"{name}_{part}_most": float(off.max())}
@@ -87,7 +91,8 @@ def distances(scene: Scene, name: str, solver: str, substep: float) -> dict[str,
 def run(args) -> int:
     scenes = {name: load_scene(SCENES / f"{name}.toml") for name in ("hard_throw", "whip")}
     scenes["pendulum"] = pendulum()
-    rows, cells = [], []
+    rows = []
+    cells = []
     for solver in args.solvers:
         for substep in STEPS[solver]:
             row = {"solver": solver, "substep": substep}

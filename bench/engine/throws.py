@@ -31,7 +31,10 @@ def thrown(policy: str, solver: str | None, target: float, args: Namespace) -> t
 
 
 def run(args: Namespace) -> int:
-    rows, landings, firsts, cells = [], [], {}, []
+    rows = []
+    landings = []
+    firsts = {}
+    cells = []
     for policy in args.policies:
         for solver in args.solvers or [None]:
             for target in args.targets:

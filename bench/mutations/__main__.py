@@ -53,7 +53,8 @@ def load(rooms: list[str]) -> list[Mutation]:
 
     Raises ValueError where an old text does not stand in its file exactly once.
     """
-    mutations, wrong = [], []
+    mutations = []
+    wrong = []
     for path in sorted(FOLDER.glob("*.toml")):
         if rooms and path.stem not in rooms:
             continue

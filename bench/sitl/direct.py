@@ -43,7 +43,8 @@ from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
 SETTINGS = "settings"  # folder of the firmware's settings beside those of the throws
-AFTER, MOST = 1.2, 25.0  # flown on after a landing; flown at most [s]
+AFTER = 1.2
+MOST = 25.0  # flown on after a landing; flown at most [s]
 
 
 class FlightClock:
@@ -52,7 +53,8 @@ class FlightClock:
     """
 
     def __init__(self, fake: Fake) -> None:
-        self._fake, self._now = fake, fake.plant.time
+        self._fake = fake
+        self._now = fake.plant.time
 
     def now(self) -> float:
         return self._now
@@ -103,7 +105,9 @@ def opened(
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     shutil.copy(set_up(program, folder.parent, params), folder)
-    firmware, fake, parts = Firmware(program, folder), None, []
+    firmware = Firmware(program, folder)
+    fake = None
+    parts = []
     try:
         firmware.start()
         port = check_device(params.source.device or params.link.device).port
@@ -161,7 +165,8 @@ def throw(
 
 def _flown(loop: Loop, fake: BetaflightSitl) -> dict[str, Any]:
     """Take turns until the runner is done and the payload has lain for a while."""
-    plant, done = fake.plant, False
+    plant = fake.plant
+    done = False
     while plant.time < MOST and not done:
         loop.turn(False)
         landed = plant.landing["landing_time"]
@@ -219,7 +224,8 @@ def main() -> None:
             FakeMocapParams(),
             seed,
         )
-        summary, landed = report.pop("run"), report["landing_w"]
+        summary = report.pop("run")
+        landed = report["landing_w"]
         error = None if landed is None else math.dist(landed[:2], params.goal_w[:2])
         told = {
             "seed": seed,

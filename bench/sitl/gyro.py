@@ -49,7 +49,8 @@ def flown(folder: Path, step: float, seed: int) -> Path:
     its folder.
     """
     params = config.load(HilParams, config.find("hil", "betaflight_sitl"), [f'policy="{BASE}"'])
-    settings, where = folder / SETTINGS, folder / f"{seed}"
+    settings = folder / SETTINGS
+    where = folder / f"{seed}"
     if not where.exists():
         if not (settings / "eeprom.bin").exists():
             Firmware(program(), settings).set_up(
@@ -66,17 +67,17 @@ def flown(folder: Path, step: float, seed: int) -> Path:
 
 def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
     """The throw's log with its blackbox."""
-    (box,), (run,) = (
-        logs_of_blackbox(path := next(where.glob("LOG*"))),
-        read(where / "run" / "throw-01.npz"),
-    )
+    (box,) = logs_of_blackbox(path := next(where.glob("LOG*")))
+    (run,) = read(where / "run" / "throw-01.npz")
     if unfiltered:
         raw = read_blackbox(path)[0]
         columns = dict(zip(raw.names, raw.main.T))
         values = np.stack([columns[f"gyroUnfilt[{i}]"] for i in range(3)], axis=1)
         box.channels["rate_b"] = replace(box["rate_b"], values=np.radians(values.astype(float)))
     log = join([run, box])
-    rate, setpoint, command = log["rate_b"], log["rate_setpoint_b"], log["command"]
+    rate = log["rate_b"]
+    setpoint = log["rate_setpoint_b"]
+    command = log["command"]
     every = round(EVERY / np.median(np.diff(rate.time)))
     log.channels["rate_b"] = replace(
         rate, time=rate.time[::every], values=rate.values[::every], valid=rate.valid[::every]
@@ -97,10 +98,8 @@ def joined(where: Path, unfiltered: bool, as_taken: bool) -> FlightLog:
 
 def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
     """Mean square of what windows leave of the gyro, in deviations of its noise, shape (3,)."""
-    path, hover = (
-        config.find("train", BASE),
-        config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover,
-    )
+    path = config.find("train", BASE)
+    hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     file = folder / "settings.toml"
     file.write_text(
         patch.with_firmware(box, str(path), config.load(Experiment, path), hover, DELAY)
@@ -112,7 +111,8 @@ def left(logs: list[FlightLog], box: Path, folder: Path) -> list[float]:
     )
     squares = []
     for w in model.windows({}):
-        scaled, residual = w.nuisance * w.nuisance_sd / w.sigma[:, None], w.residual / w.sigma
+        scaled = w.nuisance * w.nuisance_sd / w.sigma[:, None]
+        residual = w.residual / w.sigma
         fitted = np.linalg.solve(np.eye(scaled.shape[1]) + scaled.T @ scaled, scaled.T @ residual)
         squares.append(
             (residual - scaled @ fitted)[w.channel == model.channels.index("rate_b")].reshape(-1, 3)

@@ -37,7 +37,8 @@ from visthrow.throws.loading import load_policy
 from visthrow.throws.wire_plant import HybridWirePlant
 
 PERIOD = 0.002
-BEFORE, LENGTH = 0.02, 0.36
+BEFORE = 0.02
+LENGTH = 0.36
 """A window begins so long before its doublet and lasts so long [s]."""
 
 EVERY = 0.9
@@ -69,20 +70,23 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
     run = folder / "run"
     run.mkdir(parents=True, exist_ok=True)
     desk = bench.Bench(run, settings)
-    backend, seen, mocap = (
-        Held(desk.backend, params.delay.hold),
-        FlightRecorder({"source": "doublets"}),
-        Mocap(FakeMocapParams(), seed),
-    )
-    rng, plant = np.random.default_rng(seed), desk.plant
+    backend = Held(desk.backend, params.delay.hold)
+    seen = FlightRecorder({"source": "doublets"})
+    mocap = Mocap(FakeMocapParams(), seed)
+    rng = np.random.default_rng(seed)
+    plant = desk.plant
     hover = HoverController(HoverParams(max_thrust=plant.max_thrust), bench.TICK)
-    rows, starts = [], []
+    rows = []
+    starts = []
     try:
         desk.take()
         clock = FlightClock(desk.fake)
         while mocap.due(plant.time):  # what was seen before is not kept
             mocap.measure(plant.time, plant.state)
-        end, due, doublet, lift = plant.time + seconds, plant.time + 2.0, None, 1.0
+        end = plant.time + seconds
+        due = plant.time + 2.0
+        doublet = None
+        lift = 1.0
         while plant.time < end:
             state = plant.state
             views = [state[name].astype(float)[None] for name in ("pos_w", "quat_wb", "vel_w")]
@@ -90,15 +94,13 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
             if plant.time >= due:
                 axis = int(rng.integers(3))
                 size = rng.choice(SIZES[axis]) * rng.choice((-1.0, 1.0))
-                doublet, due = (
-                    (
-                        axis,
-                        size,
-                        plant.time,
-                        rng.integers(2, 5) * bench.TICK,
-                    ),
-                    due + EVERY,
+                doublet = (
+                    axis,
+                    size,
+                    plant.time,
+                    rng.integers(2, 5) * bench.TICK,
                 )
+                due = due + EVERY
                 lift = rng.choice(LIFTS)
                 starts.append((plant.time, axis, size, lift))
             command[0] *= (
@@ -179,12 +181,11 @@ class Windows:
                 for at in first
             ]
         )
-        self.starts, self.stalled, first = (
-            flight["starts"][: len(first)][~stood],
-            int(stood.sum()),
-            first[~stood],
-        )
-        self.flight, self.first = rows, first
+        self.starts = flight["starts"][: len(first)][~stood]
+        self.stalled = int(stood.sum())
+        first = first[~stood]
+        self.flight = rows
+        self.first = first
         self.rows = np.stack([rows[at : at + count] for at in first])  # (E, T, fields)
         lead = round(0.1 / PERIOD)
         self.earlier = np.stack(
@@ -199,9 +200,11 @@ class Windows:
         """Integral, smoothed set-point and gyro of the block at each period of the whole flight, by
         what it was asked and flew.
         """
-        c, rows = vehicle.controller, self.flight
+        c = vehicle.controller
+        rows = self.flight
         late = np.searchsorted(rows[:, 0], rows[:, 0] - vehicle.queue.delay + 1e-6) - 1
-        asked, rate = rows[np.maximum(late, 0), 15:18], rows[:, 1:4]
+        asked = rows[np.maximum(late, 0), 15:18]
+        rate = rows[:, 1:4]
 
         def smoothed(values: np.ndarray, time_constant: float) -> np.ndarray:
             share = 1.0 - np.exp(-PERIOD / time_constant)
@@ -209,10 +212,8 @@ class Windows:
                 [share], [1.0, share - 1.0], values, axis=0, zi=(1.0 - share) * values[:1]
             )[0]
 
-        setpoint, gyro = (
-            smoothed(asked, c.setpoint_time_constant),
-            smoothed(rate, c.gyro_time_constant),
-        )
+        setpoint = smoothed(asked, c.setpoint_time_constant)
+        gyro = smoothed(rate, c.gyro_time_constant)
         if c.kind != "motor_mixing":
             return {"setpoint": setpoint, "gyro": gyro, "integral": np.zeros_like(rate)}
         error = asked - rate - np.array(c.gyro_share) * (gyro - rate)
@@ -344,11 +345,10 @@ def main() -> None:
     flight = dict(np.load(file))
     windows = Windows(flight, args.policy)
     every = np.arange(len(windows.rows))
-    seen, held_out = every[every % 3 != 2], every[every % 3 == 2]
-    shipped, configured = (
-        windows.plant.vehicle,
-        config.load(VehicleParams, config.find("vehicle", "betaflight_sitl")),
-    )
+    seen = every[every % 3 != 2]
+    held_out = every[every % 3 == 2]
+    shipped = windows.plant.vehicle
+    configured = config.load(VehicleParams, config.find("vehicle", "betaflight_sitl"))
     settings = read_blackbox(next((args.out / "run").glob("LOG*")))[0].header
     hover = config.load(HilParams, config.find("hil", "betaflight_sitl")).betaflight.thrust.hover
     weight = 0.25 * windows.plant.total_mass * GRAVITY

@@ -22,7 +22,8 @@ from visthrow.diagnose.extend import patch
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.task import Experiment
 
-BASE, DELAY = "vision", 0.028
+BASE = "vision"
+DELAY = 0.028
 """The vehicle that the policy was trained in; from a decision to the firmware's mixer, with the
 wait of `delay.hold` [s].
 """

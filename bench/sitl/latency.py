@@ -25,13 +25,16 @@ from hil.links import msp
 from hil.links.pymav import mav
 from tests.sitl.test_betaflight import program, visthrow, wait_for
 
-POSES, COMMANDS = 14560, 5761
+POSES = 14560
+COMMANDS = 5761
 """Ports of the runner's poses (UDP) and of the firmware's first serial port (TCP)."""
 
 STAMP = struct.Struct("qq")
 SO_TIMESTAMPNS = 35
 ETH_P_IP = 0x0800
-IP, ETHER, UDP = 20, 14, 8
+IP = 20
+ETHER = 14
+UDP = 8
 
 
 class Wire(threading.Thread):
@@ -45,8 +48,10 @@ class Wire(threading.Thread):
         self._socket.bind(("lo", 0))
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 24)
         self._socket.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        self.poses, self.commands = [], []
-        self._mavlink, self._msp = mav.MAVLink(None), msp.FrameParser()
+        self.poses = []
+        self.commands = []
+        self._mavlink = mav.MAVLink(None)
+        self._msp = msp.FrameParser()
         self._mavlink.robust_parsing = True
 
     def run(self) -> None:
@@ -76,7 +81,8 @@ class Wire(threading.Thread):
 
     def times(self) -> np.ndarray:
         """Of each command, since the newest pose before it [s]."""
-        poses, commands = np.array(self.poses), np.array(self.commands)
+        poses = np.array(self.poses)
+        commands = np.array(self.commands)
         newest = np.searchsorted(poses, commands) - 1
         return (commands - poses[newest])[newest >= 0]
 

@@ -81,9 +81,12 @@ def _watch(runner: Any, clock: Any, fake: Piloted) -> dict[str, Any]:
     """Close the runner's port, and tell what the sticks and the vehicle do; then the pilot switches
     off.
     """
-    last, begun, start_w = fake.firmware[:STICKS], clock.now(), fake.plant.state["pos_w"].copy()
+    last = fake.firmware[:STICKS]
+    begun = clock.now()
+    start_w = fake.plant.state["pos_w"].copy()
     runner.backend.close()
-    expired, way = None, []
+    expired = None
+    way = []
     while clock.now() < begun + WATCHED:
         clock.sleep_until(clock.now() + 0.02)
         way.append(fake.plant.state["pos_w"] - start_w)

@@ -18,7 +18,8 @@ FACTS = values("betaflight")
 RADIO = struct.Struct("<d16H")  # stamp, channels
 FRAME = 0.02  # between two frames of the transmitter [s]
 ARMS = 1.0  # when the pilot arms, the throttle low [s]
-ARM, OVERRIDE = STICKS, STICKS + 1  # channels of the switches
+ARM = STICKS
+OVERRIDE = STICKS + 1  # channels of the switches
 
 
 class Piloted(BetaflightSitl):
@@ -34,7 +35,8 @@ class Piloted(BetaflightSitl):
         self.override = False
         self.radio: list[int] = []
         self.firmware: tuple[int, ...] = ()
-        self._sticks, self._framed = Sticks(self.params.rates), -np.inf
+        self._sticks = Sticks(self.params.rates)
+        self._framed = -np.inf
         self._transmitter = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._transmitter.connect(("127.0.0.1", FACTS["radio_port"]))
 

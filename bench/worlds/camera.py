@@ -10,7 +10,8 @@ import numpy as np
 from bench.worlds.turns import matrix, sampled, small_turn
 
 SIZE = 640
-FOCAL, CENTRE = 166.6786, np.array([319.5, 319.5])
+FOCAL = 166.6786
+CENTRE = np.array([319.5, 319.5])
 HALF_VIEW = np.radians(110.0)
 LENS = np.array([0.03, 0.0, -0.02])
 """Place of the lens in the body frame [m]."""
@@ -76,8 +77,10 @@ def marks(
     points, seen = imaged(corners, w)
     ring = outline(np.einsum("tij,tj->ti", to_camera, ball - lens), BALL * (1.0 + w.camera_ball))
     around, whole = imaged(ring, w)
-    (left, top), (right, bottom) = around.min(1).T, around.max(1).T
-    u, v = 0.5 * (left + right), 0.5 * (top + bottom)
+    (left, top) = around.min(1).T
+    (right, bottom) = around.max(1).T
+    u = 0.5 * (left + right)
+    v = 0.5 * (top + bottom)
     box = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)
     return np.concatenate([points, box], 1), np.concatenate(
         [seen, np.tile(whole.all(1)[:, None], 4)], 1
@@ -110,8 +113,12 @@ def looked(
             points[:, k], seen[:, k] = (x[:, k] for x in marks(flight, lane, then, goal, w))
     seen[stamps > landed, 4:] = False
     off = noise * PIXEL * rng.normal(size=points.shape)
-    left, top, right, bottom = off[:, 4, 0], off[:, 5, 1], off[:, 6, 0], off[:, 7, 1]
-    u, v = 0.5 * (left + right), 0.5 * (top + bottom)
+    left = off[:, 4, 0]
+    top = off[:, 5, 1]
+    right = off[:, 6, 0]
+    bottom = off[:, 7, 1]
+    u = 0.5 * (left + right)
+    v = 0.5 * (top + bottom)
     off[:, 4:] = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)
     look = (points + off - CENTRE) / (FOCAL * HALF_VIEW)
     return {

@@ -70,12 +70,14 @@ def ahead(
     actuators by their own rates.
     """
     i = wp.tid()
-    p, b = numbers[i], bodies[i]
+    p = numbers[i]
+    b = bodies[i]
     m = inner(b, b)
     m.v = b.v + REAL(0.5) * (b.v - before[i].v)
     m.w = b.w + REAL(0.5) * (b.w - before[i].w)
     m.x = b.x + REAL(0.5) * h * b.v
-    axis, turn = V3(b.q[1], b.q[2], b.q[3]), REAL(0.25) * h * m.w
+    axis = V3(b.q[1], b.q[2], b.q[3])
+    turn = REAL(0.25) * h * m.w
     side = axis + b.q[0] * turn + wp.cross(axis, turn)
     m.q = wp.normalize(V4(b.q[0] - wp.dot(axis, turn), side[0], side[1], side[2]))
     before[i] = b
@@ -105,8 +107,10 @@ def behind(
     their rates half-way.
     """
     i = wp.tid()
-    p, was = numbers[i], before[i]
-    b, m = inner(bodies[i], bodies[i]), inner(bodies[i], middle[i])
+    p = numbers[i]
+    was = before[i]
+    b = inner(bodies[i], bodies[i])
+    m = inner(bodies[i], middle[i])
     if hanging[i]:
         rot = rotation(b.q)
         b.x += rot * p.com
@@ -130,12 +134,10 @@ def model_of(w) -> mujoco.MjModel:
     )
     body = spec.worldbody.add_body(name="vehicle")
     body.add_freejoint()
-    body.mass, body.ipos, body.inertia, body.explicitinertial = (
-        w.mass,
-        w.com.tolist(),
-        w.inertia.tolist(),
-        True,
-    )
+    body.mass = w.mass
+    body.ipos = w.com.tolist()
+    body.inertia = w.inertia.tolist()
+    body.explicitinertial = True
     body.add_site(name="centre", pos=w.com.tolist())
     for i in range(6):
         gear = [0.0] * 6
@@ -143,11 +145,15 @@ def model_of(w) -> mujoco.MjModel:
         spec.add_actuator(
             name=f"a{i}", trntype=mujoco.mjtTrn.mjTRN_SITE, target="centre", gear=gear
         )
-    length, mass = w.length / SEGMENTS, w.rope_mass / SEGMENTS
-    parent, at = body, w.mount.tolist()
+    length = w.length / SEGMENTS
+    mass = w.rope_mass / SEGMENTS
+    parent = body
+    at = w.mount.tolist()
     for i in range(SEGMENTS):
         rod = parent.add_body(name=f"rod{i}", pos=at)
-        total, centre, inertia = mass, length / 2, mass * length**2 / 12
+        total = mass
+        centre = length / 2
+        inertia = mass * length**2 / 12
         if i == SEGMENTS - 1:
             reach = length + w.ball_reach
             total = mass + w.ball_mass
@@ -158,14 +164,13 @@ def model_of(w) -> mujoco.MjModel:
                 + w.ball_mass * (reach - centre) ** 2
             )
             rod.add_site(name="ball", pos=[0.0, 0.0, -reach])
-        rod.mass, rod.ipos, rod.inertia, rod.explicitinertial = (
-            total,
-            [0.0, 0.0, -centre],
-            [inertia, inertia, TWIST],
-            True,
-        )
+        rod.mass = total
+        rod.ipos = [0.0, 0.0, -centre]
+        rod.inertia = [inertia, inertia, TWIST]
+        rod.explicitinertial = True
         rod.add_joint(type=mujoco.mjtJoint.mjJNT_BALL).damping[0] = w.joint_damping
-        parent, at = rod, [0.0, 0.0, -length]
+        parent = rod
+        at = [0.0, 0.0, -length]
     return spec.compile()
 
 
@@ -178,7 +183,8 @@ class Chain:
                 raise ValueError(
                     "the chain of MuJoCo has no bending, stretch or quadratic joint damping"
                 )
-        cache, count = {}, len(worlds)
+        cache = {}
+        count = len(worlds)
         self.models = [cache.setdefault(repr(vars(w)), model_of(w)) for w in worlds]
         self.data = [mujoco.MjData(m) for m in self.models]
         self.worlds = worlds
@@ -202,15 +208,14 @@ class Chain:
         )
         self._behind = wp.launch(behind, count, [*state, arrays["hanging"], 0.0], record_cmd=True)
         self._view = {k: v.numpy() for k, v in arrays.items()}
-        self.bodies, self.ball_v, self.hanging = (
-            self._view["bodies"],
-            self._view["ball_v"],
-            self._view["hanging"],
-        )
+        self.bodies = self._view["bodies"]
+        self.ball_v = self._view["ball_v"]
+        self.hanging = self._view["hanging"]
         self.bodies[:] = bodies
         self._view["middle"][:] = bodies
         for d, b, w in zip(self.data, self.bodies, worlds):
-            d.qpos[:3], d.qpos[3:7] = b["x"] - w.com, b["q"]
+            d.qpos[:3] = b["x"] - w.com
+            d.qpos[3:7] = b["q"]
         self._view["before"][:] = self.bodies
         self.ball_x = np.zeros((count, 3))
         self.tension = np.array([9.81 * (w.ball_mass + w.rope_mass) for w in worlds])
@@ -225,14 +230,17 @@ class Chain:
         self._seen = now
         out = np.zeros(6)
         for e in np.flatnonzero(self.hanging):
-            m, d, w = self.models[e], self.data[e], self.worlds[e]
+            m = self.models[e]
+            d = self.data[e]
+            w = self.worlds[e]
             mujoco.mj_kinematics(m, d)
             mujoco.mj_comPos(m, d)
             mujoco.mj_comVel(m, d)
             mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_SITE, self.site[e], out, 0)
             pull = (out[3:] - self.ball_v[e]) / since + [0.0, 0.0, 9.81]
             self.tension[e] = (w.ball_mass + w.rope_mass) * np.linalg.norm(pull)
-            self.ball_x[e], self.ball_v[e] = d.site_xpos[self.site[e]], out[3:]
+            self.ball_x[e] = d.site_xpos[self.site[e]]
+            self.ball_v[e] = out[3:]
 
     def _step(self, lanes: np.ndarray) -> float:
         """Integration step for the ropes' pull at the last look [s]."""
@@ -251,8 +259,11 @@ class Chain:
             return
         count = max(1, int(np.ceil((stop - start) / self._step(lanes) - 1e-9)))
         h = (stop - start) / count
-        v, b = self._view, self.bodies
-        v["commands"][:], v["push"][:], v["twist"][:] = commands, push, twist
+        v = self._view
+        b = self.bodies
+        v["commands"][:] = commands
+        v["push"][:] = push
+        v["twist"][:] = twist
         loads = ball.copy()
         for e in lanes:
             self.models[e].opt.timestep = h
@@ -262,19 +273,22 @@ class Chain:
                 loads[e] -= self._drag[e] * (self.ball_v[e] - n * (n @ self.ball_v[e]))
         self._ahead.set_param_by_name("h", h)
         self._behind.set_param_by_name("h", h)
-        x, q, speed, rate = b["x"], b["q"], b["v"], b["w"]
+        x = b["x"]
+        q = b["q"]
+        speed = b["v"]
+        rate = b["w"]
         for _ in range(count):
             self._ahead.launch()
             on_ball = v["on_ball"] + loads
             for e in lanes:
-                d, rod = self.data[e], self.rod[e]
-                d.ctrl[:3], d.ctrl[3:] = v["force"][e], v["torque"][e]
+                d = self.data[e]
+                rod = self.rod[e]
+                d.ctrl[:3] = v["force"][e]
+                d.ctrl[3:] = v["torque"][e]
                 # MuJoCo applies it at the rod's centre of mass; the couple moves it to the ball's
                 # centre.
-                (a0, a1, a2), (f0, f1, f2) = (
-                    (self.ball_x[e] - d.xipos[rod]).tolist(),
-                    on_ball[e].tolist(),
-                )
+                (a0, a1, a2) = (self.ball_x[e] - d.xipos[rod]).tolist()
+                (f0, f1, f2) = on_ball[e].tolist()
                 d.xfrc_applied[rod] = (
                     f0,
                     f1,
@@ -284,7 +298,10 @@ class Chain:
                     a0 * f1 - a1 * f0,
                 )
                 mujoco.mj_step(self.models[e], d)
-                x[e], q[e], speed[e], rate[e] = d.qpos[:3], d.qpos[3:7], d.qvel[:3], d.qvel[3:6]
+                x[e] = d.qpos[:3]
+                q[e] = d.qpos[3:7]
+                speed[e] = d.qvel[:3]
+                rate[e] = d.qvel[3:6]
             self._behind.launch()
         if any(self.data[e].warning.number.any() for e in lanes):
             raise RuntimeError(

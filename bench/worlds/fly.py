@@ -47,7 +47,8 @@ def hover(worlds: list[SimpleNamespace], starts: np.ndarray, used: np.ndarray) -
     out = np.zeros(len(worlds), dtype=Body.numpy_dtype())
     for row, w, start, fraction in zip(out, worlds, starts, used, strict=True):
         weight = EARTH * (w.mass + w.ball_mass + w.rope_mass)
-        row["x"], row["q"] = start + w.com, (1.0, 0.0, 0.0, 0.0)
+        row["x"] = start + w.com
+        row["q"] = (1.0, 0.0, 0.0, 0.0)
         row["used"] = fraction
         c = w.ocv
         rest = row["volt"] = c[0] + fraction * (c[1] + fraction * (c[2] + fraction * c[3]))
@@ -67,7 +68,8 @@ class Hanging:
     def __init__(
         self, kind: str, worlds: list[SimpleNamespace], bodies: np.ndarray, starts: np.ndarray
     ):
-        self.kind, self.lanes = kind, len(worlds)
+        self.kind = kind
+        self.lanes = len(worlds)
         # After the separation all plants are alike: the chain's lanes then go on in the kernel of
         # the rod.
         self._advance, nodes = build("rod" if kind == "chain" else kind)
@@ -89,7 +91,9 @@ class Hanging:
         self._numbers = wp.array(rows(worlds), dtype=Numbers)
         self._bodies = wp.array(bodies, dtype=Body)
         ride = np.zeros(self.lanes, dtype=Ride.numpy_dtype())
-        ride["hanging"], ride["release_at"], ride["separated_at"] = 1, np.inf, np.inf
+        ride["hanging"] = 1
+        ride["release_at"] = np.inf
+        ride["separated_at"] = np.inf
         ride["tension"] = [EARTH * (w.ball_mass + w.rope_mass) for w in worlds]
         self.rides = wp.array(ride, dtype=Ride)
         self._places, self._speeds = wp.array(at, dtype=V3), wp.zeros((self.lanes, nodes), dtype=V3)
@@ -159,13 +163,15 @@ class Hanging:
         """MuJoCo's part of a period: all hanging lanes from event to event; ``begin`` becomes where
         the rest starts.
         """
-        chain, ride = self._chain, self.rides.numpy()
+        chain = self._chain
+        ride = self.rides.numpy()
         out = [np.full((self.lanes, RECORDS, n), np.nan) for n in (3, 4, 3, 3)]
         acts = stamps + self._delays[:, None]
         events = np.unique(
             np.round(np.concatenate([marks, acts.ravel(), ride["release_at"][chain.hanging]]), 9)
         )
-        now, last = t, marks[-1]
+        now = t
+        last = marks[-1]
         for stop in events[(events > t + 1e-9) & (events <= last + 1e-9)]:
             active = np.array([np.flatnonzero(a <= now + 1e-9)[-1] for a in acts])
             part = (0.5 * (now + stop) - t) / PERIOD
@@ -180,7 +186,8 @@ class Hanging:
                 chain.look(now)
                 for e in np.flatnonzero(chain.hanging):
                     out[0][e, hit[0]] = chain.data[e].qpos[:3]
-                    out[1][e, hit[0]], out[3][e, hit[0]] = view[e]["q"], view[e]["w"]
+                    out[1][e, hit[0]] = view[e]["q"]
+                    out[3][e, hit[0]] = view[e]["w"]
                     out[2][e, hit[0]] = chain.ball_x[e]
             for e in np.flatnonzero(chain.hanging & (np.abs(ride["release_at"] - now) < 2e-9)):
                 chain.look(now)
@@ -188,11 +195,11 @@ class Hanging:
                 body = self._bodies.numpy()
                 body[e] = chain.bodies[e]
                 self._bodies.assign(body)
-                ride["hanging"][e], ride["separated_at"][e], begin[e] = 0, now, now
-                ride["ball_x"][e], ride["ball_v"][e] = (
-                    chain.ball_x[e],
-                    chain.ball_v[e] + self._kicks[e],
-                )
+                ride["hanging"][e] = 0
+                ride["separated_at"][e] = now
+                begin[e] = now
+                ride["ball_x"][e] = chain.ball_x[e]
+                ride["ball_v"][e] = chain.ball_v[e] + self._kicks[e]
         begin[chain.hanging] = last + 1.0  # nothing left to do in the other kernel
         self.rides.assign(ride)
         return out
@@ -202,13 +209,14 @@ class Flights:
     """Everything that happened in a set of lanes; arrays over time (1 kHz), lane first."""
 
     def __init__(self, time, pos, quat, ball, commands, release_at, separated_at, rate, volt):
-        self.time, self.pos, self.quat, self.ball = time, pos, quat, ball
-        self.commands, self.release_at, self.separated_at, self.rate = (
-            commands,
-            release_at,
-            separated_at,
-            rate,
-        )
+        self.time = time
+        self.pos = pos
+        self.quat = quat
+        self.ball = ball
+        self.commands = commands
+        self.release_at = release_at
+        self.separated_at = separated_at
+        self.rate = rate
         self.volt = volt  # at the start of each period, shape (E, ticks)
 
 
@@ -238,29 +246,30 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         lost: share of commands that never arrive, where the last one stays for a period more.
     """
     wp.config.log_level = wp.LOG_WARNING
-    lanes, ticks = len(worlds), round(seconds / PERIOD)
+    lanes = len(worlds)
+    ticks = round(seconds / PERIOD)
     rng = np.random.default_rng(seed)
     starts = np.array([r.at(0.0)[0] for r in references])
     plant = Hanging(kind, worlds, hover(worlds, starts, used), starts)
     level = np.zeros((lanes, 4))
     level[:, 0] = [EARTH * (w.mass + w.ball_mass + w.rope_mass) for w in worlds]
-    queue, stamps = (
-        np.repeat(level[:, None], QUEUE, 1),
-        np.tile(np.arange(-QUEUE, 0) * PERIOD - 1.0, (lanes, 1)),
-    )
+    queue = np.repeat(level[:, None], QUEUE, 1)
+    stamps = np.tile(np.arange(-QUEUE, 0) * PERIOD - 1.0, (lanes, 1))
     blows = [ornstein(rng, np.full(lanes, size), ticks) for size in gusts]
     jitter = rng.normal(size=lanes)
     pos, ball, rate = (np.empty((lanes, ticks * RECORDS + 1, 3)) for _ in range(3))
-    quat, sent, volts = (
-        np.empty((lanes, ticks * RECORDS + 1, 4)),
-        np.empty((lanes, ticks, 4)),
-        np.empty((lanes, ticks)),
-    )
-    pos[:, 0], quat[:, 0], rate[:, 0] = starts, (1.0, 0.0, 0.0, 0.0), 0.0
+    quat = np.empty((lanes, ticks * RECORDS + 1, 4))
+    sent = np.empty((lanes, ticks, 4))
+    volts = np.empty((lanes, ticks))
+    pos[:, 0] = starts
+    quat[:, 0] = (1.0, 0.0, 0.0, 0.0)
+    rate[:, 0] = 0.0
     ball[:, 0] = [s + w.mount - [0, 0, w.length + w.ball_reach] for s, w in zip(starts, worlds)]
-    asked, link = np.full(lanes, np.inf), np.random.default_rng([seed, 9])
+    asked = np.full(lanes, np.inf)
+    link = np.random.default_rng([seed, 9])
     for k in range(ticks):
-        t, now = k * PERIOD, k * RECORDS
+        t = k * PERIOD
+        now = k * RECORDS
         b, hanging, tension = plant.look()
         sent[:, k] = pilots(t, pos[:, now], b["v"], b["q"], hanging)
         volts[:, k] = b["volt"]
@@ -276,7 +285,8 @@ def _fly(kind, worlds, pilots, references, seconds, gusts, seed, used, lost=0.0)
         stamps = np.concatenate([stamps[:, 1:], np.full((lanes, 1), t)], 1)
         blow = np.zeros(lanes, dtype=Gust.numpy_dtype())
         for name, series in zip(("push", "twist", "ball"), blows):
-            blow[name], blow[name + "_end"] = series[k], series[k + 1]
+            blow[name] = series[k]
+            blow[name + "_end"] = series[k + 1]
         span = slice(now + 1, now + RECORDS + 1)
         pos[:, span], quat[:, span], ball[:, span], rate[:, span] = plant.period(
             t, queue, stamps, blow

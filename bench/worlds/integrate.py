@@ -123,7 +123,9 @@ def build(kind: str):
                         vs[i] = v0[i]
                         dx[i] = V3()
                         dv[i] = V3()
-                    ball_dx, ball_dv, first_pull = V3(), V3(), r.tension + REAL(0.0)
+                    ball_dx = V3()
+                    ball_dv = V3()
+                    first_pull = r.tension + REAL(0.0)
                     ball_vs = r.ball_v + V3()
                     for s in range(4):
                         weight = REAL(2.0)

@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
-RELEASE_LAG, LANDING_HEIGHT = 0.11, 0.04
+RELEASE_LAG = 0.11
+LANDING_HEIGHT = 0.04
 
 
 def nominal() -> SimpleNamespace:
@@ -19,7 +20,10 @@ def nominal() -> SimpleNamespace:
     v = tomllib.loads((CONFIGS / "vehicle" / "paper.toml").read_text())
     r = tomllib.loads((CONFIGS / "rope" / "paper.toml").read_text())
     release = tomllib.loads((CONFIGS / "release" / "paper.toml").read_text())
-    c, b, a, t = v["controller"], v["battery"], v["aero"], v["thrust"]
+    c = v["controller"]
+    b = v["battery"]
+    a = v["aero"]
+    t = v["thrust"]
     return SimpleNamespace(
         mass=v["body"]["mass"],
         inertia=np.array(v["body"]["inertia"]),
@@ -170,18 +174,18 @@ def _rotor_drag(w, theta):
 
 
 def _rate_gain(w, theta):
-    w.kp, w.ki, w.kd = w.kp * (1 + theta), w.ki * (1 + theta), w.kd * (1 + theta)
+    w.kp = w.kp * (1 + theta)
+    w.ki = w.ki * (1 + theta)
+    w.kd = w.kd * (1 + theta)
 
 
 def _no_aero(w, _):
-    w.drag, w.parasitic, w.inflow, w.torque_inflow, w.lift, w.flapping = (
-        np.zeros(3),
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-        0.0,
-    )
+    w.drag = np.zeros(3)
+    w.parasitic = 0.0
+    w.inflow = 0.0
+    w.torque_inflow = 0.0
+    w.lift = 0.0
+    w.flapping = 0.0
 
 
 def _geometric(w, _):

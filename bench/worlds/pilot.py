@@ -6,7 +6,9 @@ import numpy as np
 
 PERIOD = 0.02
 GRAVITY = 9.81
-POSITION, VELOCITY, ATTITUDE = np.array([3.0, 3.0, 6.0]), np.array([2.8, 2.8, 4.0]), 4.5
+POSITION = np.array([3.0, 3.0, 6.0])
+VELOCITY = np.array([2.8, 2.8, 4.0])
+ATTITUDE = 4.5
 """Gains [1/s^2], [1/s], [1/s] of the tracking controller: calm with 20 ms more of delay or motor
 lag, or 30 % less rate gain.
 """
@@ -51,10 +53,8 @@ class FreeFlight:
         self.centre = np.array([0.0, 0.0, height])
         self.yaw = rng.uniform(-0.8, 0.8), rng.uniform(0.2, 0.6)
         self.release = np.inf
-        self.tones, self.phases = (
-            rng.uniform(0.8, 4.0, (TONES, 3)) * 2 * np.pi,
-            rng.uniform(0, 2 * np.pi, (TONES, 3)),
-        )
+        self.tones = rng.uniform(0.8, 4.0, (TONES, 3)) * 2 * np.pi
+        self.phases = rng.uniform(0, 2 * np.pi, (TONES, 3))
 
     def shaken(self, t: float) -> np.ndarray:
         """Rates that are added [rad/s]."""
@@ -83,7 +83,8 @@ class Throw:
 
     def __init__(self, rng: np.random.Generator, push: float, heading: float):
         self.along = np.array([np.cos(heading), np.sin(heading), 0.0])
-        self.back, self.push = rng.uniform(1.5, 3.0), push * rng.uniform(0.9, 1.1)
+        self.back = rng.uniform(1.5, 3.0)
+        self.push = push * rng.uniform(0.9, 1.1)
         self.lift = rng.uniform(0.3, 1.2)
         self.home = np.array(
             [rng.uniform(-0.3, 0.3), rng.uniform(-0.3, 0.3), rng.uniform(1.5, 2.0)]
@@ -92,7 +93,10 @@ class Throw:
         grid = np.arange(0.0, 4.0, 0.005)
         a = np.outer(self._push(grid), self.along) + np.outer(self._rise(grid), [0.0, 0.0, 1.0])
         v = np.cumsum(a, 0) * 0.005
-        self.grid, self.a, self.v, self.p = grid, a, v, self.home + np.cumsum(v, 0) * 0.005
+        self.grid = grid
+        self.a = a
+        self.v = v
+        self.p = self.home + np.cumsum(v, 0) * 0.005
 
     def shaken(self, t: float) -> np.ndarray:
         """Rates that are added [rad/s]: none, a throw excites by itself."""
@@ -119,7 +123,8 @@ def turn_rate(reference, t: float, step: float = 0.01) -> np.ndarray:
     before, after = (
         np.asarray(reference.at(t + h)[2]) + [0.0, 0.0, GRAVITY] for h in (-step, step)
     )
-    before, after = before / np.linalg.norm(before), after / np.linalg.norm(after)
+    before = before / np.linalg.norm(before)
+    after = after / np.linalg.norm(after)
     return np.cross(before, after) / (2 * step)
 
 
@@ -133,8 +138,10 @@ class Tracker:
     lead = LEAD
 
     def __init__(self, references: list, mass: float, ball_mass: float, rng: np.random.Generator):
-        self.references, self.rng = references, rng
-        self.with_ball, self.alone = mass + ball_mass, mass
+        self.references = references
+        self.rng = rng
+        self.with_ball = mass + ball_mass
+        self.alone = mass
         self.off = np.zeros((len(references), 3))  # integral of the position's error [m s]
 
     def command(self, t: float, x, v, q, hanging) -> np.ndarray:

@@ -37,7 +37,8 @@ def build():
         """
         force, torque, thrust, d = vehicle_load(p, b, command, push, twist)
         rot = rotation(b.q)
-        n, u = place[0], speed[0]
+        n = place[0]
+        u = speed[0]
         arm_b = p.mount - p.com
         arm = rot * arm_b
         reach = p.length + p.ball_reach

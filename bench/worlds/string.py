@@ -63,12 +63,16 @@ def build(nodes: int = 24):
         gravity = V3(REAL(0.0), REAL(0.0), -REAL(EARTH))
         load = V3()  # of the joints' forces on the mount
         reaction = V3()  # their couple on the vehicle
-        above, above_rate = V3(), w_world + V3()
+        above = V3()
+        above_rate = w_world + V3()
         for i in range(N):
-            tail, tail_v = mount, mount_v
+            tail = mount
+            tail_v = mount_v
             if i > 0:
-                tail, tail_v = place[i - 1] + V3(), speed[i - 1] + V3()
-            d_x, d_v = place[i] - tail, speed[i] - tail_v
+                tail = place[i - 1] + V3()
+                tail_v = speed[i - 1] + V3()
+            d_x = place[i] - tail
+            d_v = speed[i] - tail_v
             size = wp.length(d_x)
             n = d_x / size
             normal[i] = n
@@ -95,7 +99,8 @@ def build(nodes: int = 24):
                     load -= up_pair
                 else:
                     side[i - 2] = side[i - 2] - up_pair
-            above, above_rate = n, rate
+            above = n
+            above_rate = rate
         last = normal[N - 1]
         ball_v = speed[N - 1]
         air = (
@@ -124,15 +129,19 @@ def build(nodes: int = 24):
         for i in range(N):  # forward sweep of the tridiagonal system in the tensions
             n = normal[i]
             free_here = gravity + side[i] / node_mass(p, i)
-            free_there, tail, tail_v = mount_a, mount, mount_v
+            free_there = mount_a
+            tail = mount
+            tail_v = mount_v
             weight_there = wp.dot(n, mobility * n)
             coupling_there = REAL(0.0)
             if i > 0:
                 free_there = gravity + side[i - 1] / node_mass(p, i - 1)
-                tail, tail_v = place[i - 1] + V3(), speed[i - 1] + V3()
+                tail = place[i - 1] + V3()
+                tail_v = speed[i - 1] + V3()
                 weight_there = REAL(1.0) / node_mass(p, i - 1)
                 coupling_there = wp.dot(n, normal[i - 1]) / node_mass(p, i - 1)
-            d_x, d_v = place[i] - tail, speed[i] - tail_v
+            d_x = place[i] - tail
+            d_v = speed[i] - tail_v
             size = wp.length(d_x)
             along = wp.dot(n, d_v)
             rest = bit + REAL(0.0)

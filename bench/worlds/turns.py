@@ -7,7 +7,9 @@ def small_turn(v: np.ndarray) -> np.ndarray:
     """Rotation matrices of rotation vectors, shape (..., 3) to (..., 3, 3)."""
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     k = np.zeros((*v.shape[:-1], 3, 3))
-    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    k[..., 0, 1] = -v[..., 2]
+    k[..., 0, 2] = v[..., 1]
+    k[..., 1, 2] = -v[..., 0]
     k -= np.swapaxes(k, -1, -2)
     safe = np.where(angle > 1e-12, angle, 1.0)
     return np.eye(3) + np.sin(angle) / safe * k + (1 - np.cos(angle)) / safe**2 * (k @ k)
@@ -15,9 +17,12 @@ def small_turn(v: np.ndarray) -> np.ndarray:
 
 def matrix(q: np.ndarray) -> np.ndarray:
     """Rotation matrices of quaternions wxyz, shape (T, 4) to (T, 3, 3)."""
-    w, v = q[..., :1, None], q[..., 1:]
+    w = q[..., :1, None]
+    v = q[..., 1:]
     k = np.zeros((*v.shape[:-1], 3, 3))
-    k[..., 0, 1], k[..., 0, 2], k[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    k[..., 0, 1] = -v[..., 2]
+    k[..., 0, 2] = v[..., 1]
+    k[..., 1, 2] = -v[..., 0]
     k -= np.swapaxes(k, -1, -2)
     return np.eye(3) + 2 * w * k + 2 * (k @ k)
 

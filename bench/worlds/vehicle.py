@@ -7,7 +7,9 @@ vehicle's numbers, another one its state."""
 import warp as wp
 
 REAL = wp.float64
-V3, V4, M3 = wp.vec3d, wp.vec4d, wp.mat33d
+V3 = wp.vec3d
+V4 = wp.vec4d
+M3 = wp.mat33d
 SINKING = wp.constant(wp.float64(0.3))  # [m/s]
 EARTH = 9.81
 
@@ -110,8 +112,12 @@ class Body:
 
 @wp.func
 def rotation(q: V4):
-    w, x, y, z = q[0], q[1], q[2], q[3]
-    one, two = REAL(1.0), REAL(2.0)
+    w = q[0]
+    x = q[1]
+    y = q[2]
+    z = q[3]
+    one = REAL(1.0)
+    two = REAL(2.0)
     return M3(
         one - two * (y * y + z * z),
         two * (x * y - w * z),
@@ -158,7 +164,8 @@ def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
     """Wanted rotor speeds; fills the derivatives of integral and filters into ``rates``."""
     out = rates
     asked = V3(command[1], command[2], command[3])
-    mean_x, mean_y = REAL(0.0), REAL(0.0)
+    mean_x = REAL(0.0)
+    mean_y = REAL(0.0)
     for i in range(4):
         mean_x += p.believed_x[i] * p.believed_x[i]
         mean_y += p.believed_y[i] * p.believed_y[i]
@@ -179,7 +186,8 @@ def motor_demand(p: Numbers, b: Body, command: V4, rates: Body):
         level[i] = torque[0] * p.believed_y[i] / mean_y - torque[1] * p.believed_x[i] / mean_x
     yaw = torque[2] / (REAL(4.0) * p.believed_kappa)
     f = V4()
-    share, yaw_share = REAL(1.0), REAL(1.0)
+    share = REAL(1.0)
+    yaw_share = REAL(1.0)
     if p.geometric == 1:
         for i in range(4):
             f[i] = wp.clamp(
@@ -252,7 +260,10 @@ def vehicle_load(p: Numbers, b: Body, command: V4, push: V3, twist: V3):
     cushion = cushion * (REAL(1.0) + p.speed_thrust * wp.sqrt(air[0] * air[0] + air[1] * air[1]))
     force = -wp.cw_mul(p.drag, air) - p.parasitic * wp.length(air) * air
     torque = twist
-    total, power, momentum, slew = REAL(0.0), p.idle_power + REAL(0.0), REAL(0.0), REAL(0.0)
+    total = REAL(0.0)
+    power = p.idle_power + REAL(0.0)
+    momentum = REAL(0.0)
+    slew = REAL(0.0)
     for i in range(4):
         thrust = (
             (p.thrust_square * speed[i] * speed[i] + p.thrust_linear * speed[i])

@@ -83,7 +83,10 @@ PLANTS = ("chain", "string", "rod")
 GUSTS = (0.015, 1.5e-4, 6e-4)
 NOISE = {"pos": 5e-4, "att": np.radians(0.2), "ball": 8e-4, "volt": 2e-2}
 RATE = 200.0
-TIME, CUTOFF, TAILS, HELD = 0.03, 15.0, 3.0, 0.1
+TIME = 0.03
+CUTOFF = 15.0
+TAILS = 3.0
+HELD = 0.1
 """Of a sensor's noise: correlation time [s] where it is coloured, cut-off [Hz] of a second-order
 filter, degrees of freedom of Student's distribution; share of frames that a tracker repeats.
 """
@@ -215,7 +218,9 @@ def lanes_of(recipe: Recipe, rng: np.random.Generator):
 def fly_recipe(recipe: Recipe) -> list[Flights]:
     """Fly the world: one :class:`Flights` of the free flights, one of the throws."""
     rng = np.random.default_rng(recipe.seed + 1)
-    known, out, first = hide({}), [], 0
+    known = hide({})
+    out = []
+    first = 0
     for lanes, seconds in zip(lanes_of(recipe, rng), (recipe.free_seconds, 2.6)):
         if lanes:
             pilot = Tracker(lanes, known.mass, known.ball_mass + known.rope_mass, rng)
@@ -251,7 +256,8 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
         for seed in (recipe.seed + 3, [recipe.seed, 4], [recipe.seed, 5])
     )
     w = world_of(recipe)
-    tilt, turn = small_turn(w.frame_tilt), small_turn(w.marker_turn)
+    tilt = small_turn(w.frame_tilt)
+    turn = small_turn(w.marker_turn)
     out = []
     for f in flights:
         for e in range(len(f.pos)):
@@ -279,9 +285,13 @@ def recorded(recipe: Recipe, flights: list[Flights]) -> list[dict]:
                 fresh = np.maximum.accumulate(
                     np.where(rng.random(len(t)) < HELD, 0, np.arange(len(t)))
                 )
-                pos, quat, ball = pos[fresh], quat[fresh], ball[fresh]
+                pos = pos[fresh]
+                quat = quat[fresh]
+                ball = ball[fresh]
             lost = rng.random(len(t)) < recipe.dropouts
-            pos[lost], quat[lost], ball[lost] = np.nan, np.nan, np.nan
+            pos[lost] = np.nan
+            quat[lost] = np.nan
+            ball[lost] = np.nan
             release = f.release_at[e] if np.isfinite(f.release_at[e]) else None
             out.append(
                 {

@@ -14,7 +14,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--live", action="store_true", help="serve the run while it goes on, on 127.0.0.1 alone")
     out = "of the recording: .rrd (rerun) or .mcap (Foxglove); default: run.rrd in the folder"
     add("--out", metavar="FILE", help=out)
-    web, data = "of the live view (default: 9090)", "of its data (default: 9876)"
+    web = "of the live view (default: 9090)"
+    data = "of its data (default: 9876)"
     add("--web-port", metavar="N", type=PORT, default=9090, help=web)
     add("--data-port", metavar="N", type=PORT, default=9876, help=data)
 

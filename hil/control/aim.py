@@ -41,7 +41,9 @@ class ReleaseCheck:
             height: of the payload's centre as it lands [m].
             rope: of the policy's contract, with mass and drag of the payload.
         """
-        self._params, self._delay, self._height = params, delay, height
+        self._params = params
+        self._delay = delay
+        self._height = height
         self._drag = rope.get("payload_drag", 0.0) / rope["payload_mass"]
         self.refused = 0
         self._first: float | None = None  # refusal of this throw [s]
@@ -62,7 +64,8 @@ class ReleaseCheck:
                 share = min(max((pos[2] - self._height) / (pos[2] - after[2]), 0.0), 1.0)
                 return pos[0] + share * (after[0] - pos[0]), pos[1] + share * (after[1] - pos[1])
             vel = tuple(v + TIME_STEP * a for v, a in zip(vel, self._acceleration(middle)))
-            pos, time = after, time + TIME_STEP
+            pos = after
+            time = time + TIME_STEP
         return pos[0], pos[1]
 
     def _acceleration(self, vel: Vector) -> Vector:

@@ -56,7 +56,8 @@ class CalibrationSolver:
         """Return a new result, or why there is none, once; None while there is nothing new."""
         if self._result is None or not self._result.done():
             return None
-        result, self._result = self._result, None
+        result = self._result
+        self._result = None
         error = result.exception()
         return result.result() if error is None else f"{type(error).__name__}: {error}"
 
@@ -121,20 +122,24 @@ class Calibrating:
     def stop(self) -> None:
         """Start again with the next calm hover: the vehicle was not ours."""
         if self.calibration is None and not self._solving:
-            self._begin, self._rows = None, []
+            self._begin = None
+            self._rows = []
 
     def _finish(self, goal_w: Vector) -> None:
         rows = self._rows
-        self._begin, self._rows = None, []
+        self._begin = None
+        self._rows = []
         if len(rows) < 3:
             self._problem = "no picture arrived in the hover"
             return
         *columns, ages = (np.array(column) for column in zip(*rows))
-        self._due, self._solving = Hovered(*columns, np.array(goal_w), ages), True
+        self._due = Hovered(*columns, np.array(goal_w), ages)
+        self._solving = True
 
     def due(self) -> Hovered | None:
         """Return a hover to estimate from, once."""
-        due, self._due = self._due, None
+        due = self._due
+        self._due = None
         return due
 
     def take(self, result: Calibration | str) -> None:
@@ -147,7 +152,8 @@ class Calibrating:
 
     def problems(self) -> list[str]:
         """Return why a throw has to wait, or is refused."""
-        p, estimate = self.params, self.calibration
+        p = self.params
+        estimate = self.calibration
         if estimate is None:
             repeated = f" again: {self._problem}" if self._problem else ""
             return [f"calibrating in the hover{repeated}"]

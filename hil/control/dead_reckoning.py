@@ -33,12 +33,15 @@ class DeadReckoning:
         """Take a tick: body rates that the autopilot last reported [rad/s], the last command, and
         the mass that flies [kg].
         """
-        time, vehicle = estimate.time, estimate.vehicle
-        reported, self._reported = self._reported, rates
+        time = estimate.time
+        vehicle = estimate.vehicle
+        reported = self._reported
+        self._reported = rates
         if vehicle is None or vehicle.quat is None:
             self.state = None
         elif self.state is None or time - vehicle.age > self._arrival + ROUNDING:
-            self.state, self.duration = vehicle, 0.0
+            self.state = vehicle
+            self.duration = 0.0
             self._arrival, self._time = time - vehicle.age, time - estimate.shown_age
         else:
             step = time - self._time

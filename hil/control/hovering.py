@@ -18,7 +18,9 @@ class Hovering:
 
     def __init__(self, place_w: Vector, heading: float, max_thrust: float, period: float) -> None:
         """Start at a place [m] and heading [rad]; the period is between two commands [s]."""
-        self.place_w, self._heading, self._period = place_w, heading, period
+        self.place_w = place_w
+        self._heading = heading
+        self._period = period
         self._controller = HoverController(HoverParams(max_thrust=max_thrust), period)
         self._shares: deque[float] = deque(maxlen=HOVER_TICKS)  # thrust over weight
 

@@ -17,12 +17,15 @@ STUCK_AFTER = 0.6
 ROUNDING = 1e-9  # tolerance of differences of times [s]
 GRAVITY_UP = np.array([0.0, 0.0, GRAVITY])
 
-FALL_START, FEWEST_FALL_POSES, FALL_TIME = 0.02, 5, 0.12
+FALL_START = 0.02
+FEWEST_FALL_POSES = 5
+FALL_TIME = 0.12
 """Free fall by which a separation is detected: from this long after the expected one [s], with so
 many poses at least, and for this long [s], in which drag takes a few millimetres.
 """
 
-BEND, BEND_TIME = 5e-3, 0.1
+BEND = 5e-3
+BEND_TIME = 0.1
 """Distance from the free fall, extended backwards, at which the rope still pulls [m], above the
 noise; poses up to this long before the expected separation are used [s].
 """
@@ -36,7 +39,8 @@ The vision policy lets go at 2 to 6 m/s2; there the line ended up to 96 ms late.
 # last poses that a landing is extrapolated from: over 0.1 s free fall needs no drag
 LANDING_POSES = 8
 
-POSE_TIMEOUT, MOST_EXTRAPOLATION = 0.1, 0.15
+POSE_TIMEOUT = 0.1
+MOST_EXTRAPOLATION = 0.15
 """A ball whose poses ended this long ago [s], and no longer than that before the ground [s], has
 landed where its fall leads: a gate that has missed those poses takes the impact for a jump.
 """
@@ -67,8 +71,11 @@ class PayloadFlight:
         """Begin at the latch [s] of a throw; the payload separates a lag later [s], and its centre
         lands at a height [m].
         """
-        self.goal_w, self.start, self.latch = goal_w, start, latch
-        self.height, self.lag = height, lag
+        self.goal_w = goal_w
+        self.start = start
+        self.latch = latch
+        self.height = height
+        self.lag = lag
         self._times: list[float] = []
         self._points: list[Vector] = []
 
@@ -102,7 +109,8 @@ class PayloadFlight:
         return landing if landed else None
 
     def _landing(self) -> Landing:
-        times, points = np.array(self._times), np.array(self._points)
+        times = np.array(self._times)
+        points = np.array(self._points)
         last = times[-1]
         pos, vel = _parabola(times[-LANDING_POSES:] - last, points[-LANDING_POSES:])
         fall = fall_time(pos[2] - self.height, vel[2])
@@ -197,7 +205,9 @@ class Latch:
                 f" was trained with {lag:g} s; train one for the slower mechanism"
             )
         self.lag, self._wait = lag, max(0.0, lag + command_delay - mechanism_lag)
-        self._hang, self._tolerance, self._height = hang, tolerance, height
+        self._hang = hang
+        self._tolerance = tolerance
+        self._height = height
         self.at: float | None = None
         self.command_time = -math.inf
         self.count = self.stuck = 0
@@ -239,7 +249,8 @@ class Latch:
             return False
         hangs = abs(excess) < self._tolerance
         if hangs and self._flight is not None:
-            self.stuck, self._flight = self.stuck + 1, None
+            self.stuck = self.stuck + 1
+            self._flight = None
         return hangs
 
     def follow(self, time: float, payload_w: Vector) -> None:

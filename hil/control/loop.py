@@ -20,7 +20,8 @@ from hil.links.team_link import TeamLink
 from hil.poses.sources.images import Eyes
 from hil.poses.sources.pose_source import Source
 
-LEAD, LEAD_SPREAD = 1e-3, 5e-3
+LEAD = 1e-3
+LEAD_SPREAD = 5e-3
 """Before a tick the poses that have come are taken in [s], so that the tick finds the last one or
 two alone; earlier by a share of the second number that goes round from tick to tick, so that the
 link is looked at, and peers are asked for their time, at any point of their periods.
@@ -48,7 +49,8 @@ class LandAfterCalibration:
     """An operator who lands once the camera is calibrated, and never arms."""
 
     def __init__(self, operator: Operator, calibrating: Calibrating) -> None:
-        self._operator, self._calibrating = operator, calibrating
+        self._operator = operator
+        self._calibrating = calibrating
 
     def words(self, state: str) -> OperatorInput:
         words = self._operator.words(state)
@@ -94,7 +96,9 @@ class Loop:
         A vehicle that is ours is never left without a word: where the time is over in flight, or
         something raises, the run is aborted and goes on until it has ended. A second Ctrl-C ends it
         at once, after one more request to land."""
-        runner, clock, begin = self.runner, self.clock, self.clock.now()
+        runner = self.runner
+        clock = self.clock
+        begin = self.clock.now()
         with collected():
             while runner.machine.state is not State.DONE and not self.source.ended:
                 finished = clock.now() - begin >= limit
@@ -114,13 +118,11 @@ class Loop:
 
     def turn(self, finished: bool) -> None:
         """Do one tick; ``finished``: the run's time is over, and what flies is to come down."""
-        runner, source, clock, ticker, backend = (
-            self.runner,
-            self.source,
-            self.clock,
-            self.ticker,
-            self.runner.backend,
-        )
+        runner = self.runner
+        source = self.source
+        clock = self.clock
+        ticker = self.ticker
+        backend = self.runner.backend
         source.hold(runner.in_flight)
         _wait(
             clock,
@@ -131,12 +133,15 @@ class Loop:
         early = source.poll(clock.now())
         runner.take_poses(early)
         _wait(clock, ticker.due(), backend, source)
-        due, missed = ticker.due(), ticker.missed
-        time, start = ticker.take(), perf_counter()
+        due = ticker.due()
+        missed = ticker.missed
+        time = ticker.take()
+        start = perf_counter()
         self.ours += (ticker.missed - missed) * (self._ended > due)
         late = source.poll(time)
         polled = perf_counter()
-        status, words = backend.status(time), self.operator.words(runner.machine.state.value)
+        status = backend.status(time)
+        words = self.operator.words(runner.machine.state.value)
         if finished:
             words = replace(words, abort=True, why=words.why or "the time of the run is over")
         recording = self.recorder is None or self.recorder.failed is None
@@ -183,10 +188,12 @@ class Loop:
         """Say a change of state and a new reason to wait at once, and one that differs in its
         numbers alone every few seconds.
         """
-        waits, time = decision.waits, decision.time
+        waits = decision.waits
+        time = decision.time
         kind = NUMBER.sub("", waits)
         if decision.state != self._state:
-            self._state, self._announced = decision.state, {}
+            self._state = decision.state
+            self._announced = {}
         elif decision.calibration is not None:
             pass
         elif (
@@ -195,7 +202,8 @@ class Loop:
             or time - self._announced.get(kind, -math.inf) < SAY_AGAIN
         ):
             return
-        self._announced[kind], self._waits = time, waits
+        self._announced[kind] = time
+        self._waits = waits
         if self.tell is not None:
             self.tell(decision)
 
@@ -203,7 +211,9 @@ class Loop:
         """Return the runner's summary with ticks, misses (all, and ours: of a tick that took too
         long), and each stage's times.
         """
-        runner, backend, ticker = self.runner, self.runner.backend, self.ticker
+        runner = self.runner
+        backend = self.runner.backend
+        ticker = self.ticker
         record = getattr(backend, "release_record", None)  # a dry run has none
         for delay in record.answers if record is not None else ():
             self.stages.add({"ack": delay})

@@ -19,7 +19,8 @@ from visthrow.config.bounds import Bound, Bounded
 SWITCH = (
     5e-4  # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
 )
-LOCK_CURRENT, LOCK_FUTURE = 1, 2  # Flags of mlockall(2)
+LOCK_CURRENT = 1
+LOCK_FUTURE = 2  # Flags of mlockall(2)
 
 
 @dataclass(frozen=True)

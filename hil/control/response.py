@@ -32,9 +32,12 @@ RATE_NOISE = (
 GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
 HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
 FEWEST_RATES = 4  # reported changes that a sign is taken from
-FALL, FALL_DEAD = 0.4, 2  # time over which the thrust is judged [s], its dead time in ticks
-ANGLE_NOISE, HEIGHT_NOISE = 0.006, 0.002  # of an attitude, a height between poses [rad], [m]
-CERTAIN, CERTAIN_SIGN = 4.0, 5.0  # deviations of the noise beyond which something is known
+FALL = 0.4
+FALL_DEAD = 2  # time over which the thrust is judged [s], its dead time in ticks
+ANGLE_NOISE = 0.006
+HEIGHT_NOISE = 0.002  # of an attitude, a height between poses [rad], [m]
+CERTAIN = 4.0
+CERTAIN_SIGN = 5.0  # deviations of the noise beyond which something is known
 FEWEST_HEIGHTS = 5  # heights that a vertical acceleration is taken from
 
 
@@ -55,8 +58,10 @@ class Response:
             tolerance: of the thrust, relative. probe: rate of the doublets [rad/s]; 0: none, and
                 signs are judged by what the hover happens to command.
         """
-        self._period, self._probe = period, probe
-        self._mass, self._allowed = mass, tolerance * GRAVITY
+        self._period = period
+        self._probe = probe
+        self._mass = mass
+        self._allowed = tolerance * GRAVITY
         self.problem: str | None = None
         self._ticks = 0
         strokes = [round(stroke / period) for stroke in STROKES]
@@ -151,7 +156,8 @@ class Response:
         """Judge by reported rates: by how each goes on from the last one, so that what the vehicle
         did before it was ours does not count.
         """
-        last, self._reported = self._reported, None if rates is None else np.array(rates)
+        last = self._reported
+        self._reported = None if rates is None else np.array(rates)
         if last is None or self._reported is None or (last == self._reported).all():
             return
         change = self._reported - last + self._shares * last

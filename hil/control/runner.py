@@ -43,10 +43,16 @@ class Runner:
         with, or the policy is incomplete; RunError: the mechanism is slower than the policy was
         trained for."""
         self.parts = parts = build_parts(params, policy, backend, mechanism_lag)
-        self.params, self.backend, self.pilot = params, backend, parts.pilot
-        self.machine, self.tracks, self.latch = parts.machine, parts.tracks, parts.latch
-        self.calibrating, self.mass = parts.calibrating, parts.mass
-        self.estimator, self.decider = StateEstimator(parts), Decider(parts)
+        self.params = params
+        self.backend = backend
+        self.pilot = parts.pilot
+        self.machine = parts.machine
+        self.tracks = parts.tracks
+        self.latch = parts.latch
+        self.calibrating = parts.calibrating
+        self.mass = parts.mass
+        self.estimator = StateEstimator(parts)
+        self.decider = Decider(parts)
         self.commander = Commander(parts)
         self.errors: list[str] = []
         self._early_error: Exception | None = None
@@ -98,7 +104,8 @@ class Runner:
 
     def _raise_early_error(self) -> None:
         if self._early_error is not None:
-            error, self._early_error = self._early_error, None
+            error = self._early_error
+            self._early_error = None
             raise error
 
     def fail(self, time: float, error: BaseException) -> TickRecord:
@@ -124,7 +131,9 @@ class Runner:
 
     def summary(self) -> dict[str, Any]:
         """Return counts of the run so far."""
-        machine, latch, guard = self.machine, self.latch, self.commander.guard
+        machine = self.machine
+        latch = self.latch
+        guard = self.commander.guard
         calibration = None if self.calibrating is None else self.calibrating.calibration
         bodies = {
             body: {

@@ -73,7 +73,8 @@ class FenceParams(Bounded):
     def __post_init__(self) -> None:
         super().__post_init__()
         for body in ("vehicle", "payload"):
-            lower, upper = getattr(self, f"{body}_low"), getattr(self, f"{body}_high")
+            lower = getattr(self, f"{body}_low")
+            upper = getattr(self, f"{body}_high")
             if any(low >= high for low, high in zip(lower, upper)):
                 raise ConfigError(
                     f"{body}_low is {lower} m, {body}_high {upper} m; expected ascending corners"

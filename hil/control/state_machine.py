@@ -130,9 +130,12 @@ class Machine:
             sends: whether commands go to a vehicle. Without, no fence applies before a throw is
                 armed: others fly.
         """
-        self.params, self.max_throws = params, throws
-        self.patient, self.sends = patient, sends
-        self.state, self.reason = State.IDLE, "start"
+        self.params = params
+        self.max_throws = throws
+        self.patient = patient
+        self.sends = sends
+        self.state = State.IDLE
+        self.reason = "start"
         self.since: float | None = None
         self.throws = self.cancelled = 0
         self.flown = self.aborted = False
@@ -181,8 +184,11 @@ class Machine:
     def _go(self, time: float, state: State, reason: str) -> None:
         if self.state is State.THROW and state is not State.THROW and reason != "separated":
             self.cancelled += 1
-        self.state, self.reason, self.since = state, reason, time
-        self._lasting_since, self.ready_to_throw = None, False
+        self.state = state
+        self.reason = reason
+        self.since = time
+        self._lasting_since = None
+        self.ready_to_throw = False
         self.throws += state is State.THROW
         self.flown |= state in FLYING
         self.aborted |= state is State.ABORT

@@ -95,7 +95,8 @@ class Ticker:
 
     def take(self) -> float:
         """Begin the tick that is due; returns the time now [s]."""
-        due, time = self.due(), self.clock.now()
+        due = self.due()
+        time = self.clock.now()
         lag = max(0.0, time - due)
         skipped = int(lag / self.period)
         self.late = lag - skipped * self.period

@@ -18,7 +18,9 @@ from visthrow.common.extras import load_extra
 FACTS = values("crazyflie")
 MOST = FACTS["packet_data"] + 1  # bytes of a packet
 
-MANUAL, POSITION, POSE = struct.Struct("<B3fHB"), struct.Struct("<B4f"), struct.Struct("<B7f")
+MANUAL = struct.Struct("<B3fHB")
+POSITION = struct.Struct("<B4f")
+POSE = struct.Struct("<B7f")
 
 CFLIB = ("radio://", "usb://", "serial://")
 
@@ -97,7 +99,9 @@ def ask_protocol() -> bytes:
 class CflibPort:
     """A radio or USB link of cflib; a `hil.links.device.Port`."""
 
-    whole, sender, peer = True, None, None
+    whole = True
+    sender = None
+    peer = None
 
     def __init__(self, address: str) -> None:
         """Open it; raises `LinkError` where cflib is missing, or the link cannot be opened."""

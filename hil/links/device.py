@@ -57,7 +57,8 @@ def check_device(text: str, *, remote: bool = False) -> Device:
         )
     host = "127.0.0.1" if match[2] == "localhost" else match[2].strip("[]")
     try:
-        address, port = ipaddress.ip_address(host), int(match[3])
+        address = ipaddress.ip_address(host)
+        port = int(match[3])
     except ValueError as error:
         raise LinkError(
             f"device {text!r}: {error}; expected a numeric address such as 127.0.0.1"
@@ -192,7 +193,9 @@ class UdpPort(_Opened):
 class _Stream(_Opened):
     """A stream of bytes to and from one peer."""
 
-    whole, sender, peer = False, None, None
+    whole = False
+    sender = None
+    peer = None
     _get: Callable[[], bytes]
     _put: Callable[[bytes], int | None]
 
@@ -222,7 +225,8 @@ class TcpPort(_Stream):
             ) from error
         self._open.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._open.setblocking(False)
-        self._get, self._put = lambda: self._open.recv(LARGEST_DATAGRAM), self._open.send
+        self._get = lambda: self._open.recv(LARGEST_DATAGRAM)
+        self._put = self._open.send
 
 
 class SerialPort(_Stream):
@@ -247,7 +251,8 @@ class SerialPort(_Stream):
                 f"cannot open {device.host}: {os.strerror(number) if number else error}; plugged in"
                 f" here: {ports or 'no serial port'}"
             ) from error
-        self._get, self._put = lambda: self._open.read(self._open.in_waiting or 1), self._open.write
+        self._get = lambda: self._open.read(self._open.in_waiting or 1)
+        self._put = self._open.write
 
 
 def open_port(device: Device, other: str = "") -> Port:

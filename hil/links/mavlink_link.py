@@ -26,7 +26,8 @@ NAN_QUATERNION = (math.nan,) * 4
 # type_mask of SET_ATTITUDE_TARGET: rates and thrust, no attitude. Other bits beside it are silently
 # not followed
 IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
-OUR_SYSTEM, OUR_COMPONENT = 245, mav.MAV_COMP_ID_ONBOARD_COMPUTER
+OUR_SYSTEM = 245
+OUR_COMPONENT = mav.MAV_COMP_ID_ONBOARD_COMPUTER
 # where system and component stand in a message's bytes
 IDS = {mav.PROTOCOL_MARKER_V1: slice(3, 5), mav.PROTOCOL_MARKER_V2: slice(5, 7)}
 MOST_PENDING = 50  # questions for a time whose answer may still come
@@ -61,9 +62,12 @@ class Link:
                 anybody.
             key: that messages are signed with, and have to be; None: neither.
         """
-        self.port, self.roster, self._tlog = port, roster or Roster(), tlog
+        self.port = port
+        self.roster = roster or Roster()
+        self._tlog = tlog
         self.roster.only = port.peer
-        self._key, streams = key, {}
+        self._key = key
+        streams = {}
         self.parser = Parser() if key is None else Parser(lambda: Signed(key, streams=streams))
         self._mav = self.packer(system, component)
         self._listeners: list[Callable[[Any, float], None]] = []
@@ -88,7 +92,9 @@ class Link:
         """Hand all that has arrived to the listeners; returns the number of chunks that were read,
         refused ones as well.
         """
-        count, looked, shut = 0, 0, 0
+        count = 0
+        looked = 0
+        shut = 0
         while (
             looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None
         ):
@@ -105,7 +111,8 @@ class Link:
 
     def _take(self, data: bytes, arrival: float) -> int:
         """Hand on the messages in a chunk that are of our parties; returns their number."""
-        count, errors = 0, self.parser.errors
+        count = 0
+        errors = self.parser.errors
         messages = self.parser.parse(data, self.port.whole)
         if self.parser.errors > errors and not self.parser.forged:
             self.roster.drop(self.sender, "bytes", "no MAVLink message")
@@ -217,7 +224,8 @@ question that comes at the same point of its period always with the same delay, 
 round trip would betray.
 """
 
-EARLY, LATE = 0.005, 0.2
+EARLY = 0.005
+LATE = 0.2
 """A pose that seems to arrive earlier than it was measured by more than this, or later by more,
 bears another clock [s].
 """
@@ -231,7 +239,9 @@ class LinkSync:
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self._asked, self._pause, self._random = -1e9, 0.0, random.Random(0)
+        self._asked = -1e9
+        self._pause = 0.0
+        self._random = random.Random(0)
         self.peers: dict[tuple[int, Address], TimeSync] = {}
         self._pending: list[int] = []
         self.foreign = 0

@@ -35,7 +35,9 @@ SET_RAW_RC = FACTS["MSP_SET_RAW_RC"]
 SET_RC_TUNING = FACTS["MSP_SET_RC_TUNING"]
 EEPROM_WRITE = FACTS["MSP_EEPROM_WRITE"]
 
-TO_CONTROLLER, ANSWER, REFUSAL = b"<", b">", b"!"
+TO_CONTROLLER = b"<"
+ANSWER = b">"
+REFUSAL = b"!"
 MOST_PAYLOAD = FACTS["jumbo"] - 1  # answers that are used here have some forty bytes
 START = FACTS["frame_start"]  # of what the checksum goes over
 HEAD = START + 2  # bytes before the payload
@@ -90,7 +92,8 @@ class FrameParser:
 
     def parse(self, data: bytes) -> list[Frame]:
         """Return frames that are complete by now."""
-        buffer, frames = self._buffer, []
+        buffer = self._buffer
+        frames = []
         buffer += data
         while (start := buffer.find(b"$")) >= 0:
             del buffer[:start]

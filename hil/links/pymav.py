@@ -38,7 +38,8 @@ class Parser:
 
     def __init__(self, make: Callable[[], mav.MAVLink] = lambda: mav.MAVLink(None)) -> None:
         """Take what makes pymavlink's parser, which may ask for signatures."""
-        self.errors, self._make = 0, make
+        self.errors = 0
+        self._make = make
         self.forged: list[bytes] = []
         self._fresh()
 
@@ -68,11 +69,9 @@ class Parser:
             ]
         if whole and self._mav.buf_len():
             self.errors += 1
-            self._mav.buf, self._mav.buf_index, self._mav.expected_length = (
-                bytearray(),
-                0,
-                mav.HEADER_LEN_V1 + 2,
-            )
+            self._mav.buf = bytearray()
+            self._mav.buf_index = 0
+            self._mav.expected_length = mav.HEADER_LEN_V1 + 2
         return messages
 
 
@@ -93,7 +92,8 @@ def read_key(path: str | Path) -> bytes:
     """
     path = Path(path)
     try:
-        data, mode = path.read_bytes(), path.stat().st_mode
+        data = path.read_bytes()
+        mode = path.stat().st_mode
     except OSError as error:
         raise LinkError(
             f"key {path}: {error.strerror}; expected a file with a key for --sign"
@@ -132,7 +132,8 @@ class Signed(mav.MAVLink):
         another parser of the same link.
         """
         super().__init__(None, system, component)
-        self.signing.secret_key, self.signing.sign_outgoing = key, True
+        self.signing.secret_key = key
+        self.signing.sign_outgoing = True
         self.signing.stream_timestamps = {} if streams is None else streams
         self.touch()
 
@@ -150,7 +151,8 @@ class Signed(mav.MAVLink):
         good = hashlib.sha256(self.signing.secret_key + signed).digest()[: len(signature)]
         if not hmac.compare_digest(good, signature):
             return False
-        stream, last = (link, srcSystem, srcComponent), self.signing.stream_timestamps
+        stream = (link, srcSystem, srcComponent)
+        last = self.signing.stream_timestamps
         stamp = int.from_bytes(units, "little")
         if stamp <= last.get(stream, stamp_now() - BEHIND) or (
             stream not in last and len(last) >= MOST_STREAMS

@@ -134,7 +134,9 @@ class Roster:
         """Wait for all parties; without one, the first valid message of anybody says who is heard
         and answered. ``allow``: addresses that may send at all; none: any.
         """
-        self.parties, self._allow, self.tell = tuple(parties), check_allowed(allow), tell
+        self.parties = tuple(parties)
+        self._allow = check_allowed(allow)
+        self.tell = tell
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
         self.flying = self.simulated = False
@@ -182,11 +184,9 @@ class Roster:
         """Return whether a message is one of a party's; binds the party to its sender's address at
         a time [s].
         """
-        kind, system, component = (
-            message.get_type(),
-            message.get_srcSystem(),
-            message.get_srcComponent(),
-        )
+        kind = message.get_type()
+        system = message.get_srcSystem()
+        component = message.get_srcComponent()
         party = self._party(kind, system, component, address)
         if party is None and any(
             p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties
@@ -273,7 +273,8 @@ class Roster:
         if why is not None:
             self.refuse(Seen(address, None, None, name, why))
             return False
-        self.at[name], self.heard[name] = address, host_time
+        self.at[name] = address
+        self.heard[name] = host_time
         return True
 
     def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:

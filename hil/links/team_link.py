@@ -97,7 +97,8 @@ class TeamLink:
         Raises LinkError: an address is none, is taken, or leaves this machine without ``remote``.
         """
         devices = [check_device(f"udp:{text}", remote=remote) for text in params.members]
-        self.offset, self._period = offset, period
+        self.offset = offset
+        self._period = period
         self._agreement = Agreement(params.member, len(devices), params.delay)
         self._port = open_port(devices.pop(params.member))
         numbers = [k for k in range(len(params.members)) if k != params.member]

@@ -12,11 +12,9 @@ from typing import Any
 from hil.links.device import Port
 from visthrow.common.errors import StorageError
 
-TLOG, POSES_TLOG, MSP_LOG = (
-    "link.tlog",
-    "poses.tlog",
-    "link.msp",
-)  # in a run's folder: of the link, of poses on a port of their own, of MSP
+TLOG = "link.tlog"
+POSES_TLOG = "poses.tlog"
+MSP_LOG = "link.msp"  # in a run's folder: of the link, of poses on a port of their own, of MSP
 # chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
 MOST_WAITING = 100_000
 
@@ -49,7 +47,9 @@ class Writer:
                 f"cannot write {path}: {error.strerror}; expected a folder that can be written"
                 " (--out)"
             ) from error
-        self._name, self.failed, self.why = Path(path).name, 0, None
+        self._name = Path(path).name
+        self.failed = 0
+        self.why = None
         self._waiting: deque[bytes] = deque()
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._write, name=self._name, daemon=True)

@@ -51,7 +51,9 @@ class Track:
         """
         self._turns = turns
         self.stream = Stream(gate, estimate)
-        self.frames, self.gate, self.filter = Frames(frames), Gate(gate), SlopeFilter(estimate)
+        self.frames = Frames(frames)
+        self.gate = Gate(gate)
+        self.filter = SlopeFilter(estimate)
         self.accepted = 0
         self._pose: Pose | None = None
         self._vel: Vector = (0.0, 0.0, 0.0)
@@ -82,7 +84,8 @@ class Track:
         if not self._turns and raw.quat is not None and not has_attitude(raw.quat):
             raw = replace(raw, quat=None)
         pose = self.frames.pose_from_source(raw)
-        before, stepped = self.gate.last, self.gate.stepped(pose)
+        before = self.gate.last
+        stepped = self.gate.stepped(pose)
         reason = self.gate.check(pose, self._vel if self._pose is not None else None, tether)
         if reason is not None:
             return reason
@@ -142,7 +145,10 @@ class Track:
         pose = self._pose
         if pose is None:
             return None
-        pos, quat, vel, age = pose.pos, pose.quat, self._vel, self.gate.age(time)
+        pos = pose.pos
+        quat = pose.quat
+        vel = self._vel
+        age = self.gate.age(time)
         rate = self.filter.rate if self._turns else (0.0, 0.0, 0.0)
         lead = min(max(lead, 0.0), MOST_PREDICTION)
         if lead > 0.0:

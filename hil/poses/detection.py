@@ -71,7 +71,8 @@ class Detections:
         """Start with nothing seen by the camera of training; ``hold``: for which a frame counts
         [s].
         """
-        self._camera, self._hold = camera, hold
+        self._camera = camera
+        self._hold = hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
         self._times = {
@@ -80,7 +81,8 @@ class Detections:
         }  # of the last frame, where it holds the thing
         self._newest = -np.inf
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
-        self._scale, self._latency = 0.0, 0.0
+        self._scale = 0.0
+        self._latency = 0.0
         self._path: deque[tuple[float, np.ndarray, np.ndarray]] = deque(maxlen=PATH)
         self.fresh: tuple[float, np.ndarray, np.ndarray] | None = None
 
@@ -88,11 +90,9 @@ class Detections:
         """Turn rays and carry them forward from now on by what a calibration found."""
         rot_cb = self._camera.rot_cb.double()
         turn = rotation_from_vector(torch.tensor(calibration.turn_b, dtype=torch.float64))
-        self._turn, self._scale, self._latency = (
-            (rot_cb @ turn @ rot_cb.T).numpy(),
-            calibration.scale,
-            max(calibration.latency, 0.0),
-        )
+        self._turn = (rot_cb @ turn @ rot_cb.T).numpy()
+        self._scale = calibration.scale
+        self._latency = max(calibration.latency, 0.0)
 
     def note_vehicle(self, time: float, pos: Vector, quat: Quaternion) -> None:
         """Note where the vehicle is at a tick, as of the poses, for frames that are older than
@@ -116,7 +116,8 @@ class Detections:
         for name, part in PARTS.items():
             self._times[name] = -np.inf if getattr(frame, name) is None else detection.stamp
             if getattr(frame, name) is not None:
-                self._points[part], self._valid[part] = points[part], valid[part]
+                self._points[part] = points[part]
+                self._valid[part] = valid[part]
 
     def problems(self, time: float) -> list[str]:
         """Return what speaks against a throw at a time [s]: a ball that hangs and a goal that lies
@@ -134,17 +135,19 @@ class Detections:
         """
         _, pos_now, quat_now = self._path[-1]
         pos, quat = self._pose(when)
-        rot_now, rot = matrix_of_quat(quat_now), matrix_of_quat(quat)
-        rot_bc, lens = (
-            self._camera.rot_cb.double().numpy().T,
-            self._camera.position_b.double().numpy(),
-        )
-        turn, ball, goal = self._turn, detections.ball, detections.goal
+        rot_now = matrix_of_quat(quat_now)
+        rot = matrix_of_quat(quat)
+        rot_bc = self._camera.rot_cb.double().numpy().T
+        lens = self._camera.position_b.double().numpy()
+        turn = self._turn
+        ball = detections.ball
+        goal = detections.goal
         if ball is not None:
             ray = rot_bc.T @ rot_now.T @ rot @ rot_bc @ turn @ self._to_scale(ball.ray_c[None])[0]
             ball = BallSeen(ray, ball.half_angle / (1.0 + self._scale), ball.score)
         if goal is not None:
-            eye, rays_w = pos + rot @ lens, self._to_scale(goal.rays_c) @ (rot @ rot_bc @ turn).T
+            eye = pos + rot @ lens
+            rays_w = self._to_scale(goal.rays_c) @ (rot @ rot_bc @ turn).T
             reach = eye[2] / np.maximum(-rays_w[:, 2:], 0.05)
             from_now = eye + reach * rays_w - (pos_now + rot_now @ lens)
             rays = from_now @ (rot_now @ rot_bc)
@@ -166,7 +169,8 @@ class Detections:
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:
             return path[after][1:]
-        (begin, pos, quat), (end, pos_after, quat_after) = path[after - 1], path[after]
+        (begin, pos, quat) = path[after - 1]
+        (end, pos_after, quat_after) = path[after]
         share = (when - begin) / (end - begin)
         nearest = quat_after if quat @ quat_after > 0.0 else -quat_after
         return pos + share * (pos_after - pos), quat + share * (nearest - quat)
@@ -175,7 +179,8 @@ class Detections:
         """Return keypoints at a time [s]: normalised, float32, shape (1, 8, 2), and validity, shape
         (1, 8).
         """
-        points, valid = self._points.clone(), self._valid.clone()
+        points = self._points.clone()
+        valid = self._valid.clone()
         for name, part in PARTS.items():
             if time - self._times[name] > self._hold:
                 radius = points[part].norm(dim=-1, keepdim=True)

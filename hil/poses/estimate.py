@@ -38,10 +38,15 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
 
     With too few samples for the order the order is lowered; with one sample the slope is 0. The
     second one of a line is 0."""
-    order, none = min(order, len(ages) - 1), [0.0] * len(ages)
+    order = min(order, len(ages) - 1)
+    none = [0.0] * len(ages)
     if order < 1:
         return none, none
-    n, s1, s2, s3, s4 = float(len(ages)), 0.0, 0.0, 0.0, 0.0
+    n = float(len(ages))
+    s1 = 0.0
+    s2 = 0.0
+    s3 = 0.0
+    s4 = 0.0
     for age in ages:
         square = age * age
         s1 -= age
@@ -53,11 +58,16 @@ def fit_weights(ages: list[float], order: int) -> tuple[list[float], list[float]
         return ([(-n * age - s1) / det for age in ages] if det > 0.0 else none), none
     # The middle and the last row of the inverse of the normal matrix [[n, s1, s2], [s1, s2, s3],
     # [s2, s3, s4]].
-    r0, r1, r2 = s2 * s3 - s1 * s4, n * s4 - s2 * s2, s1 * s2 - n * s3
+    r0 = s2 * s3 - s1 * s4
+    r1 = n * s4 - s2 * s2
+    r2 = s1 * s2 - n * s3
     det = r0 * s1 + r1 * s2 + r2 * s3
     if not det > 0.0:
         return none, none
-    l0, l2, scale, double = s1 * s3 - s2 * s2, n * s2 - s1 * s1, 1.0 / det, 2.0 / det
+    l0 = s1 * s3 - s2 * s2
+    l2 = n * s2 - s1 * s1
+    scale = 1.0 / det
+    double = 2.0 / det
     slope = [(r0 - r1 * age + r2 * age * age) * scale for age in ages]
     return slope, [(l0 - r2 * age + l2 * age * age) * double for age in ages]
 
@@ -87,7 +97,9 @@ class SlopeFilter:
         """Return the velocity, world frame [m/s], at a pose in our frames newer than the last; the
         source's own where it gives one.
         """
-        window, params, stamp = self._window, self.params, pose.stamp
+        window = self._window
+        params = self.params
+        stamp = pose.stamp
         if window and not 0.0 < stamp - window[0].stamp <= MOST_GAP:
             window.clear()
         window.appendleft(pose)
@@ -96,7 +108,9 @@ class SlopeFilter:
         self._ages = [stamp - sample.stamp for sample in window]
         self._weights, self._bends = fit_weights(self._ages, params.order)
         places = [sample.pos for sample in window]
-        self.acceleration, self._rate, self._spin = _sum(self._bends, places), None, (0.0, 0.0, 0.0)
+        self.acceleration = _sum(self._bends, places)
+        self._rate = None
+        self._spin = (0.0, 0.0, 0.0)
         return _sum(self._weights, places) if pose.vel is None else pose.vel
 
     @property

@@ -94,7 +94,8 @@ class Frames:
 
     def source_from_pose(self, pose: Pose) -> Pose:
         """Return the inverse of :meth:`pose_from_source`: what the source would have said."""
-        pos, vel = pose.pos, pose.vel
+        pos = pose.pos
+        vel = pose.vel
         if pose.quat is not None and any(self._offset):
             pos = _plus(pos, rotate_one(pose.quat, self._offset))
             if vel is not None and pose.rate is not None:

@@ -108,7 +108,8 @@ class Gate:
         if reason is not None:
             self.refused[reason] = self.refused.get(reason, 0) + 1
             return reason
-        first, self.last = self.last is None, pose
+        first = self.last is None
+        self.last = pose
         self._came = pose
         rare = not first and pose.arrival - self._changed > self.params.hold
         self._gaps = self._gaps + 1 if rare else 0
@@ -136,7 +137,8 @@ class Gate:
         same = pose.pos == last.pos and pose.quat == last.quat
         if pose.stamp <= last.stamp and not stepped:
             return "repeated" if same and pose.stamp == last.stamp else "old"
-        previous, self._came = self._came or last, pose
+        previous = self._came or last
+        self._came = pose
         if same:
             return "repeated"
         # A clock that was set says nothing of how long ago the last pose was; the arrivals do.

@@ -26,7 +26,8 @@ SPEED, RATE = (
 )  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
 SPAN = 0.2  # over which speed and rate are taken [s]
 REST_TIME = 0.5  # shortest rest [s]
-LEAST_WAY, LEAST_TURN = 0.2, math.radians(15.0)  # of a move [m], [rad]
+LEAST_WAY = 0.2
+LEAST_TURN = math.radians(15.0)  # of a move [m], [rad]
 POLL_INTERVAL = 0.25  # [s]
 TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
 
@@ -115,7 +116,8 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     if len(poses) < 3:
         return []
     times = np.array([p.arrival for p in poses])
-    pos, quat = np.array([p.pos for p in poses]), np.array([p.quat for p in poses])
+    pos = np.array([p.pos for p in poses])
+    quat = np.array([p.quat for p in poses])
     late = np.minimum(np.searchsorted(times, times + SPAN), len(times) - 1)
     early = np.maximum(np.searchsorted(times, times - SPAN, side="right") - 1, 0)
     span = np.maximum(times[late] - times[early], 1e-9)
@@ -211,7 +213,8 @@ def _line(move: CarryMove, step: MeasuredMove, frames: FrameParams) -> Line:
     angle = math.acos(max(-1.0, min(1.0, motion[move.axis] / max(length, 1e-12))))
     passed = angle <= TOLERANCE and length >= (LEAST_TURN if move.turn else LEAST_WAY)
     numbers = ", ".join(f"{axis} {value:+.2f}" for axis, value in zip("xyz", motion))
-    name, deviation = move.text.split(",")[0], math.degrees(angle)
+    name = move.text.split(",")[0]
+    deviation = math.degrees(angle)
     return f"{name}: {numbers} ({size} our axes), {deviation:.0f} deg off", passed
 
 
@@ -240,7 +243,8 @@ def collect(
     """
     poses: list[Pose] = []
     steps: list[MeasuredMove] = []
-    begin, prompted = clock.now(), -1
+    begin = clock.now()
+    prompted = -1
     while (
         not source.ended and len(steps) < len(MOVES) and (recorded or clock.now() - begin < seconds)
     ):
@@ -264,7 +268,8 @@ def summary_text(finding: CarryResult, frames: FrameParams) -> str:
             " or the source is left-handed"
         )
     for name in ("axes", "body_axes", "quaternion", "yaw_offset_deg"):
-        was, fits = getattr(frames, name), getattr(finding.fitting, name)
+        was = getattr(frames, name)
+        fits = getattr(finding.fitting, name)
         if was != fits and not finding.passed:
             lines.append(
                 f"would fit: {name} = {fits!r}".replace("'", '"')

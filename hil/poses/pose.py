@@ -11,7 +11,9 @@ from visthrow.common.rotations import Quaternion as Quaternion
 from visthrow.common.rotations import Vector as Vector
 
 Body = Literal["vehicle", "payload", "goal"]
-VEHICLE, PAYLOAD, GOAL = "vehicle", "payload", "goal"
+VEHICLE = "vehicle"
+PAYLOAD = "payload"
+GOAL = "goal"
 BODIES = (VEHICLE, PAYLOAD, GOAL)
 
 

@@ -23,7 +23,8 @@ MOST_STALE = 0.1  # share of time in which the content may be older than gate.wa
 MOST_DRIFT = 0.1  # by which a second of stamps may differ from one of arrivals
 MOST_CLOSE = 0.2  # share of intervals that may be shorter than a quarter of their mean
 
-LEAST_SCATTER, SCATTER = 0.0015, 0.2
+LEAST_SCATTER = 0.0015
+SCATTER = 0.2
 """Scatter of intervals that is put up with [s], or as a share of their mean: at 3 m/s it moves a
 pose by less than a centimetre.
 """
@@ -59,7 +60,8 @@ class Stream:
 
     def __init__(self, gate: GateParams, estimate: EstimateParams) -> None:
         """Take what the gate and the estimate need."""
-        self._gate, self._estimate = gate, estimate
+        self._gate = gate
+        self._estimate = estimate
         self._rows: deque[tuple[float, float, str | None, bool]] = deque(maxlen=MOST_KEPT)
         self._first: float | None = None
         self._judged: tuple[float, list[str]] = (-math.inf, [])
@@ -82,7 +84,8 @@ class Stream:
         arrivals, stamps = (np.array([row[i] for row in rows]) for i in (0, 1))
         good = np.array([row[2] is None for row in rows], bool)
         stamps[~np.isfinite(stamps)] = math.nan
-        steps, taken = np.diff(stamps), stamps[good]
+        steps = np.diff(stamps)
+        taken = stamps[good]
         waits = np.diff(np.concatenate([[begin], arrivals[good], [time]]))
         late = np.maximum(waits - self._gate.warn, 0.0).sum()
         unknown = good & ~np.array([row[3] for row in rows], bool)
@@ -150,9 +153,12 @@ class Stream:
 
     def _times(self, flow: Flow) -> list[str]:
         """Return what is wrong with rate and regularity."""
-        gate, estimate = self._gate, self._estimate
-        lowest, highest = estimate.order / estimate.window, MOST_SAMPLES / estimate.window
-        rate, out = flow.rate, []
+        gate = self._gate
+        estimate = self._estimate
+        lowest = estimate.order / estimate.window
+        highest = MOST_SAMPLES / estimate.window
+        rate = flow.rate
+        out = []
         if rate < lowest:
             out.append(
                 f"{rate:.1f} good poses a second; expected {lowest:.0f} or more: the estimate's"

@@ -24,7 +24,8 @@ from visthrow.config.bounds import Bounded, NotNegative
 from visthrow.onboard.hover import GRAVITY, HoverController, HoverParams
 
 # MAVLink system and component that poses of vehicle and payload come from
-VEHICLE_ID, PAYLOAD_ID = (1, 1), (1, mav.MAV_COMP_ID_USER1)
+VEHICLE_ID = (1, 1)
+PAYLOAD_ID = (1, mav.MAV_COMP_ID_USER1)
 MAX_RATES = (10.0, 10.0, 4.0)  # largest body rates that the policies were trained with [rad/s]
 
 NEVER = 1e9  # a time after every flight [s]
@@ -33,7 +34,9 @@ ROOM = 1.01  # over a limit: whole microseconds of a stick, float32 on the wire
 MOST_KEPT = 100  # breaches
 ANNOUNCED = 1.0  # between two words that nothing real flies, which `--auto-arm` asks for [s]
 # set-point of a landing below the vehicle, and at least; height that counts as down [m]
-DESCENT, LOWEST, TOUCH = 0.4, 0.05, 0.12
+DESCENT = 0.4
+LOWEST = 0.05
+TOUCH = 0.12
 # of the policy's vehicle: weight [N], its share of 14 N, straight, tolerance, no voltage
 THRUST = HoverThrustParams(2.668, 0.1906, 1.0, 0.1, 0.0)
 GOES_ON = 1.5  # periods after which an event that comes again is a new one
@@ -126,7 +129,8 @@ class SetPoints:
         """Return what acts in the period from a time on [s]: the mean, where it changes within it;
         None before the first one.
         """
-        mean, since = np.zeros(4), begin
+        mean = np.zeros(4)
+        since = begin
         while self._coming and self._coming[0][0] < begin + period - SLACK:
             when, target = self._coming.popleft()
             if self._acting is not None:
@@ -228,7 +232,9 @@ class Fake(ABC):
         """Begin in the hands of a pilot; poses go out on the link, with the vehicle's ids, commands
         come by the port, or on the link.
         """
-        self.plant, self.link, self.options = plant, link, options or FakeOptions()
+        self.plant = plant
+        self.link = link
+        self.options = options or FakeOptions()
         self.port: Any = port or link.port
         self.mocap = Mocap(mocap or FakeMocapParams(), seed)
         self.spoil: Callable[[list[Pose], float], list[Pose]] = lambda poses, time: poses
@@ -458,7 +464,8 @@ class Fake(ABC):
 
     def report(self) -> dict[str, Any]:
         """Return what happened to the payload, on the plant's clock, and to the messages."""
-        w, last = self.witness, self._last_command
+        w = self.witness
+        last = self._last_command
         return {
             **self.plant.landing,
             "followed": self.followed,

@@ -37,7 +37,8 @@ class FakeArduPilot(FakeMavlink):
 
     autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     modes = (GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE)
-    usual_mode, pilots_mode = GUIDED, LOITER
+    usual_mode = GUIDED
+    pilots_mode = LOITER
     thrust_map = THRUST
     defaults = {  # noqa: RUF012 - copied by each instance
         "GUID_OPTIONS": float(THRUST_AS_THRUST),
@@ -62,10 +63,8 @@ class FakeArduPilot(FakeMavlink):
         return servo or super().is_release(message)
 
     def answer_release(self, message: Any) -> None:
-        servo, function = (
-            message.command == mav.MAV_CMD_DO_SET_SERVO,
-            self.parameters[f"SERVO{SERVO}_FUNCTION"],
-        )
+        servo = message.command == mav.MAV_CMD_DO_SET_SERVO
+        function = self.parameters[f"SERVO{SERVO}_FUNCTION"]
         able = servo or bool(self.parameters["GRIP_ENABLE"])
         if able and function == (0.0 if servo else SERVO_GRIPPER):
             self.open_mechanism()
@@ -84,7 +83,8 @@ class FakeArduPilot(FakeMavlink):
 
     def _meant(self, target: np.ndarray) -> np.ndarray:
         """Return the set-point as the parameters make it mean."""
-        out, now = target.copy(), self.plant.state
+        out = target.copy()
+        now = self.plant.state
         if not int(self.parameters["GUID_OPTIONS"]) & THRUST_AS_THRUST:
             climb = FACTS["climb_rate"] * (2.0 * target[0] / self.plant.max_thrust - 1.0)
             out[0] = self.weight() * (

@@ -29,11 +29,9 @@ from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
 
-PLANT, MOTORS, BALL = (
-    "visthrow.throws.wire_plant:make",
-    "visthrow.throws.wire_plant:make_motors",
-    "hil.rehearsal.fake_command:make_ball",
-)
+PLANT = "visthrow.throws.wire_plant:make"
+MOTORS = "visthrow.throws.wire_plant:make_motors"
+BALL = "hil.rehearsal.fake_command:make_ball"
 """What makes the vehicle behind a fake, and behind a firmware; the ball below a firmware's own
 vehicle.
 """
@@ -152,10 +150,8 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
         flown.sensors.start()
         said = "the firmware has its settings; it flies"
     elif args.kind == "ardupilot-sitl":
-        flown, said = (
-            ArduPilotSitl(*vehicle, params.ardupilot),
-            "waiting for ArduPilot: --model json:127.0.0.1",
-        )
+        flown = ArduPilotSitl(*vehicle, params.ardupilot)
+        said = "waiting for ArduPilot: --model json:127.0.0.1"
     else:
         flown = Px4Sih(
             *vehicle,
@@ -175,7 +171,8 @@ def make_ball(policy: str, seed: int) -> HangingBall:
     it is.
     """
     contract = Policy.load(find_policy(policy)).contract
-    rope, alone = contract["rope"], contract["vehicle"]["body"]["mass"]
+    rope = contract["rope"]
+    alone = contract["vehicle"]["body"]["mass"]
     return HangingBall(
         np.array(rope["mount"]),
         rope["length"] + rope["payload_offset"],

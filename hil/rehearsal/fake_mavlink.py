@@ -42,7 +42,8 @@ class FakeMavlink(Fake):
         self.link.listen(self._hear)
 
     def _hear(self, message: Any, arrival: float) -> None:
-        kind, self.heard = message.get_type(), arrival
+        kind = message.get_type()
+        self.heard = arrival
         if self.silent:
             return
         if kind == "SET_ATTITUDE_TARGET":

@@ -47,7 +47,8 @@ class Mocap:
         Those that are not lost come back, vehicle first, in our frames; their arrival is the
         latency after the instant."""
         self._next += 1.0 / self.params.rate
-        p, rng = self.params, self._rng
+        p = self.params
+        rng = self._rng
         names = ("pos_w", "payload_pos_w", "quat_wb")
         noise = dict(
             zip(names, (p.position_noise, p.position_noise, math.radians(p.angle_noise_deg)))

@@ -82,7 +82,9 @@ def serve(
     """Fly in real time, or on a firmware's clock, until ``after`` seconds after the landing, for
     ``most`` seconds, or until Ctrl-C; returns the report.
     """
-    plant, begun, late = fake.plant, fake.plant.time, 0
+    plant = fake.plant
+    begun = fake.plant.time
+    late = 0
     # where the machine is late the vehicle's clock is as late as the vehicle
     start = clock.now() - begun
     heard: list[tuple[float, float]] = []  # first and last period on a firmware's clock
@@ -98,7 +100,8 @@ def serve(
             time = plant.time + plant.period
             due = start + time
             if fake.paced:
-                start, due = clock.now() - plant.time, -math.inf
+                start = clock.now() - plant.time
+                due = -math.inf
                 heard = [*heard[:1], (clock.now(), plant.time)]
             late += math.isfinite(due) and clock.now() > due
             while clock.now() < due:  # what comes meanwhile acts from when it comes

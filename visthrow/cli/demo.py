@@ -15,10 +15,8 @@ from visthrow.common.storage import writable
 # another number
 THROWS = 100
 
-REFERENCE_THROWS, REFERENCE_TARGETS = (
-    6,
-    (2.0,),
-)  # on the reference plant, for each policy; one such throw costs seconds
+REFERENCE_THROWS = 6
+REFERENCE_TARGETS = (2.0,)  # on the reference plant, for each policy; one such throw costs seconds
 
 SEED = 0
 

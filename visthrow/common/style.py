@@ -8,8 +8,13 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 MARKERS = ("o", "^", "s", "D", "v", "P")  # beside the colour, so that it never stands alone
 
-INK, QUIET, FAINT = "#222222", "#767676", "#D9D9D9"
-VEHICLE, ROPE, PAYLOAD, GOAL = "#3A3F47", "#8A6D3B", "#D55E00", "#009E73"
+INK = "#222222"
+QUIET = "#767676"
+FAINT = "#D9D9D9"
+VEHICLE = "#3A3F47"
+ROPE = "#8A6D3B"
+PAYLOAD = "#D55E00"
+GOAL = "#009E73"
 
 
 def use() -> None:

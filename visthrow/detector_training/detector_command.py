@@ -20,7 +20,8 @@ from visthrow.training.compute_device import resolve
 
 TOGETHER = 20  # throws in one process at a time
 
-CHECKPOINT, WEIGHTS = "checkpoint.pt", "learnt.npz"
+CHECKPOINT = "checkpoint.pt"
+WEIGHTS = "learnt.npz"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

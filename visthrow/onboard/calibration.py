@@ -58,10 +58,8 @@ CONSTANTS = {
 }
 """Unknowns that stay the same; see `Spreads`."""
 
-LEAST_STEPS, LEAST_SEEN = (
-    75,
-    0.5,
-)  # steps of a calibration, and share of them in which the ball is seen
+LEAST_STEPS = 75
+LEAST_SEEN = 0.5  # steps of a calibration, and share of them in which the ball is seen
 ROUNDS, SETTLED = (
     12,
     1e-3,
@@ -179,7 +177,8 @@ class CalibrationError(VisthrowError):
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
-HOVER, SWAY = 1.5, 1.5  # of a hover before the sway, and of the sway [s]
+HOVER = 1.5
+SWAY = 1.5  # of a hover before the sway, and of the sway [s]
 
 SWAY_RATE = 1.0
 SWAY_FREQUENCY = 4.0 / 3.0
@@ -561,9 +560,11 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tens
             weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
             base = base * weight
             off = off * weight
-        even, odd = off[: 2 * width : 2], off[1 : 2 * width : 2]
+        even = off[: 2 * width : 2]
+        odd = off[1 : 2 * width : 2]
         is_even = (step % 2 == 0)[:, None]
-        at_step, at_next = torch.where(is_even, even, odd), torch.where(is_even, odd, even)
+        at_step = torch.where(is_even, even, odd)
+        at_next = torch.where(is_even, odd, even)
         slopes = torch.cat([at_step, at_next, off[2 * width :]]).permute(1, 2, 0)
         first = step[:, None] * width + torch.arange(2 * width)
         shared = count * width + torch.arange(len(c)).expand(len(step), -1)

@@ -248,15 +248,11 @@ class Policy:
         except (TypeError, ValueError) as error:
             raise PolicyError(f"contract or made_by holds what JSON cannot: {error}") from error
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
-            arrays[f"layer{i}_weight"], arrays[f"layer{i}_bias"] = (
-                weight.cpu().numpy(),
-                bias.cpu().numpy(),
-            )
+            arrays[f"layer{i}_weight"] = weight.cpu().numpy()
+            arrays[f"layer{i}_bias"] = bias.cpu().numpy()
         if self.mean is not None and self.std is not None:
-            arrays["normalizer_mean"], arrays["normalizer_std"] = (
-                self.mean.cpu().numpy(),
-                self.std.cpu().numpy(),
-            )
+            arrays["normalizer_mean"] = self.mean.cpu().numpy()
+            arrays["normalizer_std"] = self.std.cpu().numpy()
             arrays["normalizer_eps"] = np.array(self.eps)
         if self.estimator is not None:
             for name, part in self.estimator.parts().items():

@@ -25,7 +25,8 @@ from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
 
 # a throw's log begins this long before it, and ends this long after its recovery [s]
-LEAD_TIME, TRAIL_TIME = 2.0, 0.5
+LEAD_TIME = 2.0
+TRAIL_TIME = 0.5
 LEAST_STEP = 1e-6  # between two samples of a channel [s]: simultaneous poses keep their order
 SPUN_UP = math.log(100.0)
 """Time in which standing rotors reach the commanded speed to 1 % [time constants of a motor], after
@@ -86,7 +87,8 @@ def read(folder: str | Path) -> PlayedRun:
     if not lines:
         raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
     playback = Playback(params, policy)
-    provenance, links = _read_json(folder / PROVENANCE), _read_json(folder / SUMMARY).get("links")
+    provenance = _read_json(folder / PROVENANCE)
+    links = _read_json(folder / SUMMARY).get("links")
     provenance["simulated"] = any(link.get("simulated") for link in links or [])
     ticks = [playback.feed(line, poses.get(line["n"], [])) for line in lines]
     return PlayedRun(playback, ticks, provenance)
@@ -117,7 +119,8 @@ class TickLogger:
 
     def flush(self) -> FlightLog:
         """Return the log of the ticks since the last call."""
-        log, self.recorder = self.recorder.log(), FlightRecorder(self.recorder.meta)
+        log = self.recorder.log()
+        self.recorder = FlightRecorder(self.recorder.meta)
         self._declare()
         return log
 
@@ -130,7 +133,8 @@ class TickLogger:
         """Add a tick."""
         for sample in tick.samples:
             self._add_pose(sample, tick.attached)
-        record, time = tick.decision, tick.line["time"]
+        record = tick.decision
+        time = tick.line["time"]
         values: dict[str, Any] = {
             "mode": int(record.state == State.THROW),
             "state": STATES.index(record.state),
@@ -159,7 +163,9 @@ class TickLogger:
         self.recorder.add(time, **values)
 
     def _add_pose(self, sample: Sample, attached: bool) -> None:
-        pose, body, add = sample.pose, sample.body, self.recorder.add
+        pose = sample.pose
+        body = sample.body
+        add = self.recorder.add
         time = measured(sample, self.params) if sample.time is None else sample.time
         time = max(time, self._times.get(body, -np.inf) + LEAST_STEP)
         self._times[body] = time
@@ -194,7 +200,8 @@ def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dic
     """Return the metadata that are known from a run's beginning on; ``start`` [s] is the zero of
     its pictures.
     """
-    params, policy = playback.params, playback.runner.pilot.policy
+    params = playback.params
+    policy = playback.runner.pilot.policy
     goal_w = playback.runner.estimator.goal_w or params.goal_w
     simulated = ", of a simulated vehicle" if provenance.get("simulated") else ""
     return {
@@ -229,7 +236,8 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     """Return the log of the ticks from ``first`` to ``last``, both included; of a throw by its
     number.
     """
-    ticks, runner = played.ticks[first : last + 1], played.playback.runner
+    ticks = played.ticks[first : last + 1]
+    runner = played.playback.runner
     begin = first if throw is None else played.throws[throw][0]
     start = played.ticks[begin].line["time"]
     logger = logger_of(played, start)
@@ -301,7 +309,8 @@ def _add_result(
 
 def throws(played: PlayedRun) -> list[FlightLog]:
     """Return a log a throw."""
-    logs, begin = [], 0
+    logs = []
+    begin = 0
     period = played.playback.runner.pilot.period
     begins = [first for first, _ in played.throws[1:]] + [len(played.ticks)]
     for number, ((first, last), following) in enumerate(zip(played.throws, begins)):

@@ -52,7 +52,8 @@ class Playback:
 
     def __init__(self, params: HilParams, policy: Policy) -> None:
         """Start before the first tick; see `hil.control.recording.record.load_run` for both."""
-        self.params, self.runner = params, Runner(params, policy, DryRun())
+        self.params = params
+        self.runner = Runner(params, policy, DryRun())
         self.runner.estimator.watcher = lambda body, track: self._samples.append(
             Sample(body, *track.sample())
         )
@@ -60,7 +61,9 @@ class Playback:
 
     def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
         """Run one recorded tick."""
-        self._samples, runner, time = [], self.runner, line["time"]
+        self._samples = []
+        runner = self.runner
+        time = line["time"]
         detection = line.get("detection", line.get("seen"))  # runs of before call it "seen"
         if detection is not None:
             runner.estimator.take_detections([Detection.of(detection)])
@@ -102,7 +105,9 @@ def replay(folder: str | Path) -> dict[str, Any]:
     recorded value, value now), and what is missing of the recording, or None; ``story``: where it
     went wrong, in a sentence."""
     params, policy, ticks, poses = load_run(folder)
-    playback, turn, last = Playback(params, policy), None, None
+    playback = Playback(params, policy)
+    turn = None
+    last = None
     differences: list[tuple[int, str, Any, Any]] = []
     actions = 0
     for line in ticks:
@@ -121,7 +126,8 @@ def replay(folder: str | Path) -> dict[str, Any]:
             turn = {**moment, "state": before["state"], "since": before["since"]}
         last = moment
         for name in COMPARED:
-            was, value = line[name], getattr(decision, name)
+            was = line[name]
+            value = getattr(decision, name)
             value = list(value) if isinstance(value, tuple) else value
             if was != value:
                 differences.append((line["n"], name, was, value))
@@ -166,10 +172,8 @@ def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str 
     vehicle: BodyState | None = turn_number["vehicle"]
     where = "had not been seen"
     if vehicle is not None:
-        place, speed = (
-            ", ".join(f"{x:.2f}" for x in vehicle.pos),
-            sum(v * v for v in vehicle.vel) ** 0.5,
-        )
+        place = ", ".join(f"{x:.2f}" for x in vehicle.pos)
+        speed = sum(v * v for v in vehicle.vel) ** 0.5
         where = f"was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
     return (
         f"It went wrong {turn_number['time'] - turn_number['since']:.2f} s into"

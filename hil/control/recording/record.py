@@ -30,14 +30,12 @@ from visthrow.common.storage import atomic_write, write_json
 from visthrow.common.toml_text import dumps
 from visthrow.onboard.policy import Policy, find_policy
 
-POLICY, CONFIG, POSES, TICKS, SUMMARY, PROVENANCE = (
-    "policy.npz",
-    "config.toml",
-    "poses.jsonl",
-    "ticks.jsonl",
-    "summary.json",
-    "provenance.json",
-)
+POLICY = "policy.npz"
+CONFIG = "config.toml"
+POSES = "poses.jsonl"
+TICKS = "ticks.jsonl"
+SUMMARY = "summary.json"
+PROVENANCE = "provenance.json"
 
 
 EXPECTED = f"expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it"
@@ -210,11 +208,10 @@ def load_run(
     """
     folder = Path(folder)
     require_run(folder)
-    params, policy = (
-        config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG)),
-        Policy.load(folder / POLICY),
-    )
-    ticks, poses = list(lines(folder / TICKS)), read_poses(folder)
+    params = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG))
+    policy = Policy.load(folder / POLICY)
+    ticks = list(lines(folder / TICKS))
+    poses = read_poses(folder)
     if not (
         folder / SUMMARY
     ).is_file():  # killed: the two files may end at different ticks, with half of its poses
@@ -233,10 +230,8 @@ PARTS = (
 
 RECORDS = ("*.tlog", "*.msp")
 
-ENDING, MOST_BYTES = (
-    ".zip",
-    2 << 30,
-)  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
+ENDING = ".zip"
+MOST_BYTES = 2 << 30  # bytes that a bundle may unpack to; a run of an hour has a tenth of it
 
 
 def pack(folder: str | Path) -> Path:

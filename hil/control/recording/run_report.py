@@ -11,7 +11,8 @@ from hil.control.recording.latency import Stages, draw, slowed, table
 from visthrow.common.errors import VisthrowError
 from visthrow.onboard.calibration import Calibration
 
-LATENCY_PICTURE, WHOLE = "latency.png", "flight.npz"
+LATENCY_PICTURE = "latency.png"
+WHOLE = "flight.npz"
 PICTURE_PACKAGES = ("matplotlib", "cv2")  # of the extra pictures
 
 
@@ -75,7 +76,8 @@ def finish(folder: str | Path, stages: Stages | None = None, speed: float = 1.0)
     """
     from visthrow.view import strip
 
-    folder, lines = Path(folder), []
+    folder = Path(folder)
+    lines = []
     missing = [name for name in PICTURE_PACKAGES if importlib.util.find_spec(name) is None]
     if missing:
         lines.append(

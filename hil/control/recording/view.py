@@ -53,7 +53,8 @@ class Show:
         """Send what does not move; ``start`` is the zero of the viewer's time [s]."""
         from visthrow.view import rerun_view
 
-        self._stream, self._view = stream, rerun_view
+        self._stream = stream
+        self._view = rerun_view
         self._meta = meta_of(playback, provenance, start)
         self._samples = TickLogger(playback, self._meta)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
@@ -111,7 +112,8 @@ class Follower:
         `RunError` for no folder of a run.
         """
         require_run(folder, (CONFIG, POLICY, PROVENANCE))
-        self.folder, self.params = folder, config.load(HilParams, folder / CONFIG)
+        self.folder = folder
+        self.params = config.load(HilParams, folder / CONFIG)
         self.playback = Playback(self.params, Policy.load(folder / POLICY))
         self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
         self._tails = {name: tail(folder / name) for name in (TICKS, POSES)}
@@ -142,7 +144,9 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
     """Send a run to a stream of rerun while it is written, until it is over; returns the number of
     ticks that were left out.
     """
-    follower, show, dropped = Follower(Path(folder)), None, 0
+    follower = Follower(Path(folder))
+    show = None
+    dropped = 0
     try:
         while going():
             finished = (follower.folder / SUMMARY).is_file()

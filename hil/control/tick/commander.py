@@ -20,7 +20,8 @@ from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import PilotOutput
 
-HAND_OVER_SPEED, HAND_OVER_TILT = 1.0, math.radians(20.0)
+HAND_OVER_SPEED = 1.0
+HAND_OVER_TILT = math.radians(20.0)
 """Below these the autopilot's own hold takes over after a throw: braking out of 60 deg is done on
 poses [m/s, rad].
 """
@@ -66,7 +67,9 @@ class Commander:
 
     def enter(self, estimate: Estimate, state: str) -> None:
         """Do what a change of state requires."""
-        parts, time, previous = self.parts, estimate.time, self._state
+        parts = self.parts
+        time = estimate.time
+        previous = self._state
         if state != previous:
             self._state = state
             self._change_state(estimate, previous, state)
@@ -78,7 +81,8 @@ class Commander:
         """Command the vehicle, and note in the tick's record what was sent; ``begin`` of the tick
         is a reading of `perf_counter`.
         """
-        parts, state = self.parts, record.state
+        parts = self.parts
+        state = record.state
         record.ready = THROW if parts.machine.ready_to_throw else NOTHING
         command = self._wanted_command(estimate, status, record)
         if parts.calibrating is not None:
@@ -107,15 +111,20 @@ class Commander:
 
     def warm_up(self, vehicle: BodyState | None = None) -> None:
         """Call the policy a few times on a copy: the first calls are slow."""
-        pilot, params = copy.copy(self.parts.pilot), self.parts.params
+        pilot = copy.copy(self.parts.pilot)
+        params = self.parts.params
         pos = np.array([params.home_w if vehicle is None else vehicle.pos])
-        level, zero = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
-        payload_w, goal_w = pos - [0.0, 0.0, self.parts.hang], np.array(params.goal_w)
+        level = np.array([[0.0, 0.0, 0.0, 1.0]])
+        zero = np.zeros((1, 3))
+        payload_w = pos - [0.0, 0.0, self.parts.hang]
+        goal_w = np.array(params.goal_w)
         for _ in range(WARM_CALLS):
             pilot.act(pos, level, zero, zero, payload_w, goal_w)
 
     def _change_state(self, estimate: Estimate, previous: str, state: str) -> None:
-        parts, time, latch = self.parts, estimate.time, self.parts.latch
+        parts = self.parts
+        time = estimate.time
+        latch = self.parts.latch
         if previous == State.THROW:
             # Where commands act late, a fast mechanism gets its command only after the policy's
             # own time of separation.
@@ -138,7 +147,8 @@ class Commander:
         self, estimate: Estimate, status: Status, record: TickRecord
     ) -> Command | None:
         """Return the command of a state, before the guard; None for none."""
-        parts, state = self.parts, record.state
+        parts = self.parts
+        state = record.state
         if state not in FLYING and state != State.ABORT:
             return None
         mass = parts.mass if parts.carries_payload(estimate) else parts.vehicle_mass
@@ -174,7 +184,8 @@ class Commander:
 
     def _release_problem(self, estimate: Estimate) -> str | None:
         """Return why the payload must not be released now, or None."""
-        fence, payload = self.parts.params.fence, estimate.payload
+        fence = self.parts.params.fence
+        payload = estimate.payload
         violation = box_violation(payload.pos, fence.payload_low, fence.payload_high)
         if violation is not None:
             return f"payload {violation}"
@@ -182,7 +193,9 @@ class Commander:
 
     def _run_policy(self, estimate: Estimate, record: TickRecord) -> PilotOutput:
         """Run the policy on the estimate, and note its input and output."""
-        parts, vehicle, time = self.parts, estimate.vehicle, record.time
+        parts = self.parts
+        vehicle = estimate.vehicle
+        time = record.time
         keypoints = None if parts.detections is None else parts.detections.keypoints(time)
         output: PilotOutput = parts.pilot.act(
             np.array([vehicle.pos]),
@@ -209,8 +222,11 @@ class Commander:
         """Return the command with the sway of a calibration, and give the calibration what came in
         this tick.
         """
-        parts, calibrating, time = self.parts, self.parts.calibrating, record.time
-        result, self.calibration = self.calibration, None
+        parts = self.parts
+        calibrating = self.parts.calibrating
+        time = record.time
+        result = self.calibration
+        self.calibration = None
         if result is not None:
             calibrating.take(result)
             record.calibration = result if isinstance(result, str) else result.values()
@@ -231,7 +247,9 @@ class Commander:
 
     def _ask_mode(self, estimate: Estimate, state: str, status: Status) -> None:
         """Ask the autopilot to follow, or to hold and land by itself where it can."""
-        parts, backend, time = self.parts, self.parts.backend, estimate.time
+        parts = self.parts
+        backend = self.parts.backend
+        time = estimate.time
         if state in (State.READY, State.ARMED, State.THROW):
             backend.ask(FOLLOW, time)
             if status.mode != FOLLOW:
@@ -269,9 +287,11 @@ class Commander:
             return None
         limited = self.guard.check(command)
         if limited is None:
-            machine, failure = self.parts.machine, f"command {command} is not finite"
+            machine = self.parts.machine
+            failure = f"command {command} is not finite"
             machine.step(record.time, Inputs(ABORT, ABORT, failure=failure))
-            record.state, record.reason = machine.state.value, machine.reason
+            record.state = machine.state.value
+            record.reason = machine.reason
             record.release = False
             self.parts.backend.stop_release()
         return limited

@@ -17,7 +17,9 @@ PATIENCE = 10  # ticks of a throw in which the team agrees on nothing, as after 
 GROUND = 0.12  # height of the vehicle that counts as landed [m]
 # reports that the autopilot's hover thrust is averaged over, and kept; share of the weight below
 # which it stands on the ground
-FEWEST_REPORTS, MOST_REPORTS, GROUND_SHARE = 25, 50, 0.3
+FEWEST_REPORTS = 25
+MOST_REPORTS = 50
+GROUND_SHARE = 0.3
 
 
 class Decider:
@@ -49,9 +51,14 @@ class Decider:
     def _inputs(
         self, estimate: Estimate, status: Status, words: OperatorInput, recording: bool
     ) -> Inputs:
-        parts, time = self.parts, estimate.time
-        state, latch, vehicle = parts.machine.state, parts.latch, estimate.vehicle
-        failure, fence, calm = status.fault, None, False
+        parts = self.parts
+        time = estimate.time
+        state = parts.machine.state
+        latch = parts.latch
+        vehicle = estimate.vehicle
+        failure = status.fault
+        fence = None
+        calm = False
         self._alone = self._alone + 1 if parts.agreed == NOTHING else 0
         if status.release == FAILED and state in (State.THROW, State.RECOVER):
             failure = "the release was refused or not answered"
@@ -92,7 +99,9 @@ class Decider:
 
     def _failed_checks(self, estimate: Estimate, status: Status) -> list[str]:
         """Return the failed pre-throw checks, in words."""
-        parts, params, state = self.parts, self.parts.params, self.parts.machine.state
+        parts = self.parts
+        params = self.parts.params
+        state = self.parts.machine.state
         # After a throw the payload may have been attached again; only the operator's next word
         # resets the latch.
         thrown = state is State.THROW or (parts.latch.at is not None and state is not State.READY)
@@ -129,8 +138,11 @@ class Decider:
         before the take-over, then ours: the calibration is wrong, the vehicle another, or the
         battery low.
         """
-        parts, flown, problems = self.parts, self.parts.machine.flown, []
-        ratio, tolerance = parts.hovering.share(), parts.thrust_tolerance
+        parts = self.parts
+        flown = self.parts.machine.flown
+        problems = []
+        ratio = parts.hovering.share()
+        tolerance = parts.thrust_tolerance
         if len(self._shares) >= FEWEST_REPORTS:
             ratio = sum(self._shares) / len(self._shares)
         wrong = ratio is not None and abs(ratio - 1.0) > tolerance
@@ -157,7 +169,8 @@ class Decider:
 
     def problems(self) -> list[str]:
         """Return what forbids the take-over of the vehicle, as of the last tick."""
-        inputs, tracks = self.inputs, self.parts.tracks
+        inputs = self.inputs
+        tracks = self.parts.tracks
         if inputs is None:
             return ["no tick has run yet"]
         missing = [f"no good pose of the {n}" for n, t in tracks.items() if not t.accepted]

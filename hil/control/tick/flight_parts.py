@@ -18,7 +18,8 @@ from hil.poses.pose import PAYLOAD, VEHICLE
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
 
-CALM_OFFSET, CALM_SPEED = 0.05, 0.25
+CALM_OFFSET = 0.05
+CALM_SPEED = 0.25
 """Distance of the vehicle from its hover point [m], and speed of vehicle and payload over 0.2 s
 [m/s], that count as calm: half of what the policies were trained to start from.
 """
@@ -49,7 +50,8 @@ class FlightParts:
 
     def carries_payload(self, estimate: Estimate) -> bool:
         """Return whether the payload hangs on the vehicle, by the latch and by its own poses."""
-        vehicle, payload = estimate.vehicle, estimate.fresh_payload
+        vehicle = estimate.vehicle
+        payload = estimate.fresh_payload
         if vehicle is None:
             return self.latch.at is None
         place_w = None if payload is None else payload.pos
@@ -72,9 +74,12 @@ def build_parts(
     params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float
 ) -> FlightParts:
     """Build the parts of a runner; errors as of `hil.control.runner.Runner`."""
-    pilot, delay, check = Pilot(policy, params.camera), params.delay, params.check
+    pilot = Pilot(policy, params.camera)
+    delay = params.delay
+    check = params.check
     contract = policy.contract
-    rope, vehicle_mass = contract["rope"], contract["vehicle"]["body"]["mass"]
+    rope = contract["rope"]
+    vehicle_mass = contract["vehicle"]["body"]["mass"]
     mass = vehicle_mass + rope["rope_mass"] + rope["payload_mass"]
     max_thrust = float(contract["action"]["max_thrust"])
     hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]

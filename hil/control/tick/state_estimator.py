@@ -55,7 +55,8 @@ class StateEstimator:
     def estimate(self, time: float) -> Estimate:
         """Return the states of the bodies at a tick [s]."""
         parts = self.parts
-        tracks, delay = parts.tracks, parts.params.delay
+        tracks = parts.tracks
+        delay = parts.params.delay
         parts.latch.overdue(time)
         if parts.machine.state in (State.IDLE, State.CHECK):
             for track in tracks.values():
@@ -80,7 +81,8 @@ class StateEstimator:
 
     def show_detection(self, estimate: Estimate, record: TickRecord) -> None:
         """Turn the newest detection into keypoints, and note it in the tick's record."""
-        detections, detection = self.parts.detections, self._detection
+        detections = self.parts.detections
+        detection = self._detection
         self._detection = None
         if detections is None:
             return
@@ -96,7 +98,8 @@ class StateEstimator:
         """Return a hint for a detector: the vehicle's pose and, while the payload hangs, limits of
         its distance; None without a fresh pose.
         """
-        track, hang = self.parts.tracks[VEHICLE], self.parts.hang
+        track = self.parts.tracks[VEHICLE]
+        hang = self.parts.hang
         vehicle = track.state(time)
         if vehicle is None or vehicle.quat is None or track.gate.level(time) >= HOLD:
             return None
@@ -122,12 +125,15 @@ class StateEstimator:
         """Return the state of a body, predicted to the age that the policy was trained with where
         the config says so.
         """
-        delay, age, lead = self.parts.params.delay, self._age(track, time), 0.0
+        delay = self.parts.params.delay
+        age = self._age(track, time)
+        lead = 0.0
         if delay.compensate and math.isfinite(age):
             lead = age - self.parts.trained_age + delay.command
         return track.state(time, lead)
 
     def _age(self, track: Track, time: float) -> float:
         """Return the age of a body's last pose [s]."""
-        last, source = track.gate.last, self.parts.params.delay.source
+        last = track.gate.last
+        source = self.parts.params.delay.source
         return track.gate.age(time) + (source if last is None else last.transit(source))

@@ -54,7 +54,8 @@ def make_backend(
             table.
         folder: of the run, where MSP is written down as the link's messages are in its .tlog.
     """
-    name, vehicle = params.backend, getattr(params, params.backend.replace("-", "_"), None)
+    name = params.backend
+    vehicle = getattr(params, params.backend.replace("-", "_"), None)
     backend: Backend
     if name == "dry-run":
         backend = DryRun()
@@ -84,7 +85,8 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
     """
     if params.backend == "dry-run":
         return
-    vehicle, action = getattr(params, params.backend), contract["action"]
+    vehicle = getattr(params, params.backend)
+    action = contract["action"]
     rope = contract["rope"]
     mass = contract["vehicle"]["body"]["mass"] + rope["rope_mass"] + rope["payload_mass"]
     ratio = vehicle.thrust.weight / (mass * GRAVITY)
@@ -94,7 +96,8 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
             f" weight that the policy was trained with, {mass * GRAVITY:.3f} N; expected it within"
             f" {vehicle.thrust.tolerance:g}: train a policy for this vehicle"
         )
-    available, trained = vehicle.thrust.most, float(action["max_thrust"])
+    available = vehicle.thrust.most
+    trained = float(action["max_thrust"])
     if available < THRUST_SHORT * trained:
         raise RunError(
             f"{params.backend}.thrust gives {available:.2f} N at most, the policy was trained with"

@@ -26,7 +26,8 @@ GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE = (
     FACTS[mode] for mode in ("guided", "guided_nogps", "loiter", "brake", "land")
 )
 THRUST_AS_THRUST = FACTS["thrust_option"]  # bit of GUID_OPTIONS
-SERVO_GRIPPER, SERVO_DISABLED = FACTS["gripper_function"], FACTS["servo_disabled"]
+SERVO_GRIPPER = FACTS["gripper_function"]
+SERVO_DISABLED = FACTS["servo_disabled"]
 MOST_SILENCE = 0.5  # of GUID_TIMEOUT [s]: at a throw's rates a vehicle turns over in a second
 
 
@@ -56,7 +57,8 @@ class ArduPilotParams(AutopilotParams):
 class ArduPilot(MavlinkAutopilot):
     """An ArduCopter."""
 
-    name, autopilot = "ardupilot", mav.MAV_AUTOPILOT_ARDUPILOTMEGA
+    name = "ardupilot"
+    autopilot = mav.MAV_AUTOPILOT_ARDUPILOTMEGA
     params: ArduPilotParams
 
     def _role(self, mode: int) -> str | None:

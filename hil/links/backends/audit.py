@@ -9,7 +9,8 @@ ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
 # after a value was written, answers may still be on their way that were given before; then it is
 # read back [s]
 SETTLE = 0.5
-GIVE_UP, GIVE_UP_OPTIONAL = 5.0, 1.0  # a value that has not come within this time is missing [s]
+GIVE_UP = 5.0
+GIVE_UP_OPTIONAL = 1.0  # a value that has not come within this time is missing [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 MOST_NAMED = 4  # parameters that a fault names; the table has all
 
@@ -83,12 +84,10 @@ class Audit:
 
         ``ask`` sends a question for a parameter, ``write`` a new value (None: nothing is ever
         written), ``tell`` is handed the table, once."""
-        self.rules, self._ask, self._write, self._tell = (
-            {rule.name: rule for rule in rules},
-            ask,
-            write,
-            tell,
-        )
+        self.rules = {rule.name: rule for rule in rules}
+        self._ask = ask
+        self._write = write
+        self._tell = tell
         self.found: dict[str, float] = {}
         self.refused: dict[str, str] = {}
         self.written: list[str] = []
@@ -178,7 +177,8 @@ class Audit:
 
     def table(self) -> str:
         """Return parameter, found, expected, why, a line each."""
-        rows, wrong = [("", "parameter", "found", "expected", "why")], self._wrong()
+        rows = [("", "parameter", "found", "expected", "why")]
+        wrong = self._wrong()
         for name, rule in self.rules.items():
             shown = (
                 rule.text(self.found[name])

@@ -90,7 +90,10 @@ class MavlinkAutopilot(Autopilot, ABC):
         Wrong parameters are written or not.
         """
         super().__init__()
-        self.params, self._link, self._write, self._tell = params, link, write, tell
+        self.params = params
+        self._link = link
+        self._write = write
+        self._tell = tell
         self._heartbeat: Any = None
         self._heard = self._beat_at = self._asked_at = self._streamed = -1e9
         self._wanted: str | None = None
@@ -165,14 +168,16 @@ class MavlinkAutopilot(Autopilot, ABC):
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
-        p, handle = self.params, _HANDLERS.get(message.get_type())
+        p = self.params
+        handle = _HANDLERS.get(message.get_type())
         if message.get_srcSystem() != p.system or message.get_srcComponent() != p.component:
             return
         if handle is not None:
             handle(self, message, arrival)
 
     def _hear_heartbeat(self, message: Any, arrival: float) -> None:
-        self._heartbeat, self._heard = message, arrival
+        self._heartbeat = message
+        self._heard = arrival
         self._judge_mode()
 
     def _hear_acknowledgement(self, message: Any, arrival: float) -> None:
@@ -211,7 +216,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         self.rates = rates if all(map(math.isfinite, rates)) else None
 
     def _hear_target(self, message: Any, arrival: float) -> None:
-        self.share, self._exact = message.thrust, True
+        self.share = message.thrust
+        self._exact = True
 
     def _hear_hud(self, message: Any, arrival: float) -> None:
         if not self._exact:  # in whole percent
@@ -230,7 +236,9 @@ class MavlinkAutopilot(Autopilot, ABC):
             return
         self._was_armed |= bool(self._heartbeat.base_mode & ARMED)
         if role == self._wanted:
-            self._reached, self._taken_over, self._may = True, False, {role}
+            self._reached = True
+            self._taken_over = False
+            self._may = {role}
             self._ours |= role == FOLLOW
         elif self._reached or role not in self._may:
             self._taken_over = True
@@ -247,7 +255,8 @@ class MavlinkAutopilot(Autopilot, ABC):
             return f"no heartbeat for {silent:.1f} s", WAIT
         if not self.audit.done:
             return "parameters are being read", WAIT
-        role, armed = self._role(beat.custom_mode), bool(beat.base_mode & ARMED)
+        role = self._role(beat.custom_mode)
+        armed = bool(beat.base_mode & ARMED)
         mode = self._mode_text(beat.custom_mode)
         if self._wanted is None:
             return self._note_before(role, mode, armed)
@@ -306,7 +315,9 @@ class MavlinkAutopilot(Autopilot, ABC):
             if first:  # the mode before it was the pilot's
                 self._may.add(self._role(self._heartbeat.custom_mode))
             self._may.add(mode)
-            self._wanted, self._reached, self._asked_at = mode, False, -1e9
+            self._wanted = mode
+            self._reached = False
+            self._asked_at = -1e9
             if self._heartbeat is not None:
                 self._judge_mode()
         if self._taken_over or host_time - self._asked_at < ASK_AGAIN:
@@ -325,7 +336,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         has been judged by the mode before, so that a pilot who took over is not overruled.
         """
         if mode != self._next:
-            self._next, self._wished_at = mode, host_time
+            self._next = mode
+            self._wished_at = host_time
             self._request_heartbeat()
         late = host_time - self._wished_at >= CONFIRMATION_TIME
         return late or self._wanted is None or self._heard > self._wished_at
@@ -366,7 +378,8 @@ class MavlinkAutopilot(Autopilot, ABC):
         )
 
     def _write_parameter(self, name: str, value: float) -> None:
-        p, kind = self.params, self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
+        p = self.params
+        kind = self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
         self._link.send(
             mav.MAVLink_param_set_message(
                 p.system, p.component, name.encode(), self._field(value, kind), kind

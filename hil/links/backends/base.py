@@ -10,14 +10,15 @@ from hil.links.backends.audit import Audit
 from hil.links.device import Port
 from hil.links.roster import Address, Roster, shown
 
-IDLE, PENDING, ACCEPTED, FAILED = (
-    "idle",
-    "pending",
-    "accepted",
-    "failed",
-)  # how far a release has come
+IDLE = "idle"
+PENDING = "pending"
+ACCEPTED = "accepted"
+FAILED = "failed"  # how far a release has come
 
-WAIT, FOLLOW, HOLD, LAND = "wait", "follow", "hold", "land"
+WAIT = "wait"
+FOLLOW = "follow"
+HOLD = "hold"
+LAND = "land"
 """What the autopilot does: it is in other hands, follows commands, holds its place by itself, lands
 by itself.
 """
@@ -144,14 +145,17 @@ class Release:
         Without a final answer within the time-out [s], and a movement where it is read back, it has
         failed.
         """
-        self.timeout, self.read_back = timeout, read_back
+        self.timeout = timeout
+        self.read_back = read_back
         self.answers: list[float] = []
         self.open_at_rest = self._begun = False  # the output, before the first release
         self.reset()
 
     def reset(self) -> None:
         """Forget the last throw."""
-        self.state, self.note, self.sends = IDLE, "", 0
+        self.state = IDLE
+        self.note = ""
+        self.sends = 0
         self.at: float | None = None
         self._first = 0.0
         self._sent: float | None = None  # until the first answer
@@ -160,7 +164,10 @@ class Release:
     def start(self, when: float) -> None:
         """Open at a time [s]."""
         if self.state == IDLE:
-            self.state, self.at, self._first, self._begun = PENDING, when, when, True
+            self.state = PENDING
+            self.at = when
+            self._first = when
+            self._begun = True
             self.open_at_rest = False
 
     def stop(self) -> None:
@@ -208,7 +215,8 @@ class Release:
         elif self.at is not None and host_time >= self.at - ROUNDING:
             if not self.sends:
                 self._sent = perf_counter()
-            self.sends, self.at = self.sends + 1, host_time + self.REPEAT
+            self.sends = self.sends + 1
+            self.at = host_time + self.REPEAT
             return True
         return False
 
@@ -217,7 +225,9 @@ class Release:
             self._end(ACCEPTED, "")
 
     def _end(self, state: str, note: str) -> None:
-        self.state, self.note, self.at = state, note, None
+        self.state = state
+        self.note = note
+        self.at = None
 
 
 class Autopilot(Backend):
@@ -254,7 +264,8 @@ class Autopilot(Backend):
 
     def status(self, host_time: float) -> Status:
         note, mode = self._note(host_time)
-        fault, thrust = self.audit.fault(), None
+        fault = self.audit.fault()
+        thrust = None
         if not note and self.release_record.open_at_rest:
             note = "the mechanism's output is at its open end: close it; or its ends are exchanged"
         if self.share is not None and self._flies_itself():
@@ -293,7 +304,10 @@ class OnPort(Autopilot):
         """
         super().__init__()
         self.roster = Roster(tell=tell)
-        self._port, self._silence, self._heard, self.dropped = port, silence, -1e9, 0
+        self._port = port
+        self._silence = silence
+        self._heard = -1e9
+        self.dropped = 0
         self._taken = self._raised = self._over = False  # asked for; has followed; over
 
     def _note(self, host_time: float) -> tuple[str, str]:
@@ -336,7 +350,9 @@ class Held:
 
     def __init__(self, backend: Backend, hold: float) -> None:
         """Hold the commands of a back-end back by a time [s]."""
-        self._backend, self._hold, self._taken = backend, hold, True
+        self._backend = backend
+        self._hold = hold
+        self._taken = True
         self._waiting: deque[tuple[float, Command]] = deque()
 
     def __getattr__(self, name: str) -> Any:

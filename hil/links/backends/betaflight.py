@@ -40,9 +40,11 @@ from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 FACTS = values("betaflight")
-BOX_ARM, BOX_OVERRIDE = FACTS["box_arm"], FACTS["box_override"]  # permanent ids of flight modes
+BOX_ARM = FACTS["box_arm"]
+BOX_OVERRIDE = FACTS["box_override"]  # permanent ids of flight modes
 STICKS = FACTS["sticks"]  # channels before the first AUX
-LOW, HIGH = FACTS["low"], FACTS["high"]  # ends of a channel [us]
+LOW = FACTS["low"]
+HIGH = FACTS["high"]  # ends of a channel [us]
 FORWARDING = FACTS["forwarding"]  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
 BLOCKS = FACTS["blocks"]
 """Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM
@@ -74,7 +76,8 @@ with a question or two beside every frame the frames queued up, and came 0.1 to 
 after a release.
 """
 
-RATES_PERIOD, RATES_TIME = 0.02, 0.2
+RATES_PERIOD = 0.02
+RATES_TIME = 0.2
 """Between two questions for body rates [s], and how long they are asked for once it follows, in
 which the signs of its rates show [s]: for longer they would make frames queue up.
 """
@@ -120,7 +123,8 @@ class BetaflightParams(Bounded):
 class Betaflight(OnPort):
     """A Betaflight flight controller; ``refused`` counts commands that it did not know."""
 
-    name, protocol = "betaflight", "MSP"
+    name = "betaflight"
+    protocol = "MSP"
 
     def __init__(
         self,
@@ -133,7 +137,8 @@ class Betaflight(OnPort):
         written or not.
         """
         super().__init__(port, params.silence)
-        self.params, self.parser = params, msp.FrameParser()
+        self.params = params
+        self.parser = msp.FrameParser()
         self.sticks = Sticks(params.rates)
         self.release_record = Release(params.release_timeout, params.servo_output > 0)
         self.audit = Audit(
@@ -224,7 +229,8 @@ class Betaflight(OnPort):
         if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
         own = self.params.arm_channel > 0  # all channels are ours
-        armed, ours = self._box(BOX_ARM), own or self._box(BOX_OVERRIDE)
+        armed = self._box(BOX_ARM)
+        ours = own or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
             self._raised = True
             return "", FOLLOW
@@ -385,7 +391,8 @@ class Betaflight(OnPort):
             self.voltage = 0.01 * volts
 
     def _hear_outputs(self, frame: msp.Frame) -> None:
-        p, outputs = self.params, frame.words()
+        p = self.params
+        outputs = frame.words()
         if 1 <= p.servo_output <= len(outputs):
             self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
 
@@ -414,7 +421,8 @@ class Betaflight(OnPort):
 
     def _hear_channels(self, frame: msp.Frame) -> None:
         """Take MSP_RC: roll, pitch, yaw, throttle, AUX 1 and on, whatever the map."""
-        p, channels = self.params, frame.words()
+        p = self.params
+        channels = frame.words()
         if len(channels) < STICKS:
             return
         if not self._box(BOX_OVERRIDE):

@@ -31,9 +31,11 @@ from visthrow.config.bounds import Bounded, NotNegative, Positive
 FACTS = values("crazyflie")
 MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
-ASK, ARM_PERIOD = 0.1, 0.2  # between two questions for its state, two requests to arm [s]
+ASK = 0.1
+ARM_PERIOD = 0.2  # between two questions for its state, two requests to arm [s]
 # a vehicle that is handed back holds its place so long [s], then sinks so fast [m/s]
-HOLDS, DESCENT = 2.0, 0.3
+HOLDS = 2.0
+DESCENT = 0.3
 SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
 
 BLOCKS = {
@@ -74,7 +76,8 @@ class CrazyflieParams(Bounded):
 class Crazyflie(OnPort):
     """A Crazyflie; ``poses`` counts those that went to its estimator."""
 
-    name, protocol = "crazyflie", "CRTP"
+    name = "crazyflie"
+    protocol = "CRTP"
 
     def __init__(
         self, port: Port, params: CrazyflieParams, tell: Callable[[str], None] | None = None
@@ -86,7 +89,8 @@ class Crazyflie(OnPort):
         self.poses = 0
         self.audit = Audit(self._rules(), self._ask, None, tell)
         self.gyro = GyroStream(self._put)
-        self._state, self._speaks = 0, False
+        self._state = 0
+        self._speaks = False
         self._place: tuple[tuple[float, ...], float] | None = None  # position [m], heading [deg]
         self._returned: tuple[float, tuple[float, ...], float] | None = None  # when, and where
         self._yaw = 0.0, -1e9  # rate of yaw that was wanted last [rad/s], when [s]
@@ -140,7 +144,8 @@ class Crazyflie(OnPort):
     def send(self, command: Command, host_time: float) -> bool:
         thrust, *rates = command
         if not (self._state & FACTS["armed"] and self._taken):
-            thrust, rates = 0.0, [0.0, 0.0, 0.0]
+            thrust = 0.0
+            rates = [0.0, 0.0, 0.0]
         share = self.params.thrust.share(thrust)
         rates[2] = self._moved_yaw(rates[2], host_time)
         x, y, z = (math.degrees(rate) for rate in rates)
@@ -208,9 +213,11 @@ class Crazyflie(OnPort):
         self._put(crtp.arm(False))
 
     def _hear(self, packet: crtp.Packet, host_time: float) -> None:
-        place, data = (packet.port, packet.channel), packet.data
+        place = (packet.port, packet.channel)
+        data = packet.data
         self._speaks = True
-        state, version = FACTS["ask_state"] | FACTS["answer"], FACTS["ask_protocol"]
+        state = FACTS["ask_state"] | FACTS["answer"]
+        version = FACTS["ask_protocol"]
         if len(data) < 3:
             return
         if packet.port == FACTS["port_log"]:
@@ -218,7 +225,8 @@ class Crazyflie(OnPort):
             self.rates = self.gyro.rates
             return
         if (*place, data[0]) == (FACTS["port_supervisor"], FACTS["channel_info"], state):
-            self._heard, self._state = host_time, int.from_bytes(data[1:], "little")
+            self._heard = host_time
+            self._state = int.from_bytes(data[1:], "little")
         elif (*place, data[0]) == (FACTS["port_platform"], FACTS["channel_version"], version):
             self.audit.feed("protocol", int.from_bytes(data[1:], "little"))
         elif place == (FACTS["port_param"], FACTS["channel_by_name"]):

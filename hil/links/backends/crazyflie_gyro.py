@@ -14,10 +14,12 @@ from hil.links.facts import values
 
 FACTS = values("crazyflie")
 NAMES = [f"gyro\0{axis}\0".encode() for axis in FACTS["log_gyro"]]
-BLOCK, PERIOD_MS = 239, 20  # ours among the blocks of others, and how often it is sent [ms]
+BLOCK = 239
+PERIOD_MS = 20  # ours among the blocks of others, and how often it is sent [ms]
 AT_ONCE = 8  # questions for variables that are out at a time
 ASK_AGAIN = 0.1  # for an answer that did not come [s]
-RATES, ITEM = struct.Struct("<3f"), struct.Struct("<BHB")
+RATES = struct.Struct("<3f")
+ITEM = struct.Struct("<BHB")
 STAMP = 4  # bytes of block and time before the values
 
 
@@ -37,7 +39,8 @@ class GyroStream:
         self._next = 0  # the first variable whose name is not known
         self._numbers: dict[bytes, int] = {}
         self._created = False
-        self._asked, self._asked_for = -math.inf, None
+        self._asked = -math.inf
+        self._asked_for = None
 
     def service(self, host_time: float) -> None:
         """Ask for the next step, again where its answer did not come."""
@@ -45,7 +48,8 @@ class GyroStream:
         waits = step == self._asked_for and host_time - self._asked < ASK_AGAIN
         if waits or self.rates is not None:
             return
-        self._asked, self._asked_for = host_time, step
+        self._asked = host_time
+        self._asked_for = step
         if self._count is None:
             self._send("log_contents", bytes([FACTS["log_info"]]))
         elif self._created:

@@ -24,11 +24,16 @@ from visthrow.config.bounds import Bound
 
 FACTS = values("px4")
 # main modes, bits 16 to 23 of a heartbeat's custom mode, and sub-modes of AUTO, bits 24 to 31
-MAIN_POSCTL, MAIN_AUTO, MAIN_OFFBOARD = FACTS["posctl"], FACTS["auto"], FACTS["offboard"]
-AUTO_LOITER, AUTO_LAND = FACTS["auto_loiter"], FACTS["auto_land"]
+MAIN_POSCTL = FACTS["posctl"]
+MAIN_AUTO = FACTS["auto"]
+MAIN_OFFBOARD = FACTS["offboard"]
+AUTO_LOITER = FACTS["auto_loiter"]
+AUTO_LAND = FACTS["auto_land"]
 # set-points are streamed for this long before OFFBOARD is asked for; a longer pause begins anew [s]
-MARGIN, GAP = 0.2, 0.6  # more than PX4 asks for [s]; of its longest pause
-STREAM_FIRST, STREAM_GAP = FACTS["stream_first"] + MARGIN, GAP / FACTS["stream_hz"]
+MARGIN = 0.2
+GAP = 0.6  # more than PX4 asks for [s]; of its longest pause
+STREAM_FIRST = FACTS["stream_first"] + MARGIN
+STREAM_GAP = GAP / FACTS["stream_hz"]
 LAND_OR_HOLD = (FACTS["loss_land"], FACTS["loss_hold"])  # values of COM_OBL_RC_ACT
 POSITION_BITS = FACTS["vision_horizontal"] | FACTS["vision_vertical"]  # of EKF2_EV_CTRL
 MOST_LOSS = 0.5  # of COM_OF_LOSS_T [s]: at a throw's rates a vehicle turns over in a second
@@ -53,7 +58,8 @@ class Px4Params(AutopilotParams):
 class Px4(MavlinkAutopilot):
     """A PX4 multicopter."""
 
-    name, autopilot = "px4", mav.MAV_AUTOPILOT_PX4
+    name = "px4"
+    autopilot = mav.MAV_AUTOPILOT_PX4
     params: Px4Params
     _stream_since = _sent_at = -1e9
 
@@ -131,7 +137,9 @@ class Px4(MavlinkAutopilot):
         return [*rules, *self._mechanism_rules()]
 
     def _mechanism_rules(self) -> list[Rule]:
-        p, rules, gripper = self.params, [], self.params.release == "gripper"
+        p = self.params
+        rules = []
+        gripper = self.params.release == "gripper"
         if gripper:
             rules += [
                 Rule(

@@ -19,11 +19,9 @@ TRAVEL = FACTS["travel"]  # from the middle of a stick to its end [us]
 MIDDLE = FACTS["middle"]  # middle of a stick [us]
 
 
-Steep, Byte, Percent = (
-    Annotated[int, Bound(1, 255)],
-    Annotated[int, Bound(0, 255)],
-    Annotated[int, Bound(0, 100)],
-)
+Steep = Annotated[int, Bound(1, 255)]
+Byte = Annotated[int, Bound(0, 255)]
+Percent = Annotated[int, Bound(0, 100)]
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,8 @@ class RatesParams(Bounded):
         return math.copysign(math.radians(min(curve(axis, size), RATE_LIMIT)), stick)
 
     def _betaflight(self, axis: int, size: float) -> float:
-        expo, gain = self.expo[axis] / 100.0, self.rc_rates[axis] / 100.0
+        expo = self.expo[axis] / 100.0
+        gain = self.rc_rates[axis] / 100.0
         bent = size**4 * expo + size * (1.0 - expo)
         if gain > 2.0:
             gain += FACTS["rate_steep"] * (gain - 2.0)
@@ -55,7 +54,8 @@ class RatesParams(Bounded):
         return FACTS["rate_unit"] * gain * bent / super_rate
 
     def _actual(self, axis: int, size: float) -> float:
-        expo, middle = self.expo[axis] / 100.0, 10.0 * self.rc_rates[axis]
+        expo = self.expo[axis] / 100.0
+        middle = 10.0 * self.rc_rates[axis]
         bent = size * (size ** FACTS["rate_power"] * expo + size * (1.0 - expo))
         return size * middle + max(0.0, 10.0 * self.rates[axis] - middle) * bent
 
@@ -83,7 +83,8 @@ class Sticks:
         """Return the position [us] that gives a body rate [rad/s] about our axis, as near as whole
         microseconds allow.
         """
-        table, size = self._tables[axis], abs(rate)
+        table = self._tables[axis]
+        size = abs(rate)
         above = min(bisect_left(table, size), TRAVEL)
         index = above if above == 0 or table[above] - size <= size - table[above - 1] else above - 1
         return MIDDLE + int(math.copysign(index, self.SIGNS[axis] * rate))

@@ -22,10 +22,15 @@ from typing import Any
 PAUSE = 1e-3  # after a frame that raised [s]
 LOOK = 0.5  # between two looks for sockets that the package has opened [s]
 
-PR_SET_PDEATHSIG, SO_ATTACH_FILTER, SO_MEMINFO, DROPS = 1, 26, 55, 8
+PR_SET_PDEATHSIG = 1
+SO_ATTACH_FILTER = 26
+SO_MEMINFO = 55
+DROPS = 8
 PROGRAM = struct.Struct("HBBI")  # of one instruction of a filter: code, jump if true, if false, k
 SENDER = 0xFFF00000 + 12  # SKF_NET_OFF and the place of the sender's address in IPv4's header
-LOAD, EQUAL, RETURN = 0x20, 0x15, 0x06
+LOAD = 0x20
+EQUAL = 0x15
+RETURN = 0x06
 
 Put = Callable[[Any], None]
 
@@ -48,7 +53,8 @@ class Strangers:
         self._filter = struct.pack("HP", len(rows), ctypes.addressof(self._code))
         self._known: set[str] = set()
         self._guarded: list[socket.socket] = []
-        self._looked, self._count = -LOOK, 0
+        self._looked = -LOOK
+        self._count = 0
 
     def look(self) -> int:
         """Put the filter on new sockets, every now and then; returns the datagrams that were
@@ -62,7 +68,8 @@ class Strangers:
             if name.startswith("socket:") and name not in self._known:
                 self._known.add(name)
                 self._guard(int(link.name))
-        before, self._count = self._count, sum(map(_dropped, self._guarded))
+        before = self._count
+        self._count = sum(map(_dropped, self._guarded))
         return self._count - before
 
     def _guard(self, number: int) -> None:

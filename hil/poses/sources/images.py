@@ -86,7 +86,8 @@ class Eyes:
         if params.by not in DETECTORS:
             raise ConfigError(f"images.by '{params.by}'; {suggest(params.by, DETECTORS)}")
         self._params = params
-        lens, mount = params.fisheye or training.fisheye, params.mount or training.mount
+        lens = params.fisheye or training.fisheye
+        mount = params.mount or training.mount
         distance = math.dist(mount.position_b, training.mount.position_b)
         if distance > SAME_PLACE:
             raise ConfigError(
@@ -107,7 +108,9 @@ class Eyes:
         """Look at a picture, BGR, uint8, exposed at a time [s]; raises `SourceError` for one of
         another size.
         """
-        prior, rot_wc, hint = Prior(), None, self.hint
+        prior = Prior()
+        rot_wc = None
+        hint = self.hint
         if hint is not None:
             rot_wb = rotation_of(hint.quat)
             rot_wc = rot_wb @ self._rot_cb.T
@@ -159,7 +162,8 @@ class RecordedImages(Eyes):
         """Return detections that have come, of several pictures the newest; raises `SourceError`
         for one that cannot be read.
         """
-        first, self._next = self._next, bisect_right(self._times, time, self._next)
+        first = self._next
+        self._next = bisect_right(self._times, time, self._next)
         if self._next == first:
             return []
         index = self._next - 1
@@ -210,7 +214,8 @@ class LiveImages(Eyes):
             print(f"camera stopped: {self.failure}", file=sys.stderr, flush=True)
 
     def poll(self, time: float) -> list[Detection]:
-        detection, self._newest = self._newest, None
+        detection = self._newest
+        self._newest = None
         return [] if detection is None else [detection]
 
     def close(self) -> None:
@@ -269,7 +274,8 @@ def _video(path: Path) -> tuple[Callable[[int], np.ndarray], list[float]]:
 
     def read(index: int) -> np.ndarray:
         nonlocal position
-        good, picture = True, None
+        good = True
+        picture = None
         while position < index and good:  # seeking would land on key frames
             good, picture = video.read()
             position += 1

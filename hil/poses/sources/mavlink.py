@@ -57,12 +57,14 @@ class MavlinkDecoder:
                 f"senders {keys}; expected at least one, and no two bodies with the same message,"
                 " system and component"
             )
-        self._bodies, self._drop = bodies, drop
+        self._bodies = bodies
+        self._drop = drop
         self._attitudes: dict[tuple[int, int], Any] = {}
 
     def feed(self, message: Any, arrival: float) -> Pose | None:
         """Return the pose in a message, if it is one of ours."""
-        kind, sender = message.get_type(), (message.get_srcSystem(), message.get_srcComponent())
+        kind = message.get_type()
+        sender = (message.get_srcSystem(), message.get_srcComponent())
         if kind in ATTITUDES:
             self._attitudes[sender] = message
             return None
@@ -157,5 +159,6 @@ class MavlinkSource(Source):
 
     def poll(self, time: float) -> list[Pose]:
         self.pump()
-        poses, self._waiting = self._waiting, []
+        poses = self._waiting
+        self._waiting = []
         return poses

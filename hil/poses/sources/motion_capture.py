@@ -37,7 +37,9 @@ from visthrow.config.bounds import Bounded, Positive
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
 HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
-SERVER_INFO, FRAME, IGNORED = 1, 7, (1, 3, 5, 8, 100)  # messages; those that are passed over
+SERVER_INFO = 1
+FRAME = 7
+IGNORED = (1, 3, 5, 8, 100)  # messages; those that are passed over
 RESTART_DELAY = 1.0  # after which a capture that has ended is started again, on the ground [s]
 QUIET = 5.0  # without a frame, after which it is started again on the ground: it may hang [s]
 ENDING = 2.0  # that threads and processes are given to end [s]
@@ -143,12 +145,16 @@ class MotionCaptureSource(MocapSource):
         is missing, no body is named, or the system does not answer.
         """
         super().__init__(clock, link, tell)
-        self._params, self._names, self._module = params, body_names(bodies), module
+        self._params = params
+        self._names = body_names(bodies)
+        self._module = module
         if module is None and importlib.util.find_spec("motioncapture") is None:
             load_extra("motioncapture", "motioncapture", "this source", SourceError)
-        self._stop, self._ready = threading.Event(), threading.Event()
+        self._stop = threading.Event()
+        self._ready = threading.Event()
         self._process: subprocess.Popen | None = None
-        self._heard, self._said = math.inf, ""
+        self._heard = math.inf
+        self._said = ""
         self._thread = threading.Thread(
             target=self._keep_listening, name="motioncapture", daemon=True
         )
@@ -168,7 +174,8 @@ class MotionCaptureSource(MocapSource):
                 self._listen() if self._module is None else self._listen_here()
             except Exception as error:  # whatever the package raises, the run goes on
                 self.failure = f"{type(error).__name__}: {error}"
-            first, stopping = not self._ready.is_set(), self._stop.is_set()
+            first = not self._ready.is_set()
+            stopping = self._stop.is_set()
             self._ready.set()
             if first or stopping:
                 return
@@ -191,7 +198,8 @@ class MotionCaptureSource(MocapSource):
         return super().poll(time)
 
     def _listen_here(self) -> None:
-        p, stopped = self._params, self._stop.is_set
+        p = self._params
+        stopped = self._stop.is_set
         listen(
             self._module.connect,
             p.system,
@@ -215,7 +223,8 @@ class MotionCaptureSource(MocapSource):
                 text=True,
             ) as process,
         ):
-            self._process, self._heard = process, monotonic()
+            self._process = process
+            self._heard = monotonic()
             for line in process.stdout:
                 self._take(json.loads(line))
             status = process.wait()
@@ -227,7 +236,8 @@ class MotionCaptureSource(MocapSource):
 
     def _take(self, value: Any) -> None:
         """Take what `hil.poses.sources.capture.listen` puts."""
-        arrival, host = self._clock(), (self._params.host, 0)
+        arrival = self._clock()
+        host = (self._params.host, 0)
         if value is None:
             if self._ready.is_set():
                 self._say("motion capture is connected again")
@@ -291,10 +301,8 @@ class NatNetSource(MocapSource):
             self._client.connect(timeout=params.timeout)
             self._client.run_async()
         except Exception as error:  # sockets, time-outs, and the package's own
-            cast, why = (
-                "multi" if params.multicast else "uni",
-                str(error) or f"no answer within {params.timeout:g} s",
-            )
+            cast = "multi" if params.multicast else "uni"
+            why = str(error) or f"no answer within {params.timeout:g} s"
             text = (
                 f"natnet at {params.host} (our address {params.local}, {cast}cast): {why}; expected"
                 " Motive that streams"
@@ -345,11 +353,9 @@ class NatNetSource(MocapSource):
         for rigid_body in frame.rigid_bodies:
             body = self._names.get(rigid_body.id_num)
             if body is not None:
-                stamp, pos, rot = (
-                    float(frame.suffix.timestamp),
-                    tuple(rigid_body.pos),
-                    tuple(rigid_body.rot),
-                )
+                stamp = float(frame.suffix.timestamp)
+                pos = tuple(rigid_body.pos)
+                rot = tuple(rigid_body.rot)
                 # None before NatNet 2.6, which does not say. Motive sends the last position on.
                 valid = rigid_body.tracking_valid is not False
                 self.hand_over(Pose(stamp, arrival, body, pos, rot, valid=valid))

@@ -157,7 +157,8 @@ def unit_problems(poses: Iterable[Pose], frames: dict[str, FrameParams]) -> list
     """Return what in a recording's raw poses no vehicle does, by the frames of each body; each says
     which unit would make sense of it.
     """
-    poses, channels = list(poses), {}
+    poses = list(poses)
+    channels = {}
     for body, params in frames.items():
         channels |= _channels(
             [pose for pose in poses if pose.body == body], Frames(params), CHANNELS[body]

@@ -78,7 +78,8 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
     position = CHANNELS[body][0]
     if position not in log or not len(log[position].time):
         return []
-    times, parts = log[position].time, []
+    times = log[position].time
+    parts = []
     for name in CHANNELS[body]:
         column: list[tuple | None] = [None] * len(times)
         if name in log:
@@ -120,7 +121,8 @@ def read_tlog(
     """
     roster = roster or Roster()
     decoder = MavlinkDecoder(bodies, lambda m, why: roster.refuse(seen_of(m, None, why)))
-    poses, first = [], None
+    poses = []
+    first = None
     for arrival, message in messages.telemetry(path):
         first = arrival if first is None else first
         pose = decoder.feed(message, arrival - first)

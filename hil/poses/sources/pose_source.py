@@ -25,7 +25,8 @@ class Source:
         self, links: tuple[Link, ...] = (), clock: Callable[[], float] = lambda: 0.0
     ) -> None:
         """Serve links while it is polled; ``clock`` gives the arrivals [s]."""
-        self.links, self._clock = links, clock
+        self.links = links
+        self._clock = clock
         self.rosters = [link.roster for link in links]
 
     def poll(self, time: float) -> list[Pose]:
@@ -97,8 +98,6 @@ class RecordedSource(Source):
         return self.poses[0].arrival
 
     def poll(self, time: float) -> list[Pose]:
-        first, self._next = (
-            self._next,
-            bisect_right(self.poses, time, self._next, key=lambda pose: pose.arrival),
-        )
+        first = self._next
+        self._next = bisect_right(self.poses, time, self._next, key=lambda pose: pose.arrival)
         return self.poses[first : self._next]

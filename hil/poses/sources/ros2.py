@@ -166,7 +166,8 @@ class Ros2Source(MocapSource):
         """
         super().__init__(clock, link, tell)
         topics = [(*_topic(name), body) for name, body in body_names(bodies).items()]
-        types, self._domain = message_types(), domain(params)
+        types = message_types()
+        self._domain = domain(params)
         core, sub, topic = (
             load_extra(f"cyclonedds.{name}", "ros2", "ROS 2 topics", SourceError)
             for name in ("core", "sub", "topic")

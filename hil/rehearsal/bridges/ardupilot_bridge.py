@@ -39,11 +39,9 @@ HEAD = struct.Struct(
 MAGIC = {FACTS[f"json_magic_{size}"]: FACTS[f"json_outputs_{size}"] for size in ("16", "32")}
 OURS = FACTS["motor_order"]
 
-LOW, HIGH, NEAR = (
-    1000.0,
-    2000.0,
-    50.0,
-)  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
+LOW = 1000.0
+HIGH = 2000.0
+NEAR = 50.0  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
 # for the next frame of an ArduPilot that was heard [s]; then the plant goes on without it
 PATIENCE = 1.0
 
@@ -65,7 +63,8 @@ def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
 
 def state_line(time: float, plant: MotorPlant) -> bytes:
     """The state of a vehicle as ArduPilot takes it, a line of JSON between two line feeds."""
-    now, (x, y, z, w) = plant.state, plant.quat_wb.tolist()
+    now = plant.state
+    (x, y, z, w) = plant.quat_wb.tolist()
     told = {
         "timestamp": time,
         "imu": {
@@ -100,8 +99,12 @@ class ArduPilotSitl(Bridge):
         Raises `LinkError`: the port is taken.
         """
         super().__init__(plant, link, mocap, seed, options)
-        self.params, self._number = params, -1
-        self.motors, self.frames, self.repeated, self.restarts = np.zeros(4), 0, 0, 0
+        self.params = params
+        self._number = -1
+        self.motors = np.zeros(4)
+        self.frames = 0
+        self.repeated = 0
+        self.restarts = 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
             self._socket.bind(("127.0.0.1", SERVOS))
@@ -128,9 +131,11 @@ class ArduPilotSitl(Bridge):
             self.repeated += 1
         else:
             self.restarts += number < self._number
-            self._number, self.frames = number, self.frames + 1
+            self._number = number
+            self.frames = self.frames + 1
             self.motors = np.clip((servos[OURS] - LOW) / (HIGH - LOW), 0.0, 1.0)
-            at, opens = self.params.servo_output - 1, self.params.servo_open_us
+            at = self.params.servo_output - 1
+            opens = self.params.servo_open_us
             self.output(0 <= at < len(servos) and abs(servos[at] - opens) <= NEAR, self.plant.time)
             super().fly()
         self._socket.sendto(state_line(self.plant.time, self.plant), to)

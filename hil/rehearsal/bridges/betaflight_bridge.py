@@ -63,23 +63,25 @@ class BetaflightSitl(Bridge):
         mechanism, ``stands``: see `Sensors`.
         """
         super().__init__(plant, link, mocap, seed, options)
-        self.params, self.armed = params, False
-        self.port, self.sensors = TcpPort(Device("tcp", "127.0.0.1", PORTS[1])), Sensors(stands)
-        self._parser, self._asked = msp.FrameParser(), dict.fromkeys(ASK, -1e9)
+        self.params = params
+        self.armed = False
+        self.port = TcpPort(Device("tcp", "127.0.0.1", PORTS[1]))
+        self.sensors = Sensors(stands)
+        self._parser = msp.FrameParser()
+        self._asked = dict.fromkeys(ASK, -1e9)
         self._boxes: tuple[int, ...] = ()
         self.motors = np.zeros(4)
         self.answered = 0
         self.cycles: list[int] = []
         self._outputs: list[np.ndarray] = []
         self._samples = round(plant.period / SAMPLE)
-        self._rate_b, self._sent = (
-            plant.rate_b,
-            0,
-        )  # at the beginning of the last period; samples sent in this one
+        self._rate_b = plant.rate_b
+        self._sent = 0  # at the beginning of the last period; samples sent in this one
 
     def run_on(self, when: float) -> None:
         """Send samples by the rates at the period's beginning and their last change."""
-        plant, step = self.plant, self.plant.period / self._samples
+        plant = self.plant
+        step = self.plant.period / self._samples
         due = np.arange(
             self._sent,
             min(max(math.ceil((when - SLACK - plant.time) / step), self._sent), self._samples),
@@ -91,7 +93,8 @@ class BetaflightSitl(Bridge):
 
     def fly(self) -> None:
         self.run_on(self.plant.time + self.plant.period)
-        self._rate_b, self._sent = self.plant.rate_b, 0
+        self._rate_b = self.plant.rate_b
+        self._sent = 0
         super().fly()
 
     def hear(self) -> None:
@@ -107,11 +110,13 @@ class BetaflightSitl(Bridge):
         elif frame.command == msp.STATUS and self._boxes:
             self._hear_status(frame)
         elif frame.command == msp.RC:
-            channels, at = frame.words(), STICKS + self.params.release_channel - 1
+            channels = frame.words()
+            at = STICKS + self.params.release_channel - 1
             self.output(at < len(channels) and abs(channels[at] - HIGH) <= NEAR, self.heard)
 
     def _hear_status(self, frame: msp.Frame) -> None:
-        flags, cycle = frame.number("<I", FACTS["status_flags"]) or 0, frame.number("<H", 0)
+        flags = frame.number("<I", FACTS["status_flags"]) or 0
+        cycle = frame.number("<H", 0)
         armed = BOX_ARM in self._boxes and bool(flags >> self._boxes.index(BOX_ARM) & 1)
         if armed != self.armed:
             self.happened("armed" if armed else "disarmed")
@@ -120,9 +125,11 @@ class BetaflightSitl(Bridge):
             self.cycles.append(cycle)
 
     def flown(self) -> np.ndarray:
-        came, self._outputs = np.concatenate(self._outputs), []
+        came = np.concatenate(self._outputs)
+        self._outputs = []
         if len(came):
-            self.motors, self.answered = came.mean(axis=0, dtype=float), self.answered + 1
+            self.motors = came.mean(axis=0, dtype=float)
+            self.answered = self.answered + 1
         return self.motors
 
     def speak(self) -> None:

@@ -28,11 +28,9 @@ from hil.rehearsal.bridges.packets import at_rest, stood
 PORTS = (FACTS["serial_port"] + 1, FACTS["serial_port"] + 2)
 LAST_WORDS = 200  # of its output, in an error
 LOOK_AGAIN = 0.02  # for a port that opens [s]
-START, ANSWER, END = (
-    20.0,
-    20.0,
-    10.0,
-)  # time for a start, for an answer of the command line and for the process's end [s]
+START = 20.0
+ANSWER = 20.0
+END = 10.0  # time for a start, for an answer of the command line and for the process's end [s]
 FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
 
 SETTINGS = Path(__file__).with_name("firmware_settings.toml")
@@ -88,7 +86,8 @@ class Firmware:
 
         Raises `RunError`: there is no such program.
         """
-        self.program, self.folder = Path(program).resolve(), Path(folder)
+        self.program = Path(program).resolve()
+        self.folder = Path(folder)
         if not self.program.is_file():
             raise RunError(
                 f"no firmware at {program}; expected Betaflight's program for a PC, as `make"
@@ -256,7 +255,8 @@ class CommandLine:
 
     def _heard(self, last: bytes = PROMPT) -> str:
         """Return the output up to the next prompt, or to other last words."""
-        data, end = b"", time.monotonic() + ANSWER
+        data = b""
+        end = time.monotonic() + ANSWER
         while not data.endswith(last):
             self._socket.settimeout(max(end - time.monotonic(), 1e-3))
             try:

@@ -38,7 +38,8 @@ TIME, MOTORS, LARGEST_ANSWER = (
 OURS = FACTS["motor_order"]
 SEA_LEVEL = 101325.0  # [Pa]
 
-STILL, CALIBRATION = 0.002, 3.0
+STILL = 0.002
+CALIBRATION = 3.0
 """Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its
 receiver to begin [s].
 """
@@ -87,7 +88,8 @@ class Sensors:
         """
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", SENSORS))
-        self._stands, self._stamp = stands, 0.0
+        self._stands = stands
+        self._stamp = 0.0
         self._last: tuple[Sequence[float], ...] = (
             (0.0, 0.0, 0.0),
             (0.0, 0.0, GRAVITY),
@@ -108,9 +110,12 @@ class Sensors:
             Motor outputs that came, 0 to 1, shape (M, 4), in our order; M is N, or less where the
             firmware is not ready.
         """
-        force, quat, packets = force_b.tolist(), quat_wb.tolist(), []
+        force = force_b.tolist()
+        quat = quat_wb.tolist()
+        packets = []
         for rate in rates_b.tolist():
-            self._stamp, self._last = self._stamp + period, (rate, force, quat)
+            self._stamp = self._stamp + period
+            self._last = (rate, force, quat)
             packets.append(sample(self._stamp, *self._last))
         return self._run(b"".join(packets))
 
@@ -147,7 +152,8 @@ def at_rest(stands: int) -> Iterator[None]:
     """Feed a firmware with a vehicle at rest, while nothing flies yet: it calibrates its gyro and
     answers only with samples.
     """
-    done, sensors = threading.Event(), Sensors(stands)
+    done = threading.Event()
+    sensors = Sensors(stands)
 
     def feed() -> None:
         with suppress(

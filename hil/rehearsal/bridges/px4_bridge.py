@@ -45,7 +45,8 @@ HALVING = 1.4  # a slow swing halves in this time, as below the simulator's hove
 MOST_DAMPING = 0.15  # of the ball [m/s^2], so that it takes 2 % off a throw
 
 FACTS = values("px4")
-EQUATOR, ECCENTRICITY = FACTS["earth_radius"], FACTS["earth_eccentricity"]
+EQUATOR = FACTS["earth_radius"]
+ECCENTRICITY = FACTS["earth_eccentricity"]
 DEGREE = FACTS["degree_unit"]  # of a latitude on the wire [deg]
 SETTLING = 0.3  # in which the place, integrated from velocities, follows the latitude's steps [s]
 
@@ -69,7 +70,8 @@ def between(before: Motion, after: Motion, time: float) -> Motion:
         return after._replace(time=time)
     s = max((time - before.time) / span, 0.0)
     shift = after.pos - before.pos
-    bend_0, bend_1 = span * before.vel - shift, span * after.vel - shift
+    bend_0 = span * before.vel - shift
+    bend_1 = span * after.vel - shift
     pos = before.pos + s * shift + s * (1.0 - s) * ((1.0 - s) * bend_0 - s * bend_1)
     sign = 1.0 if before.quat @ after.quat >= 0.0 else -1.0
     quat = (1.0 - s) * before.quat + s * sign * after.quat
@@ -101,9 +103,11 @@ class HangingBall:
             raise ValueError(f"rope of {self.length} m; expected a length above 0")
         self.time = 0.0
         still = Motion(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-        self._now, self._motions = still, deque[Motion]()
+        self._now = still
+        self._motions = deque[Motion]()
         self._hangs = False
-        self._ball, self._vel = np.array([0.0, 0.0, -self.length]), np.zeros(3)
+        self._ball = np.array([0.0, 0.0, -self.length])
+        self._vel = np.zeros(3)
         self._trip: float | None = None
         self.attached = True
         self.landing: dict[str, Any] = {
@@ -207,7 +211,9 @@ class Place:
         east = EQUATOR / math.sqrt(curve) * math.cos(math.radians(latitude))
         self._origin = np.array([latitude, longitude, altitude])
         self._scale = np.array([math.radians(north), -math.radians(east), 1.0])
-        self._time, self._pos, self._vel = -math.inf, np.zeros(3), np.zeros(3)
+        self._time = -math.inf
+        self._pos = np.zeros(3)
+        self._vel = np.zeros(3)
 
     def update(self, time: float, message: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return place [m] and velocity [m/s] at a time [s], z up, by a HIL_STATE_QUATERNION."""
@@ -222,7 +228,9 @@ class Place:
         if 0.0 < step < SETTLING:
             expected = self._pos + 0.5 * step * (self._vel + vel)
             pos = expected + step / SETTLING * (pos - expected)
-        self._time, self._pos, self._vel = time, pos, vel
+        self._time = time
+        self._pos = pos
+        self._vel = vel
         return pos, vel
 
 
@@ -252,12 +260,15 @@ class Px4Sih(Bridge):
         opens the mechanism.
         """
         super().__init__(plant, link, mocap, seed, options)
-        self.params, self.autopilot, self.port = params, autopilot, autopilot.port
+        self.params = params
+        self.autopilot = autopilot
+        self.port = autopilot.port
         self._asked: dict[int | str, float] = {}
         self._origin: dict[str, float] = {}
         self._place: Place | None = None
         self._offset = 0.0  # of PX4's clock to the plant's [s]
-        self.heard_of, self.last_output = 0, None
+        self.heard_of = 0
+        self.last_output = None
         autopilot.listen(self._hear)
 
     def hear(self) -> None:
@@ -271,7 +282,8 @@ class Px4Sih(Bridge):
         if kind == "HIL_STATE_QUATERNION":
             self._hear_state(message)
         elif kind == "PARAM_VALUE" and message.param_id in ORIGIN:
-            value, kind = message.param_value, message.param_type
+            value = message.param_value
+            kind = message.param_type
             # up to 1.14 latitude and longitude are integers
             unit = DEGREE if kind == mav.MAV_PARAM_TYPE_INT32 else 1.0
             self._origin[message.param_id] = unit * parameter_value(value, kind)
@@ -288,7 +300,8 @@ class Px4Sih(Bridge):
         time = 1e-6 * message.time_usec - self._offset
         if not self.paced:  # the first one, or after a pause
             self._offset += time - self.plant.time
-            time, self.paced = self.plant.time, True
+            time = self.plant.time
+            self.paced = True
         elif time <= self.plant.until:
             return
         self.heard_of += 1
@@ -300,7 +313,8 @@ class Px4Sih(Bridge):
 
     def fly(self) -> None:
         """Fly a period once PX4 has flown it; without PX4, a period as it was."""
-        wanted, end = self.plant.time + self.plant.period - SLACK, monotonic() + PATIENCE
+        wanted = self.plant.time + self.plant.period - SLACK
+        end = monotonic() + PATIENCE
         waits = self.paced
         while waits and self.plant.until < wanted and monotonic() < end:
             select.select([self.port], [], [], max(end - monotonic(), 0.0))

@@ -94,10 +94,8 @@ def run(args: argparse.Namespace) -> int:
                 " --hover 0.36"
             )
         plant = args.plant or DEFAULT_PLANT
-        base, experiment = (
-            _named("train", plant),
-            config.load(Experiment, config.find("train", plant)),
-        )
+        base = _named("train", plant)
+        experiment = config.load(Experiment, config.find("train", plant))
         atomic_write(
             args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
         )
@@ -134,7 +132,8 @@ def run(args: argparse.Namespace) -> int:
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )
-    name, account = _made_with(report, args, option, folder), origin(report, args.diagnosis)
+    name = _made_with(report, args, option, folder)
+    account = origin(report, args.diagnosis)
     base = _named(folder, name)
     diagnosed = config.load(
         schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ()
@@ -179,7 +178,8 @@ def _made_with(report: dict, args: argparse.Namespace, option: str, folder: str)
 
     Raises DiagnoseError: another one is asked for; neither the diagnosis nor the option names one.
     """
-    recorded, requested = report.get(option), getattr(args, option)
+    recorded = report.get(option)
+    requested = getattr(args, option)
     if not (recorded or requested):
         model = report.get("model", "throw")
         raise DiagnoseError(
@@ -240,7 +240,8 @@ def origin(report: dict, path: str) -> list[str]:
         )
     landing = (report.get("gain") or {}).get("landing")
     if landing:
-        before, after = landing["before"], landing["after"]
+        before = landing["before"]
+        after = landing["after"]
         lines.append(
             f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m"
             " after."

@@ -77,10 +77,8 @@ def text(
         plants: to draw in training from the joint posterior.
         laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
-    named, covariance = (
-        [catalogue()[name] for name in theta],
-        np.reshape(covariance, (len(theta), len(theta))),
-    )
+    named = [catalogue()[name] for name in theta]
+    covariance = np.reshape(covariance, (len(theta), len(theta)))
     # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
     # blocks there are
     header = [
@@ -106,7 +104,8 @@ def text(
         e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}"
         for i, e in enumerate(named)
     }
-    section, switched = "", [e.name for e in named if e.switch]
+    section = ""
+    switched = [e.name for e in named if e.switch]
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
@@ -201,7 +200,8 @@ def with_firmware(
 
     Raises DiagnoseError: settings are missing; LogError: no blackbox.
     """
-    settings, plant = read_blackbox(path)[0].header, plant_of(experiment)
+    settings = read_blackbox(path)[0].header
+    plant = plant_of(experiment)
     weight = 0.25 * plant.total_mass * GRAVITY
     try:
         voltage = calibrated_voltage(plant.vehicle, settings, weight, hover)

@@ -95,12 +95,10 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     after = model.residuals(problem.sizes(point.theta))
     units = tuple(model.effects[i].unit for i in columns)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    channel, measured = (
-        np.concatenate([w.channel for w in before]),
-        (
-            [w.residual for w in before],
-            after,
-        ),
+    channel = np.concatenate([w.channel for w in before])
+    measured = (
+        [w.residual for w in before],
+        after,
     )
     rms = [
         {
@@ -139,7 +137,8 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
 
 
 def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
-    gain, curve = 1.0 + size["thrust_gain"], size["thrust_curve"]
+    gain = 1.0 + size["thrust_gain"]
+    curve = size["thrust_curve"]
     mass = p.mass + size["mass_quad"]
     motor = dataclasses.replace(
         base.motor,

@@ -81,7 +81,8 @@ class Opened:
         Raises ConfigError, LogError: as what is read."""
         from visthrow.diagnose.inputs import setup
 
-        self._args, self.logs = args, setup.read_logs(args.logs, args.config)
+        self._args = args
+        self.logs = setup.read_logs(args.logs, args.config)
 
     @cached_property
     def model(self) -> Model:
@@ -91,7 +92,8 @@ class Opened:
         model."""
         from visthrow.diagnose.inputs import measures, setup
 
-        args, logs = self._args, self.logs
+        args = self._args
+        logs = self.logs
         chosen = setup.load(args.config) if args.config else None
         if chosen is None or not chosen.model:
             model, self.logs = throw_model(args, logs)

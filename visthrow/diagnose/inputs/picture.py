@@ -65,9 +65,11 @@ def _channel(axis, log: FlightLog, name: str) -> None:
     values = channel.values.reshape(len(channel.values), -1).astype(float)
     values = np.where(channel.valid[:, None], values, np.nan)
     step = max(1, len(values) // _POINTS)
-    time, values = channel.time[::step], values[::step]
+    time = channel.time[::step]
+    values = values[::step]
     wide = np.flatnonzero(np.diff(time) > 5 * np.median(np.diff(time)))
-    time, values = np.insert(time, wide + 1, np.nan), np.insert(values, wide + 1, np.nan, axis=0)
+    time = np.insert(time, wide + 1, np.nan)
+    values = np.insert(values, wide + 1, np.nan, axis=0)
     for i, column in enumerate(values.T[:4]):
         axis.plot(time, column, lw=0.8, color=style.COLOURS[i])
     axis.grid(True, axis="y")

@@ -28,23 +28,32 @@ from visthrow.logs.unit_names import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
 _NAMES = tomllib.loads(Path(__file__).with_name("column_names.toml").read_text(encoding="utf-8"))
-_SUFFIX, _ENDINGS, _HINTS = _NAMES["units"], _NAMES["components"], _NAMES["hints"]
+_SUFFIX = _NAMES["units"]
+_ENDINGS = _NAMES["components"]
+_HINTS = _NAMES["hints"]
 
 
 def _pattern(name: str) -> re.Pattern[str]:
     return re.compile(_NAMES["patterns"][name], re.IGNORECASE)
 
 
-_TIME, _TARGET, _NOT_VEHICLE = _pattern("time"), _pattern("target"), _pattern("not_vehicle")
-_ESTIMATE, _CAPTURE = _pattern("estimate"), _pattern("capture")
-_COMPONENT, _MOTOR = _pattern("component"), _pattern("motor")
+_TIME = _pattern("time")
+_TARGET = _pattern("target")
+_NOT_VEHICLE = _pattern("not_vehicle")
+_ESTIMATE = _pattern("estimate")
+_CAPTURE = _pattern("capture")
+_COMPONENT = _pattern("component")
+_MOTOR = _pattern("motor")
 UPS = ("", "x,-z,y")
 """Axes of a world whose z is up, and of one whose y is, as Motive's."""
 _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
 """Unit of commands of motors by what they exceed."""
-_FIRMLY, _BELONGS = 0.8, 0.6  # correlations of what is the derivative of what
-_REACH, _LATEST = 0.2, 0.15  # delays between them that are tried, and that count [s]
-_SPAN, _COARSE = 0.1, 0.02  # over which a path is differentiated; of the grid of many pairs [s]
+_FIRMLY = 0.8
+_BELONGS = 0.6  # correlations of what is the derivative of what
+_REACH = 0.2
+_LATEST = 0.15  # delays between them that are tried, and that count [s]
+_SPAN = 0.1
+_COARSE = 0.02  # over which a path is differentiated; of the grid of many pairs [s]
 _COMPARED = 1000  # rows on which the distance of two paths is judged
 _TURN = 7.0  # above a full turn in radians: degrees
 
@@ -88,7 +97,9 @@ def propose(
     numbers = {name: np.where(np.isfinite(cells), cells, np.nan) for name, cells in numbers.items()}
     if not any(_moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
-    proposal, channels, clocks = MappingProposal(None), {}, {}
+    proposal = MappingProposal(None)
+    channels = {}
+    clocks = {}
     for topic, part in _tables(numbers).items():
         if len(next(iter(part.values()))) < 50:
             continue
@@ -244,7 +255,8 @@ def _groups(numbers: Table) -> list[Group]:
         if set(letters) <= columns.keys():
             listed.append((stem, unit, [columns[letter] for letter in letters]))
     listed += [("", "", names) for names in _without_names(numbers)]
-    groups, used = [], set()
+    groups = []
+    used = set()
     for stem, unit, names in listed:
         if not used & set(names):
             values = np.column_stack([numbers[name] for name in names])
@@ -267,13 +279,16 @@ def _without_names(numbers: Table) -> list[list[str]]:
     names = list(numbers)
     if not names or not all(name.startswith("column ") for name in names):
         return []
-    groups, i, run = [], 0, []
+    groups = []
+    i = 0
+    run = []
     while i < len(names):
         four = np.column_stack([numbers[name] for name in names[i : i + 4]])
         length = np.linalg.norm(four, axis=1)
         if four.shape[1] == 4 and np.nanmax(np.abs(length - 1.0)) < 0.05:
             groups.append(names[i : i + 4])
-            i, run = i + 4, []
+            i = i + 4
+            run = []
             continue
         run.append(names[i])
         i += 1
@@ -293,7 +308,9 @@ class _Chooser:
         proposal: MappingProposal,
         settings: dict[str, str],
     ) -> None:
-        self.time, self.found, self.settings = time, proposal, settings
+        self.time = time
+        self.found = proposal
+        self.settings = settings
         for group in groups:
             group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
         self.groups = [g for g in groups if _moves(g.values)]
@@ -357,18 +374,18 @@ class _Chooser:
         """Make a channel of a group, unless its units contradict what the name stands for;
         ``options``: of its :class:`ChannelMap`.
         """
-        entry, values = ChannelMap(name, group.columns, unit, **options), group.values
+        entry = ChannelMap(name, group.columns, unit, **options)
+        values = group.values
         if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
-            entry, why = (
-                replace(entry, held=True),
-                why + "; its values are held between measurements",
-            )
+            entry = replace(entry, held=True)
+            why = why + "; its values are held between measurements"
         try:
             channel, _ = make_channel(self.time, values, entry, "table")
         except (ConfigError, LogError):
             return
         self.taken.add(id(group))
-        self.made[name], self.found.why[name] = (entry, channel), why
+        self.made[name] = (entry, channel)
+        self.found.why[name] = why
 
     def _hinted(self, group: Group, kind: str) -> bool:
         stem = group.stem.lower()
@@ -431,7 +448,8 @@ class _Chooser:
         """Order of a quaternion that no name says, and which axis is up, by what the lean does."""
         if not {"quat_wb", "pos_w"} <= self.made.keys():
             return
-        entry, (place, path) = self.made["quat_wb"][0], self.made["pos_w"]
+        entry = self.made["quat_wb"][0]
+        (place, path) = self.made["pos_w"]
         named = entry.kind != "quaternion" or any("w" in c.lower() for c in entry.columns)
         group = next(g for g in self.groups if g.columns == entry.columns)
         orders = (entry.order,) if named else ("wxyz", "xyzw")
@@ -608,7 +626,8 @@ class _Chooser:
         Returns the path's of the likeliest.
         """
         unit, angle, ratio = min(leans, key=lambda lean: abs(np.log(lean[2])))
-        listed, angles = ", ".join(path.columns), ", ".join(self.made["quat_wb"][0].columns)
+        listed = ", ".join(path.columns)
+        angles = ", ".join(self.made["quat_wb"][0].columns)
         pairs = " or ".join(
             f"{unit_name} and {leaning} ({times:.2g} times)" for unit_name, leaning, times in leans
         )
@@ -654,7 +673,8 @@ class _Chooser:
                     continue
                 gap = lower.values[rows] * UNITS[b][1] - upper.values[rows] * UNITS[a][1]
                 length = np.linalg.norm(gap, axis=1)
-                middle, spread = np.nanmedian(length), np.nanstd(length)
+                middle = np.nanmedian(length)
+                spread = np.nanstd(length)
                 if (
                     0.05 < middle < 20.0
                     and spread < 0.1 * middle
@@ -672,7 +692,8 @@ class _Chooser:
         values = group.values[np.all(np.isfinite(group.values), axis=1)]
         if len(values) < 50:
             return False
-        moves, steps = np.std(values, axis=0), np.std(np.diff(values, axis=0), axis=0)
+        moves = np.std(values, axis=0)
+        steps = np.std(np.diff(values, axis=0), axis=0)
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
     def _relation(self, path: Group, rate: Group, threshold: float) -> relations.Relation | None:
@@ -830,7 +851,8 @@ class _Chooser:
         attitude = self.made.get("quat_wb", (None, None))[1]
         ranked = []
         for group in (g for g in self._open(3) if self._hinted(g, "rate_b")):
-            relation, times = None, 1.0
+            relation = None
+            times = 1.0
             if attitude is not None and len(attitude.time) > 100:
                 stamps, derived = relations.rates_of(*attitude.samples())
                 good = np.all(np.isfinite(group.values), axis=1)
@@ -856,7 +878,8 @@ class _Chooser:
         elif not group.unit:
             listed = ", ".join(group.columns)
             if group.columns == ("gyro.x", "gyro.y", "gyro.z"):
-                unit, why = "deg/s", why + "; a Crazyflie's gyro.x is in deg/s"
+                unit = "deg/s"
+                why = why + "; a Crazyflie's gyro.x is in deg/s"
             self.found.questions.append(
                 f"are the rates {listed} in rad/s or deg/s? '{unit}' is taken: no attitude says"
             )
@@ -1031,7 +1054,8 @@ def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -
         return log
     mine = [replace(c, unit=unit) if c is entry else c for c in proposal.mapping.channels]
     proposal.mapping = replace(proposal.mapping, channels=tuple(mine))
-    channel, times = log[entry.name], UNITS[unit][1] / UNITS[entry.unit][1]
+    channel = log[entry.name]
+    times = UNITS[unit][1] / UNITS[entry.unit][1]
     return FlightLog(
         {**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta
     )
@@ -1080,9 +1104,11 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         or np.median(applied[2]) <= 0.0
     ):
         return None
-    mass, gap = thrust_checks.mass_of(log), None
+    mass = thrust_checks.mass_of(log)
+    gap = None
     if "payload_pos_w" in log:
-        (time, pos), (time_p, pos_p) = log["pos_w"].samples(), log["payload_pos_w"].samples()
+        (time, pos) = log["pos_w"].samples()
+        (time_p, pos_p) = log["payload_pos_w"].samples()
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
     name, _, total = applied
     motors = 1 if name in ("thrust_command", "throttle") else 4

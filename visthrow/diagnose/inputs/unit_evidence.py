@@ -152,6 +152,7 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
 def rising(time: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are numbers, later than those before."""
     good = np.isfinite(time) & np.all(np.isfinite(path), axis=1)
-    time, path = time[good], path[good]
+    time = time[good]
+    path = path[good]
     later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
     return time[later], path[later]

@@ -34,7 +34,8 @@ simulator's.
 
 NORMAL_95 = 1.96
 
-STRONG, VERY_STRONG = 3.0, 5.0
+STRONG = 3.0
+VERY_STRONG = 5.0
 """Nats:
 
 Bayes factors above 20 are strong, above 150 very strong (Kass and Raftery 1995). What is less than

@@ -181,7 +181,9 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         rows = window.channel == c
         white = z[rows]
         residual = r[rows]
-        inner[c], cross[c], square[c] = white.T @ white, residual @ white, residual @ residual
+        inner[c] = white.T @ white
+        cross[c] = residual @ white
+        square[c] = residual @ residual
     count = np.bincount(window.channel, minlength=len(square)).astype(float)
     blocks = np.asarray(window.latent_block, dtype=int)
     states = window.nuisance.shape[1]
@@ -255,7 +257,8 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     factor = knot_factor(window, time)
     knots = len(factor)
     groups = gram.latents // len(factor)
-    part, (channels, size) = slice(gram.nuisances, gram.nuisances + gram.latents), gram.cross.shape
+    part = slice(gram.nuisances, gram.nuisances + gram.latents)
+    (channels, size) = gram.cross.shape
     inner = gram.inner.copy()
     inner[:, part] = (factor.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
         channels, -1, size
@@ -387,7 +390,9 @@ def gather(
         samples[i] += gram.count.sum()
         total += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
     silent = np.diagonal(information.sum(0)) < ROUNDING * total
-    information[:, silent], information[:, :, silent], score[:, silent] = 0.0, 0.0, 0.0
+    information[:, silent] = 0.0
+    information[:, :, silent] = 0.0
+    score[:, silent] = 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
     if lowest < -NEGATIVE:

@@ -32,7 +32,8 @@ CORRELATION_TIMES = (0.15, 0.3, 0.6, 1.2, 2.4)
 
 SCALE_BOUNDS = (0.3, 10.0)  # of a channel's sigma against what the model said
 
-LEVEL_LOW, LEVEL_HIGH = 1e-2, 1e4
+LEVEL_LOW = 1e-2
+LEVEL_HIGH = 1e4
 """Latent deviations, in the level at which they become visible.
 
 A hundredth of it is as good as none: thousands of knots together do not show it, and far below it
@@ -55,7 +56,8 @@ WIDE = (
 )
 
 ITERATIONS = 40
-ENOUGH_NATS, ROUGHLY_NATS = 0.2, 1.0
+ENOUGH_NATS = 0.2
+ROUGHLY_NATS = 1.0
 """A step that promises less is the last in the search for the levels, and leaves some twentieth of
 it; while correlation times are compared.
 """
@@ -207,7 +209,8 @@ class _Layout:
         last = len(self.keys) + len(self.pairs)
         share = noise.share.copy()
         scale = noise.scale.copy()
-        share[tuple(self.pairs.T)], scale[self.seen] = np.exp(x[first:last]), np.exp(x[last:])
+        share[tuple(self.pairs.T)] = np.exp(x[first:last])
+        scale[self.seen] = np.exp(x[last:])
         return replace(
             noise,
             scale=scale,
@@ -240,7 +243,8 @@ def maximised(
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at
     all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
     promises less is the last."""
-    layout, stack = _Layout.of(grams, noise), Stack(grams, device)
+    layout = _Layout.of(grams, noise)
+    stack = Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 

@@ -105,7 +105,8 @@ class Stack:
         ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of
         the noise's shares; default: their order."""
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
-        self.device, size = device, BATCH if device == "cpu" else max(len(grams), 1)
+        self.device = device
+        size = BATCH if device == "cpu" else max(len(grams), 1)
         self._sizes = [gram.nuisances + gram.latents for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
@@ -254,7 +255,8 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     curvature by [blocks, scales].
     """
     covariance = _inverse(shape.factor)
-    variance, (count, channels) = covariance.diagonal(dim1=1, dim2=2).clone(), batch.count.shape
+    variance = covariance.diagonal(dim1=1, dim2=2).clone()
+    (count, channels) = batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
     spread = (batch.hidden * scaled[:, None]).sum(
@@ -305,16 +307,15 @@ class _Integrated:
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
-        weight, (count, n, columns) = noise.scale**-2.0, self.half.shape
+        weight = noise.scale**-2.0
+        (count, n, columns) = self.half.shape
         hidden = np.zeros((count, n))
         effects = np.zeros((count, columns))
         for w, (gram, kept_columns) in enumerate(zip(grams, self.left)):
             cross = weight @ gram.cross
             size = gram.nuisances + gram.latents
-            hidden[w, :size], effects[w, kept_columns] = (
-                cross[:size],
-                cross[len(cross) - len(kept_columns) :],
-            )
+            hidden[w, :size] = cross[:size]
+            effects[w, kept_columns] = cross[len(cross) - len(kept_columns) :]
         right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
         projected = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
         results = (
@@ -363,7 +364,8 @@ class Integrals:
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
-    shape, (_, channels, n) = _shape(batch, noise), batch.cross.shape
+    shape = _shape(batch, noise)
+    (_, channels, n) = batch.cross.shape
     sizes = [gram.nuisances + gram.latents for gram in batch.grams]
     inner = [gram.inner for gram in batch.grams]
     width = len(batch.grams[0].inner[0]) - sizes[0]

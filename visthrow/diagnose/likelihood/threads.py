@@ -27,7 +27,8 @@ PIECES = 4  # of what is to be done, for each thread
 # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth
 # longer
 THREADS_BESIDE_GPU = 3
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # numbers of glibc's ``malloc.h``
+TRIM_THRESHOLD = -1
+MMAP_THRESHOLD = -3  # numbers of glibc's ``malloc.h``
 BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
 MAPPED = (
     2**30
@@ -74,7 +75,8 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
 
 def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
     """The function of every item, in order, on all cores; no call may wait for another of these."""
-    items, threads = list(items), min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
+    items = list(items)
+    threads = min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
     if min(threads, len(items)) < 2:
         return [function(item) for item in items]
     pieces = min(

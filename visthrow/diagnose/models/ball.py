@@ -72,7 +72,8 @@ class BallModel(NumericModel):
         spin = top[:, None] * self._across[lanes.owner] + side[:, None] * np.array([0.0, 0.0, 1.0])
         push = latent_force(lanes.latent, STEPS, 1)[:, 0]
         gravity = np.array([0.0, 0.0, -self.params.gravity])
-        quadratic, linear = (self.params.drag + drag)[:, None], linear[:, None]
+        quadratic = (self.params.drag + drag)[:, None]
+        linear = linear[:, None]
 
         def slope(index: int, state: np.ndarray) -> np.ndarray:
             vel = state[:, 3:]
@@ -112,10 +113,12 @@ def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
     times, path = log[CHANNEL].samples()
     if len(times) < 40:
         return []
-    sigma, flights = sigma_of(log[CHANNEL], 1e-5), []
+    sigma = sigma_of(log[CHANNEL], 1e-5)
+    flights = []
     for start, end in _free(times, path, params):
         rows = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
-        time, pos = times[rows], path[rows]
+        time = times[rows]
+        pos = path[rows]
         fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
         horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
         horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)

@@ -79,29 +79,30 @@ class FlyerModel(NumericModel):
 
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the
         step's own mean: commands switch there."""
-        p, fine = self.params, self.params.step / FINE
-        delay, tau = (
-            p.command_delay + self.of(lanes, "cmd_delay"),
-            p.motor_time_constant + self.of(lanes, "motor_tau"),
-        )
+        p = self.params
+        fine = self.params.step / FINE
+        delay = p.command_delay + self.of(lanes, "cmd_delay")
+        tau = p.motor_time_constant + self.of(lanes, "motor_tau")
         tau = np.maximum(tau, SHORTEST)
         position = (
             p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
         ) / fine  # tables begin one window early
         index = np.clip(position.astype(int), 0, self._commanded.shape[1] - 1)
-        share, out = (
-            (position - index)[..., None],
-            np.empty((2, *position.shape, self._commanded.shape[2])),
-        )
+        share = (position - index)[..., None]
+        out = np.empty((2, *position.shape, self._commanded.shape[2]))
         for lag in np.unique(tau):
-            keep, members = np.exp(-fine / lag), np.flatnonzero(tau == lag)
+            keep = np.exp(-fine / lag)
+            members = np.flatnonzero(tau == lag)
             after, _ = lfilter(
                 [1.0 - keep], [1.0, -keep], self._commanded, 1, keep * self._commanded[:, :1]
             )
             thrust = np.concatenate([self._commanded[:, :1], after], 1)
             whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
-            which, rows, part = lanes.owner[members], index[:, members], share[:, members]
-            begin, rise = thrust[which, rows], thrust[which, rows + 1] - thrust[which, rows]
+            which = lanes.owner[members]
+            rows = index[:, members]
+            part = share[:, members]
+            begin = thrust[which, rows]
+            rise = thrust[which, rows + 1] - thrust[which, rows]
             out[:, :, members] = (
                 begin + part * rise,
                 whole[which, rows] + part * (begin + 0.5 * part * rise),
@@ -116,8 +117,10 @@ class FlyerModel(NumericModel):
 
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
-        p, forces = self.params, latent_force(lanes.latent, self.steps, self._blocks)
-        thrust, curve = self._thrusts(lanes), self.of(lanes, "thrust_curve")[:, None]
+        p = self.params
+        forces = latent_force(lanes.latent, self.steps, self._blocks)
+        thrust = self._thrusts(lanes)
+        curve = self.of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
         since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
         faded = 1.0 + self.of(lanes, "thrust_fade") * since
@@ -143,11 +146,10 @@ class FlyerModel(NumericModel):
         """See the base class; the cable's tension is what accelerates the payload
         against gravity.
         """
-        p, time = self.params, np.unique(stretch.latent_time)
-        grid, halves = (
-            stretch.data["start"] + p.step * np.arange(len(path)),
-            np.arange(2 * self.steps + 1) + self._spare,
-        )
+        p = self.params
+        time = np.unique(stretch.latent_time)
+        grid = stretch.data["start"] + p.step * np.arange(len(path))
+        halves = np.arange(2 * self.steps + 1) + self._spare
         values = triangles(time, grid) @ path
         rot = Rotation.from_matrix(stretch.data["rot"][halves])
         turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
@@ -163,7 +165,8 @@ class FlyerModel(NumericModel):
             "thrust": values[:, -self._commanded.shape[2] :].sum(1),
         }
         if p.cable is not None:
-            gap, vel = path[:, 6:9], path[:, 3:6] + path[:, 9:12]
+            gap = path[:, 6:9]
+            vel = path[:, 3:6] + path[:, 9:12]
             direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
             at_knots = triangles(time, grid) @ np.column_stack(
@@ -196,7 +199,8 @@ class FlyerModel(NumericModel):
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
-        p, start = self.params, stretch.data["start"]
+        p = self.params
+        start = stretch.data["start"]
         out = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
             rows = stretch.channel == channel
@@ -211,9 +215,11 @@ class FlyerModel(NumericModel):
                 ).reshape(len(path), -1)
                 continue
             late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
-            value, rate = path[..., 0:3], path[..., 3:6]
+            value = path[..., 0:3]
+            rate = path[..., 3:6]
             if name == "payload_pos_w":
-                value, rate = value + path[..., 6:9], rate + path[..., 9:12]
+                value = value + path[..., 6:9]
+                rate = rate + path[..., 9:12]
             pos = hermite(late, start, p.step, value, rate)
             if channel == 0 and "marker_z" in self.numbers:
                 lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
@@ -237,14 +243,19 @@ class _Dynamics:
         :func:`latent_force` gives it.
         """
         p = model.params
-        self.thrust, self.total, self.latent = thrust, thrust.sum(2, keepdims=True), latent
+        self.thrust = thrust
+        self.total = thrust.sum(2, keepdims=True)
+        self.latent = latent
         self.rise = model._rise(thrust) if model.laws else None
 
         def get(name: str) -> np.ndarray:
             return model.of(lanes, name)
 
         mass = (p.mass + get("mass_quad"))[:, None]
-        self.model, self.p, self.mass, self.owner = model, p, mass, lanes.owner
+        self.model = model
+        self.p = p
+        self.mass = mass
+        self.owner = lanes.owner
         self.blocks = (
             "",
             *["payload force"] * (p.cable is not None),
@@ -252,14 +263,16 @@ class _Dynamics:
         )
         self.turn = model.stack(lanes, "marker_rot_x", "marker_rot_y", "")
         self.lean = get("estimator_lean")[:, None]
-        self.turns, self.half = bool(np.any(self.turn) or np.any(self.lean)), -1
+        self.turns = bool(np.any(self.turn) or np.any(self.lean))
+        self.half = -1
         tilt = model.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
         self.gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
         self.wind = model.stack(lanes, "wind_x", "wind_y", "")
         self.shift = model._spare + get("attitude_delay") / (0.5 * p.step)
         added = model.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
         self.drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
-        self.parasitic, self.lift = get("parasitic")[:, None], get("translational_lift")[:, None]
+        self.parasitic = get("parasitic")[:, None]
+        self.lift = get("translational_lift")[:, None]
         if p.cable is not None:
             self.length = (p.cable.length + get("rope_length"))[:, None]
             self.payload = (p.cable.mass + get("mass_payload"))[:, None]
@@ -274,9 +287,11 @@ class _Dynamics:
         """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in
         a row are asked for at each.
         """
-        self.half, position = half, half + self.shift
+        self.half = half
+        position = half + self.shift
         index = np.minimum(np.maximum(position.astype(int), 0), self.model._rot.shape[1] - 2)
-        share, before = (position - index)[:, None, None], self.model._rot[self.owner, index]
+        share = (position - index)[:, None, None]
+        before = self.model._rot[self.owner, index]
         self.rot = before + share * (self.model._rot[self.owner, index + 1] - before)
         if self.turns:
             self.off = (
@@ -305,7 +320,9 @@ class _Dynamics:
         """Derivative of all but the motors' thrusts."""
         if half != self.half:
             self._turn_to(half)
-        total, latent, vel = self.total[half], self.latent[half], state[:, 3:6]
+        total = self.total[half]
+        latent = self.latent[half]
+        vel = state[:, 3:6]
         vel_b = np.einsum("bji,bj->bi", self.rot, vel - self.wind)
         level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
         speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
@@ -326,7 +343,8 @@ class _Dynamics:
         else:
             free_q, free_p, direction, pull = self._pull(state, vel, force, latent[1])
             pull_w = pull * direction
-            acc_q, acc_p = free_q + pull_w / self.mass, free_p - pull_w / self.payload
+            acc_q = free_q + pull_w / self.mass
+            acc_p = free_p - pull_w / self.payload
             parts += [acc_q, state[:, 9:12], acc_p - acc_q]
         if self.p.torque is not None:
             parts.append(
@@ -345,13 +363,12 @@ class _Dynamics:
         """Accelerations without the cable, its direction, and what it pulls with [N]; it never
         pushes.
         """
-        gap, gap_rate = state[:, 6:9], state[:, 9:12]
+        gap = state[:, 6:9]
+        gap_rate = state[:, 9:12]
         vel_p = vel + gap_rate - self.wind
         drag = -self.payload_drag * np.sqrt(_products(vel_p, vel_p)) * vel_p
-        free_q, free_p = (
-            force / self.mass + self.gravity,
-            (drag + latent) / self.payload + self.gravity,
-        )
+        free_q = force / self.mass + self.gravity
+        free_p = (drag + latent) / self.payload + self.gravity
         length = np.sqrt(_products(gap, gap))
         direction = gap / length
         relative = _products(direction, free_p - free_q) + _products(gap_rate, gap_rate) / length
@@ -363,7 +380,9 @@ class _Dynamics:
         """Return the forces and torques of the laws in each latent block, at the cable's tension
         without them.
         """
-        vel, none, half_step = state[:, 3:6], np.zeros((len(state), 3)), half + self.model._spare
+        vel = state[:, 3:6]
+        none = np.zeros((len(state), 3))
+        half_step = half + self.model._spare
         turn = np.einsum(
             "bji,bjk->bik",
             self.model._rot[self.owner, half_step - 1],

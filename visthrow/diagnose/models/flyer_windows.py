@@ -76,7 +76,8 @@ def _windows(
         name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels
     }  # no less is believed
     driven = [log[name] for name in (params.position, params.attitude, params.input)]
-    first, last = max(c.time[0] for c in driven), min(c.time[-1] for c in driven)
+    first = max(c.time[0] for c in driven)
+    last = min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
     starts = starts[
         :: max(1, len(starts) // (4 * params.most_windows))
@@ -221,7 +222,9 @@ def _guess(rows, channels, params: FlyerParams) -> tuple[np.ndarray, np.ndarray,
     """Unknowns at the start, their spread, and the cable's direction there."""
     start = float(rows[0][0][0])
     pos, vel = _line(*rows[0], start)
-    guess, spread, direction = [*pos, *vel], [0.1] * 3 + [1.0] * 3, np.array([0.0, 0.0, -1.0])
+    guess = [*pos, *vel]
+    spread = [0.1] * 3 + [1.0] * 3
+    direction = np.array([0.0, 0.0, -1.0])
     if params.cable is not None:
         first_row = rows[channels.index("payload_pos_w")]
         if len(first_row[0]) >= 4:

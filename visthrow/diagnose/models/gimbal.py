@@ -72,7 +72,8 @@ class GimbalModel(NumericModel):
             self.stack(lanes, *(f"{what}_{axis}" for axis in "xyz"))
             for what in ("camera_tilt", "camera_lever", "marker_rot")
         )
-        time, table = stretch.time.reshape(-1, 3)[:, 0], stretch.data["table"]
+        time = stretch.time.reshape(-1, 3)[:, 0]
+        table = stretch.data["table"]
         late = time[None] - self.of(lanes, "camera_delay")[:, None]
         gap, axes, level = (
             on_grid(stretch.data["table_time"], table[name], late)
@@ -98,7 +99,9 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
     """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body,
     matrices as rows of 9.
     """
-    vehicle, attitude, payload = log["pos_w"], log["quat_wb"], log["payload_pos_w"]
+    vehicle = log["pos_w"]
+    attitude = log["quat_wb"]
+    payload = log["payload_pos_w"]
     good = (
         vehicle.valid & attitude.valid & payload.valid
         if len(vehicle.time) == len(payload.time)
@@ -125,7 +128,9 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
     if not all(np.any(log[name].valid) for name in NEEDED):
         return []
     table_time, tables = _tables(log, params)
-    stretches, rejected, frames = [], 0, 0
+    stretches = []
+    rejected = 0
+    frames = 0
     for start in np.arange(
         marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window
     ):
@@ -135,14 +140,16 @@ def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
         in_table = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
         if len(rows) < 10 or np.sum(in_table) < 20:
             continue
-        time, point = marker.time[rows], marker.values[rows].astype(float)
+        time = marker.time[rows]
+        point = marker.values[rows].astype(float)
         distance = np.linalg.norm(tables["gap"][in_table], axis=1)
         fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
         rejected += len(fits) - int(np.sum(fits))
         frames += len(fits)
         if np.sum(fits) < 10:
             continue
-        time, point = time[fits], point[fits]
+        time = time[fits]
+        point = point[fits]
         sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
         near = {name: values[in_table] for name, values in tables.items()}
         data = {"table_time": table_time[in_table], "table": near}

@@ -139,7 +139,8 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
     """Return the forces and torques of laws in each latent block at states with these quantities,
     shape (k, 3); empty without laws.
     """
-    values, total = KnotValues(values), {}
+    values = KnotValues(values)
+    total = {}
     for law in laws:
         value = law.coefficient * VECTORS[law.block][law.vector].read(values)
         for factor in law.factors:
@@ -174,7 +175,8 @@ def _slope(k: KnotValues) -> np.ndarray:
 
 def _swing(k: KnotValues) -> np.ndarray:
     """Velocity of the payload against the vehicle, across the rope."""
-    relative, n = k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]
+    relative = k["payload_vel_w"] - k["vel_w"]
+    n = k["cable_dir_w"]
     return relative - _dot(relative, n)[:, None] * n
 
 
@@ -293,10 +295,8 @@ class TermLayout:
         """Sort out the factors of terms."""
         scalars = tuple(dict.fromkeys(f for t in members for f in t.factors))
         vectors = tuple(dict.fromkeys(t.vector for t in members))
-        scalar_index, place = (
-            {f: i + 1 for i, f in enumerate(scalars)},
-            {v: i for i, v in enumerate(vectors)},
-        )
+        scalar_index = {f: i + 1 for i, f in enumerate(scalars)}
+        place = {v: i for i, v in enumerate(vectors)}
         rows = [
             ([scalar_index[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS]
             for t in members
@@ -342,7 +342,8 @@ def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]
     if block != JOINT:
         return {block: values}
     quantities = knots if isinstance(knots, KnotValues) else KnotValues(knots)
-    torque_b, reach = np.swapaxes(values, 1, 2), quantities["reach_w"][:, None, :]
+    torque_b = np.swapaxes(values, 1, 2)
+    reach = quantities["reach_w"][:, None, :]
     turn = np.stack([quantities[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
     torque_w = np.einsum("kij,ktj->kti", turn, torque_b)
     pair = -cross(torque_w, reach) / (reach**2).sum(-1, keepdims=True)

@@ -125,7 +125,8 @@ class NumericModel(Model, ABC):
             for e in effects
         )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
-        self.channels, self.stretches = tuple(channels), list(stretches)
+        self.channels = tuple(channels)
+        self.stretches = list(stretches)
         self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
         self._base = np.zeros(
@@ -149,7 +150,8 @@ class NumericModel(Model, ABC):
                     f" {high:g}"
                 )
         if laws:
-            first, one = self.stretches[0], self._lanes(base).part([0])
+            first = self.stretches[0]
+            one = self._lanes(base).part([0])
             quantities = self.knots(first, self.simulate(one)[0]).keys()
             for term in map(term_of, laws):
                 lacking = sorted(term.needs - quantities) or (
@@ -160,7 +162,8 @@ class NumericModel(Model, ABC):
                         f"the law {term.formula} cannot act here:"
                         f" {self.lawless or 'this model has no ' + ', '.join(lacking)}"
                     )
-        self._base, self.laws = base, (*self.laws, *laws)
+        self._base = base
+        self.laws = (*self.laws, *laws)
         self.effects = tuple(
             replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b))
             for e, b in zip(self.effects, base.tolist())
@@ -175,7 +178,9 @@ class NumericModel(Model, ABC):
     def plain(self) -> "NumericModel":
         """See the base class."""
         model = copy(self)
-        model._base, model.laws, model._flown = np.zeros_like(self._base), (), None
+        model._base = np.zeros_like(self._base)
+        model.laws = ()
+        model._flown = None
         return model
 
     def with_laws(self, laws: Sequence[LawParams]) -> "NumericModel":
@@ -331,8 +336,10 @@ class NumericModel(Model, ABC):
         return np.array(costs)
 
     def _newton(self, i: int, residual: np.ndarray) -> np.ndarray:
-        s, slope = self.stretches[i], self._slopes[i]
-        weight, prior = 1.0 / s.sigma, 1.0 / s.nuisance_sd
+        s = self.stretches[i]
+        slope = self._slopes[i]
+        weight = 1.0 / s.sigma
+        prior = 1.0 / s.nuisance_sd
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slope))):
             return np.zeros(
                 len(s.nuisance)
@@ -346,7 +353,8 @@ class NumericModel(Model, ABC):
         """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central
         differences; (N, directions) a stretch.
         """
-        stretches, lanes = len(self.stretches), self._lanes(size)
+        stretches = len(self.stretches)
+        lanes = self._lanes(size)
         width = getattr(lanes, name).shape[1]
         axes = np.arange(width)
         if name == "theta":
@@ -387,7 +395,8 @@ def integrate(
 
     ``slope``: of the half step counted from the start, and the state; ``state``: at the start,
     shape (B, S); ``step``: [s], shape (B, 1)."""
-    path, half = np.empty((len(state), steps + 1, state.shape[1])), 0.5 * step
+    path = np.empty((len(state), steps + 1, state.shape[1]))
+    half = 0.5 * step
     path[:, 0] = state
     for i in range(steps):
         k1 = slope(2 * i, state)
@@ -416,12 +425,10 @@ def hermite(
     index = np.clip(position.astype(int), 0, value.shape[1] - 2)
     s = (position - index)[..., None]
     lane = np.arange(len(value))[:, None]
-    a, b, da, db = (
-        value[lane, index],
-        value[lane, index + 1],
-        rate[lane, index],
-        rate[lane, index + 1],
-    )
+    a = value[lane, index]
+    b = value[lane, index + 1]
+    da = rate[lane, index]
+    db = rate[lane, index + 1]
     out = (1 + 2 * s) * (1 - s) ** 2 * a + s**2 * (3 - 2 * s) * b
     return out + step * (s * (1 - s) ** 2 * da + s**2 * (s - 1) * db)
 

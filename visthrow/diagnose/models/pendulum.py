@@ -64,7 +64,8 @@ class PendulumModel(NumericModel):
     Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg
     at the pendulum's length."""
 
-    latent_step, bends = 0.1, True
+    latent_step = 0.1
+    bends = True
 
     def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
         """Cut the logs.
@@ -87,11 +88,9 @@ class PendulumModel(NumericModel):
         p = self.params
         length, viscous, coulomb, quadratic, _, _, clock, spring = lanes.theta.T
         stiffness = p.gravity / (p.length + length)
-        viscous, coulomb, quadratic = (
-            p.viscous + viscous,
-            p.coulomb + coulomb,
-            p.quadratic + quadratic,
-        )
+        viscous = p.viscous + viscous
+        coulomb = p.coulomb + coulomb
+        quadratic = p.quadratic + quadratic
         push = latent_force(lanes.latent, self._steps, 1, 2)[:, 0]
 
         def slope(index: int, state: np.ndarray) -> np.ndarray:
@@ -114,24 +113,24 @@ class PendulumModel(NumericModel):
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class."""
-        time, grid = (
-            np.unique(stretch.latent_time),
-            stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path)),
-        )
+        time = np.unique(stretch.latent_time)
+        grid = stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path))
         return self._knot_values(time, triangles(time, grid) @ path)
 
     def _knot_values(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
         """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and
         still.
         """
-        length, (angle, rate) = self.params.length, state.T
-        direction, vel, upright = (
-            np.zeros((len(state), 3)),
-            np.zeros((len(state), 3)),
-            np.zeros((len(state), 4)),
-        )
-        direction[:, 0], direction[:, 2], upright[:, 3] = np.sin(angle), -np.cos(angle), 1.0
-        vel[:, 0], vel[:, 2] = -length * rate * direction[:, 2], length * rate * direction[:, 0]
+        length = self.params.length
+        (angle, rate) = state.T
+        direction = np.zeros((len(state), 3))
+        vel = np.zeros((len(state), 3))
+        upright = np.zeros((len(state), 4))
+        direction[:, 0] = np.sin(angle)
+        direction[:, 2] = -np.cos(angle)
+        upright[:, 3] = 1.0
+        vel[:, 0] = -length * rate * direction[:, 2]
+        vel[:, 2] = length * rate * direction[:, 0]
         tension = np.maximum(length * rate**2 - self.params.gravity * direction[:, 2], 0.0)
         return {
             "time": time,
@@ -175,7 +174,8 @@ def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretc
         rows = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
         if len(rows) < FEWEST:
             continue
-        t, y = time[rows], angle[rows]
+        t = time[rows]
+        y = angle[rows]
         fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
         layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
         table = t, y[:, None], sigma

@@ -60,7 +60,8 @@ class StandModel(NumericModel):
         gain, exponent, linear, voltage, zero, power_gain, power_exponent, idle, resistance = (
             x[:, None] for x in lanes.theta.T
         )
-        speed, volts = stretch.data["speed"], stretch.data["volts"]
+        speed = stretch.data["speed"]
+        volts = stretch.data["volts"]
         thrust = p.k_f * (
             speed**2 * (speed / self.middle) ** exponent * (1.0 + gain)
             + linear * self.middle * speed

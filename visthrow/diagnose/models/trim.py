@@ -62,10 +62,13 @@ class TrimModel(NumericModel):
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: the commands at which everything balances, shape (B, 4)."""
-        p, theta = self.params, lanes.theta
-        motors, added = theta[:, :4], theta[:, 4:8]
+        p = self.params
+        theta = lanes.theta
+        motors = theta[:, :4]
+        added = theta[:, 4:8]
         mass, gain, sag, com_x, com_y, yaw = theta[:, 8:].T
-        x, y = p.arm * np.array([1.0, 1.0, -1.0, -1.0]), p.arm * np.array([1.0, -1.0, 1.0, -1.0])
+        x = p.arm * np.array([1.0, 1.0, -1.0, -1.0])
+        y = p.arm * np.array([1.0, -1.0, 1.0, -1.0])
         weight = (p.mass + mass + added.sum(1)) * p.gravity
         total = p.mass + mass + added.sum(1)
         off_x = ((p.mass + mass) * com_x + added @ x) / total
@@ -100,7 +103,8 @@ class TrimModel(NumericModel):
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
-        data, (start, end) = stretch.data, np.unique(stretch.latent_time)
+        data = stretch.data
+        (start, end) = np.unique(stretch.latent_time)
         thrust = self.params.mass * self.params.gravity * data["lift"]
         return {
             "time": np.array([start, end]),
@@ -120,17 +124,17 @@ def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
 
 def _latent(start: float, end: float) -> dict[str, np.ndarray]:
     """Draught in a window: a push along the vertical and three torques."""
-    push, torque = latent_layout(start, end, 2, (0,), (2,)), latent_layout(start, end, 2, (1,))
+    push = latent_layout(start, end, 2, (0,), (2,))
+    torque = latent_layout(start, end, 2, (1,))
     return {name: np.concatenate([push[name], torque[name]]) for name in push}
 
 
 def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
-    window, stamps, nothing = (
-        params.slowest_window,
-        log[params.command].time,
-        (np.zeros(0), np.zeros(0)),
-    )
-    (time, sent), (time_p, pos) = log[params.command].samples(), log[params.position].samples()
+    window = params.slowest_window
+    stamps = log[params.command].time
+    nothing = (np.zeros(0), np.zeros(0))
+    (time, sent) = log[params.command].samples()
+    (time_p, pos) = log[params.position].samples()
     time_v, vel = (
         log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
     )

@@ -29,7 +29,8 @@ from visthrow.diagnose.planning.fly_manoeuvres import Simulate, Simulated
 from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, rise
 from visthrow.diagnose.planning.plan import PlanningGoal
 
-SLOWEST, FASTEST = 0.08, 2.0
+SLOWEST = 0.08
+FASTEST = 2.0
 """Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop
 still follows.
 """
@@ -82,12 +83,10 @@ class Limits:
         """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of
         both ``PERIOD`` apart, (N, 3).
         """
-        middle, room = (
-            (0.0, 0.0, 0.5 * (self.highest + self.lowest)),
-            (
-                *self.half,
-                0.5 * (self.highest - self.lowest),
-            ),
+        middle = (0.0, 0.0, 0.5 * (self.highest + self.lowest))
+        room = (
+            *self.half,
+            0.5 * (self.highest - self.lowest),
         )
         ways = [((path - middle)[:, [i]], rates[:, [i]], room[i]) for i in range(3)]
         ways += zip(_derivatives(path), _derivatives(rates), (self.speed, self.acceleration))
@@ -116,11 +115,9 @@ def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _leaving(position: np.ndarray, velocity: np.ndarray, radius: float) -> float:
     """Share of a way from within a ball about 0 at which its first row leaves it, shapes (N, D)."""
-    inward, square, slack = (
-        -(position * velocity).sum(1),
-        (velocity**2).sum(1),
-        np.maximum(radius**2 - (position**2).sum(1), 0.0),
-    )
+    inward = -(position * velocity).sum(1)
+    square = (velocity**2).sum(1)
+    slack = np.maximum(radius**2 - (position**2).sum(1), 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):  # of a row that does not move
         return float(
             np.nanmin((inward + np.sqrt(inward**2 + square * slack)) / square, initial=np.inf)
@@ -309,7 +306,10 @@ class _Search:
     def __init__(
         self, aim: PlanningGoal, base: Manoeuvre, simulate: Simulate, limits: Limits
     ) -> None:
-        self.aim, self.base, self.simulate, self.limits = aim, base, simulate, limits
+        self.aim = aim
+        self.base = base
+        self.simulate = simulate
+        self.limits = limits
         self.best: tuple[float, np.ndarray, np.ndarray] | None = None
         self.flights = 0
 

@@ -80,14 +80,13 @@ def simulator_of(
     setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
     """
     if isinstance(model, ThrowModel):
-        plant, device, requested = (
-            apply(model.entries, model.setting, diagnosis.theta).plant,
-            model.device,
-            {e.name for e in model.effects},
-        )
+        plant = apply(model.entries, model.setting, diagnosis.theta).plant
+        device = model.device
+        requested = {e.name for e in model.effects}
 
         def model_of_flight(flight: "SimulatedFlight") -> Model:
-            log, carries = flight.log(noise), flight.manoeuvre.payload
+            log = flight.log(noise)
+            carries = flight.manoeuvre.payload
             effects = effects_for(
                 model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
             )
@@ -103,12 +102,10 @@ def simulator_of(
             )
 
     elif isinstance(model, FlyerModel) and build is not None:
-        plant, device = (
-            vehicle_of(
-                model.params, plant_of(config.load(Experiment, config.find("train", "state")))
-            ),
-            "cpu",
+        plant = vehicle_of(
+            model.params, plant_of(config.load(Experiment, config.find("train", "state")))
         )
+        device = "cpu"
 
         def model_of_flight(flight: "SimulatedFlight") -> Model:
             return build(
@@ -149,7 +146,8 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     """
     ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
-    v, rope = in_units(plant.vehicle, alike), in_units(plant.rope, alike)
+    v = in_units(plant.vehicle, alike)
+    rope = in_units(plant.rope, alike)
     no_drag = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
     aero = replace(
         v.aero,
@@ -177,7 +175,8 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
     """Deviation of each channel, as stated by the model times the scale that was found."""
-    point, channels = diagnosis.work.after, diagnosis.work.problem.model.channels
+    point = diagnosis.work.after
+    channels = diagnosis.work.problem.model.channels
     noise = {name: point.sigma(c) * float(point.noise.scale[c]) for c, name in enumerate(channels)}
     return {name: sigma for name, sigma in noise.items() if np.isfinite(sigma)}
 
@@ -250,7 +249,8 @@ class SimulatedFlight:
         """Return a flight log like those of a setup: its channel names, inputs through its map of
         thrust, and what an IMU on board measures.
         """
-        truth, time = self.truth, self.time
+        truth = self.truth
+        time = self.time
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
         volts = (
             params.reference_voltage
@@ -343,8 +343,10 @@ class _Pilot:
     def __init__(
         self, sim, plant: PlantParams, references: Sequence[Reference], carried: np.ndarray
     ) -> None:
-        self.sim, self.references = sim, references
-        self.loaded, self.bare = plant.total_mass, plant.vehicle.body.mass
+        self.sim = sim
+        self.references = references
+        self.loaded = plant.total_mass
+        self.bare = plant.vehicle.body.mass
         motors = plant.vehicle.controller
         limits = replace(
             TRACKING, min_thrust=4.0 * motors.min_thrust, max_thrust=4.0 * motors.max_thrust

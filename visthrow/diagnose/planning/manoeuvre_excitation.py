@@ -18,14 +18,17 @@ AMPLITUDES = (1.5, 1.5, 1.0)
 paper's vehicle do not saturate.
 """
 
-LOW, HIGH, SECONDS = 0.5, 15.0, 20.0
+LOW = 0.5
+HIGH = 15.0
+SECONDS = 20.0
 """First and last frequency [Hz]: a swing of the hover to three times a rate loop of 30 rad/s;
 duration [s].
 """
 
 FADE = 2.0  # in which ArduPilot's sweep begins and ends [s]
 
-CHIRP_BOX, SYSTEMID = 55, 25
+CHIRP_BOX = 55
+SYSTEMID = 25
 
 AXES = {"roll": 7, "pitch": 8, "yaw": 9}  # SID_AXIS of the sweeps of a rate
 

@@ -52,7 +52,8 @@ class Reference:
 
     def limits(self) -> str:
         """Return when to abort, in words."""
-        low, high = self.pos_w.min(0) - 0.5, self.pos_w.max(0) + 0.5
+        low = self.pos_w.min(0) - 0.5
+        high = self.pos_w.max(0) + 0.5
         speed = np.linalg.norm(self.vel_w, axis=1).max()
         return (
             f"x {low[0]:.1f}..{high[0]:.1f}, y {low[1]:.1f}..{high[1]:.1f}, z"
@@ -136,10 +137,13 @@ def _passes(
     """
 
     def position(t: np.ndarray) -> np.ndarray:
-        value, begin, forth = np.zeros_like(t), 0.0, 1.0
+        value = np.zeros_like(t)
+        begin = 0.0
+        forth = 1.0
         for speed in speeds:
             value += forth * length * rise(t, begin, length / speed)
-            begin, forth = begin + length / speed + 1.0, -forth
+            begin = begin + length / speed + 1.0
+            forth = -forth
         return value - 0.5 * length
 
     return position, sum(length / speed + 1.0 for speed in speeds)
@@ -150,7 +154,8 @@ def _doublets(size: float, width: float) -> Callable[[np.ndarray], np.ndarray]:
 
     def rates(t: np.ndarray) -> np.ndarray:
         out = np.zeros((len(t), 3))
-        number, phase = np.floor(t / 0.8).astype(int), np.mod(t, 0.8)
+        number = np.floor(t / 0.8).astype(int)
+        phase = np.mod(t, 0.8)
         value = size * ((phase < width) * 1.0 - ((phase >= width) & (phase < 2 * width)))
         out[np.arange(len(t)), number % 3] = value
         return out

@@ -60,7 +60,9 @@ class PlanningGoal:
         ``names``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect
         that the diagnosis does not know."""
         work = diagnosis.work
-        self.diagnosis, self.base, self.priors = diagnosis, work.after, work.problem.priors
+        self.diagnosis = diagnosis
+        self.base = work.after
+        self.priors = work.problem.priors
         self.names = [e.name for e in work.problem.model.effects]
         expect_known(names, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
         number = self.names.index
@@ -123,7 +125,10 @@ class PlanningGoal:
 
         A member that is already behind by more than a class allows is no truth to plan for.
         """
-        information, score, priors, gaps = self.base.information, self.base.score, self.priors, []
+        information = self.base.information
+        score = self.base.score
+        priors = self.priors
+        gaps = []
         remaining = [j for j in self.diagnosis.work.active if j not in pair]
         evidence = {j: log_evidence(information, score, priors, [*remaining, j]) for j in pair}
         for truth, rival in (pair, pair[::-1]):
@@ -132,7 +137,8 @@ class PlanningGoal:
             theta = np.zeros(len(priors.floor))
             for j in [*remaining, truth]:
                 theta[j] = self.diagnosis.findings[j].estimate / priors.floor[j]
-            after, total = score + new @ theta, information + new
+            after = score + new @ theta
+            total = information + new
             gaps.append(
                 log_evidence(total, after, priors, [*remaining, truth])
                 - log_evidence(total, after, priors, [*remaining, rival])
@@ -143,7 +149,8 @@ class PlanningGoal:
         """Posterior deviation of each effect that is planned for, if it were named, with more
         information.
         """
-        total, active = self.base.information + new, self.diagnosis.work.active
+        total = self.base.information + new
+        active = self.diagnosis.work.active
         return np.array(
             [
                 np.sqrt(covariance(total, self.priors.deviation([*active, j]))[j, j])
@@ -184,7 +191,8 @@ def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
     """Return the flights of one session: of ranked proposals, each that separates what none before
     it does.
     """
-    chosen, separated = [], set()
+    chosen = []
+    separated = set()
     for p in proposals:
         if new := set(p.separates) - separated:
             chosen.append(p)
@@ -201,7 +209,9 @@ def _worth(p: FlightProposal) -> tuple[float, float]:
 
 def _measured(aim: PlanningGoal) -> list[FlightProposal]:
     """Measurements on the ground that settle members of classes."""
-    diagnosis, names, pairs = aim.diagnosis, aim.names, aim.pairs
+    diagnosis = aim.diagnosis
+    names = aim.names
+    pairs = aim.pairs
     findings = {f.name: f for f in diagnosis.findings}
     out = []
     for m in MEASUREMENTS:

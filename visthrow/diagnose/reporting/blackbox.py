@@ -55,7 +55,9 @@ class ForceTable:
 
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
-        basis, parts, values = self.radial(_inputs(window)), [], laws.KnotValues(window.knots)
+        basis = self.radial(_inputs(window))
+        parts = []
+        values = laws.KnotValues(window.knots)
         for block in self.blocks:
             turned = block != "vehicle torque" and "quat_wb" in values
             axes = np.stack(
@@ -81,7 +83,8 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
     inputs = np.vstack([_inputs(w) for w in point.windows])
     if not inputs.shape[1]:
         return None
-    mean, deviation = inputs.mean(0), np.maximum(inputs.std(0), 1e-9)
+    mean = inputs.mean(0)
+    deviation = np.maximum(inputs.std(0), 1e-9)
     chosen = rng.choice(len(inputs), size=min(CENTRES, len(inputs)), replace=False)
     blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
     if not blocks:
@@ -100,8 +103,10 @@ class Trained:
 
     def weights(self, keep: np.ndarray) -> np.ndarray:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
-        information, score = self.information[keep].sum(0), self.score[keep].sum(0)
-        best, mean = -np.inf, np.zeros(len(score))
+        information = self.information[keep].sum(0)
+        score = self.score[keep].sum(0)
+        best = -np.inf
+        mean = np.zeros(len(score))
         for reach in REACHES:
             prior = reach * self.reach
             normal = information * np.outer(prior, prior) + np.eye(len(prior))
@@ -109,7 +114,8 @@ class Trained:
             half = np.linalg.solve(lower, score * prior)
             value = 0.5 * half @ half - np.log(np.diag(lower)).sum()
             if value > best:
-                best, mean = value, prior * np.linalg.solve(lower.T, half)
+                best = value
+                mean = prior * np.linalg.solve(lower.T, half)
         return mean
 
 
@@ -123,7 +129,8 @@ def train(
     shift = point.statistics.theta - (0.0 if theta is None else theta)
     names = np.array(sorted(set(groups)))
     size = table.columns(point.windows[0]).shape[1]
-    information, score = np.zeros((len(names), size, size)), np.zeros((len(names), size))
+    information = np.zeros((len(names), size, size))
+    score = np.zeros((len(names), size))
     for window, part, group in zip(
         point.windows, statistics(point.grams, point.noise, point.device), groups
     ):

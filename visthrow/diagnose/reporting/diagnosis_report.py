@@ -125,10 +125,12 @@ def instead(diagnosis: Diagnosis) -> list[str]:
     """A line for each set of causes that says the same with several others; single ones that do are
     told as a class.
     """
-    lines, named = [], set(diagnosis.theta)
+    lines = []
+    named = set(diagnosis.theta)
     withdrawn = not diagnosis.sets or set(diagnosis.sets[0][0]) != named  # for a law
     for names, nats in () if withdrawn else diagnosis.sets:
-        removed, new = sorted(named - set(names)), sorted(set(names) - named)
+        removed = sorted(named - set(names))
+        new = sorted(set(names) - named)
         if max(len(removed), len(new)) > 1:
             lines.append(
                 f"{', '.join(new) or 'nothing'} in place of {', '.join(removed) or 'nothing'},"

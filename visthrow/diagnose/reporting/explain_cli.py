@@ -53,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.reporting import diagnosis_report as report
 
-    folder, made_with = Path(args.out), opening.made_with(args)
+    folder = Path(args.out)
+    made_with = opening.made_with(args)
     check_place(folder / DIAGNOSIS)
     opened = opening.Opened(args)
     test_flights = opening.Opened(argparse.Namespace(**{**vars(args), "logs": args.test}))

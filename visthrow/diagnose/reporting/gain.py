@@ -73,7 +73,8 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
 
     ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; ``seed``: of the black box's
     basis."""
-    work, rng = diagnosis.work, np.random.default_rng(seed)
+    work = diagnosis.work
+    rng = np.random.default_rng(seed)
     cross = crossed(diagnosis)
     box = _blackbox(
         work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng
@@ -167,14 +168,13 @@ def on_others(
         diagnosis: that diagnosis, whose noise is taken.
         without: flights that are left out.
     """
-    noise, rms = (
-        replace(
-            diagnosis.work.after.noise,
-            scale=np.array([diagnosis.sensor_scale[name] for name in after.channels]),
-        ),
-        [],
+    noise = replace(
+        diagnosis.work.after.noise,
+        scale=np.array([diagnosis.sensor_scale[name] for name in after.channels]),
     )
-    floors, channels = diagnosis.work.problem.priors.floor, len(after.channels)
+    rms = []
+    floors = diagnosis.work.problem.priors.floor
+    channels = len(after.channels)
     outliers = 0
     for model, sizes in ((before, {}), (after, theta)):
         sums = np.zeros((3, channels))
@@ -236,11 +236,9 @@ def _blackbox(
 
 def _nats(before: Point, after: Point, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain, named, change = (
-        regrouped(before, cross.groups),
-        regrouped(after, cross.groups),
-        cross.trained - after.theta,
-    )
+    plain = regrouped(before, cross.groups)
+    named = regrouped(after, cross.groups)
+    change = cross.trained - after.theta
     quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
     square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic
     return float(0.5 * (plain.square.sum() - square.sum()) / named.samples.sum())

@@ -21,7 +21,8 @@ from visthrow.diagnose.select.search_state import Work
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # [inch]
-BEFORE, AFTER = style.COLOURS[1], style.COLOURS[0]
+BEFORE = style.COLOURS[1]
+AFTER = style.COLOURS[0]
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
@@ -145,10 +146,8 @@ def residuals(work: Work, channel: int) -> bytes:
     figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
     for axis, i in zip(axes[0], chosen):
         before, _, rows, old, new = pairs[i]
-        time, noise = (
-            before.time[rows],
-            factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel]),
-        )
+        time = before.time[rows]
+        noise = factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
         axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
         axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
         axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
@@ -166,10 +165,8 @@ def ladder(diagnosis: Diagnosis) -> bytes:
     """
     steps = diagnosis.steps
     columns = min(len(steps), STEPS_ACROSS)
-    down, height = (
-        -(-len(steps) // columns),
-        max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps),
-    )
+    down = -(-len(steps) // columns)
+    height = max(sum(1.0 + 0.6 * name.count(", ") for name in step.screened) for step in steps)
     figure, axes = _figure(down, columns, down * (0.55 + 0.27 * height))
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
@@ -212,7 +209,8 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     }
     findings = [f for f in diagnosis.findings if f.verdict in colours][::-1]
     figure, axes = _figure(1, 1, 0.8 + 0.19 * len(findings))
-    axis, labelled = axes[0, 0], set()
+    axis = axes[0, 0]
+    labelled = set()
     axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
     for y, f in enumerate(findings):
         label = None if f.verdict in labelled else f.verdict
@@ -300,7 +298,8 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     strongest_effects = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
     names = [work.problem.model.effects[j].name for j in visible[strongest_effects]]
     figure, axes = _figure(1, 1, 1.6 + 0.3 * len(strongest_effects))
-    axis, block = axes[0, 0], correlation[np.ix_(strongest_effects, strongest_effects)]
+    axis = axes[0, 0]
+    block = correlation[np.ix_(strongest_effects, strongest_effects)]
     image = axis.imshow(block, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
     for (i, j), value in np.ndenumerate(block):
         if i != j and abs(value) > 0.3:
@@ -322,7 +321,8 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
     axis = axes[0, 0]
     for y, (curve, floor) in enumerate(pairs[::-1]):
-        sizes, share = np.array(curve.sizes) / floor, np.maximum.accumulate(curve.up_to_class)
+        sizes = np.array(curve.sizes) / floor
+        share = np.maximum.accumulate(curve.up_to_class)
         half, top = (
             float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9)
         )

@@ -63,7 +63,8 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.reporting import pictures
 
     check_place(Path(args.out) / "plan.json")
-    limits, chosen = _limits(args), _chosen(args.manoeuvres)
+    limits = _limits(args)
+    chosen = _chosen(args.manoeuvres)
     opened = opening.Opened(args)
     diagnosis = opened.diagnose(laws=False)
     print(report.summary(diagnosis) + "\n")

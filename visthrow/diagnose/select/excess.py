@@ -25,7 +25,8 @@ LANDING = 5e-3
 matter: a cause that moves a landing by less is below its floor as well.
 """
 
-STEP, MOST_STEPS = 1.4, 60
+STEP = 1.4
+MOST_STEPS = 60
 """Factor from one level to the next above the best, until one is too high.
 
 A level that nothing holds up lies anywhere below.
@@ -111,11 +112,9 @@ class _Phase:
     def __init__(self, point: Point, phase: str):
         """Put them side by side."""
         windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-        self.noise, self.phase, self.stack = (
-            point.noise,
-            phase,
-            Stack([point.grams[w] for w in windows], point.device, windows),
-        )
+        self.noise = point.noise
+        self.phase = phase
+        self.stack = Stack([point.grams[w] for w in windows], point.device, windows)
 
     def likelihood(self, block: int, level: float) -> float:
         """Return the log likelihood of the phase's residuals."""

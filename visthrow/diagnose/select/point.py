@@ -48,7 +48,8 @@ SMALL_STEP = 0.5 * OWN_FLOOR
 its bound.
 """
 
-TURNS, TURNED = 8, 0.5
+TURNS = 8
+TURNED = 0.5
 """Times that sizes and noise levels are estimated in turn, while the levels leave a step of the
 sizes worth so many nats.
 """

@@ -10,10 +10,13 @@ from typing import Any
 from visthrow.diagnose.select.scatter import Scatter
 from visthrow.diagnose.throw.command_mistakes import Mistake
 
-FOUND, CLASS, BOUNDED = "FOUND", "CLASS", "BOUNDED"
+FOUND = "FOUND"
+CLASS = "CLASS"
+BOUNDED = "BOUNDED"
 CANDIDATE = "CANDIDATE"
 NAMED = (FOUND, CLASS, CANDIDATE)  # verdicts on effects that the flights ask for
-NOT_IDENTIFIABLE, UNOBSERVABLE = "NOT IDENTIFIABLE", "UNOBSERVABLE"
+NOT_IDENTIFIABLE = "NOT IDENTIFIABLE"
+UNOBSERVABLE = "UNOBSERVABLE"
 VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",
     CLASS: "this or one of its partners; these flights cannot tell which",
@@ -27,8 +30,12 @@ VERDICTS = {
 }
 """Verdicts on one effect; each effect has exactly one."""
 
-NO_EFFECT, KNOWN, IN_PART, UNKNOWN = "NO EFFECT", "KNOWN", "EXPLAINED IN PART", "UNKNOWN"
-INCONSISTENT, OUT_OF_DOMAIN = "DATA INCONSISTENT", "OUT OF DOMAIN"
+NO_EFFECT = "NO EFFECT"
+KNOWN = "KNOWN"
+IN_PART = "EXPLAINED IN PART"
+UNKNOWN = "UNKNOWN"
+INCONSISTENT = "DATA INCONSISTENT"
+OUT_OF_DOMAIN = "OUT OF DOMAIN"
 OVERALL = {
     NO_EFFECT: "the model explains the flights",
     KNOWN: "the causes named explain the flights",

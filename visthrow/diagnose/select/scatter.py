@@ -29,7 +29,9 @@ from visthrow.diagnose.likelihood.evidence import (
 )
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
+FLIGHT = "flight"
+DAY = "day"
+COMMAND = "command"  # what has a share of its own
 # before these, at the end of the names of effects that differ and are none of the catalogue's
 # random effects
 FORM = "_by_"

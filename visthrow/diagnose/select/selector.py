@@ -479,7 +479,9 @@ class Selector(SearchState):
         self.nominal = nominal
         self.least = least
         self.origin, self.point = origin, candidate(problem, point, self.active)
-        self.refused, self.visited, self.proposed = {}, set(), set()
+        self.refused = {}
+        self.visited = set()
+        self.proposed = set()
         worth = self.worth()
         return bool(worth) and all(
             nats > least and self.stands(self.point, self.active, j) for j, nats in worth.items()

@@ -107,10 +107,8 @@ def screen(
     terms, layout = _laid(block, shared) if "time" in shared else ((), None)
     if layout is None:
         return None
-    latent_block, size = (
-        LATENT_BLOCKS.index(felt(block)),
-        BATCH if point.device == "cpu" else len(carriers),
-    )
+    latent_block = LATENT_BLOCKS.index(felt(block))
+    size = BATCH if point.device == "cpu" else len(carriers)
 
     ends = np.cumsum([len(quantities[w]["time"]) for w in carriers])[:-1]
     factors = zip(
@@ -291,11 +289,9 @@ def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
     count = columns.shape[1]
     products = gram.inner[:, :, part] @ columns
     inner = np.empty((len(products), size + count, size + count))
-    inner[:, :size, :size], inner[:, :size, size:], inner[:, size:, :size] = (
-        gram.inner,
-        products,
-        products.transpose(0, 2, 1),
-    )
+    inner[:, :size, :size] = gram.inner
+    inner[:, :size, size:] = products
+    inner[:, size:, :size] = products.transpose(0, 2, 1)
     inner[:, size:, size:] = columns.T @ products[:, part]
     return inner
 

@@ -454,7 +454,8 @@ def _joint(search: Selector, point: Point, members: list[int], named: list[int])
     schur = information[np.ix_(members, members)] - cross @ np.linalg.solve(nuisance, cross.T)
     score = point.score[members] - cross @ np.linalg.solve(nuisance, point.score[nuisances])
     values, vectors = np.linalg.eigh(schur * np.outer(slab, slab))
-    vector, value = vectors[:, -1] / slab, values[-1]  # per floor
+    vector = vectors[:, -1] / slab
+    value = values[-1]  # per floor
     first = int(np.argmax(np.abs(vectors[:, -1])))
     scale = vector[first] / priors.floor[members[first]]
     mean = float(

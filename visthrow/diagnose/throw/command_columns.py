@@ -28,7 +28,8 @@ def without_each_command(
     for each of these windows, shape (N, T), with the T commands that differ from the one before.
     """
     commands = [_acting(flights, w, count) for w in windows]
-    columns, first = [], 0
+    columns = []
+    first = 0
     while first < len(windows):
         fits = int(
             np.searchsorted(
@@ -45,7 +46,8 @@ def without_each_command(
 
 def _acting(flights: ReplayedFlights, w: int, delay: float) -> np.ndarray:
     """Numbers of the commands that act in a window and differ from the one before."""
-    c, f = flights.cuts[w], flights.flights[flights.cuts[w].flight]
+    c = flights.cuts[w]
+    f = flights.flights[flights.cuts[w].flight]
     acts = f.command_time + delay
     during = (np.append(acts[1:], np.inf) > c.start) & (acts < c.end)
     changed = np.append(False, np.any(np.diff(f.command, axis=0) != 0.0, axis=1))
@@ -62,7 +64,11 @@ def _flown(
     """Fly a few windows: a lane with all commands, then one without each of them, which leaves the
     first at the knot before.
     """
-    lanes, times, sent, run, rows_kept = [], [], [], [], 0
+    lanes = []
+    times = []
+    sent = []
+    run = []
+    rows_kept = 0
     for w, command_times in zip(windows, commands):
         f = flights.flights[flights.cuts[w].flight]
         part = slice(
@@ -87,7 +93,8 @@ def _flown(
             lanes.append(w)
             times.append(f.command_time[part])
             sent.append(flown)
-    ends, lane_table = np.cumsum([len(command_times) for command_times in times]), np.array(lanes)
+    ends = np.cumsum([len(command_times) for command_times in times])
+    lane_table = np.array(lanes)
     fields = {name: values[lane_table] for name, values in flights.recording.windows.items()}
     fields |= {"command_first": np.append(0, ends[:-1]), "command_last": ends}
     data = flights.recording.data | {
@@ -97,7 +104,8 @@ def _flown(
     measured = (
         flights.repeated(lane_table).fly(simulation, states, run, Recording(fields, data)).seen
     )
-    columns, first = [], 0
+    columns = []
+    first = 0
     for w, command_times in zip(windows, commands):
         part = measured[: int(flights.rows[w]), first : first + len(command_times) + 1]
         columns.append(np.moveaxis(part[:, 1:] - part[:, :1], 1, 2).reshape(-1, len(command_times)))

@@ -25,11 +25,9 @@ from visthrow.logs.flightlog import Channel, FlightLog
 FOLLOWS = 0.8
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
-VARIED, LATE, SLOPES = (
-    0.05,
-    0.05,
-    (0.3, 2.0),
-)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
+VARIED = 0.05
+LATE = 0.05
+SLOPES = (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,8 @@ def commanded(
     h of full throttle. The slope s is fitted where an accelerometer tells the force and the
     throttle varies enough, else it is 1."""
     weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
-    corrected, shares = list(logs), []
+    corrected = list(logs)
+    shares = []
     for i, log in enumerate(logs):
         if "command" in log or "throttle" not in log or "rate_setpoint_b" not in log:
             continue
@@ -125,7 +124,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     where nothing flies.
     """
     channel = log["throttle"]
-    time, share = channel.time[channel.valid], channel.values[channel.valid].astype(float)
+    time = channel.time[channel.valid]
+    share = channel.values[channel.valid].astype(float)
     flies = (
         share > 0.5 * np.percentile(share, 75)
         if np.any(share > 0.0)
@@ -137,7 +137,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
         flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
-    start, end = float(time[flies][0]), float(time[flies][-1])
+    start = float(time[flies][0])
+    end = float(time[flies][-1])
     rows = (time >= start) & (time <= end)
     hover = float(np.median(share[rows]))
     if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
@@ -211,7 +212,8 @@ def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     factor = min(words, key=lambda f: abs(np.log(gain / f))) if gain > 0.0 else 1.0
     if factor == 1.0:
         return None
-    change, equation = np.diag([1.0, factor, factor, factor]), f"rates times {factor:.5g}"
+    change = np.diag([1.0, factor, factor, factor])
+    equation = f"rates times {factor:.5g}"
     return Mistake(
         "rate_unit",
         f"Commanded rates are in {words[factor]}",

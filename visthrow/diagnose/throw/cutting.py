@@ -10,7 +10,8 @@ from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight
 
 LENGTH = 1.0  # of a window, about [s]
 SHORTEST = 0.25  # of a window [s]
-BEFORE, AFTER = 0.55, 0.45  # of the separation, that the window of the throw reaches [s]
+BEFORE = 0.55
+AFTER = 0.45  # of the separation, that the window of the throw reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
 # by which the release may lag more than expected, before a payload counts as free where the rope
@@ -72,14 +73,16 @@ def cut(
 
     ``lag``: of the release, as far as known [s]; ``landing_height``: of the payload's centre [m];
     ``carries``: whether the flight carries a payload."""
-    first, last = flight.start, flight.end
+    first = flight.start
+    last = flight.end
     separation = flight.latch + lag
     hanging = ATTACHED if carries else NO_PAYLOAD
     down = payload_down(flight, landing_height)
     if not carries or separation > last:
         spans = [(a, b, "", hanging) for a, b in _split(first, last)]
     else:
-        before, after = max(first, separation - BEFORE), min(last, separation + AFTER, down)
+        before = max(first, separation - BEFORE)
+        after = min(last, separation + AFTER, down)
         spans = [(a, b, "", hanging) for a, b in _split(first, before)]
         spans.append((before, after, "throw", ATTACHED))
         end = min(down, last)

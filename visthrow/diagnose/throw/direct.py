@@ -23,7 +23,8 @@ from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, measu
 from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
 
-LANDING, KEYPOINTS = "landing", "keypoints"
+LANDING = "landing"
+KEYPOINTS = "keypoints"
 # of a logged landing's height [m]: a ball is pressed in, and samples lie milliseconds apart
 LANDING_SIGMA = 2e-3
 GRID = 0.02  # between the smoothed poses that a camera's views are predicted from [s]
@@ -169,7 +170,8 @@ class LandingHeight:
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`."""
-        x, point = setting.sensing, self.windows[window][1]
+        x = setting.sensing
+        point = self.windows[window][1]
         payload = _origin(x, point[None])[0] - np.array(x.payload_offset)
         payload[2] = setting.plant.release.landing_height
         measured = Rotation.from_rotvec(x.frame_tilt).apply(
@@ -196,7 +198,8 @@ class CameraView:
 
         ``logs``: flights. flights: the same as the replay takes them. cuts: windows. setting: the
         diagnosed one."""
-        self._nominal, self.windows = setting, {}
+        self._nominal = setting
+        self.windows = {}
         for w, c in enumerate(cuts):
             if (
                 c.retained
@@ -215,7 +218,8 @@ class CameraView:
 
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`; NaN where the lens is none."""
-        view, x = self.windows[window], setting.sensing
+        view = self.windows[window]
+        x = setting.sensing
         try:
             lens = self._nominal.camera
             row = lens.fisheye.cy + view["points"][..., 1] * _reach(lens)[1]
@@ -251,7 +255,8 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     if np.count_nonzero(during) < 5:
         return None
     valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
-    stamps, indices = channel.time[during], np.flatnonzero(during)
+    stamps = channel.time[during]
+    indices = np.flatnonzero(during)
     index = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
     points = np.asarray(channel.values, dtype=float)
     goal = (
@@ -305,7 +310,8 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
 
 def _interpolated(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     """A smoothed track at times: points [m], or rotations from xyzw."""
-    grid, (values, slopes) = view["grid"], view[name]
+    grid = view["grid"]
+    (values, slopes) = view[name]
     k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
     h = time - grid[k]
     s = (h / GRID)[:, None]
@@ -337,9 +343,11 @@ def _visible_keypoints(
 
     from camera.keypoints import KeypointCamera, keypoints
 
-    x, camera = setting.sensing, setting.camera
+    x = setting.sensing
+    camera = setting.camera
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
-    frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)
+    frame = Rotation.from_rotvec(x.frame_tilt)
+    marker = Rotation.from_rotvec(x.marker_rotation)
     turned = (
         frame.inv() * Rotation.from_quat(_interpolated(view, "attitude", vehicle)) * marker.inv()
     )
@@ -357,6 +365,7 @@ def _visible_keypoints(
     points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[
         0
     ].numpy()
-    fisheye, nominal_fisheye = camera.fisheye, nominal.camera.fisheye
+    fisheye = camera.fisheye
+    nominal_fisheye = nominal.camera.fisheye
     pixel = points * _reach(camera) + np.array([fisheye.cx, fisheye.cy])
     return (pixel - np.array([nominal_fisheye.cx, nominal_fisheye.cy])) / _reach(nominal.camera)

@@ -53,7 +53,8 @@ SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from
 elsewhere lead to the goal.
 """
-TRUE, WHOLE = 0.5, 0.8
+TRUE = 0.5
+WHOLE = 0.8
 """Of what a step promised, that it must bring, and of what the least damped one promised, for
 derivatives to be used further.
 """
@@ -89,7 +90,9 @@ class InitialFit:
         """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far
         as known [s].
         """
-        self.flights, self.retained, self.simulation = flights, retained, simulation
+        self.flights = flights
+        self.retained = retained
+        self.simulation = simulation
         self.directions = directions(simulation.settings[0].plant)
         self.slopes: dict[
             int, np.ndarray
@@ -126,28 +129,26 @@ class InitialFit:
         were moved before; those that do not count keep the last; ``slopes``: of windows' samples by
         their states, as :attr:`slopes` of another fit has them."""
         count = len(self.flights.cuts)
-        damping, remaining, promised = (
-            np.full(count, DAMPING),
-            self.retained,
-            np.full(count, np.inf),
-        )
+        damping = np.full(count, DAMPING)
+        remaining = self.retained
+        promised = np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals, cost = self._best(starts)
-        stale, doubtful = ~aged, np.zeros(count, dtype=bool)
+        stale = ~aged
+        doubtful = np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, remaining[stale[remaining]])
             aged &= ~stale
             trial = self._tried(states, remaining, residuals, damping, doubtful)
             helps = trial.cost < cost[remaining]
             tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
-            tried[remaining], hoped[remaining], whole[remaining] = (
-                trial.cost,
-                np.where(helps, trial.hoped, trial.whole),
-                trial.whole,
-            )
+            tried[remaining] = trial.cost
+            hoped[remaining] = np.where(helps, trial.hoped, trial.whole)
+            whole[remaining] = trial.whole
             damping[remaining] = np.where(helps, trial.damping, damping[remaining])
-            better, rows = tried < cost, np.flatnonzero(helps)
+            better = tried < cost
+            rows = np.flatnonzero(helps)
             residuals |= {remaining[row]: trial.residuals[row] for row in rows}
             states = {name: value.copy() for name, value in states.items()}
             for name, value in states.items():
@@ -164,10 +165,12 @@ class InitialFit:
             damping = np.where(better, damping / 10.0, np.where(aged, damping, raised))
             doubtful = ~(better & true)
             promised = np.where(better, hoped, promised)
-            aged, cost = aged | better, np.where(better, tried, cost)
+            aged = aged | better
+            cost = np.where(better, tried, cost)
             for w in remaining[settled[remaining]]:
                 if self._lower_gusts(w, residuals[w]):
-                    settled[w], promised[w] = False, np.inf
+                    settled[w] = False
+                    promised[w] = np.inf
                     cost[w] = self._cost(w, residuals[w])
             remaining = remaining[~settled[remaining] & (damping[remaining] < DAMPING_MOST)]
             if not len(remaining):
@@ -178,7 +181,8 @@ class InitialFit:
         """The best of each window's states, what they leave, and its cost, shape (W,); all are
         flown at once.
         """
-        retained, count = self.retained, len(self.retained)
+        retained = self.retained
+        count = len(self.retained)
         residuals = self._residuals(
             stacked([rows_of(states, retained) for states in starts]),
             np.tile(retained, len(starts)),
@@ -190,7 +194,8 @@ class InitialFit:
             ],
             (len(starts), count),
         )
-        which, cost = tried.argmin(axis=0), np.full(len(self.flights.cuts), np.inf)
+        which = tried.argmin(axis=0)
+        cost = np.full(len(self.flights.cuts), np.inf)
         cost[retained] = tried.min(axis=0)
         best = {name: value.copy() for name, value in starts[-1].items()}
         for name, value in best.items():
@@ -216,14 +221,16 @@ class InitialFit:
     ) -> _Trial:
         """The next step of each window that is left, or the best of several."""
         rungs = np.where(doubtful[windows], len(LADDER), 1)
-        which, first = np.repeat(windows, rungs), np.cumsum(rungs) - rungs
+        which = np.repeat(windows, rungs)
+        first = np.cumsum(rungs) - rungs
         dampings = [damping[w] * LADDER[:n] for w, n in zip(windows, rungs)]
         parallel_map(self._scaled, windows)
         trials = [
             self._increments(w, residuals[w], states[MOVED][w], its)
             for w, its in zip(windows, dampings)
         ]
-        tries, (steps, hoped) = np.concatenate(dampings), map(np.concatenate, zip(*trials))
+        tries = np.concatenate(dampings)
+        (steps, hoped) = map(np.concatenate, zip(*trials))
         states_moved = moved_along(rows_of(states, which), self.directions, steps)
         states_moved[MOVED] = states_moved[MOVED] + steps
         left_over = self._residuals(states_moved, which)
@@ -245,7 +252,8 @@ class InitialFit:
         """Residuals of windows, of what depends on their initial states; a row of the states for
         each.
         """
-        f, lanes = self.flights, [Lane(w, 0, row) for row, w in enumerate(which)]
+        f = self.flights
+        lanes = [Lane(w, 0, row) for row, w in enumerate(which)]
         measured = f.fly(self.simulation, states, lanes, self._shortened).seen
         return [self._sensitive[w] * f.residual(measured, w, lane) for lane, w in enumerate(which)]
 
@@ -259,7 +267,9 @@ class InitialFit:
         """Take a window's gusts for as strong as what is left of it says, if that is much less than
         was thought.
         """
-        square, noise, drift = residual**2, self.flights.sigma[w] ** 2, self._drift[w] ** 2
+        square = residual**2
+        noise = self.flights.sigma[w] ** 2
+        drift = self._drift[w] ** 2
         samples = np.count_nonzero(self._sensitive[w])
         calmer = [
             g
@@ -276,7 +286,9 @@ class InitialFit:
         """Derivatives of windows' samples by their initial states."""
         if not len(which):
             return {}
-        count, lanes, first = len(which), [], []
+        count = len(which)
+        lanes = []
+        first = []
         ways = {
             d: 1 + index
             for index, d in enumerate(sorted({d for w in which for d in self._free[w]}))
@@ -291,7 +303,8 @@ class InitialFit:
         measured = self.flights.fly(self.simulation, states_moved, lanes, self._shortened).seen
         slopes = {}
         for index, w in zip(first, which):
-            ds, rows = self._free[w], int(self.flights.rows[w])
+            ds = self._free[w]
+            rows = int(self.flights.rows[w])
             flat = np.swapaxes(measured[:rows, index : index + 1 + len(ds)], 1, 2).reshape(
                 3 * rows, -1
             )
@@ -303,7 +316,8 @@ class InitialFit:
         """Prior deviations of a window's state, its derivatives in these and the samples'
         deviations, and their inner products.
         """
-        slopes, spread = self.slopes[w], self._spreads[w]
+        slopes = self.slopes[w]
+        spread = self._spreads[w]
         scales = self._scales.get(w)
         if scales is None or scales[0] is not slopes or scales[1] is not spread:
             sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
@@ -319,12 +333,14 @@ class InitialFit:
 
         ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape
         (T,). Returns steps, shape (T, directions); falls of the cost, shape (T,)."""
-        ds, (sd, scaled, bend) = self._free[w], self._scaled(w)
+        ds = self._free[w]
+        (sd, scaled, bend) = self._scaled(w)
         off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):
             bend = scaled.T @ (scaled * weight[:, None])
-        diagonal, slope = bend.diagonal() + 1.0, scaled.T @ (off * weight)
+        diagonal = bend.diagonal() + 1.0
+        slope = scaled.T @ (off * weight)
         damped = np.repeat(bend[None], len(dampings), axis=0)
         damped.reshape(len(dampings), -1)[:, :: len(ds) + 1] = (
             diagonal + dampings[:, None] * diagonal
@@ -348,7 +364,8 @@ def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[np.
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
     few are left."""
-    c, time = flights.cuts[w], flights.time[w]
+    c = flights.cuts[w]
+    time = flights.time[w]
     time_left = flights.flights[c.flight].latch + lag - EARLIER
     if c.payload != ATTACHED or not c.start + FITTED_SPAN < time_left < c.end:
         return np.ones(len(time)), c.end
@@ -377,7 +394,8 @@ def following(
 
 def perturbed(states: States, directions: Sequence[Direction]) -> States:
     """The states, and after them each direction's perturbed ones: row ``(1 + d) W + w``."""
-    rows, parts = np.arange(len(states["pos_w"])), [states]
+    rows = np.arange(len(states["pos_w"]))
+    parts = [states]
     for _, members in groupby(directions, key=lambda d: d.field):
         group = list(members)
         steps = np.repeat(np.diag([d.step for d in group]), len(rows), axis=0)

@@ -15,10 +15,8 @@ from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
-SMOOTH_BEFORE, SMOOTH_AFTER = (
-    0.06,
-    0.08,
-)  # of a window's start, over which measurements are smoothed [s]
+SMOOTH_BEFORE = 0.06
+SMOOTH_AFTER = 0.08  # of a window's start, over which measurements are smoothed [s]
 LEAST_SAMPLES = 6
 MODES = 4  # half waves of a bent rope
 INTEGRAL = 1.0
@@ -26,7 +24,8 @@ INTEGRAL = 1.0
 pull a centre of mass that lies 1.4 mm off by a quarter towards the frame's origin.
 """
 
-BENT, SHAKEN = (0.03, 0.5), (0.1, 1.5)
+BENT = (0.03, 0.5)
+SHAKEN = (0.1, 1.5)
 """Deviation of a bend of the rope [rad] and of its rate [rad/s]: where the rope stayed taut, and
 where it has just come taut.
 
@@ -127,11 +126,9 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
     out = dict(states)
     for field in dict.fromkeys(direction.field for direction in directions):
         members = [d for d, direction in enumerate(directions) if direction.field == field]
-        axes, size, value = (
-            [directions[d].axis for d in members],
-            sizes[:, members],
-            states[field].copy(),
-        )
+        axes = [directions[d].axis for d in members]
+        size = sizes[:, members]
+        value = states[field].copy()
         if field == "quat_wb":
             turn = np.zeros((len(value), 3))
             turn[:, axes] = size
@@ -206,7 +203,8 @@ def _smoothed(
     for reach in (1.0, 2.0, 4.0):
         span = samples.between(instant - reach * before, instant + reach * after)
         if span.stop - span.start >= LEAST_SAMPLES:
-            time, values = samples.time[span] - instant, samples.values[span]
+            time = samples.time[span] - instant
+            values = samples.values[span]
             if values.shape[1] == 4:
                 return _smoothed_turn(time, values)
             fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
@@ -231,11 +229,10 @@ def measured_state(
     The measurements are taken back through the setting's delays, frame and markers.
     """
     out = {name: value.copy() for name, value in inner.items()}
-    x, plant = setting.sensing, setting.plant
-    level, marker = (
-        Rotation.from_rotvec(x.frame_tilt).inv(),
-        Rotation.from_rotvec(x.marker_rotation),
-    )
+    x = setting.sensing
+    plant = setting.plant
+    level = Rotation.from_rotvec(x.frame_tilt).inv()
+    marker = Rotation.from_rotvec(x.marker_rotation)
     pos, vel = smoothed(flight.vehicle, time + x.vehicle_delay) or (
         flight.vehicle.values[0],
         np.zeros(3),
@@ -253,14 +250,17 @@ def measured_state(
         rate = turn_rate[0] - np.array(x.gyro_bias)
     off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
     pos, vel = level.apply([pos, vel]) / (1.0 + x.scale)
-    out["pos_w"][0], out["quat_wb"][0] = pos - attitude.apply(off), attitude.as_quat()
-    out["vel_w"][0], out["rate_b"][0] = vel - attitude.apply(cross(rate, off)), rate
+    out["pos_w"][0] = pos - attitude.apply(off)
+    out["quat_wb"][0] = attitude.as_quat()
+    out["vel_w"][0] = vel - attitude.apply(cross(rate, off))
+    out["rate_b"][0] = rate
     if payload in (ATTACHED, LOOSE) and flight.payload is not None:
         turn_rate = smoothed(flight.payload, time + x.payload_delay)
         if turn_rate is not None:
             point, speed = level.apply(turn_rate) / (1.0 + x.scale)
             point = point - np.array(x.payload_offset)
-            out["payload_pos_w"][0], out["payload_vel_w"][0] = point, speed
+            out["payload_pos_w"][0] = point
+            out["payload_vel_w"][0] = speed
             if payload == ATTACHED:
                 _hang(out, plant, attitude, point, speed)
     return out
@@ -277,25 +277,32 @@ def _hang(
     mount_vel = state["vel_w"][0] + attitude.apply(cross(state["rate_b"][0], arm))
     reach = point - mount
     distance = max(float(np.linalg.norm(reach)), 1e-3)
-    n, u = state["cable_dir_w"][0], state["cable_vel_w"][0]
+    n = state["cable_dir_w"][0]
+    u = state["cable_vel_w"][0]
     link = np.full((len(n), 1), plant.rope.length / len(n))
     link[-1] += plant.rope.payload_offset
     chord = np.sum(link * n, axis=0)
     chord /= np.linalg.norm(chord)
     axis = cross(chord, reach / distance)
-    sine, cosine = float(np.linalg.norm(axis)), float(chord @ reach / distance)
+    sine = float(np.linalg.norm(axis))
+    cosine = float(chord @ reach / distance)
     turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.0))
-    n, u = turn.apply(n), turn.apply(u)
+    n = turn.apply(n)
+    u = turn.apply(u)
     lacking = speed - mount_vel - np.sum(link * u, axis=0)
     spin = cross(reach, lacking) / distance**2
-    state["cable_dir_w"][0], state["cable_vel_w"][0] = n, u + np.cross(spin, n)
+    state["cable_dir_w"][0] = n
+    state["cable_vel_w"][0] = u + np.cross(spin, n)
 
 
 def hover_state(flight: RecordedFlight, plant: PlantParams, payload: int) -> States:
     """A state in hover at the flight's start: what the first window's measurements do not tell."""
-    v, rope, L = plant.vehicle, plant.rope, plant.rope.segments
+    v = plant.vehicle
+    rope = plant.rope
+    L = plant.rope.segments
     thrust = max(float(flight.command[0, 0]), 0.05)
-    speed, power = np.sqrt(thrust / 4.0 / v.thrust.k_f), _power(v, thrust)
+    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
+    power = _power(v, thrust)
     used = _charge(flight, v, power)
     open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
     sagged = 0.5 * (
@@ -334,10 +341,12 @@ def _charge(flight: RecordedFlight, v: VehicleParams, power: float) -> float:
     then. Where none was logged: from that of the hover in which throttle was calibrated, where the
     controller makes up for no other; else a fifth.
     """
-    cell, c = v.battery, v.controller
+    cell = v.battery
+    c = v.controller
     volts = flight.voltage
     if volts is None and c.kind == "motor_mixing":
-        volts, power = c.calibration_voltage, _power(v, 4.0 * c.mix_thrust)
+        volts = c.calibration_voltage
+        power = _power(v, 4.0 * c.mix_thrust)
     if volts is None or cell.kind != "sag":
         return 0.2 if cell.kind == "sag" else 0.0
     grid = np.linspace(0.0, 1.0, 201)

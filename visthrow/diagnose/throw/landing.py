@@ -152,7 +152,8 @@ def _fly(
     """
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
     setting, states = model.with_cuts(cuts).begun(theta)
-    release, x = setting.plant.release, model.setting.sensing
+    release = setting.plant.release
+    x = model.setting.sensing
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
@@ -161,11 +162,10 @@ def _fly(
     measured = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):
-        first, count = (
-            2 * int(onward.windows["vehicle_count"][i]),
-            int(onward.windows["payload_count"][i]),
-        )
-        time, path = onward.samples["payload"][i].time, measured[first : first + count, i]
+        first = 2 * int(onward.windows["vehicle_count"][i])
+        count = int(onward.windows["payload_count"][i])
+        time = onward.samples["payload"][i].time
+        path = measured[first : first + count, i]
         out[i] = _crossing(
             path[time > looked[c.flight].latch + release.lag], release.landing_height
         )
@@ -194,5 +194,6 @@ def _crossing(path: np.ndarray, height: float) -> np.ndarray:
     down = np.flatnonzero((path[:-1, 2] > height) & (path[1:, 2] <= height))
     if not len(down):
         return np.full(3, np.nan)
-    a, b = path[down[0]], path[down[0] + 1]
+    a = path[down[0]]
+    b = path[down[0] + 1]
     return a + (a[2] - height) / (a[2] - b[2]) * (b - a)

@@ -101,8 +101,10 @@ class Plan:
         )
         for part in (columns[:, : self.fine], columns[:, self.fine :]):
             part -= part[:, :1].clone()
-        K, D = len(steps), len(self.nuisances)
-        order, sizes = torch.from_numpy(self.order).to(columns.device), columns.new_tensor(sizes)
+        K = len(steps)
+        D = len(self.nuisances)
+        order = torch.from_numpy(self.order).to(columns.device)
+        sizes = columns.new_tensor(sizes)
         return [
             columns[:, order[part]].div_(sizes[part])
             for part in (slice(K), slice(K, K + D), slice(K + D, None))
@@ -124,8 +126,10 @@ class Plan:
         ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated
         quantities at all its knots; ``moved``: how far each window's state was moved from where its
         prior has its middle, shape (W, directions): there the residual is taken."""
-        w, f = self.window, flights
-        c, (effects, states, latents) = f.cuts[w], slopes
+        w = self.window
+        f = flights
+        c = f.cuts[w]
+        (effects, states, latents) = slopes
         values = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
             c.flight,
@@ -164,14 +168,17 @@ def lanes_of(
         first: number of the first lane.
         kept: first row of the knots; twice as many as the window's are taken.
     """
-    c, count, knots = flights.cuts[w], len(flights.cuts), int(flights.knots[w])
+    c = flights.cuts[w]
+    count = len(flights.cuts)
+    knots = int(flights.knots[w])
     whips = c.phase in FINENESS or c.after_slack
     nuisances = tuple(d for d, x in enumerate(directions) if concerns(x, c))
     latents = tuple(
         (axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots)
     )
     fine = alike | needs | whips
-    effects, states = len(fine), len(nuisances)
+    effects = len(fine)
+    states = len(nuisances)
     split = (
         1 + np.count_nonzero(fine) + states * whips
     )  # where the rough nominal lane stands, which latent lanes leave

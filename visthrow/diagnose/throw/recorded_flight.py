@@ -98,7 +98,8 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     if np.count_nonzero(fresh) < 5:
         return None
     if not step:
-        time, values = time[fresh], values[fresh]
+        time = time[fresh]
+        values = values[fresh]
     if name == "quat_wb":
         values = continuous(values / np.linalg.norm(values, axis=1, keepdims=True))
     if name == "rate_b":
@@ -125,7 +126,8 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     stride = int(1.0 / (SUFFICIENT_RATE * np.median(steps)) + 0.1)  # clocks are some per cent off
     if stride < 2:
         return time, values
-    weights, parts = savgol_coeffs(2 * stride + 1, 2), []
+    weights = savgol_coeffs(2 * stride + 1, 2)
+    parts = []
     for stretch in np.split(
         np.arange(len(time)), np.flatnonzero(steps > 1.5 / SUFFICIENT_RATE) + 1
     ):
@@ -162,11 +164,9 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
             " autopilot's throttle and rate_setpoint_b, of which it is made), pos_w and quat_wb; it"
             f" has {', '.join(sorted(log.channels))}; a table's columns get these names by --config"
         )
-    pos, quat, (landing, landing_point) = (
-        _samples(log, "pos_w"),
-        _samples(log, "quat_wb"),
-        _landing(log),
-    )
+    pos = _samples(log, "pos_w")
+    quat = _samples(log, "quat_wb")
+    (landing, landing_point) = _landing(log)
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)

@@ -49,7 +49,8 @@ def rough_step(setting: Setting, substep: float) -> float:
     """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest
     lag allows.
     """
-    controller, motor = setting.plant.vehicle.controller, setting.plant.vehicle.motor
+    controller = setting.plant.vehicle.controller
+    motor = setting.plant.vehicle.motor
     lags = (
         [controller.gyro_time_constant, controller.setpoint_time_constant]
         if controller.kind != "geometric"
@@ -127,7 +128,8 @@ class ReplayedFlights:
 
         ``delays``: of vehicle, payload and gyro that the setting knows of [s].
         """
-        self.flights, self.cuts = list(flights), list(cuts)
+        self.flights = list(flights)
+        self.cuts = list(cuts)
         self.knots = np.array(
             [int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts]
         )
@@ -204,7 +206,8 @@ class ReplayedFlights:
         """Whether a window is flown alike in two settings, which may be seen otherwise: what
         differs does nothing in it.
         """
-        c, plant = self.cuts[w], second.plant
+        c = self.cuts[w]
+        plant = second.plant
         if setting.step_square != second.step_square:
             return False
         if c.payload == NO_PAYLOAD and not plant.laws:
@@ -270,7 +273,8 @@ class ReplayedFlights:
         once.
         """
         flights = copy.copy(self)
-        flights.knots, flights._fineness = self.knots[windows], self._fineness[windows]
+        flights.knots = self.knots[windows]
+        flights._fineness = self._fineness[windows]
         return flights
 
     def ended(self, ends: Sequence[float]) -> Recording:
@@ -295,7 +299,8 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
         windows = [ws[k] for ws in by_flight.values() if k < len(ws)]
         for w in windows:
             c = flights.cuts[w]
-            flight, before = flights.flights[c.flight], by_flight[c.flight][k - 1] if k else None
+            flight = flights.flights[c.flight]
+            before = by_flight[c.flight][k - 1] if k else None
             gap = (
                 before is None or c.start > flights.cuts[before].end + 1e-6
             )  # in which the inner states have gone

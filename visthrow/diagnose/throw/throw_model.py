@@ -97,12 +97,14 @@ class ThrowModel(Model):
             camera: whose keypoints the logs hold.
         """
         self.setting = generalised(Setting(plant, sensing or SensingParams(), camera=camera))
-        self.device, self.substep = device, substep
+        self.device = device
+        self.substep = substep
         if device != "cpu":
             limit_threads_beside_gpu()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        carries, release = any(hangs), (plant.release.lag, plant.release.landing_height)
+        carries = any(hangs)
+        release = (plant.release.lag, plant.release.landing_height)
         cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
         if not cuts:
             raise DiagnoseError(
@@ -170,7 +172,8 @@ class ThrowModel(Model):
             setting,
             *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)],
         ]
-        graded, begun = len(self._graded), perturbed(states, self._directions)
+        graded = len(self._graded)
+        begun = perturbed(states, self._directions)
         simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
         listed: list[Window] = []
         for batch in self._batches():
@@ -236,7 +239,8 @@ class ThrowModel(Model):
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
-        states, moves = self._latest.get(self._switches(theta), self._fitted()[0]), {}
+        states = self._latest.get(self._switches(theta), self._fitted()[0])
+        moves = {}
         if linearised is not None:
             states, moves = self._following(setting, theta, linearised)
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
@@ -258,10 +262,8 @@ class ThrowModel(Model):
     ) -> list[np.ndarray]:
         """See the base class; the command before stays."""
         setting = apply(self.entries, self.setting, theta)
-        states, slopes = (
-            self._settled_at.get(_key(theta), self._fitted()[0]),
-            self.setting.plant.vehicle.queue.delay,
-        )
+        states = self._settled_at.get(_key(theta), self._fitted()[0])
+        slopes = self.setting.plant.vehicle.queue.delay
         return without_each_command(
             self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
         )
@@ -322,7 +324,8 @@ class ThrowModel(Model):
     def step_error(self, finer: int = 4) -> dict[str, float]:
         """See the base class; the step is so many times finer."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
-        worst, states = np.zeros(len(self.channels)), self._fitted()[0]
+        worst = np.zeros(len(self.channels))
+        states = self._fitted()[0]
         for w, plain, halved in zip(
             self._retained, self._flown(self.setting, states), self._flown(fine, states)
         ):
@@ -338,12 +341,10 @@ class ThrowModel(Model):
     def with_cuts(self, cuts: Sequence[Cut]) -> "ThrowModel":
         """Return the model of other windows of its flights."""
         model = copy.copy(self)
-        model._settled_at, model._before, model._follows, model._secants = (
-            {},
-            {},
-            None,
-            {},
-        )  # of other windows
+        model._settled_at = {}
+        model._before = {}
+        model._follows = None
+        model._secants = {}  # of other windows
         model.flights = self._cut(self.flights.flights, cuts)
         model._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
         return model
@@ -429,7 +430,8 @@ class ThrowModel(Model):
 
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
-        batches, room = [], 0
+        batches = []
+        room = 0
         for w in self._retained:
             lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
             if not batches or room < lanes:
@@ -442,12 +444,12 @@ class ThrowModel(Model):
     def _linearised(
         self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]
     ) -> list[Window]:
-        f, settings, needs = (
-            self.flights,
-            simulation.settings,
-            np.array([exact(e) for e in self._graded], dtype=bool),
-        )
-        plans, lanes, rows_kept = [], [], 0
+        f = self.flights
+        settings = simulation.settings
+        needs = np.array([exact(e) for e in self._graded], dtype=bool)
+        plans = []
+        lanes = []
+        rows_kept = 0
         computed: dict[tuple, np.ndarray] = {}
         for w in batch:
             if f.like(w) not in computed:
@@ -474,7 +476,8 @@ class ThrowModel(Model):
         parts = all_to_host([part for lanes_of_plan in windows for part in lanes_of_plan])
 
         def window(i: int) -> Window:
-            w, lanes_of_plan = plans[i].window, parts[3 * i : 3 * i + 3]
+            w = plans[i].window
+            lanes_of_plan = parts[3 * i : 3 * i + 3]
             arguments = (
                 self._channel(w),
                 f.residual(nominal, w, i),
@@ -503,7 +506,8 @@ class ThrowModel(Model):
         cuts: list[Cut] = []
         rings: dict[int, float] = {}  # flight -> until when
         for w, c in enumerate(self.flights.cuts):
-            first, last = float(ends["slack_first"][w]), float(ends["slack_last"][w])
+            first = float(ends["slack_first"][w])
+            last = float(ends["slack_last"][w])
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
                 c = dataclasses.replace(c, after_slack=True)

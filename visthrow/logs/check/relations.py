@@ -19,7 +19,8 @@ _WIDTH = 0.04  # half the width of the narrowest parabola that is laid through a
 _NATS = 10.0  # of likelihood that a peak must have over its sides, so that noise does not make it
 # where the rest goes together by so much, a block that leaves so many times the middle one is of
 # something else, as a crash
-_TOGETHER, _TUMBLE = 0.7, 25.0
+_TOGETHER = 0.7
+_TUMBLE = 25.0
 # 95 % of Student's t of 7 degrees of freedom, those of 8 pairs of blocks, over the normal's
 _STUDENT = 2.365 / 1.960
 
@@ -245,7 +246,8 @@ def _vertex(
         powers = np.array(
             [[1.0, vertex, vertex * vertex], [0.0, 1.0, 2.0 * vertex], [0.0, 0.0, 2.0]]
         )
-        product, second = powers @ xy, powers @ yy  # value, slope and bend
+        product = powers @ xy
+        second = powers @ yy  # value, slope and bend
         scale = max(float(np.sum(product[0]) / np.sum(xx)), 0.0)
         residual = second[0] - 2.0 * scale * product[0] + scale**2 * xx
         weight = 1.0 / np.maximum(residual, floor)

@@ -20,14 +20,13 @@ import numpy as np
 
 from sim.params import GRAVITY, PlantParams
 
-STATES, INPUTS = 16, 4
-POS, VEL, DIR, RATE, QUAT = (
-    slice(0, 3),
-    slice(3, 6),
-    slice(6, 9),
-    slice(9, 12),
-    slice(12, 16),
-)  # parts of the state
+STATES = 16
+INPUTS = 4
+POS = slice(0, 3)
+VEL = slice(3, 6)
+DIR = slice(6, 9)
+RATE = slice(9, 12)
+QUAT = slice(12, 16)  # parts of the state
 
 _TINY = 1e-30  # complex step: so small that the derivative has no truncation error
 

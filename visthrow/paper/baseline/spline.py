@@ -25,12 +25,14 @@ from sim.params import GRAVITY
 from visthrow.common.errors import VisthrowError
 from visthrow.paper.baseline.pendulum_model import Pendulum
 
-SEGMENTS, ORDER = 4, 8
+SEGMENTS = 4
+ORDER = 8
 SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at the start
 
 END = 5  # derivatives 0 to 4 are given at the release
 
-SAMPLES, DENSE = 30, 300
+SAMPLES = 30
+DENSE = 300
 """Samples of a segment, for penalties and energy: while improving a path, and to judge it, as
 thrust has narrow peaks.
 """

@@ -14,7 +14,8 @@ from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
-PLANT, TARGET = "hybrid", 2.0
+PLANT = "hybrid"
+TARGET = 2.0
 
 
 @dataclass(frozen=True)

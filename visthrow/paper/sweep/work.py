@@ -27,7 +27,8 @@ from visthrow.throws.loading import Loaded, load_policy
 
 PIECES = "pieces"  # folder of a run with one file a piece
 
-EXIT_STOPPED, EXIT_BUSY = 130, 75
+EXIT_STOPPED = 130
+EXIT_BUSY = 75
 
 
 def lock_of(out: Path, name: str) -> Path:

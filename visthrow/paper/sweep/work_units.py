@@ -26,7 +26,9 @@ FULL = {
     "vision": "vision_ideal",
 }  # layout -> the training config whose variants are compared with it
 
-POLICY, SUMMARY, PROGRESS = "policy.npz", "summary.json", "progress.csv"
+POLICY = "policy.npz"
+SUMMARY = "summary.json"
+PROGRESS = "progress.csv"
 
 
 @dataclass(frozen=True)

@@ -17,11 +17,9 @@ from visthrow.training.ppo.network import Network
 # least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away
 # from there
 SLACK_THROTTLE = 0.05
-PREVIOUS_AT, GOAL_AT, LOAD_AT = (
-    ob.VEHICLE,
-    ob.VEHICLE + 5,
-    ob.VEHICLE + 7,
-)  # columns of a state observation where these begin
+PREVIOUS_AT = ob.VEHICLE
+GOAL_AT = ob.VEHICLE + 5
+LOAD_AT = ob.VEHICLE + 7  # columns of a state observation where these begin
 
 
 @wp.struct
@@ -201,7 +199,8 @@ class Layers:
         x = self._network.obs_normalizer(obs[rows])
         for layer, inner in zip(self._linear, self._inner):
             out = torch.addmm(layer.bias, x, layer.weight.T)
-            inner[k, rows], x = out, self._network.mlp[1](out)
+            inner[k, rows] = out
+            x = self._network.mlp[1](out)
         return self.action[k]
 
     def prepare(self, steps: int) -> None:

@@ -24,7 +24,10 @@ from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch,
 from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
-ALTITUDE, GROUND, ABOVE, UPRIGHT = 0.15, 0.1, 0.08, 0.15
+ALTITUDE = 0.15
+GROUND = 0.1
+ABOVE = 0.08
+UPRIGHT = 0.15
 """Reach of the barriers: of altitude and distance, payload over ground, payload below vehicle [m],
 cosine of the tilt.
 """
@@ -219,10 +222,8 @@ class FirstOrder:
         steps = self.flights.steps
         T = self.flights.last
         lag = self.lag
-        k, K = (
-            torch.arange(T, device=steps.device)[:, None],
-            T - lag - 1,
-        )  # the cubic looks a step past the separation
+        k = torch.arange(T, device=steps.device)[:, None]
+        K = T - lag - 1  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
         latch_input = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
         smooth = torch.sigmoid(latch_input / self._width)

@@ -32,16 +32,14 @@ from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import Network
 
-EXCITED, RETAINED = (
-    (
-        0.35,
-        0.5,
-        0.5,
-        0.5,
-        0.0,
-    ),
-    0.7,
-)  # random actions of the fit: spread about hover, share of one that the next keeps
+EXCITED = (
+    0.35,
+    0.5,
+    0.5,
+    0.5,
+    0.0,
+)
+RETAINED = 0.7  # random actions of the fit: spread about hover, share of one that the next keeps
 FITTED = 8000  # steps of flight that the fit rests on
 TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
 
@@ -81,13 +79,15 @@ class FlightBatch:
         make = {"device": env.device}
         self.env = env
         self.last = steps
-        self.course, self.made = Course(), Course()
+        self.course = Course()
+        self.made = Course()
         self.adjoint = {}
         self.x = {"command": torch.zeros(steps + 1, E, actions.COMMANDS, **make)}
         for name in STATES:
             dtype = Course.vars[name].type.dtype
             x, adjoint = torch.zeros(2, steps + 1, E, dtype._length_, **make)
-            self.x[name], self.adjoint[name] = x, adjoint
+            self.x[name] = x
+            self.adjoint[name] = adjoint
             grad = wp.from_torch(adjoint, dtype=dtype)
             setattr(self.course, name, wp.from_torch(x, dtype=dtype, grad=grad))
             unused = wp.from_torch(torch.zeros_like(x), dtype=dtype, grad=grad)
@@ -128,7 +128,8 @@ class FlightBatch:
         sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
         observation = env.reset()["actor"]
         torch.add(self._body * state["mass_scale"], self._rope, out=self.mass)
-        self.flying[:], self.steps[:] = 1, 0
+        self.flying[:] = 1
+        self.steps[:] = 0
         for k in range(len(self.obs) + 1):
             with on_torch_stream(env.device):
                 env.sim.foresee()

@@ -8,7 +8,8 @@ from torch import Tensor
 from sim.torch_bridge import captured
 from visthrow.training.ppo.network import Network
 
-SLOWEST, FASTEST = 1e-5, 1e-2  # range of the adaptive learning rate
+SLOWEST = 1e-5
+FASTEST = 1e-2  # range of the adaptive learning rate
 
 
 class CapturedPPO(PPO):
@@ -149,7 +150,8 @@ class CapturedPPO(PPO):
         """
         result = super().load(loaded_dict, load_cfg, strict)
         self.set_rate(float(self.learning_rate))
-        self._graph, self._updates = None, 0
+        self._graph = None
+        self._updates = 0
         return result
 
     def set_rate(self, rate: float) -> None:
