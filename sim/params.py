@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 from camera.field_bounds import (
+    Air,
     Arm,
     BoundedFields,
+    Drag,
     Duration,
     Lag,
     Length,
@@ -227,14 +229,14 @@ class AeroParams(BoundedFields):
     """
 
     kind: Literal["rotor_drag", "none"]
-    drag_x: float  # [kg/s]
-    drag_y: float  # [kg/s]
-    drag_z: float  # [kg/s]
-    parasitic: float  # 1/2 rho C_d A [kg/m]
-    inflow: float  # [s/m]
-    torque_inflow: float  # [s/m]
-    translational_lift: float  # [s^2/m^2]
-    flapping: float  # [s]
+    drag_x: Drag  # [kg/s]
+    drag_y: Drag  # [kg/s]
+    drag_z: Drag  # [kg/s]
+    parasitic: Drag  # 1/2 rho C_d A [kg/m]
+    inflow: Air  # [s/m]
+    torque_inflow: Air  # [s/m]
+    translational_lift: Air  # [s^2/m^2]
+    flapping: Air  # [s]
 
 
 @dataclass(frozen=True)

@@ -148,7 +148,14 @@ def explain(
         if not search.stands_without(windows_lost, problem, nominal, threshold_nats):
             search = Selector(problem, nominal, threshold_nats, say, laws)
     diagnosis = held_out.judged(conclude(search))
-    return replace(diagnosis, seconds=time.monotonic() - begun, seed=seed)
+    reasons = diagnosis.reasons
+    left_out = len(usable) - len(problem.kept)
+    if left_out:
+        reasons += (
+            f"{left_out} of {len(usable)} windows are left out, which the simulation does not"
+            " follow: a cause that acts in these alone does not show",
+        )
+    return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
 
 
 def correct_interface_mistakes(
