@@ -68,4 +68,6 @@ def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goe
     assert sum("named" in line for line in said) == 1
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)
-    assert diagnosis.windows == len(model.windows({})) - 1
+    count = len(model.windows({}))
+    assert diagnosis.windows == count - 1
+    assert diagnosis.reasons[-1].startswith(f"1 of {count} windows are left out")
