@@ -73,9 +73,8 @@ class KeypointCamera:
             rot_cb, shape (E, 3, 3), and position_b [m], shape (E, 3): the ``extrinsics`` of
             `keypoints`.
         """
-        turn = rotation_from_vector(
-            rotation_error
-        )  # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
+        # rot_bc = turn @ nominal, hence rot_cb = nominal @ turn^T
+        turn = rotation_from_vector(rotation_error)
         return rotate(turn, self.rot_cb.expand(turn.shape)), self.position_b + position_error
 
 

@@ -91,16 +91,10 @@ class MountParams(BoundedFields):
     (optical axis) = -z_b. ``rpy_deg`` turns the camera about the body axes from there, ``rot_bc =
     Rz(yaw) Ry(pitch) Rx(roll) rot_bc_down``: a negative pitch lets it look forward."""
 
-    position_b: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # lens from the centre of mass [m], body frame
-    rpy_deg: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # roll, pitch, yaw from the downward pose [deg], about body axes
+    # lens from the centre of mass [m], body frame
+    position_b: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    # roll, pitch, yaw from the downward pose [deg], about body axes
+    rpy_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [rad]
     position_error_std: NotNegative = 0.0  # per episode and axis, unknown to the policy [m]
 

@@ -118,9 +118,8 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
         if ids is None or len(ids) < VIEW_AT_LEAST:
             return None
-        margin = 0.5 * (
-            1.0 - board.marker_size / board.square_size
-        )  # free of the marker about each corner, in squares
+        # free of the marker about each corner, in squares
+        margin = 0.5 * (1.0 - board.marker_size / board.square_size)
         return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
     if board.pattern == "circles":
         success, centres = cv2.findCirclesGrid(

@@ -19,8 +19,9 @@ Values = Mapping[str, float]
 HOLDS_PX = 0.05
 """Difference of pixels up to which a fitted lens counts as the lens of the file [px]."""
 ANGLES = 721
+"""Angles off the axis, from 0 to 180 deg, on which a lens is sampled."""
 TURNS = 48
-"""Rays on which a lens is sampled: angles off the axis from 0 to 180 deg, directions about it."""
+"""Directions about the axis on which a lens is sampled."""
 LARGEST_DECENTRING = 0.01
 """Tangential coefficients p1, p2 that no lens reaches; calibrations of others stay below 0.003."""
 

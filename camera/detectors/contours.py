@@ -52,10 +52,8 @@ DISTANCE_ERROR = 0.15
 class DetectorParams(BoundedFields):
     """The looks of ball and goal."""
 
-    ball_hue_deg: tuple[float, float] = (
-        46.0,
-        88.0,
-    )  # tennis ball: 62 to 68, and what a wrong white balance makes of it
+    # tennis ball: 62 to 68, and what a wrong white balance makes of it
+    ball_hue_deg: tuple[float, float] = (46.0, 88.0)
     goal_hue_deg: tuple[float, float] = (105.0, 165.0)  # the green field of the square; as above
     saturation: Share = 0.3  # least share of colour in a pixel [-]
     brightness: Share = 0.06  # least value of a pixel [-]

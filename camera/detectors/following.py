@@ -32,10 +32,8 @@ THRUST = 14.0
 hover has 12.5. The rest is in `DRIVEN`.
 """
 
-INITIAL_SPREADS = (
-    0.05,
-    0.2,
-)  # of a ball that is said to hang still: direction [rad] and its rate [rad/s]
+INITIAL_SPREADS = (0.05, 0.2)
+"""Of a ball that is said to hang still: direction [rad] and its rate [rad/s]."""
 
 LOST = 0.04
 """Standard deviation about each axis beyond which a prediction tells nothing [rad]: a ball turns by

@@ -219,7 +219,7 @@ def _from_runs(args: argparse.Namespace) -> int:
     title = f"Throws from hover on {how}: {len(logs)} throws of {len(args.runs)} runs"
     entries = from_runs.entries(logs)
     subtitle = f"{len(logs)} throws of HIL runs"
-    comparison = Comparison("runs", title, subtitle, entries, from_runs.NOTE)
+    comparison = Comparison("runs", title, subtitle, entries, from_runs.note(logs))
     return _publish(args, comparison, {"plant": "runs", "runs": args.runs})
 
 

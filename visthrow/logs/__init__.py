@@ -17,10 +17,11 @@ TABLES = (".csv", ".csv.gz", ".csv.xz", ".tsv", ".txt", ".parquet")
 SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
 """What says itself what it holds: no mapping is used for it."""
 RUN_LOG = "flight.npz"
-RUN_TICKS = "ticks.jsonl"
-"""In the folder of a run of ``visthrow hil``: its flight log, which is there where no throw was
-flown and ``--bare`` was not given, and what it is made of.
+"""In the folder of a run of ``visthrow hil``: its flight log, written where no throw was flown and
+``--bare`` was not given.
 """
+RUN_TICKS = "ticks.jsonl"
+"""Beside it: the ticks that it is made of."""
 BAG = "metadata.yaml"
 """In the folder of a ROS 2 bag."""
 

@@ -67,6 +67,5 @@ EXCHANGES = tuple(
 )
 """All 48 sets."""
 TURNS = tuple(axes for axes in EXCHANGES if not is_mirror(axes))  # the 24 that are turns
-MATRICES = np.array(
-    [matrix_of(axes) for axes in EXCHANGES]
-)  # matrix of each of :data:`EXCHANGES`, shape (48, 3, 3)
+MATRICES = np.array([matrix_of(axes) for axes in EXCHANGES])
+"""Matrix of each of :data:`EXCHANGES`, shape (48, 3, 3)."""

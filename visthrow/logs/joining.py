@@ -17,15 +17,12 @@ from visthrow.logs.check import relations
 from visthrow.logs.flightlog import FlightLog
 
 RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
-THRESHOLD = (
-    0.6  # correlation of what was measured twice, below which two logs are not taken for one flight
-)
+# correlation of what was measured twice, below which two logs are not taken for one flight
+THRESHOLD = 0.6
 _FINE = 0.1  # around the coarse answer [s]
 _SPAN = 0.1  # of turns: rates of attitudes with 0.2 deg of noise are good to 0.05 rad/s then [s]
-_STEP, _FINE_RATE = (
-    0.001,
-    200.0,
-)  # of lags there, through whose best three a parabola is laid [s]; of samples compared there [Hz]
+_STEP = 0.001  # of lags there, through whose best three a parabola is laid [s]
+_FINE_RATE = 200.0  # of samples compared there [Hz]
 
 Signal = tuple[np.ndarray, np.ndarray]
 """Times [s], shape (T,), and values, shape (T, 1 or 3)."""

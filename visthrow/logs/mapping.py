@@ -25,10 +25,9 @@ class TimeColumn(Bounded):
     column: str = ""  # of the stamps; "": rows are evenly spaced
     unit: str = "s"  # of the stamps
     row_period: NotNegative = 0.0  # between two rows [s], where there is no column
-    offset: float = (
-        0.0  # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
-    )
-    # file's name -> the same of its flight alone, besides [s]: clocks that differ by flight
+    # added to its times [s]: streams on clocks apart, as `diagnose check` says by how much
+    offset: float = 0.0
+    # file's name -> what is added besides to the times of that flight alone [s]
     offsets: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.common.errors import LogError
+from visthrow.logs import RUN_TICKS
 from visthrow.logs.flightlog import FlightLog
 from visthrow.onboard.observations import VEHICLE
 from visthrow.task.measurement import Throws
@@ -15,13 +16,6 @@ from visthrow.throws.results import Entry
 
 PATTERN = "throw-*.npz"
 
-NOTE = (
-    "The paper's figures are ten throws a target of its vehicle. Whether a vehicle or a fake"
-    " autopilot was at the other end of these runs their folders do not say."
-)
-
-
-TICKS = "ticks.jsonl"  # of a run, a tick a line
 MOST_NAMES = 10  # of files that an error names
 
 
@@ -38,7 +32,7 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
                 hint = ", ".join(names[:MOST_NAMES]) + ", ..." * (len(names) > MOST_NAMES)
             else:
                 hint = "no such folder"
-            ticks = folder / TICKS
+            ticks = folder / RUN_TICKS
             advice = f"Of a run that was killed they are made by: visthrow hil view {folder}"
             if ticks.is_file() and '"state": "throw"' not in ticks.read_text(errors="replace"):
                 advice = "No throw was begun in this run"
@@ -48,6 +42,19 @@ def logs_of(folders: Iterable[str | Path]) -> list[FlightLog]:
             )
         logs += map(FlightLog.load, paths)
     return logs
+
+
+def note(logs: list[FlightLog]) -> str:
+    """Return what flew the paper's throws, and what flew these as far as their folders say."""
+    text = "The paper's figures are ten throws a target of its vehicle."
+    simulated = sum(bool(log.meta.get("provenance", {}).get("simulated")) for log in logs)
+    if simulated == len(logs):
+        return text + " A simulated vehicle flew these throws."
+    throws = "these throws"
+    if simulated:
+        text += f" A simulated vehicle flew {simulated} of these {len(logs)} throws."
+        throws = "the others"
+    return text + f" Whether a vehicle or a fake autopilot flew {throws}, the folders do not say."
 
 
 def entries(logs: list[FlightLog]) -> list[Entry]:

@@ -100,6 +100,15 @@ def test_the_command(tmp_path, capsys):
     )
 
 
+def test_the_note_does_not_contradict_the_title():
+    unknown = log()
+    simulated = FlightLog(unknown.channels, {**unknown.meta, "provenance": {"simulated": True}})
+    assert from_runs.note([simulated]).endswith("A simulated vehicle flew these throws.")
+    mixed = from_runs.note([simulated, unknown])
+    assert "flew 1 of these 2 throws" in mixed
+    assert "flew the others, the folders do not say" in mixed
+
+
 def test_what_holds_no_throws(tmp_path, capsys):
     assert run_command(f"compare --from {tmp_path}/none") == 2
     assert "no such folder" in capsys.readouterr().err

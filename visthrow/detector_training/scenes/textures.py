@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-SIZE = 512
-MIPS = 7  # side of the finest level [px], and the number of levels, each half as large
+SIZE = 512  # side of the finest level [px]
+MIPS = 7  # levels, each half as large as the one before
 
 TRAINING = ("brick", "gravel", "coffee", "motorcycle_left", "rocket", "color", "coins")
 HELD_OUT = ("grass", "chelsea", "motorcycle_right", "astronaut", "moon")

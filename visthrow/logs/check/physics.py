@@ -20,27 +20,28 @@ MOVES = 0.05
 STEEPEST = 75.0  # median tilt of a flight [deg]
 
 _PREFIXES = ("", "est_", "mocap_", "payload_")
-_FASTEST = 60.0
-_FARTHEST = 2000.0  # of vehicles that throw [m/s], [m]
+_FASTEST = 60.0  # of vehicles that throw [m/s]
+_FARTHEST = 2000.0  # likewise [m]
 _SHARES = ("motor_command", "motor_wanted", "throttle")
 # of a command whose full size is 1; what a controller asks for may exceed it, a wrong unit by far
 # more
 _LARGEST_SHARE = 2.0
 _VOLTS = (0.5, 100.0)  # of any pack of such a vehicle [V]
+# correlations: of one flight, surely of one flight, and by how much other axes must be better
 BELONGS = 0.35
 FIRMLY = 0.7
 CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
-_DELAY_WARN = 0.02
+_DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
-_DELAY_KNOWN = 0.012  # between measurements of one motion [s]
+_DELAY_KNOWN = 0.012  # deviation of a delay, below which it says whether delays drift [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
 # RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
 _PUSHED = 0.2
-_LONGER = 0.05
-_OTHER_CABLE = 0.25  # of the model's length: markers sit off the ends, another cable
+_LONGER = 0.05  # of the model's length: markers sit off the ends
+_OTHER_CABLE = 0.25  # likewise: another cable
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5

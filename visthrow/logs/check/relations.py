@@ -8,9 +8,8 @@ from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
 
 REACH = 0.4  # largest delay looked for [s]
-_HIGH_CORRELATION = (
-    0.25  # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
-)
+# of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
+_UNIT = 0.25
 _LONGEST_GRID = 60_000  # samples; longer stretches are thinned
 
 BLOCKS = 16  # of a stretch, whose disagreement about a delay is its deviation
@@ -24,9 +23,8 @@ _TUMBLE = 25.0
 # 95 % of Student's t of 7 degrees of freedom, those of 8 pairs of blocks, over the normal's
 _STUDENT = 2.365 / 1.960
 
-INDEPENDENT = (
-    0.1  # samples of a flight this far apart [s] count as independent where evidence is weighed
-)
+# samples of a flight this far apart [s] count as independent where evidence is weighed
+INDEPENDENT = 0.1
 
 UNITS = {
     180 / np.pi: "one is in degrees",
@@ -287,7 +285,7 @@ def peak(score: np.ndarray, index: int) -> tuple[float, float]:
 def unit_hint(ratio: float) -> str:
     """Name the unit that a ratio of two measurements suggests, or return nothing."""
     for factor, words in UNITS.items():
-        if ratio and abs(np.log(abs(ratio) / factor)) < _HIGH_CORRELATION:
+        if ratio and abs(np.log(abs(ratio) / factor)) < _UNIT:
             return words
     return ""
 

@@ -36,9 +36,8 @@ class KnownVehicle:
     cable_length: float = 0.0  # to the payload's centre [m]; 0: none
     mass: float = 0.0  # of all that flies [kg]; 0: not known
     thrust_input: str = ""  # channel that the thrust comes from; "": whatever the log holds
-    thrust_map: tuple[float, float, float] | None = (
-        None  # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
-    )
+    # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 [N]
+    thrust_map: tuple[float, float, float] | None = None
     # channels that the model does not read, and names of rows that are overruled
     unread: frozenset[str] = frozenset()
 

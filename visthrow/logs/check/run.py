@@ -17,9 +17,8 @@ from visthrow.logs.readers.vehicles import Vehicle
 _ALIKE = 0.2  # logs that share a larger part of their samples are copies of one another
 _ONE_PAYLOAD = 0.005  # two logs whose payloads' paths agree to this [m] hold one payload
 _MOST_PAIRED = 12
-_OTHER_SCALE = (
-    0.08  # of the logarithm of thrust over force, that a battery's charge alone does not make
-)
+# of the logarithm of thrust over force, that a battery's charge alone does not make
+_OTHER_SCALE = 0.08
 _MOVING = ("pos", "rate", "acc", "quat", "vel", "angle", "thrust", "motor")
 
 

@@ -10,18 +10,16 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 MAD_TO_SIGMA = 1.4826
 FEW_SAMPLES = 20
-FEW_STEPS, SLOW_PERIOD = (
-    5,
-    0.5,
-)  # values that come more slowly [s] are settled ones, as a stand's, and fewer of them suffice
+# values that come more slowly than this [s] are settled ones, as a stand's, and so few suffice
+SLOW_PERIOD = 0.5
+FEW_STEPS = 5
 SHORT = 0.5  # shorter channels answer nothing [s]
 LONG = 1800.0  # of longer logs only windows spread over them are simulated [s]
 
 _GAP_PERIODS = 3.0
 _JITTER_WARN = 0.25  # of a period, 95th percentile
-_STUCK_TIME = (
-    0.25  # [s]; a moving vehicle's pose does not stand still to the last digit for so long
-)
+# a moving vehicle's pose does not stand still to the last digit for so long [s]
+_STUCK_TIME = 0.25
 _RAIL_SHARE = 0.01
 _RAILED = (
     "command",
@@ -33,12 +31,8 @@ _RAILED = (
     "throttle",
     "motor_speed",
 )
-_SWITCHES = (
-    "release_command",
-    "attached",
-    "flying",
-    "mode",
-)  # channels that rest on one of few values by their nature
+# channels that rest on one of few values by their nature
+_SWITCHES = ("release_command", "attached", "flying", "mode")
 _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
 _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
 """Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs.

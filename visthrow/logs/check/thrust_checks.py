@@ -38,15 +38,15 @@ _FOLLOWS = 0.4
 # flight's
 _AGAINST = 8.0
 _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
-_LATEST = 0.16
-_MOTORS = 0.07  # motors and their filters take 0 to 0.12 s, usually 0.07 [s]
+_LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
+_MOTORS = 0.07  # what they usually take [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
-_MASS_WARN = 0.15
-MASS_BAD = 1.0  # of the logarithm of thrust over weight: a battery's charge; another unit or map
+_MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
+MASS_BAD = 1.0  # likewise: another unit or map
 IDLE_PULSE = 1000.0  # length of a pulse at which a motor stands [us]
 _OUTLIER = 4.0  # robust deviations beyond which a crash or a tumble has its say cut
-IDLE_SPEED = 100.0
-IDLE_SHARE = 0.12  # a vehicle whose rotors stay below has not flown [rad/s], [1]
+IDLE_SPEED = 100.0  # a vehicle whose rotors stay below has not flown [rad/s]
+IDLE_SHARE = 0.12  # likewise, of the full command
 # of the logarithm of a rotor over the others: an arm's weight or a cut blade makes 0.25 of a speed
 _UNEVEN = 0.4
 

@@ -39,9 +39,8 @@ _EXPORTED = re.compile(
     r"(?P<name>\w+?)(?:\[(?P<index>[\d,]+)\])? \[(?P<unit>.+?)(?:,"
     r" (?P<frame>world|body|camera|image|mocap))?\]"
 )
-_LARGEST = (
-    1e100  # no number of a flight is as large, in whatever unit; its square is still a number
-)
+# no number of a flight is as large, in whatever unit; its square is still a number
+_LARGEST = 1e100
 _WORDS = {"True": 1.0, "False": 0.0}
 _LIST = re.compile(r"[\[(].*[\])]")
 _PARTS = re.compile(r"[,;\s]+")

@@ -9,10 +9,8 @@ SPEEDS = (1.7, 2.2, 2.5, 2.9)  # release speeds of the sweep [m/s]; the paper's 
 WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3))
 """Duration and energy weights of the sweep; the last three are the paper's."""
 
-FRONT_TARGET, FRONT_THROWS = (
-    2.0,
-    10,
-)  # target of the sweep (the paper, Table IV) [m], and throws of a setting, as in the paper
+FRONT_TARGET = 2.0  # target of the sweep (the paper, Table IV) [m]
+FRONT_THROWS = 10  # throws of a setting, as in the paper
 
 PAPER_FRONT = (
     (2.2, 50e3, 0.005, 0.413, 1.285, 0.044, 0.143),

@@ -22,11 +22,12 @@ from sim.params import GRAVITY, PlantParams
 
 STATES = 16
 INPUTS = 4
+# parts of the state
 POS = slice(0, 3)
 VEL = slice(3, 6)
 DIR = slice(6, 9)
 RATE = slice(9, 12)
-QUAT = slice(12, 16)  # parts of the state
+QUAT = slice(12, 16)
 
 _TINY = 1e-30  # complex step: so small that the derivative has no truncation error
 

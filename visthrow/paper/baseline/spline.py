@@ -32,10 +32,9 @@ SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at
 END = 5  # derivatives 0 to 4 are given at the release
 
 SAMPLES = 30
+"""Samples of a segment, for penalties and energy, while a path is improved."""
 DENSE = 300
-"""Samples of a segment, for penalties and energy: while improving a path, and to judge it, as
-thrust has narrow peaks.
-"""
+"""Samples of a segment by which a path is judged, as thrust has narrow peaks."""
 
 
 class PlanError(VisthrowError):
@@ -140,9 +139,8 @@ def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
     return perm(k, n) * (time[:, None] ** k)[:, np.maximum(k - n, 0)]
 
 
-BEGINS, ENDS = _rows(
-    np.array([0.0, 1.0])
-)  # the same where a segment begins and where it ends, in units of its time
+# the same where a segment begins and where it ends, in units of its time
+BEGINS, ENDS = _rows(np.array([0.0, 1.0]))
 
 
 @lru_cache(maxsize=4)

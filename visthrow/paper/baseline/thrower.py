@@ -32,11 +32,8 @@ MADE_UP = {
 }
 """Compensations that are compared, of :data:`visthrow.paper.baseline.fly_plan.COMPENSATIONS`."""
 
-
-BOUNDS = (
-    "payload and thrust",
-    "payload",
-)  # what plans bound: ours, and the payload alone as the paper's do
+BOUNDS = ("payload and thrust", "payload")
+"""What plans bound: ours, and the payload alone as the paper's do."""
 
 
 def title_of(plant: str, compensation: str) -> str:

@@ -15,10 +15,9 @@ from visthrow.view.tables import PAPER_ABLATIONS
 TARGET = 2.0  # target of Table V [m]
 
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
-PAPER_THROWS, PAPER_FULL_THROWS = (
-    5,
-    10,
-)  # number of throws of each ablation and of the full model (the paper's figure of landing points)
+# number of throws of each ablation and of the full model (the paper's figure of landing points)
+PAPER_THROWS = 5
+PAPER_FULL_THROWS = 10
 
 NOTE = (
     "Scatter: root mean square distance from the mean landing point of all trainings; what is left"
@@ -40,10 +39,8 @@ TITLES = {
 }
 """Variant -> its name in tables."""
 
-PLANTS = (
-    "reference-realistic",
-    "reference",
-)  # where ablated policies fly without retraining; the first is the stand-in for a vehicle
+PLANTS = ("reference-realistic", "reference")
+"""Where ablated policies fly without retraining; the first is the stand-in for a vehicle."""
 
 SHORT_LAYOUT = {"state": "state policies", "vision": "vision policies"}
 

@@ -25,9 +25,8 @@ class ResultSet:
 
     results: tuple[Result, ...]  # sets of throws, batches joined
     runs: tuple[dict[str, Any], ...] = ()  # as the records hold them
-    findings: dict[str, str] = field(
-        default_factory=dict
-    )  # section -> text that somebody wrote beside the data
+    # section -> text that somebody wrote beside the data
+    findings: dict[str, str] = field(default_factory=dict)
 
     def policies(
         self,

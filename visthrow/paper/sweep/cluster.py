@@ -59,9 +59,8 @@ class Cluster:
     jobs: int
     minutes: float  # length of a piece; what is not done then is submitted again
     changes: tuple[str, ...] = ()
-    options: dict[str, Any] = field(
-        default_factory=dict
-    )  # of submitit's executor, for instance ``slurm_partition``
+    # of submitit's executor, for instance ``slurm_partition``
+    options: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         import submitit

@@ -109,8 +109,8 @@ def _tag8_4s16(r: Reader, count: int) -> list[int]:
     """Four fields of 0, 4, 8 or 16 bits each, packed nibble to nibble."""
     tag = r.byte()
     values = []
-    pending = 0
-    have = 0  # bits read and not used yet
+    pending = 0  # bits read and not used yet
+    have = 0  # their number
     for i in range(4):
         need = (0, 4, 8, 16)[tag >> (2 * i) & 3]
         while have < need:
