@@ -14,8 +14,8 @@ from hil.links import crtp
 from tests.loopback.wire import throw
 from visthrow.throws.wire_plant import make
 
-GOAL = 2.0
-LONGEST = 11.0  # distance [m], time of a run in which the payload lands [s]
+GOAL = 2.0  # distance [m]
+LONGEST = 11.0  # time of a run in which the payload lands [s]
 POLICY = "vision"
 
 

@@ -66,9 +66,8 @@ PRIORS = ("nothing", "pose", "track")
 was a frame ago, and how far it can be while it hangs. The runner tells all of it.
 """
 
-TRACK_ERROR = math.radians(
-    4.0
-)  # of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s
+# of the ball's direction by the frame before [rad]: 20 ms at 3.5 rad/s
+TRACK_ERROR = math.radians(4.0)
 
 
 def run(args: argparse.Namespace) -> None:

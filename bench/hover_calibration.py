@@ -130,7 +130,7 @@ def main() -> None:
     if args.plant == "hybrid":
         found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))
     else:
-        (found, turn, scale) = on_reference(flown, args.plant, args.count, args.seed)
+        found, turn, scale = on_reference(flown, args.plant, args.count, args.seed)
         asked = 0.5 * TILT_DEG
     known = [i for i, one in enumerate(found) if one is not None]
     off = np.degrees([np.array(found[i].turn_b) - turn[i] for i in known])

@@ -29,8 +29,8 @@ from visthrow.training.compute_device import resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import throw
 
-TARGET = 2.0
-COUNT = 200  # as the throws of the ablations [m], and how many
+TARGET = 2.0  # as the throws of the ablations [m]
+COUNT = 200  # throws
 
 
 @dataclass(frozen=True)

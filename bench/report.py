@@ -45,9 +45,8 @@ class Report:
     tables: tuple[Table, ...]
     # sentences below the tables: how it was measured, what a number does not say
     notes: tuple[str, ...]
-    figures: dict[str, Any] = field(
-        default_factory=dict
-    )  # the numbers behind the tables, SI units, for programs
+    # the numbers behind the tables, SI units, for programs
+    figures: dict[str, Any] = field(default_factory=dict)
 
     def record(self) -> dict[str, Any]:
         """The report with its provenance, as JSON holds it."""

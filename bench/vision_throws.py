@@ -28,7 +28,7 @@ from visthrow.task import Experiment
 from visthrow.throws.loading import load_policy
 from visthrow.training import protocol
 
-TARGETS = (1.5, 2.0, 2.5)
+TARGETS = (1.5, 2.0, 2.5)  # [m]
 FAULT_TARGET = 2.0  # [m]
 THROWS = 200
 SEEDS = 8

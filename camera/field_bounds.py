@@ -43,9 +43,9 @@ Mass = Annotated[float, Bound(0.0, 1e5, "(]")]  # [kg]
 Length = Annotated[float, Bound(0.0, 1e3, "(]")]  # [m]
 Arm = Annotated[float, Bound(-10.0, 10.0)]  # of a rotor [m]
 Duration = Annotated[float, Bound(0.0, 5.0, "(]")]  # of a filter, a lag or a step [s]
-Drag = Annotated[float, Bound(0.0, 10.0)]  # by speed [kg/s] or its square [kg/m]
-Air = Annotated[float, Bound(-10.0, 10.0)]  # coefficient of a force of the air, in its SI unit
 Lag = Annotated[float, Bound(0.0, 5.0)]  # the same, or none [s]
+Drag = Annotated[float, Bound(0.0, 10.0)]  # over speed [kg/s] or over its square [kg/m]
+AirCoefficient = Annotated[float, Bound(-10.0, 10.0)]  # of another effect of the air, in SI units
 
 
 class BoundedFields:

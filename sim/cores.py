@@ -46,6 +46,5 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(
-        after_in_child=_pool.cache_clear
-    )  # a child process has none of these threads
+    # a child process has none of these threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)

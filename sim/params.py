@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, TypeVar
 
 from camera.field_bounds import (
-    Air,
+    AirCoefficient,
     Arm,
     BoundedFields,
     Drag,
@@ -140,20 +140,14 @@ class ControllerParams(BoundedFields):
     max_thrust: Positive  # f_max a motor at u_ref [N]
     voltage_compensation: float  # 0: none, 1: full [-]
     geometric_gain: NotNegative  # [1/s]
-    mix_thrust: Positive = (
-        0.667  # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
-    )
-    calibration_voltage: Positive = (
-        15.2  # at which a command of ``motor_mixing`` gives the thrust that it names [V]
-    )
-    relax_threshold: Positive = (
-        0.698  # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
-    )
-    gyro_share: tuple[NotNegative, NotNegative, NotNegative] = (
-        1.0,
-        1.0,
-        1.0,
-    )  # of the lag of g that P and I of ``motor_mixing`` see [-]
+    # of a motor, at which the gains of ``motor_mixing`` hold [N]; hover with the payload
+    mix_thrust: Positive = 0.667
+    # at which a command of ``motor_mixing`` gives the thrust that it names [V]
+    calibration_voltage: Positive = 15.2
+    # of iterm_relax, ITERM_RELAX_SETPOINT_THRESHOLD: 40 deg/s [rad/s]
+    relax_threshold: Positive = 0.698
+    # of the lag of g that P and I of ``motor_mixing`` see [-]
+    gyro_share: tuple[NotNegative, NotNegative, NotNegative] = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -203,12 +197,8 @@ class ThrustParams(BoundedFields):
     k_1: float  # linear term [N s/rad]
     voltage_coefficient: float  # [1/V]
     torque_ratio: NotNegative  # kappa [m]
-    gain: tuple[Positive, Positive, Positive, Positive] = (
-        1.0,
-        1.0,
-        1.0,
-        1.0,
-    )  # of each rotor against the controller's map [-]
+    # of each rotor against the controller's map [-]
+    gain: tuple[Positive, Positive, Positive, Positive] = (1.0, 1.0, 1.0, 1.0)
     torque_gain: Positive = 1.0  # of the drag torque likewise [-]
 
 
@@ -233,10 +223,10 @@ class AeroParams(BoundedFields):
     drag_y: Drag  # [kg/s]
     drag_z: Drag  # [kg/s]
     parasitic: Drag  # 1/2 rho C_d A [kg/m]
-    inflow: Air  # [s/m]
-    torque_inflow: Air  # [s/m]
-    translational_lift: Air  # [s^2/m^2]
-    flapping: Air  # [s]
+    inflow: AirCoefficient  # [s/m]
+    torque_inflow: AirCoefficient  # [s/m]
+    translational_lift: AirCoefficient  # [s^2/m^2]
+    flapping: AirCoefficient  # [s]
 
 
 @dataclass(frozen=True)
@@ -327,9 +317,8 @@ class RopeParams(BoundedFields):
     payload_radius: NotNegative  # of the ball, for drawing, keypoints and collisions [m]
     joint_damping: NotNegative  # [N m s]
     mount: tuple[float, float, float]  # rope attachment in the body frame [m]
-    payload_drag: NotNegative = (
-        0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
-    )
+    # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
+    payload_drag: NotNegative = 0.0
     mount_damping: NotNegative = 0.0  # of the uppermost joint, besides joint_damping [N m s]
     swing_damping: NotNegative = 0.0  # [N s/m]
     downwash: NotNegative = 0.0  # [-]
@@ -442,11 +431,8 @@ class ReleaseParams(BoundedFields):
     clearance_margin: NotNegative  # d_m [m]
     # more lag for every newton of the rope's pull at the latch above the payload's weight [s/N]
     lag_tension: float = 0.0
-    kick_w: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # speed that the mechanism gives the payload, world frame [m/s]
+    # speed that the mechanism gives the payload, world frame [m/s]
+    kick_w: tuple[float, float, float] = (0.0, 0.0, 0.0)
     kick_along: float = 0.0  # the same along the rope's last segment, away from the vehicle [m/s]
     rope_tail: Share = 0.0  # share of the rope that leaves with the payload [-]
 
@@ -488,9 +474,8 @@ class LawParams(BoundedFields):
 
 
 LOWEST = 0.05  # height below which a law's 1/z is held [m]
-SLOWEST = (
-    0.1  # rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
-)
+# rate of the rope against the vehicle below which a law's dry friction falls to 0 [1/s]
+SLOWEST = 0.1
 
 
 @dataclass(frozen=True)
@@ -531,11 +516,8 @@ class SensingParams(BoundedFields):
     gyro_delay: float = 0.0  # [s]
     clock_rate: float = 0.0  # of the sensors' clock against the commands' [-]
     scale: float = 0.0  # of measured lengths [-]
-    frame_tilt: tuple[float, float, float] = (
-        0.0,
-        0.0,
-        0.0,
-    )  # world against the measured frame [rad]
+    # world against the measured frame [rad]
+    frame_tilt: tuple[float, float, float] = (0.0, 0.0, 0.0)
     marker_rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)  # [rad]
     marker_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # body frame [m]
     payload_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)  # world frame [m]
@@ -565,9 +547,8 @@ class RandomizationParams(BoundedFields):
     battery_used: NotNegative  # fraction of charge used is drawn from 0 to this
     # goals are uniform on a ground disk of this radius about the spawn point [m]
     goal_radius: float
-    payload_variants: int = (
-        1  # number of payload masses, and of drags, in every combination with the cable lengths
-    )
+    # number of payload masses, and of drags, in every combination with the cable lengths
+    payload_variants: int = 1
     payload_spread: NotNegative = 0.0  # the masses span +- this fraction
     drag_spread: NotNegative = 0.0  # the payload's drags span +- this fraction
     cable_yaw_deg: NotNegative = 15.0  # +- yaw of the cable [deg]

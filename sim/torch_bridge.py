@@ -45,9 +45,8 @@ def on_torch_stream(device: str):
     """
     if not device.startswith("cuda"):
         return wp.ScopedDevice(device)
-    capturing = (
-        torch.cuda.is_current_stream_capturing()
-    )  # a capture may not wait for another stream
+    # a capture may not wait for another stream
+    capturing = torch.cuda.is_current_stream_capturing()
     return wp.ScopedStream(
         wp.stream_from_torch(torch.cuda.current_stream()), sync_enter=not capturing
     )

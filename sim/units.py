@@ -82,7 +82,7 @@ def in_units(
             return item
         if name not in dimension_of:
             raise ValueError(
-                f"{type(value).__name__}.{name}: no dimension told; there are"
+                f"{type(value).__name__}.{name} has no dimension; expected one of"
                 f" {sorted(dimension_of)}"
             )
         if not any(dimension_of[name]):

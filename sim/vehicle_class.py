@@ -97,9 +97,8 @@ def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
     factors = np.exp(np.random.default_rng((fleet.seed, number)).uniform(low, high))
     x = dict(zip(fleet.ranges, factors.tolist()))
     ratio = nominal.vehicle.body.mass / x["mass"]
-    alike = Units(
-        ratio ** (1 / 3), ratio
-    )  # in these units the known vehicle has the mass that was drawn
+    # in these units the known vehicle has the mass that was drawn
+    alike = Units(ratio ** (1 / 3), ratio)
     usual = in_units(nominal.vehicle, alike)
     rope = in_units(nominal.rope, alike)
     vehicle = _vehicle(usual, x)

@@ -77,8 +77,8 @@ def marks(
     points, seen = imaged(corners, w)
     ring = outline(np.einsum("tij,tj->ti", to_camera, ball - lens), BALL * (1.0 + w.camera_ball))
     around, whole = imaged(ring, w)
-    (left, top) = around.min(1).T
-    (right, bottom) = around.max(1).T
+    left, top = around.min(1).T
+    right, bottom = around.max(1).T
     u = 0.5 * (left + right)
     v = 0.5 * (top + bottom)
     box = np.stack([left, v, u, top, right, v, u, bottom], -1).reshape(-1, 4, 2)

@@ -287,8 +287,8 @@ class Chain:
                 d.ctrl[3:] = v["torque"][e]
                 # MuJoCo applies it at the rod's centre of mass; the couple moves it to the ball's
                 # centre.
-                (a0, a1, a2) = (self.ball_x[e] - d.xipos[rod]).tolist()
-                (f0, f1, f2) = on_ball[e].tolist()
+                a0, a1, a2 = (self.ball_x[e] - d.xipos[rod]).tolist()
+                f0, f1, f2 = on_ball[e].tolist()
                 d.xfrc_applied[rod] = (
                     f0,
                     f1,

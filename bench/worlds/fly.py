@@ -224,9 +224,8 @@ def fly(*args, **options) -> Flights:
     """Fly lanes of a plant, on the CPU whatever else there is; see :func:`_fly` for the
     arguments.
     """
-    with wp.ScopedDevice(
-        "cpu"
-    ):  # state is looked at and changed through views of the kernels' memory
+    # state is looked at and changed through views of the kernels' memory
+    with wp.ScopedDevice("cpu"):
         return _fly(*args, **options)
 
 

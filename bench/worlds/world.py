@@ -111,9 +111,8 @@ class Recipe:
     low: bool = False  # free flights near the ground
     camera: bool = False  # a camera looks down and a detector marks the goal and the ball
     colour: str = ""  # of the sensors' noise, one of COLOURS; white where empty
-    varies: dict[str, float] = field(
-        default_factory=dict
-    )  # deviation of effects whose size is drawn anew for each flight
+    # deviation of effects whose size is drawn anew for each flight
+    varies: dict[str, float] = field(default_factory=dict)
     days: int = 0  # on which flights are flown by turns; then for each day, not for each flight
     lost: float = 0.0  # share of commands that never arrive
     # deviation of every other effect, in its floor: what matters to nobody, and is there in every

@@ -10,9 +10,8 @@ from sim.effects.setting import AERODYNAMICS, Setting
 from sim.params import GRAVITY, changed
 
 SEGMENTS = 15  # segments of a rope that turns out to be flexible (the paper, Sec. III-B)
-RELAX = 1.0 / (
-    2.0 * math.pi * 15.0
-)  # time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
+# time constant of Betaflight's default iterm_relax_cutoff, 15 Hz [s]
+RELAX = 1.0 / (2.0 * math.pi * 15.0)
 # length of a rope from which a payload's offset can be taken [m]: its upper bound, 0.1 m, leaves
 # something
 LONGEST_OFFSET = 0.12

@@ -92,9 +92,8 @@ class SettingEffect(Effect):
     changes: tuple[Change, ...] = ()
     step: Positive = 0.25  # of theta for derivatives, in floors
     needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
-    simpler: bool = (
-        False  # a switch to a simpler block: left out unless asked for, as each compiles a kernel
-    )
+    # a switch to a simpler block: left out unless asked for, as each compiles a kernel
+    simpler: bool = False
     lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:

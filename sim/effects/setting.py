@@ -27,9 +27,8 @@ class Setting:
 
     plant: PlantParams
     sensing: SensingParams = dataclasses.field(default_factory=SensingParams)
-    step_square: float = (
-        1.0  # of the integration step against the one asked for: errors grow with it
-    )
+    # of the integration step against the one asked for: errors grow with it
+    step_square: float = 1.0
     # camera.params.CameraParams whose keypoints the logs hold, which the simulator knows nothing
     # of; or None
     camera: Any = None

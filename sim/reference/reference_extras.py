@@ -18,19 +18,14 @@ class ReferenceExtras(BoundedFields):
     environment; fields that end in ``_jitter`` are half-widths of a uniform draw at each event; the
     others are values. Zero switches off."""
 
-    payload_drag: NotNegative = (
-        0.0  # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
-    )
+    # 1/2 rho C_d A of the payload, on the rope and in flight [kg/m]
+    payload_drag: NotNegative = 0.0
     wind_mean_w: Vector = (0.0, 0.0, 0.0)  # world frame [m/s]
-    wind_sigma_w: Spread = (
-        0.0,
-        0.0,
-        0.0,
-    )  # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
+    # of an Ornstein-Uhlenbeck process, each axis [m/s]; drawn on, not at reset only
+    wind_sigma_w: Spread = (0.0, 0.0, 0.0)
     wind_time_constant: Positive = 1.0  # of that process [s]
-    stretch_stiffness: NotNegative = (
-        0.0  # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
-    )
+    # of the whole rope, tension over elongation, lumped at its end [N/m]; 0: inextensible
+    stretch_stiffness: NotNegative = 0.0
     stretch_damping: NotNegative = 0.0  # [N s/m]
     extra_joint_damping: NotNegative = 0.0  # added to RopeParams.joint_damping [N m s]
     com_offset: Vector = (0.0, 0.0, 0.0)  # centre of mass from the frame's origin, body frame [m]
@@ -42,9 +37,8 @@ class ReferenceExtras(BoundedFields):
     release_lag_jitter: NotNegative = 0.0  # about ReleaseParams.lag [s]
     mocap_position_sigma: NotNegative = 0.0  # each axis, each sample [m]
     mocap_angle_sigma: NotNegative = 0.0  # each axis, each sample [rad]
-    mocap_velocity_sigma: NotNegative = (
-        0.0  # of the filtered velocity, each axis, each sample [m/s]
-    )
+    # of the filtered velocity, each axis, each sample [m/s]
+    mocap_velocity_sigma: NotNegative = 0.0
     gyro_sigma: NotNegative = 0.0  # each axis, each sample [rad/s]
     mocap_latency: NotNegative = 0.0  # age of a measured pose [s]
     battery_start_used: NotNegative = 0.0  # largest used fraction at reset, uniform from 0 [-]

@@ -12,9 +12,8 @@ import numpy as np
 from sim.reference.rotation_arrays import length
 from sim.reference.vehicle_blocks import TIME_TOLERANCE
 
-LARGEST_PHASE = (
-    0.9  # frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
-)
+# frequency times step beyond which a step is halved [rad]; classical RK4 is stable to 2.83
+LARGEST_PHASE = 0.9
 # turn of a segment within one step beyond which it is halved [rad]; RK4 then errs by about 0.25^5 /
 # 120 = 8e-6 rad
 LARGEST_TURN = 0.25

@@ -23,9 +23,8 @@ from sim.params import (
 )
 from sim.reference.rotation_arrays import cross, length
 
-_QUARTER_TURN = np.array(
-    [[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]
-)  # of a row vector about z, without its z
+# of a row vector about z, without its z
+_QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 # times closer than this are one event [s]; a control period of 20 ms has no finer structure
 TIME_TOLERANCE = 1e-10

@@ -114,5 +114,5 @@ def numbers(value: object) -> list[float]:
 def test_every_field_of_plant_and_task_has_a_dimension():
     task = load_experiment("any").task
     assert isinstance(in_units(task, UNITS, TASK), TaskParams)
-    with raises(ValueError, match="control_period: no dimension told"):
+    with raises(ValueError, match="control_period has no dimension"):
         in_units(plant().sim, UNITS, {})

@@ -228,9 +228,8 @@ def _lookup(schema: type, name: str, folder: Path, source: str, key: str) -> Pat
         for kind in kinds or ("**",)
         for path in root.glob(f"{kind}/*.toml")
     }
-    short = [
-        candidate for candidate in sorted(shipped) if Path(candidate).stem == name
-    ]  # a name as the command line takes it
+    # a name as the command line takes it
+    short = [candidate for candidate in sorted(shipped) if Path(candidate).stem == name]
     meant = f"did you mean '{short[0]}'?" if short else suggest(name, shipped)
     _schema.fail(
         source,

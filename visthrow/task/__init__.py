@@ -31,8 +31,8 @@ Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
 Share = Annotated[float, Bound(0.0, 1.0, "(]")]
 
-AIR_DENSITY = 1.2
-SOUND = 343.0  # of air at 20 degrees [kg/m^3], [m/s]
+AIR_DENSITY = 1.2  # at 20 degrees [kg/m^3]
+SOUND = 343.0  # speed of sound in it [m/s]
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,8 @@ class ObservationParams(Bounded):
     validity: bool  # vision: whether the actor is told which keypoints are valid
     # age of all that is measured, drawn per episode from this range [s]
     latency: tuple[float, float]
-    latency_jitter: NotNegative = (
-        0.0  # of that age, uniform up to this to either side, drawn per step [s]
-    )
+    # of that age, uniform up to this to either side, drawn per step [s]
+    latency_jitter: NotNegative = 0.0
     # whether the actor is given a fit of the goal's velocity; see visthrow.onboard.goal_motion
     goal_velocity: bool = False
     # whether the actor is given the mean goal of all steps, and in vision where the payload's
@@ -63,9 +62,8 @@ class ObservationParams(Bounded):
     # earlier steps of which the actor is given velocity, body rates and action: how this vehicle
     # answers
     response: int = 0
-    setup: Literal["none", "told", "exact"] = (
-        "none"  # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
-    )
+    # of a fleet's vehicle, what the actor is given; see visthrow.task.fleet
+    setup: Literal["none", "told", "exact"] = "none"
 
     @property
     def oldest(self) -> float:
@@ -146,10 +144,8 @@ class TargetParams(Bounded):
     where it is at impact.
     """
 
-    speed: tuple[NotNegative, NotNegative] = (
-        0.0,
-        0.0,
-    )  # uniform in this range, drawn per episode [m/s]
+    # uniform in this range, drawn per episode [m/s]
+    speed: tuple[NotNegative, NotNegative] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -218,21 +214,18 @@ class PPOParams(Bounded):
     entropy: NotNegative
     value_coefficient: NotNegative
     max_grad_norm: Positive
-    products: Literal["float32", "bfloat16"] = (
-        "float32"  # of the hidden layers; weights are float32 either way
-    )
+    # of the hidden layers; weights are float32 either way
+    products: Literal["float32", "bfloat16"] = "float32"
     settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
     # rope segments at most, and least substep [s], of the simulator that is trained in: 0 for the
     # plant's own, in which throws are measured
     segments: Annotated[int, Bound(0)] = 0
     substep: NotNegative = 0.0
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
-    critic_first: Annotated[int, Bound(0)] = (
-        0  # iterations at the beginning in which the critic alone learns
-    )
-    privileged: tuple[str, ...] = PRIVILEGED[
-        :8
-    ]  # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
+    # iterations at the beginning in which the critic alone learns
+    critic_first: Annotated[int, Bound(0)] = 0
+    # inputs of the critic alone, of PRIVILEGED; what a task lacks is left out
+    privileged: tuple[str, ...] = PRIVILEGED[:8]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -264,19 +257,14 @@ class FirstOrderParams(Bounded):
     max_grad_norm: Positive = 1.0
     width: Positive = 0.5  # of the hazard at the first iteration, in units of the fifth action
     final_width: Positive = 0.35  # at most the first
-    sharp: Positive = (
-        0.3  # share of the training after which the width is the final one; geometric till then
-    )
-    latched: tuple[float, float] = (
-        0.1,
-        0.2,
-    )  # shares of the training between which the hazard's value becomes the latch's
+    # share of the training after which the width is the final one; geometric till then
+    sharp: Positive = 0.3
+    # shares of the training between which the hazard's value becomes the latch's
+    latched: tuple[float, float] = (0.1, 0.2)
     # step before which nothing is released at the beginning: else the payload is dropped at once
     first_release: int = 24
-    free: tuple[float, float] = (
-        0.05,
-        0.15,
-    )  # shares of the training between which that step comes down to 0
+    # shares of the training between which that step comes down to 0
+    free: tuple[float, float] = (0.05, 0.15)
     initial_release: float = -2.0  # fifth action of the untrained network
     saturation: float = 1.0  # cost of the square that an action is past its limits by
 
@@ -348,16 +336,14 @@ class Experiment:
     ppo: PPOParams
     air: AirParams = field(default_factory=AirParams)
     laws: tuple[LawParams, ...] = ()  # found by a diagnosis, besides the blocks' own
-    sensing: SensingParams = field(
-        default_factory=SensingParams
-    )  # of the motion capture; the diagnosis alone reads it
+    # of the motion capture; the diagnosis alone reads it
+    sensing: SensingParams = field(default_factory=SensingParams)
     diagnosed: DiagnosedParams = field(default_factory=DiagnosedParams)
     algorithm: Literal["ppo", "first_order", "distillation"] = "ppo"
     first_order: FirstOrderParams = field(default_factory=FirstOrderParams)
     distillation: DistillationParams = field(default_factory=DistillationParams)
-    fleet: FleetParams | None = (
-        None  # with it, policies are trained for many vehicles; task and sim are in its units
-    )
+    # with it, policies are trained for many vehicles; task and sim are in its units
+    fleet: FleetParams | None = None
     flown: tuple[
         str, ...
     ] = ()  # key=value changes of this configuration that its policies are flown and measured with
@@ -489,9 +475,8 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     }
     if whole or experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
-    if (
-        experiment.fleet is not None and not whole
-    ):  # for any vehicle: conditions of one are not the policy's
+    # for any vehicle: conditions of one are not the policy's
+    if experiment.fleet is not None and not whole:
         contract["fleet"] = {
             "rope_length": experiment.fleet.rope_length,
             "total_mass": experiment.fleet.total_mass,

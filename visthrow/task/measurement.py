@@ -34,9 +34,8 @@ class Throws:
     clearance: np.ndarray  # [m], shape (N,)
     # root mean square change of the normalised commands from step to step, shape (N,)
     smoothness: np.ndarray
-    goal_w: np.ndarray | None = (
-        None  # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
-    )
+    # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
+    goal_w: np.ndarray | None = None
 
     def within(self, error: float) -> bool:
         """Whether they land so near on average [m], and all but one in twenty land."""

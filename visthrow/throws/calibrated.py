@@ -29,9 +29,8 @@ if TYPE_CHECKING:
     from visthrow.training.env import ThrowEnv
 
 SETTLE = 3.0  # after the sway [s]; of its swing some 10 deg remain
-TOO_FEW = (
-    8  # calibrations of half a second each: here they are done before other processes have started
-)
+# calibrations of half a second each: here they are done before other processes have started
+TOO_FEW = 8
 
 
 def calibrated_start(

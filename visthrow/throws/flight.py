@@ -58,9 +58,8 @@ class Decision:
 
     command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
     release: np.ndarray  # whether the latch is to trip, shape (E,), bool
-    action: np.ndarray | None = (
-        None  # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
-    )
+    # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
+    action: np.ndarray | None = None
     observation: np.ndarray | None = None  # of a policy, shape (E, D)
 
 

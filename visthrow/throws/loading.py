@@ -24,9 +24,8 @@ class Loaded:
     name: str
     policy: Policy
     experiment: Experiment
-    departures: dict[str, Any] = field(
-        default_factory=dict
-    )  # where that breaks the contract by allowance: dotted key -> value flown with
+    # where that breaks the contract by allowance: dotted key -> value flown with
+    departures: dict[str, Any] = field(default_factory=dict)
 
 
 def load_policy(
@@ -54,9 +53,8 @@ def load_policy(
     policy = Policy.load(path)
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
-        trained = (
-            [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
-        )  # of the program, not of the camera
+        # of the program, not of the camera
+        trained = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
         experiment = config.load(
             Experiment, config.find("train", config_name), [*trained, *overrides]
         )

@@ -45,9 +45,8 @@ class LooseRope:
         ends = np.vstack((self.offset_w, np.zeros(3)))
         self._lengths = np.linalg.norm(np.diff(ends, axis=0), axis=1)
         last = np.linalg.norm(np.asarray(points_w[-1]) - points_w[-2])
-        self._knot = (
-            1.0 - last / self._lengths[-1]
-        )  # where the rope ends on the last link, from the ball
+        # where the rope ends on the last link, from the ball
+        self._knot = 1.0 - last / self._lengths[-1]
 
     def fly(self, duration: float) -> None:
         """Fly on with the ball for a time [s]."""

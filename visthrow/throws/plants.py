@@ -34,14 +34,8 @@ def known_plant(name: str) -> str:
     return name
 
 
-BODIES = (
-    "pos_w",
-    "quat_wb",
-    "vel_w",
-    "rate_b",
-    "cable_dir_w",
-    "cable_vel_w",
-)  # state arrays of bodies and ropes
+# state arrays of bodies and ropes
+BODIES = ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
 FALL_STEP = 0.02  # largest of RK4 in flight [s]; 1e-8 m off a tennis ball's path after a second
 
 

@@ -18,10 +18,10 @@ from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes
 
 START_SPREAD = 0.10  # of the start about the hover point [m]
 START_SWING = 0.05  # of the rope at the start [rad]
-HOVER_LEAST = 1.5
-HOVER_MOST = 6.0  # time in hover before the throw [s]
-QUIET_OFFSET = 0.03
-QUIET_SPEED = 0.12  # vehicle off its hover point [m]; payload against the world [m/s]
+HOVER_LEAST = 1.5  # time in hover before the throw [s]
+HOVER_MOST = 6.0  # likewise [s]
+QUIET_OFFSET = 0.03  # vehicle off its hover point [m]
+QUIET_SPEED = 0.12  # payload against the world [m/s]
 QUIET_TIME = 0.4  # for which it must last [s]
 RECOVERY_MOST = 8.0  # [s]
 # height at which the rope is drawn where it would pass through the ground; no plant knows it [m]

@@ -23,9 +23,8 @@ from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import done
 
-PROTOCOL = (
-    1  # goes up when the same unit would come out otherwise: an older result is then no longer used
-)
+# goes up when the same unit would come out otherwise: an older result is then no longer used
+PROTOCOL = 1
 
 DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by
 
@@ -39,9 +38,8 @@ class Result:
 
     unit: dict[str, Any]  # what they depend on
     columns: dict[str, np.ndarray]
-    provenance: dict[str, Any] = field(
-        default_factory=dict
-    )  # commit, command, time [UTC], seconds of work
+    # commit, command, time [UTC], seconds of work
+    provenance: dict[str, Any] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)  # further figures of the whole unit
 
     @property

@@ -12,8 +12,9 @@ from urllib.parse import quote
 from visthrow.common.errors import DeviceError
 
 HOST = "127.0.0.1"
+# ports of the viewer's page and of its data; only this machine is listened to
 WEB_PORT = 9090
-DATA_PORT = 9876  # ports of the viewer's page and of its data; only this machine is listened to
+DATA_PORT = 9876
 
 
 @contextmanager

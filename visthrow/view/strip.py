@@ -20,10 +20,11 @@ from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
 GROUND = 0.13  # of it seen below z = 0 [m]
+# widths of the picture, its left margin, a panel, and the gap between two [inch]
 WIDTH = 13.6
 LEFT_MARGIN = 0.62
 PANEL = 3.06
-GAP = 0.22  # widths of the picture, its left margin, a panel, and the gap between two [inch]
+GAP = 0.22
 
 ARM = 0.097  # half the motor-to-motor diagonal, for drawing only [m]
 ROTOR = 0.0381  # propeller radius, for drawing only [m]

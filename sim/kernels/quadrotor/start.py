@@ -57,9 +57,8 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
         if wp.static(ideal):
             charge_used = real(0.0)
         else:
-            for _ in range(
-                4
-            ):  # speed and voltage depend on each other weakly: each round gains three digits
+            # speed and voltage depend on each other weakly: each round gains three digits
+            for _ in range(4):
                 voltage = hover_voltage(
                     p, used, thrust, hover_speed(p, thrust / real(4.0), voltage)
                 )

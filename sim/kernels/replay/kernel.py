@@ -21,13 +21,13 @@ from sim.kernels.rope.payload import build_payload
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
-EVERYTHING = frozenset(
-    EXTENSIONS
-)  # the replay has every extension built in, so that lanes may differ in all of them
+# the replay has every extension built in, so that lanes may differ in all of them
+EVERYTHING = frozenset(EXTENSIONS)
 
+# how the payload starts: on the rope, flying, or not there
 ATTACHED = 1
 LOOSE = 0
-NO_PAYLOAD = 2  # how the payload starts: on the rope, flying, or not there
+NO_PAYLOAD = 2
 
 STATE_FIELDS = {
     **QUAD_STATE,

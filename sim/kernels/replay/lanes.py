@@ -29,12 +29,10 @@ class Replayed:
     ``knots`` are empty where no lane keeps."""
 
     seen: np.ndarray  # shape (rows, lanes, 3)
-    ends: dict[
-        str, np.ndarray
-    ]  # states at the end of the windows of lanes that keep, as ``starts``; others undefined
-    knots: dict[
-        str, np.ndarray
-    ]  # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+    # states at the end of the windows of lanes that keep, as ``starts``; others undefined
+    ends: dict[str, np.ndarray]
+    # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
+    knots: dict[str, np.ndarray]
 
 
 class Recording:

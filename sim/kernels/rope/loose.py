@@ -179,9 +179,8 @@ def build_loose(
 
     @wp.func
     def payload_state(r: Release, ball: Ball):
-        return ball.pos + r.rope_tail * (ball.tail - ball.pos), ball.vel + r.rope_tail * (
-            ball.tail_vel - ball.vel
-        )
+        pos = ball.pos + r.rope_tail * (ball.tail - ball.pos)
+        return pos, ball.vel + r.rope_tail * (ball.tail_vel - ball.vel)
 
     return SimpleNamespace(
         Ball=Ball,

@@ -9,9 +9,8 @@ import warp as wp
 
 from sim.kernels.structs import Types
 
-LOADS = frozenset(
-    {"payload_drag", "swing_damping", "downwash", "push"}
-)  # extensions that push at the payload
+# extensions that push at the payload
+LOADS = frozenset({"payload_drag", "swing_damping", "downwash", "push"})
 
 
 def build_flight(t: Types, payload: SimpleNamespace, laws: SimpleNamespace):

@@ -15,9 +15,8 @@ FLIGHT_STEP = 0.02
 
 RK4 is 1e-8 m off a tennis ball's path after a second of them (a test shows it).
 """
-FLIGHT_STEPS = (
-    500  # steps after which a payload that has not come down counts as one that never will
-)
+# steps after which a payload that has not come down counts as one that never will
+FLIGHT_STEPS = 500
 
 
 @wp.func

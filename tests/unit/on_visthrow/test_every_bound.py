@@ -92,6 +92,8 @@ def test_a_number_outside_its_bound_is_refused(wrong):
         ),
         ("vehicle", "paper", "body.mass=1e9", "mass is .*; expected above 0 and at most 100000"),
         ("vehicle", "paper", "controller.max_thrust=0.1", "a quarter of the vehicle's weight"),
+        ("vehicle", "paper", "aero.drag_x=50", "drag_x is 50.0; expected 0 to 10"),
+        ("vehicle", "paper", "aero.inflow=-20", "inflow is -20.0; expected -10 to 10"),
         ("rope", "paper", "length=0", "length is 0.0; expected above 0"),
         ("rope", "paper", "payload_inertia=1.0", "payload_inertia"),
         ("diagnose", "cf_payload", "flyer.mass=0", "mass is 0.0; expected above 0"),
