@@ -31,7 +31,7 @@ test-all: $(STAMP)
 SITL := OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
-	{ $(SITL) -k "every_way or lock_step" & } && turns=$$! && { $(SITL) -k "not every_way and not lock_step"; paced=$$?; wait $$turns && exit $$paced; }
+	$(SITL) -k "every_way or lock_step" & turns=$$!; $(SITL) -k "not every_way and not lock_step"; paced=$$?; wait $$turns && exit $$paced
 
 # Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
 firmware: $(FIRMWARE)/.built

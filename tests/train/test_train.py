@@ -12,11 +12,12 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from types import SimpleNamespace
 
 import torch
 from numpy.testing import assert_array_equal
-from pytest import fixture, mark, raises
+from pytest import approx, fixture, mark, raises
 from torch.testing import assert_close
 
 from tests.commands import run_command
@@ -24,6 +25,7 @@ from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
 from visthrow.onboard.policy import Policy, find_policy
+from visthrow.paper import measurements
 from visthrow.task import Experiment, contract_of
 from visthrow.training import session, trainer
 from visthrow.training.ranks import Ranks
@@ -307,6 +309,13 @@ def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
     coarse = Trainer(experiment, "cpu", 1).algorithm.env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
     assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
+
+
+def test_the_recorded_seeds_are_those_of_the_record():
+    record = measurements.load(measurements.FOLDER / "train-state-fast-seeds-h100.json")
+    errors = [run["error"]["2.0"] for run in record["figures"]["runs"]]
+    recorded = tomllib.loads(session.RECORDED.read_text(encoding="utf-8"))
+    assert recorded == {"state_fast": approx(errors, abs=5.1e-5)}  # four digits are kept
 
 
 def test_the_end_compares_the_seed_with_recorded_ones(capsys):

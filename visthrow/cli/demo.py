@@ -15,8 +15,9 @@ from visthrow.common.storage import writable
 # another number
 THROWS = 100
 
+# on the reference plant, for each policy; one such throw costs seconds
 REFERENCE_THROWS = 6
-REFERENCE_TARGETS = (2.0,)  # on the reference plant, for each policy; one such throw costs seconds
+REFERENCE_TARGETS = (2.0,)  # [m]
 
 SEED = 0
 

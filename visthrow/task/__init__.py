@@ -217,9 +217,9 @@ class PPOParams(Bounded):
     # of the hidden layers; weights are float32 either way
     products: Literal["float32", "bfloat16"] = "float32"
     settled: Share = 1.0  # share of the training after which desired_kl has become final_kl
-    # rope segments at most, and least substep [s], of the simulator that is trained in: 0 for the
-    # plant's own, in which throws are measured
+    # most rope segments that training simulates, with the solver chain; 0 for the plant's number
     segments: Annotated[int, Bound(0)] = 0
+    # shortest step that training simulates, with the solver chain; 0 for the plant's [s]
     substep: NotNegative = 0.0
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
     # iterations at the beginning in which the critic alone learns
@@ -246,8 +246,8 @@ class FirstOrderParams(Bounded):
 
     iterations: Count = 1000  # gradients
     horizon: int = 48  # of a flight [control steps]; the latch trips near the 35th
-    segments: Count = 5  # as ppo.segments and ppo.substep
-    substep: Positive = 0.004
+    segments: Count = 5  # as ppo.segments
+    substep: Positive = 0.004  # as ppo.substep [s]
     decay: Positive = 0.985  # of derivatives, per step backward
     learning_rate: Positive = 2e-3  # at the first iteration
     adapting: Count = 160  # gradients where the training starts from a policy

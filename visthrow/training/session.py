@@ -35,10 +35,9 @@ EVALUATION_TARGET = 2.0  # [m]
 
 RECORDED = Path(__file__).with_name("recorded.toml")
 
-EVALUATION_SHARE, CHECKPOINT_SHARE = (
-    0.05,
-    0.01,
-)  # of the wall time that each may take where its number is left to the command
+# shares of the wall time that each may take where the command does not say how often
+EVALUATION_SHARE = 0.05
+CHECKPOINT_SHARE = 0.01
 
 FIRST = 20.0  # time after which the first of them comes then: what it costs is not known before [s]
 
@@ -69,9 +68,8 @@ def run(args: Options) -> int:
     name = compute_device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
-    trainer = Trainer(
-        experiment, ranks.device, seed, ranks
-    )  # refuses what cannot be trained before a folder is made
+    # refuses what cannot be trained before a folder is made
+    trainer = Trainer(experiment, ranks.device, seed, ranks)
     if args.resume:
         trainer.load(folder / CHECKPOINT)
     elif policy is not None:

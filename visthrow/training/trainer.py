@@ -87,10 +87,10 @@ class Algorithm(Protocol):
         """
 
 
-def coarser(experiment: Experiment) -> Experiment:
-    """Return the experiment in the simulator that is trained in: shorter ropes in longer steps
-    make throws that land alike, several times as fast. Another engine keeps its steps: its rope may
-    not be stable in longer ones.
+def coarsen(experiment: Experiment) -> Experiment:
+    """Return the experiment with fewer rope segments and longer steps, to train in: throws land
+    alike and are simulated faster. Other engines keep theirs: their ropes may be unstable in longer
+    steps.
     """
     if experiment.sim.solver != "chain":
         return experiment
@@ -163,7 +163,7 @@ class Trainer:
         self.device = device
         self.seed = seed
         self.ranks = ranks
-        self.algorithm = build(coarser(experiment), device, seed * 1000 + ranks.rank, ranks)
+        self.algorithm = build(coarsen(experiment), device, seed * 1000 + ranks.rank, ranks)
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 

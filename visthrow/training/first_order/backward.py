@@ -17,9 +17,10 @@ from visthrow.training.ppo.network import Network
 # least at which the slope of the thrust is taken: at none it is nought, and nothing would lead away
 # from there
 SLACK_THROTTLE = 0.05
+# columns of a state observation where previous action, goal and payload begin
 PREVIOUS_AT = ob.VEHICLE
 GOAL_AT = ob.VEHICLE + 5
-LOAD_AT = ob.VEHICLE + 7  # columns of a state observation where these begin
+LOAD_AT = ob.VEHICLE + 7
 
 
 @wp.struct

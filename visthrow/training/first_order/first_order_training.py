@@ -76,9 +76,8 @@ class FirstOrder:
         self._shares = [
             math.prod((remainder - b) / (a - b) for b in NODES if b != a) for a in NODES
         ]
-        simulated = dataclasses.replace(
-            experiment, ppo=dataclasses.replace(p, privileged=())
-        )  # there is no critic
+        without_critic = dataclasses.replace(p, privileged=())
+        simulated = dataclasses.replace(experiment, ppo=without_critic)
         self.env = env = ThrowEnv(simulated, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
         shape = {

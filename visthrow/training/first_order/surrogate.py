@@ -32,17 +32,10 @@ from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import Network
 
-EXCITED = (
-    0.35,
-    0.5,
-    0.5,
-    0.5,
-    0.0,
-)
-RETAINED = 0.7  # random actions of the fit: spread about hover, share of one that the next keeps
+EXCITED = (0.35, 0.5, 0.5, 0.5, 0.0)  # spread of the fit's random actions about hover
+RETAINED = 0.7  # share of a random action that the next keeps
 FITTED = 8000  # steps of flight that the fit rests on
 TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
-
 
 STATES = ("pos", "vel", "quat", "load_pos", "load_vel", "response")
 

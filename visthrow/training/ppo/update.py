@@ -8,8 +8,9 @@ from torch import Tensor
 from sim.torch_bridge import captured
 from visthrow.training.ppo.network import Network
 
+# range of the adaptive learning rate
 SLOWEST = 1e-5
-FASTEST = 1e-2  # range of the adaptive learning rate
+FASTEST = 1e-2
 
 
 class CapturedPPO(PPO):
