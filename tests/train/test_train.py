@@ -21,6 +21,7 @@ from pytest import approx, fixture, mark, raises
 from torch.testing import assert_close
 
 from tests.commands import run_command
+from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
@@ -306,9 +307,18 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
 def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
     words = [*SMALL, "ppo.segments=5", "ppo.substep=0.004"]
     experiment = config.load(Experiment, config.find("train", "laptop"), words)
-    coarse = Trainer(experiment, "cpu", 1).algorithm.env.cfg
+    run = Trainer(experiment, "cpu", 1)
+    coarse = run.algorithm.env.cfg
     assert (coarse.rope.segments, coarse.sim.substep) == (5, 0.004)
     assert (experiment.rope.segments, experiment.sim.substep) == (15, 0.002)
+    assert run.experiment == experiment
+
+
+@mark.parametrize("name", ["state_box", "state_two_cables", "state_rod_gripper"])
+def test_another_solver_keeps_its_rope_and_steps(name):
+    experiment = load_experiment(name)
+    assert experiment.ppo.segments == 5, "inherited from state_fast"
+    assert trainer.coarsen(experiment) == experiment
 
 
 def test_the_recorded_seeds_are_those_of_the_record():
