@@ -424,6 +424,19 @@ def test_two_vehicles_with_one_payload_tell_their_clocks():
     assert not [r for r in check([log_of(first), log_of(second)])[1].rows if "rms_m" in r.figures]
 
 
+@mark.parametrize(("rate", "compared"), [(4.4, True), (0.2, False)])
+def test_clocks_are_compared_where_a_noisy_payload_moves_fast_enough(rate, compared):
+    """Tracks with 1.5 mm of noise: of one that swings fast, and of one that drifts."""
+    time = np.arange(0.0, 30.0, 0.01)
+    swing = 0.1 * np.column_stack([np.sin(rate * time), np.cos(rate * time), 0.0 * time])
+    logs = []
+    for seed, late in ((0, 0.0), (1, 0.02)):
+        noise = default_rng(seed).normal(0.0, 1.5e-3, swing.shape)
+        logs.append(FlightLog({"payload_pos_w": Channel(time + late, swing + noise, "m", "world")}))
+    delays = [r.figures["delay_s"] for r in check(logs)[1].rows if "rms_m" in r.figures]
+    assert delays == ([approx(0.02, abs=3e-3)] if compared else [])
+
+
 def test_bodies_exchanged():
     columns = flight()
     columns["payload_pos_w"] = columns["pos_w"] + [0.0, 0.0, 0.4]

@@ -34,7 +34,7 @@ CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
-_DELAY_KNOWN = 0.012  # deviation of a delay, below which it says whether delays drift [s]
+DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
@@ -712,7 +712,7 @@ def _drift(
         if np.sum(near_a) < 50 or np.sum(near_b) < 50 or np.max(np.std(a[near_a], axis=0)) < MOVES:
             continue
         relation = relations.relate(time_a[near_a], a[near_a], time_b[near_b], b[near_b])
-        if relation is not None and relation.correlation > 0.8 and relation.delay_sd < _DELAY_KNOWN:
+        if relation is not None and relation.correlation > 0.8 and relation.delay_sd < DELAY_KNOWN:
             delays.append((start, relation.delay))
     if len(delays) < 3:
         return []

@@ -231,11 +231,11 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
         (time_a, a), (time_b, b) = (logs[i]["payload_pos_w"].samples() for i in (first, second))
         if max(np.max(np.std(a, axis=0)), np.max(np.std(b, axis=0))) < physics.MOVES:
             continue
-        # of a way in one direction, an offset of positions and a delay are one; of velocities not
+        # on a straight path an offset of positions looks like a delay; velocities have none
         relation = relations.relate(
             *relations.derivative(time_a, a), *relations.derivative(time_b, b)
         )
-        if relation is None or relation.correlation < 0.99:
+        if relation is None or relation.delay_sd > physics.DELAY_KNOWN:
             continue
         common = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
         difference = a[common] - relations.on_grid(time_b, b, time_a[common] + relation.delay)
