@@ -27,9 +27,8 @@ class CalibrationParams(Bounded):
     sway: Positive = calibration.SWAY  # [s]
     rate: Positive = calibration.SWAY_RATE  # amplitude of the sway's body rates [rad/s]
     frequency: Positive = calibration.SWAY_FREQUENCY  # of the sway [Hz]
-    most_tilt_deg: Positive = (
-        10.0  # of the camera, which is corrected; beyond it the field of view differs too much
-    )
+    # of the camera, which is corrected; beyond it the field of view differs too much
+    most_tilt_deg: Positive = 10.0
     most_scale: Positive = 0.06  # error of the focal length, which is corrected [-]
     most_latency: Positive = 0.06  # of the keypoints, which is compensated [s]
     thrust: Positive = 0.1  # relative error: twice the spread of masses in training

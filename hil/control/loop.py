@@ -67,10 +67,8 @@ class Loop:
     clock: Clock  # of the ticks
     operator: Operator  # who arms
     recorder: RunRecorder | None = None  # of the run's folder
-    tell: Callable[[TickRecord], None] | None = (
-        # called with the first decision of each state, and of each reason why it does not go on
-        None
-    )
+    # called with the first decision of each state, and of each reason why it does not go on
+    tell: Callable[[TickRecord], None] | None = None
     stages: Stages = field(default_factory=Stages)  # filled with the times of each stage
     eyes: Eyes | None = None  # a camera, where keypoints are a detector's
     solver: CalibrationSolver | None = None  # of its calibration

@@ -16,9 +16,8 @@ from typing import Annotated
 
 from visthrow.config.bounds import Bound, Bounded
 
-SWITCH = (
-    5e-4  # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
-)
+# after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
+SWITCH = 5e-4
 LOCK_CURRENT = 1
 LOCK_FUTURE = 2  # Flags of mlockall(2)
 

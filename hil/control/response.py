@@ -26,9 +26,8 @@ DEADS = 6
 """Dead times before an answer that are tried, in ticks: real autopilots are half way after 25 to
 100 ms. Of each sign of an axis the pair of time constant and dead time counts that explains most.
 """
-RATE_NOISE = (
-    0.02  # least change of a reported rate from tick to tick that no command explains [rad/s]
-)
+# least change of a reported rate from tick to tick that no command explains [rad/s]
+RATE_NOISE = 0.02
 GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
 HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
 FEWEST_RATES = 4  # reported changes that a sign is taken from

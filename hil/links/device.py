@@ -24,9 +24,8 @@ _SERIAL = re.compile(
 )
 PLUGGED = ("serial/by-id/*", "ttyACM*", "ttyUSB*", "cu.*")  # names of serial ports in /dev
 LARGEST_DATAGRAM = 65536
-MOST_CHUNKS = (
-    256  # datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
-)
+# datagrams, or pieces of a stream, read in one go: a flood must not hold up the tick
+MOST_CHUNKS = 256
 # datagrams of strangers thrown away in one go, unread: 5 ms; they must not stand in the way of
 # those that are ours
 MOST_SHUT_OUT = 4096

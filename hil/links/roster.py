@@ -17,16 +17,14 @@ from visthrow.config.bounds import Bound
 
 MavlinkId = Annotated[int, Bound(1, 255)]
 
-Address = (
-    tuple[str, int] | None
-)  # address of a datagram's sender; None on a stream, which has one peer
+# address of a datagram's sender; None on a stream, which has one peer
+Address = tuple[str, int] | None
 
 # after which another address may take a party's place on the ground: longer than a heartbeat's
 # second [s]
 SILENT = 1.5
-MOST_KEPT = (
-    256  # kinds of messages of all senders that are told apart; the rest is counted together
-)
+# kinds of messages of all senders that are told apart; the rest is counted together
+MOST_KEPT = 256
 MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
 # why a message of a party is not taken that has not been heard as the one that it is to be
 NOT_YET = "before its first"
@@ -43,9 +41,8 @@ class Party:
     name: str  # of a body, or "autopilot"
     system: int  # MAVLink id
     component: int  # MAVLink id; 0 for any
-    kinds: frozenset[str] = (
-        frozenset()
-    )  # messages that are its; empty: all that are no other party's
+    # messages that are its; empty: all that are no other party's
+    kinds: frozenset[str] = frozenset()
     autopilot: int | None = None  # MAV_AUTOPILOT that its HEARTBEAT must name
 
     def has(self, system: int, component: int) -> bool:

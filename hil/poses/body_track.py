@@ -11,9 +11,8 @@ from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
 from visthrow.common.rotations import turned_one
 
-MOST_PREDICTION = (
-    0.1  # poses are carried forward by no more than this [s]; older ones are the timers' affair
-)
+# poses are carried forward by no more than this [s]; older ones are the timers' affair
+MOST_PREDICTION = 0.1
 
 TRUST = 0.5
 """Share of the estimated accelerations that velocity and rate are carried forward with: they are

@@ -16,9 +16,8 @@ from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import conjugate, multiply, rotation_vector
 from visthrow.config.bounds import Bound, Bounded
 
-MOST_GAP = (
-    0.1  # a gap longer than this empties the window: what lies before it says nothing of now [s]
-)
+# a gap longer than this empties the window: what lies before it says nothing of now [s]
+MOST_GAP = 0.1
 MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost stays bounded
 
 

@@ -36,10 +36,8 @@ class Pose:
     arrival: float  # on the runner's monotonic clock [s]
     body: str  # of :data:`BODIES`
     pos: Vector  # [m]
-    quat: Quaternion | None = (
-        # attitude, body to world, in the order of the source (ours is xyzw); None for a bare marker
-        None
-    )
+    # attitude, body to world, in the order of the source (ours is xyzw); None for a bare marker
+    quat: Quaternion | None = None
     vel: Vector | None = None  # [m/s], world frame; None where the source gives none
     rate: Vector | None = None  # [rad/s], body frame; None where the source gives none
     reset: int = 0  # counter of the source's estimator; a change says that it jumped

@@ -79,29 +79,23 @@ class FakeOptions(Bounded):
     parameters: dict[str, float] = field(
         default_factory=dict
     )  # that differ from a well set-up vehicle's
-    command_delay: NotNegative | None = (
-        None  # from a set-point's arrival to its effect [s]; None: the kind's
-    )
+    # from a set-point's arrival to its effect [s]; None: the kind's
+    command_delay: NotNegative | None = None
     answer_delay: NotNegative = 0.002  # 1 to 3 ms were measured [s]
-    servo_delay: NotNegative = (
-        0.002  # from a release to the output's movement; 1 to 3 ms were measured [s]
-    )
-    timesync_delay: float = (
-        0.0  # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
-    )
+    # from a release to the output's movement; 1 to 3 ms were measured [s]
+    servo_delay: NotNegative = 0.002
+    # of an answer to TIMESYNC; 1.3 to 10.5 ms were measured, of which the best counts [s]
+    timesync_delay: float = 0.0
     # from a release to the latch of the plant, whose own lag, the output's movement in it, follows
     # [s]
     mechanism: NotNegative = 0.0
     clock_offset: float = 0.0  # of its clock [s]
     silent_after: float = NEVER  # it says nothing any more from this time on [s]
     taken_after: float = NEVER  # when the pilot takes the vehicle over [s]
-    pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = (
-        "ATT_POS_MOCAP"  # ODOMETRY carries a reset counter
-    )
-    prompt: bool | None = (
-        # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
-        None
-    )
+    # ODOMETRY carries a reset counter
+    pose_message: Literal["ATT_POS_MOCAP", "ODOMETRY"] = "ATT_POS_MOCAP"
+    # a heartbeat follows a change of mode at once, or only when it is due; None: as of the kind
+    prompt: bool | None = None
     all_channels: bool = False  # Betaflight: all channels come by MSP, the arming one as well
 
 

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-DRAWS = (
-    4000  # bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
-)
+# bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
+DRAWS = 4000
 
 LEVEL = 0.95
 

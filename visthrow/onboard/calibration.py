@@ -111,9 +111,8 @@ class Hovered:
     keypoints: np.ndarray  # normalised [-], shape (N, 8, 2)
     valid: np.ndarray  # shape (N, 8), bool
     goal_w: np.ndarray  # [m], shape (3,)
-    age: np.ndarray | None = (
-        None  # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
-    )
+    # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
+    age: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -322,9 +321,8 @@ class CalibrationProblem:
         falling = jump(swung) / dt + GRAVITY * up
         direction = mean(rope)
         perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
-        coning = (
-            torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
-        )  # Magnus: of a rate that is linear in a step
+        # Magnus: of a rate that is linear in a step
+        coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
         turned = (
             _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:])
             - (self.mean_rate - c["gyro"][:, None]) * dt

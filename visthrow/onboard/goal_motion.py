@@ -35,9 +35,8 @@ POSITION_SIGMA = 0.017
 # deviation of a corner's ray, camera and attitude together [rad]: 0.01 of a half field of view of
 # 110 degrees
 ANGLE_SIGMA = 0.02
-SPEED_SIGMA = (
-    0.4  # prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
-)
+# prior of each component of the velocity [m/s]: what speeds uniform up to 1 m/s have
+SPEED_SIGMA = 0.4
 GRAZING = 0.1  # sine of the least angle below the horizon at which a ray is followed to the ground
 
 

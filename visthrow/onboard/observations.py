@@ -117,9 +117,8 @@ def layout_of(params: Any) -> Layout:
     """
     if params.history < 0:
         raise ValueError(f"observation history {params.history}; expected 0 or more")
-    motion = (
-        2 if getattr(params, "goal_velocity", False) else 0
-    )  # contracts hold what differs from the default
+    # contracts hold what differs from the default
+    motion = 2 if getattr(params, "goal_velocity", False) else 0
     response = getattr(params, "response", 0)
     setup = SETUPS[getattr(params, "setup", "none")]
     places = LOCATED.get(params.layout, 0) if getattr(params, "located", False) else 0

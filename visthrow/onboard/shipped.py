@@ -4,9 +4,8 @@ from pathlib import Path
 
 from visthrow.common.errors import PolicyError, suggest
 
-SHIPPED = (
-    Path(__file__).resolve().parent / "policies"
-)  # folder of the policies that come with the package
+# folder of the policies that come with the package
+SHIPPED = Path(__file__).resolve().parent / "policies"
 
 
 def find_policy(name: str | Path) -> Path:

@@ -29,10 +29,8 @@ class Sample:
     pose: Pose  # stamp on the source's clock, freed of its steps
     vel_w: Vector  # [m/s]
     rate_b: Vector  # [rad/s]
-    time: float | None = (
-        # of the measurement on the runner's clock [s], once it was worked out from the whole run
-        None
-    )
+    # of the measurement on the runner's clock [s], once it was worked out from the whole run
+    time: float | None = None
 
 
 @dataclass

@@ -23,9 +23,8 @@ class Rule:
     expected: str  # in words
     why: str
     good: Callable[[float], bool]
-    value: Callable[[float], float] | None = (
-        None  # what is written where the operator asked for it; None: nothing can be
-    )
+    # what is written where the operator asked for it; None: nothing can be
+    value: Callable[[float], float] | None = None
     optional: bool = False  # firmware without it is right as well
     warns: bool = False  # a mismatch is told, and flown with
     text: Callable[[float], str] = "{:g}".format  # a value in words

@@ -40,9 +40,8 @@ class Status:
     note: str = ""  # why not, for people
     release: str = IDLE  # IDLE, PENDING, ACCEPTED or FAILED
     mode: str = FOLLOW  # WAIT, FOLLOW, HOLD or LAND
-    fault: str | None = (
-        None  # what ends the run, whatever else is well: a parameter audit that failed
-    )
+    # what ends the run, whatever else is well: a parameter audit that failed
+    fault: str | None = None
     # that it hovers with by itself, by its own report and the calibration [N]; None: not known
     thrust: float | None = None
     # body rates that it last reported [rad/s], x forward, y left, z up; None: it reports none

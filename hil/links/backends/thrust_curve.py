@@ -43,9 +43,8 @@ class HoverThrustParams(Bounded):
     ]  # of the thrust over the share around hover, relative to weight / hover
     tolerance: Inside  # of a measured share of hover, relative; beyond it the runner does not fly
     voltage: NotNegative  # of the battery in that hover [V]; 0: no correction for its voltage
-    exponent: Annotated[float, Bound(1.0, 3.0)] = (
-        1.0  # of thrust over the motors' command, where the autopilot does not straighten it
-    )
+    # of thrust over the motors' command, where the autopilot does not straighten it
+    exponent: Annotated[float, Bound(1.0, 3.0)] = 1.0
     idle: Annotated[float, Bound(0.0, 0.5, "[)")] = 0.0  # motors' command at share 0, 0 to 1
 
     def share(self, thrust: float, voltage: float | None = None) -> float:

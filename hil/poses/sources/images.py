@@ -49,9 +49,8 @@ class ImageParams(Bounded):
     kind: Literal["folder", "video", "camera"]
     path: str | None = None  # of the folder or video
     device: int = 0  # number of a live camera
-    delay: Annotated[float, Bound(0.0, 0.5)] = (
-        0.0  # from the exposure to the arrival of a picture [s]
-    )
+    # from the exposure to the arrival of a picture [s]
+    delay: Annotated[float, Bound(0.0, 0.5)] = 0.0
     hold: Annotated[float, Bound(0.0, 0.5, "(]")] = 0.1  # for which a picture counts [s]
     fisheye: FisheyeParams | None = None  # the lens; left out, that of training
     mount: MountParams | None = None  # left out, that of training

@@ -131,9 +131,8 @@ class Firmware:
             self.folder
         ).name  # by its place in the folder that it runs in: a path may hold no space
         environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
-        told = (
-            self.folder / "firmware.txt"
-        )  # its errors; of what it prints, most are the words of its memory
+        # its errors; of what it prints, most are the words of its memory
+        told = self.folder / "firmware.txt"
         with open(told, "wb") as errors:
             self._process = subprocess.Popen(
                 [self.program],

@@ -92,9 +92,8 @@ class HangingBall:
     lag: float  # from the trip of the latch to separation [s]
     mass: tuple[float, float]  # with and without the ball [kg]
     max_thrust: float  # [N]
-    ground: float = (
-        0.04  # height of the ball's centre when it has landed, landing_height of the runs [m]
-    )
+    # height of the ball's centre when it has landed, landing_height of the runs [m]
+    ground: float = 0.04
     period: float = 0.005  # [s]
     home_w: np.ndarray = field(default_factory=lambda: np.zeros(3))
 
