@@ -43,8 +43,8 @@ from visthrow import config
 from visthrow.onboard.policy import Policy, find_policy
 
 SETTINGS = "settings"  # folder of the firmware's settings beside those of the throws
-AFTER = 1.2
-MOST = 25.0  # flown on after a landing; flown at most [s]
+AFTER = 1.2  # flown on after a landing [s]
+MOST = 25.0  # flown at most [s]
 
 
 class FlightClock:

@@ -100,7 +100,7 @@ def fly(folder: Path, seconds: float, seed: int = 0) -> dict[str, np.ndarray]:
                     plant.time,
                     rng.integers(2, 5) * bench.TICK,
                 )
-                due = due + EVERY
+                due += EVERY
                 lift = rng.choice(LIFTS)
                 starts.append((plant.time, axis, size, lift))
             command[0] *= (

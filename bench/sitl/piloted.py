@@ -18,8 +18,9 @@ FACTS = values("betaflight")
 RADIO = struct.Struct("<d16H")  # stamp, channels
 FRAME = 0.02  # between two frames of the transmitter [s]
 ARMS = 1.0  # when the pilot arms, the throttle low [s]
+# channels of the switches
 ARM = STICKS
-OVERRIDE = STICKS + 1  # channels of the switches
+OVERRIDE = STICKS + 1
 
 
 class Piloted(BetaflightSitl):

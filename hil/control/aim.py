@@ -65,7 +65,7 @@ class ReleaseCheck:
                 return pos[0] + share * (after[0] - pos[0]), pos[1] + share * (after[1] - pos[1])
             vel = tuple(v + TIME_STEP * a for v, a in zip(vel, self._acceleration(middle)))
             pos = after
-            time = time + TIME_STEP
+            time += TIME_STEP
         return pos[0], pos[1]
 
     def _acceleration(self, vel: Vector) -> Vector:

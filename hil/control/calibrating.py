@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
+import torch
 
 from camera.params import CameraParams
 from hil.poses.body_track import BodyState
@@ -66,8 +67,7 @@ class CalibrationSolver:
 
 
 def _warm() -> None:
-    import torch
-
+    """Load this module, and with it what a calibration needs; compute on one core."""
     torch.set_num_threads(1)
 
 

@@ -13,7 +13,7 @@ ROUNDING = 1e-6  # tolerance of differences of times [s]
 
 
 class DeadReckoning:
-    """Carries the last pose on by thrust and body rates.
+    """An estimate that carries the last pose on by thrust and body rates.
 
     Attributes:
         state: of the vehicle at the last tick; None before the first pose with an attitude.
@@ -24,7 +24,8 @@ class DeadReckoning:
         """Wait for the first pose."""
         self.state: BodyState | None = None
         self.duration = 0.0
-        self._arrival = self._time = 0.0  # of the last pose; that the state stands for [s]
+        self._arrival = 0.0  # of the last pose [s]
+        self._time = 0.0  # that the state stands for [s]
         self._reported: tuple[float, ...] | None = None
 
     def update(
@@ -42,13 +43,14 @@ class DeadReckoning:
         elif self.state is None or time - vehicle.age > self._arrival + ROUNDING:
             self.state = vehicle
             self.duration = 0.0
-            self._arrival, self._time = time - vehicle.age, time - estimate.shown_age
+            self._arrival = time - vehicle.age
+            self._time = time - estimate.shown_age
         else:
             step = time - self._time
-            self._time, self.duration = time, self.duration + step
-            self.state = _advanced(
-                self.state, step, rates if rates != reported else None, command, mass
-            )
+            self._time = time
+            self.duration += step
+            new_rates = rates if rates != reported else None
+            self.state = _advanced(self.state, step, new_rates, command, mass)
 
 
 def _advanced(

@@ -249,7 +249,7 @@ class Latch:
             return False
         hangs = abs(excess) < self._tolerance
         if hangs and self._flight is not None:
-            self.stuck = self.stuck + 1
+            self.stuck += 1
             self._flight = None
         return hangs
 

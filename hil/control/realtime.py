@@ -18,8 +18,9 @@ from visthrow.config.bounds import Bound, Bounded
 
 # after which one thread gives way to another [s]; Python's 5 ms are a quarter of a tick
 SWITCH = 5e-4
+# flags of mlockall(2)
 LOCK_CURRENT = 1
-LOCK_FUTURE = 2  # Flags of mlockall(2)
+LOCK_FUTURE = 2
 
 
 @dataclass(frozen=True)

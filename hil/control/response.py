@@ -31,12 +31,12 @@ RATE_NOISE = 0.02
 GAINS = np.array([0.3, 1.5])  # of an axis that turns as commanded
 HOVERED = 50  # ticks of the autopilot's own hover that the true one is taken from
 FEWEST_RATES = 4  # reported changes that a sign is taken from
-FALL = 0.4
-FALL_DEAD = 2  # time over which the thrust is judged [s], its dead time in ticks
-ANGLE_NOISE = 0.006
-HEIGHT_NOISE = 0.002  # of an attitude, a height between poses [rad], [m]
-CERTAIN = 4.0
-CERTAIN_SIGN = 5.0  # deviations of the noise beyond which something is known
+FALL = 0.4  # time over which the thrust is judged [s]
+FALL_DEAD = 2  # dead time of the thrust, in ticks
+ANGLE_NOISE = 0.006  # of an attitude between poses [rad]
+HEIGHT_NOISE = 0.002  # of a height between poses [m]
+CERTAIN = 4.0  # deviations of the noise beyond which something is known
+CERTAIN_SIGN = 5.0  # likewise beyond which a sign is known
 FEWEST_HEIGHTS = 5  # heights that a vertical acceleration is taken from
 
 

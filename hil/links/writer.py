@@ -12,9 +12,10 @@ from typing import Any
 from hil.links.device import Port
 from visthrow.common.errors import StorageError
 
+# files in a run's folder
 TLOG = "link.tlog"
-POSES_TLOG = "poses.tlog"
-MSP_LOG = "link.msp"  # in a run's folder: of the link, of poses on a port of their own, of MSP
+POSES_TLOG = "poses.tlog"  # of poses on a port of their own
+MSP_LOG = "link.msp"
 # chunks that may wait for a slow disk, some minutes' worth; those beyond are lost, and counted
 MOST_WAITING = 100_000
 

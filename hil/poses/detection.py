@@ -17,7 +17,6 @@ from camera.mount import rotation_from_vector
 from hil.poses.pose import Quaternion, Vector
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.calibration import Calibration
-from visthrow.onboard.observations import rotation_from_quat
 
 # radius in the image beyond which what is not seen any more has left the field of view, of 1
 NEAR_EDGE = 0.85
@@ -55,11 +54,6 @@ class Detection:
         goal = None if self.corners is None else GoalSeen(np.array(self.corners), 1.0)
         ball = None if self.ball is None else BallSeen(np.array(self.ball[:3]), self.ball[3], 1.0)
         return FrameDetections(ball, goal)
-
-
-def rotation_of(quat: Quaternion) -> np.ndarray:
-    """Return the rotation from body to world, shape (3, 3), float64."""
-    return rotation_from_quat(torch.tensor([quat], dtype=torch.float64))[0].numpy()
 
 
 class Detections:
@@ -105,7 +99,7 @@ class Detections:
         at a tick [s].
         """
         frame = detection.frame_detections()
-        rot_wb = rotation_of(quat)
+        rot_wb = matrix_of_quat(np.array(quat))
         if self._turn is not None and self._path:
             frame = self._carried(frame, detection.stamp - self._latency + aged)
         points, valid = detected_keypoints(self._camera, frame, rot_wb)
@@ -169,8 +163,8 @@ class Detections:
         after = next((i for i, (time, _, _) in enumerate(path) if time >= when), len(path) - 1)
         if after == 0 or path[after][0] <= when:
             return path[after][1:]
-        (begin, pos, quat) = path[after - 1]
-        (end, pos_after, quat_after) = path[after]
+        begin, pos, quat = path[after - 1]
+        end, pos_after, quat_after = path[after]
         share = (when - begin) / (end - begin)
         nearest = quat_after if quat @ quat_after > 0.0 else -quat_after
         return pos + share * (pos_after - pos), quat + share * (nearest - quat)

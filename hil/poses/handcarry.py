@@ -26,8 +26,8 @@ SPEED, RATE = (
 )  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
 SPAN = 0.2  # over which speed and rate are taken [s]
 REST_TIME = 0.5  # shortest rest [s]
-LEAST_WAY = 0.2
-LEAST_TURN = math.radians(15.0)  # of a move [m], [rad]
+LEAST_WAY = 0.2  # of a move [m]
+LEAST_TURN = math.radians(15.0)  # likewise [rad]
 POLL_INTERVAL = 0.25  # [s]
 TOLERANCE = math.radians(30.0)  # between a move and its axis: people do not walk straight [rad]
 

@@ -34,9 +34,8 @@ def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
         (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
         (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
     )
-    out = np.empty(
-        (*unit.shape[:-1], 3, 3), unit.dtype
-    )  # np.stack takes twice as long on a single quaternion
+    # np.stack takes twice as long on a single quaternion
+    out = np.empty((*unit.shape[:-1], 3, 3), unit.dtype)
     for i, row in enumerate(rows):
         for j, entry in enumerate(row):
             out[..., i, j] = entry

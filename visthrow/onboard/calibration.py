@@ -58,12 +58,10 @@ CONSTANTS = {
 }
 """Unknowns that stay the same; see `Spreads`."""
 
-LEAST_STEPS = 75
-LEAST_SEEN = 0.5  # steps of a calibration, and share of them in which the ball is seen
-ROUNDS, SETTLED = (
-    12,
-    1e-3,
-)  # of Gauss-Newton at most, and the step of a constant in its spreads below which it has settled
+LEAST_STEPS = 75  # of a calibration
+LEAST_SEEN = 0.5  # share of the steps in which the ball is seen
+ROUNDS = 12  # of Gauss-Newton at most
+SETTLED = 1e-3  # step of a constant in its spreads below which it has settled
 OUTLIER = 3.0  # standard deviations beyond which a sighting counts less (Huber)
 
 
@@ -176,8 +174,8 @@ class CalibrationError(VisthrowError):
 
 NO_ANSWER = "calibration found no finite answer; expected finite poses, thrusts and keypoints"
 
-HOVER = 1.5
-SWAY = 1.5  # of a hover before the sway, and of the sway [s]
+HOVER = 1.5  # duration of a hover before the sway [s]
+SWAY = 1.5  # duration of the sway [s]
 
 SWAY_RATE = 1.0
 SWAY_FREQUENCY = 4.0 / 3.0
@@ -531,7 +529,7 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tens
 
     A residual hangs on two neighbouring steps at most, so two perturbations give a derivative for
     all of them."""
-    (count, width) = x.shape
+    count, width = x.shape
     h = 1e-5
     j, _ = problem.places(problem.split(c[None])["latency"][0, 0])
     xs = x.repeat(1 + 2 * width + len(c), 1, 1)

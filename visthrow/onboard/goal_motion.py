@@ -254,8 +254,9 @@ def middle(points: Tensor, valid: Tensor) -> Tensor:
     """
     count = valid.sum(-1, keepdim=True)
     one, two = torch.where(valid.unsqueeze(-1), points, torch.inf).split(2, 1)
+    # of two pairs, each
     small = torch.minimum(one, two)
-    large = torch.maximum(one, two)  # of two pairs, each
+    large = torch.maximum(one, two)
     first = torch.minimum(small[:, 0], small[:, 1])
     inner = torch.maximum(small[:, 0], small[:, 1])
     outer = torch.minimum(large[:, 0], large[:, 1])

@@ -9,8 +9,8 @@ ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
 # after a value was written, answers may still be on their way that were given before; then it is
 # read back [s]
 SETTLE = 0.5
-GIVE_UP = 5.0
-GIVE_UP_OPTIONAL = 1.0  # a value that has not come within this time is missing [s]
+GIVE_UP = 5.0  # a value that has not come within this time is missing [s]
+GIVE_UP_OPTIONAL = 1.0  # likewise one that not all firmware has [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 MOST_NAMED = 4  # parameters that a fault names; the table has all
 

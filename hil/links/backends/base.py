@@ -10,10 +10,11 @@ from hil.links.backends.audit import Audit
 from hil.links.device import Port
 from hil.links.roster import Address, Roster, shown
 
+# how far a release has come
 IDLE = "idle"
 PENDING = "pending"
 ACCEPTED = "accepted"
-FAILED = "failed"  # how far a release has come
+FAILED = "failed"
 
 WAIT = "wait"
 FOLLOW = "follow"
@@ -214,7 +215,7 @@ class Release:
         elif self.at is not None and host_time >= self.at - ROUNDING:
             if not self.sends:
                 self._sent = perf_counter()
-            self.sends = self.sends + 1
+            self.sends += 1
             self.at = host_time + self.REPEAT
             return True
         return False

@@ -40,11 +40,13 @@ from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 FACTS = values("betaflight")
+# permanent ids of flight modes
 BOX_ARM = FACTS["box_arm"]
-BOX_OVERRIDE = FACTS["box_override"]  # permanent ids of flight modes
+BOX_OVERRIDE = FACTS["box_override"]
 STICKS = FACTS["sticks"]  # channels before the first AUX
+# ends of a channel [us]
 LOW = FACTS["low"]
-HIGH = FACTS["high"]  # ends of a channel [us]
+HIGH = FACTS["high"]
 FORWARDING = FACTS["forwarding"]  # bit of CHANNEL_FORWARDING in MSP_FEATURE_CONFIG
 BLOCKS = FACTS["blocks"]
 """Bits of the arming-disabled flags of MSP_STATUS in words; the highest of a version is the ARM

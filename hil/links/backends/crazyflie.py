@@ -31,11 +31,10 @@ from visthrow.config.bounds import Bounded, NotNegative, Positive
 FACTS = values("crazyflie")
 MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
-ASK = 0.1
-ARM_PERIOD = 0.2  # between two questions for its state, two requests to arm [s]
-# a vehicle that is handed back holds its place so long [s], then sinks so fast [m/s]
-HOLDS = 2.0
-DESCENT = 0.3
+ASK = 0.1  # between two questions for its state [s]
+ARM_PERIOD = 0.2  # between two requests to arm [s]
+HOLDS = 2.0  # for which a vehicle that is handed back holds its place [s]
+DESCENT = 0.3  # at which it sinks then [m/s]
 SHORTEST = 0.02  # that a change of the yaw rate is spread over, at least [s]: a period
 
 BLOCKS = {

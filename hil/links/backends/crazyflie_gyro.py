@@ -14,8 +14,8 @@ from hil.links.facts import values
 
 FACTS = values("crazyflie")
 NAMES = [f"gyro\0{axis}\0".encode() for axis in FACTS["log_gyro"]]
-BLOCK = 239
-PERIOD_MS = 20  # ours among the blocks of others, and how often it is sent [ms]
+BLOCK = 239  # ours among the blocks of others
+PERIOD_MS = 20  # between two of our blocks [ms]
 AT_ONCE = 8  # questions for variables that are out at a time
 ASK_AGAIN = 0.1  # for an answer that did not come [s]
 RATES = struct.Struct("<3f")

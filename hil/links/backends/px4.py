@@ -30,8 +30,8 @@ MAIN_OFFBOARD = FACTS["offboard"]
 AUTO_LOITER = FACTS["auto_loiter"]
 AUTO_LAND = FACTS["auto_land"]
 # set-points are streamed for this long before OFFBOARD is asked for; a longer pause begins anew [s]
-MARGIN = 0.2
-GAP = 0.6  # more than PX4 asks for [s]; of its longest pause
+MARGIN = 0.2  # more than PX4 asks for [s]
+GAP = 0.6  # share of its longest pause
 STREAM_FIRST = FACTS["stream_first"] + MARGIN
 STREAM_GAP = GAP / FACTS["stream_hz"]
 LAND_OR_HOLD = (FACTS["loss_land"], FACTS["loss_hold"])  # values of COM_OBL_RC_ACT

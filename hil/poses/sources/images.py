@@ -24,9 +24,10 @@ from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb
 from camera.params import CameraParams, FisheyeParams, MountParams
 from hil.errors import SourceError
-from hil.poses.detection import Detection, rotation_of
+from hil.poses.detection import Detection
 from hil.poses.pose import Quaternion, Vector
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.rotations import matrix_of_quat
 from visthrow.config.bounds import Bound, Bounded
 
 STAMPS = "stamps.csv"
@@ -111,7 +112,7 @@ class Eyes:
         rot_wc = None
         hint = self.hint
         if hint is not None:
-            rot_wb = rotation_of(hint.quat)
+            rot_wb = matrix_of_quat(np.array(hint.quat))
             rot_wc = rot_wb @ self._rot_cb.T
             eye_w = np.array(hint.pos_w) + rot_wb @ self._position_b
             prior = self._followed.prior(rot_wc, rot_wb[:, 2], eye_w, hint.ball_distance, stamp)

@@ -140,7 +140,7 @@ class MavlinkSource(Source):
         clock: Callable[[], float],
         autopilot_link: Link | None = None,
     ) -> None:
-        """Listen to a link; ``clock`` gives the arrivals. Another ``autopilot_link`` is served."""
+        """Listen to a link, and serve the autopilot's too; ``clock`` gives the arrivals."""
         super().__init__((link,) if autopilot_link is None else (link, autopilot_link), clock)
         self._link, self._decoder = link, MavlinkDecoder(bodies, self._drop)
         self._waiting: list[Pose] = []

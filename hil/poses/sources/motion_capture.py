@@ -37,9 +37,10 @@ from visthrow.config.bounds import Bounded, Positive
 MOST_WAITING = 2000  # poses that are kept between two polls; older ones are dropped
 
 HEADER = struct.Struct("<HH")  # of NatNet's datagrams: message and length of what follows
+# messages
 SERVER_INFO = 1
 FRAME = 7
-IGNORED = (1, 3, 5, 8, 100)  # messages; those that are passed over
+IGNORED = (1, 3, 5, 8, 100)  # those that are passed over
 RESTART_DELAY = 1.0  # after which a capture that has ended is started again, on the ground [s]
 QUIET = 5.0  # without a frame, after which it is started again on the ground: it may hang [s]
 ENDING = 2.0  # that threads and processes are given to end [s]

@@ -91,7 +91,7 @@ def _of_channels(log: FlightLog, body: str) -> list[Pose]:
         parts.append(column)
     start = min(float(channel.time[0]) for channel in log.channels.values() if len(channel.time))
     arrivals = log["arrival"].hold(times) if "arrival" in log else times - start
-    resets = log["resets"].hold(times).astype(int) if "resets" in log else 0 * times.astype(int)
+    resets = log["resets"].hold(times).astype(int) if "resets" in log else np.zeros(len(times), int)
     return [
         Pose(time, arrival, body, *numbers, reset=reset, valid=valid)
         for time, arrival, reset, valid, *numbers in zip(

@@ -39,9 +39,9 @@ HEAD = struct.Struct(
 MAGIC = {FACTS[f"json_magic_{size}"]: FACTS[f"json_outputs_{size}"] for size in ("16", "32")}
 OURS = FACTS["motor_order"]
 
-LOW = 1000.0
-HIGH = 2000.0
-NEAR = 50.0  # MOT_PWM_MIN and MOT_PWM_MAX [us]; an output this near to its target has arrived [us]
+LOW = 1000.0  # MOT_PWM_MIN [us]
+HIGH = 2000.0  # MOT_PWM_MAX [us]
+NEAR = 50.0  # an output this near to its target has arrived [us]
 # for the next frame of an ArduPilot that was heard [s]; then the plant goes on without it
 PATIENCE = 1.0
 
@@ -64,7 +64,7 @@ def outputs(packet: bytes) -> tuple[int, np.ndarray] | None:
 def state_line(time: float, plant: MotorPlant) -> bytes:
     """The state of a vehicle as ArduPilot takes it, a line of JSON between two line feeds."""
     now = plant.state
-    (x, y, z, w) = plant.quat_wb.tolist()
+    x, y, z, w = plant.quat_wb.tolist()
     told = {
         "timestamp": time,
         "imu": {
@@ -132,7 +132,7 @@ class ArduPilotSitl(Bridge):
         else:
             self.restarts += number < self._number
             self._number = number
-            self.frames = self.frames + 1
+            self.frames += 1
             self.motors = np.clip((servos[OURS] - LOW) / (HIGH - LOW), 0.0, 1.0)
             at = self.params.servo_output - 1
             opens = self.params.servo_open_us

@@ -75,8 +75,8 @@ class BetaflightSitl(Bridge):
         self.cycles: list[int] = []
         self._outputs: list[np.ndarray] = []
         self._samples = round(plant.period / SAMPLE)
-        self._rate_b = plant.rate_b
-        self._sent = 0  # at the beginning of the last period; samples sent in this one
+        self._rate_b = plant.rate_b  # at the beginning of the last period
+        self._sent = 0  # samples in this one
 
     def run_on(self, when: float) -> None:
         """Send samples by the rates at the period's beginning and their last change."""
@@ -129,7 +129,7 @@ class BetaflightSitl(Bridge):
         self._outputs = []
         if len(came):
             self.motors = came.mean(axis=0, dtype=float)
-            self.answered = self.answered + 1
+            self.answered += 1
         return self.motors
 
     def speak(self) -> None:

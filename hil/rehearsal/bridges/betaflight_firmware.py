@@ -28,9 +28,9 @@ from hil.rehearsal.bridges.packets import at_rest, stood
 PORTS = (FACTS["serial_port"] + 1, FACTS["serial_port"] + 2)
 LAST_WORDS = 200  # of its output, in an error
 LOOK_AGAIN = 0.02  # for a port that opens [s]
-START = 20.0
-ANSWER = 20.0
-END = 10.0  # time for a start, for an answer of the command line and for the process's end [s]
+START = 20.0  # time for a start [s]
+ANSWER = 20.0  # time for an answer of the command line [s]
+END = 10.0  # time for the process's end [s]
 FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
 
 SETTINGS = Path(__file__).with_name("firmware_settings.toml")

@@ -114,7 +114,7 @@ class Sensors:
         quat = quat_wb.tolist()
         packets = []
         for rate in rates_b.tolist():
-            self._stamp = self._stamp + period
+            self._stamp += period
             self._last = (rate, force, quat)
             packets.append(sample(self._stamp, *self._last))
         return self._run(b"".join(packets))
