@@ -19,8 +19,8 @@ from hil.links.roster import MavlinkId, Party
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
-# before another mode is requested, a new heartbeat must show that the pilot has not taken over; so
-# long it is waited for [s]
+# for which a new heartbeat, which shows whether the pilot has taken over, is waited for before
+# another mode is requested [s]
 CONFIRMATION_TIME = 0.1
 MOST_TEXTS = 1000  # that are kept
 
@@ -332,15 +332,17 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
 
     def _confirms(self, mode: str, host_time: float) -> bool:
-        """Return whether another mode may be requested: a heartbeat that came after the wish for it
-        has been judged by the mode before, so that a pilot who took over is not overruled.
+        """Return whether another mode may be requested: once a heartbeat has come since the first
+        call for it, which shows a pilot who took over, or was waited for in vain.
         """
+        if self._wanted is None:  # the mode is the pilot's
+            return True
         if mode != self._next:
             self._next = mode
             self._wished_at = host_time
             self._request_heartbeat()
         late = host_time - self._wished_at >= CONFIRMATION_TIME
-        return late or self._wanted is None or self._heard > self._wished_at
+        return late or self._heard > self._wished_at
 
     def _request_heartbeat(self) -> None:
         self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
