@@ -32,7 +32,9 @@ Owner = TypeVar("Owner")
 
 
 def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
-    """Return a dataclass with other values at dotted paths, such as ``vehicle.queue.delay``."""
+    """Return a dataclass with other values at dotted paths, such as ``vehicle.queue.delay``; paths
+    within a table change the table that comes with them.
+    """
     fields: dict[str, Any] = {}
     tables: dict[str, dict[str, Any]] = {}
     for path, value in values.items():
@@ -41,8 +43,8 @@ def changed(owner: Owner, values: Mapping[str, Any]) -> Owner:
             tables.setdefault(name, {})[inner] = value
         else:
             fields[name] = value
-    for name, fields_of in tables.items():
-        fields[name] = changed(getattr(owner, name), fields_of)
+    for name, inner_values in tables.items():
+        fields[name] = changed(fields.get(name, getattr(owner, name)), inner_values)
     return replace(owner, **fields)  # type: ignore[type-var]
 
 

@@ -25,7 +25,7 @@ _EXPONENTS: dict[str, Dimension] = {
 
 
 def dimensions_of(tables: Mapping[str, Mapping[str, str]]) -> dict[str, dict[str, Dimension]]:
-    """Dimension of each field of each table, of tables as ``dimensions.toml`` holds them."""
+    """Return the dimension of each field of tables such as those of ``dimensions.toml``."""
     return {
         table: {
             field: _EXPONENTS[name] for name, fields in kinds.items() for field in fields.split()

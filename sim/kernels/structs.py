@@ -341,8 +341,8 @@ def pack_plants(
     releases: list[P.ReleaseParams],
     laws: list[tuple[P.LawParams, ...]] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``; ``laws``: of
-    the airs' plants, those of ``like`` without.
+    """Return structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``;
+    ``laws``: of the airs' plants, those of ``like`` without.
     """
     return {
         "vehicles": pack_vehicle(t, vehicles, kinds_of(like.vehicle)),
@@ -355,7 +355,7 @@ def pack_plants(
 def plants_on(
     t: Types, rows: dict[str, np.ndarray], sim: P.SimParams, gravity: float, device: str
 ) -> typing.Any:
-    """Struct ``t.Plants`` on a device with these rows and numerics; gravity [m/s^2]."""
+    """Return a struct ``t.Plants`` on a device with these rows and numerics; gravity [m/s^2]."""
     plants = t.Plants()
     for name, packed in rows.items():
         setattr(plants, name, wp.array(packed, dtype=t.rows[name], device=device))

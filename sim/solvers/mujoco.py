@@ -144,9 +144,8 @@ def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
             mujoco_warp.step(model_on_device, data)
         wp.synchronize_device(device)
 
-    def step(
-        _read=(model_on_device, data),
-    ) -> None:  # the graph reads these, and must not outlive them
+    # the graph reads these, and must not outlive them
+    def step(_read=(model_on_device, data)) -> None:
         wp.capture_launch(captured.graph, stream=wp.get_stream(device))
 
     def placed(mask) -> None:

@@ -141,7 +141,7 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
     plant = in_units(chosen.plant, inverse_units)
     camera = experiment.camera
     size = chosen.units.length
-    sensors = experiment.task.observation  # do not know of ropes
+    sensors = experiment.task.observation  # their delays do not follow size
     values = {name: getattr(plant, name) for name in ("vehicle", "rope", "release", "sim", "air")}
     values |= {
         "task": in_units(experiment.task, inverse_units, TASK),
@@ -150,14 +150,12 @@ def alone(experiment: Experiment, number: int = 0) -> Experiment:
         "camera.goal_side": size * camera.goal_side,
         "fleet": None,
         "flown": (),
-    }
-    observation = {
         "task.action.max_thrust": 4.0 * plant.vehicle.controller.max_thrust,
         "task.observation.setup": "none",
         "task.observation.latency": sensors.latency,
         "task.observation.latency_jitter": sensors.latency_jitter,
     }
-    return changed(changed(experiment, values), observation)
+    return changed(experiment, values)
 
 
 def specialised(

@@ -259,9 +259,8 @@ def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
     """
     points = 100.0 * log["keypoints"].values
     valid = log["keypoints_valid"].values.astype(bool)
-    for name, part in zip(
-        GROUPS, (slice(GOAL_KEYPOINTS), slice(GOAL_KEYPOINTS, None)), strict=True
-    ):
+    parts = (slice(GOAL_KEYPOINTS), slice(GOAL_KEYPOINTS, None))
+    for name, part in zip(GROUPS, parts, strict=True):
         _points(stream, log, f"camera/{name}", points[:, part], valid[:, part])
         _outline(stream, log, name, points[:, part], valid[:, part].all(axis=1))
     _points(stream, log, "camera/invalid", points, ~valid)

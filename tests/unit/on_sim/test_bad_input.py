@@ -174,5 +174,8 @@ def test_fields_that_fit_only_together_change_together():
     vehicle = {"motor.kind": "asymmetric", "motor.time_constant_down": 0.05}
     motor = changed(paper_plant().vehicle, vehicle).motor
     assert (motor.kind, motor.time_constant_down) == ("asymmetric", 0.05)
+    short = replace(paper_plant().rope, segments=3)
+    rope = changed(paper_plant(), {"rope.length": 0.5, "rope": short}).rope
+    assert (rope.segments, rope.length) == (3, 0.5)
     with raises(TypeError, match="no_such"):
         changed(paper_plant(), {"rope.no_such": 1.0})

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import norm
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import fixture, raises
 from scipy.spatial.transform import Rotation
 
@@ -178,6 +178,16 @@ def test_release_falls_between_steps(flight):
     half = [replace(plants[0], release=replace(plant().release, lag=0.10375))]
     middle = replay(flight, half, keep=0)[1].ends["payload_pos_w"][0] - ends["payload_pos_w"][0]
     assert_allclose(middle, 0.5 * shift, rtol=0.02, atol=1e-9)
+
+
+def test_lanes_do_not_see_each_other(flight):
+    heavy = replace(plant(), rope=replace(plant().rope, payload_mass=0.08))
+    rows = np.array([0, 1, 0, 1, 1, 0, 0])
+    seen, _ = replay(flight, [plant(), heavy], count=7, plant=rows)
+    alone = [replay(flight, [x])[0]["pos"][:, 0] for x in (plant(), heavy)]
+    for i, row in enumerate(rows):
+        assert_array_equal(seen["pos"][:, i], alone[row])
+    assert np.abs(alone[0] - alone[1]).max() > 1e-3
 
 
 def test_latent_forces_push(flight):

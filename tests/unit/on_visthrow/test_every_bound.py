@@ -23,14 +23,11 @@ def tables(value: typing.Any):
     if dataclasses.is_dataclass(value):
         yield value
         value = [getattr(value, name) for name in schema.hints(type(value))]
-    for item in (
-        value.values()
-        if isinstance(value, dict)
-        else value
-        if isinstance(value, list | tuple)
-        else ()
-    ):
-        yield from tables(item)
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from tables(item)
 
 
 @cache
