@@ -25,10 +25,12 @@ from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
+from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.paper import measurements
 from visthrow.task import Experiment, contract_of
 from visthrow.training import session, trainer
+from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import CHECKPOINT, Trainer
 
@@ -91,6 +93,25 @@ def test_a_run_leaves_config_log_checkpoint_summary_and_policy(whole):
     assert len(rows) == 1 + 4
     experiment = config.load(Experiment, whole / "config.toml")
     Policy.load(whole / "policy.npz").require(contract_of(experiment))
+
+
+def test_networks_may_round_their_products_and_observations_may_not(whole, monkeypatch):
+    rounded = {"observe": set(), "learn": set()}
+
+    def watch(owner, name):
+        work = getattr(owner, name)
+
+        def noted(*args, **kwargs):
+            rounded[name].add(torch.backends.cuda.matmul.allow_tf32)
+            return work(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, noted)
+
+    watch(observations, "observe")
+    watch(PPOTraining, "learn")
+    Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 1).step()
+    assert rounded == {"observe": {False}, "learn": {True}}
+    assert not torch.backends.cuda.matmul.allow_tf32
 
 
 def test_resume_goes_on_bit_for_bit(whole, tmp_path):

@@ -12,7 +12,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, Varies, own_shares, varying
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares, varying
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -63,6 +63,12 @@ def test_what_is_drawn_anew_each_day_drifts():
     assert "drifts, a value for each day" in worlds[0].sentence
     assert "5 days" in worlds[0].sentence
     assert not any(on_days(rng, 0.0, 0.0).found for _ in range(40))
+
+
+def test_what_is_drawn_anew_each_flight_does_not_drift():
+    rng = default_rng(9)
+    worlds = [on_days(rng, 0.0, 0.012) for _ in range(20)]
+    assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
 
 
 def told(rng, **deviation):

@@ -64,6 +64,7 @@ def test_a_deviation_is_about_the_mean():
     inside = np.mean([v.low <= 0.012 <= v.high for v in verdicts])
     assert inside > 0.84, inside  # 95 %, less three deviations of 40 draws
     assert abs(np.median([v.size for v in verdicts]) / 0.012 - 1.0) < 0.2
+    assert not any(told(0.010, 0.0, seed).found for seed in range(40))
 
 
 def test_what_flights_have_of_their_own_is_integrated_out():

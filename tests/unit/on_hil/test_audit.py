@@ -91,6 +91,21 @@ def test_writing_keeps_other_bits_and_is_read_back():
     assert tables[0].count("(written)") == 2
 
 
+def test_what_cannot_be_written_stays_wrong():
+    found, _, written, _, _ = audit({**GOOD, "FIXED": 1.0}, write=True)
+    assert (found.problems, written) == (["FIXED is 1; expected 7"], [])
+
+
+def test_a_value_that_the_vehicle_does_not_take_is_written_once():
+    sent = []
+    stubborn = Audit(
+        RULES[1:2], lambda name: stubborn.feed(name, 1.0), lambda name, value: sent.append(value)
+    )
+    for i in range(400):
+        stubborn.service(0.02 * i)
+    assert (sent, stubborn.problems) == ([0.0], ["ATC_ANGLE_BOOST is 1; expected 0"])
+
+
 def sends(release, until, start=0.0):
     """Times at which it is to be sent."""
     out, now = [], start

@@ -114,6 +114,15 @@ def test_a_vehicle_that_cannot_do_it_is_refused(name, override, message):
             require_reach(params, contract)
 
 
+@mark.parametrize("name", ["ardupilot", "px4", "betaflight"])
+def test_configs_of_real_vehicles_reach_what_policies_ask_and_are_audited(name):
+    params = load_run(name)
+    require_reach(params, simple_policy().contract)
+    assert getattr(params, params.backend).audit
+    with raises(ConfigError, match="a recording flies dry"):
+        load_run(name, ['source.kind="tlog"', 'source.file="a.tlog"'])
+
+
 def test_a_curve_of_the_rotors_is_inverted_exactly():
     """``T = W (z / z_h)^2`` with ``z = idle + (1 - idle) u``: 4 times the weight at twice the
     motors' command.

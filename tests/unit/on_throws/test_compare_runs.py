@@ -59,8 +59,14 @@ def test_a_row_a_policy_and_target():
     assert (found["throws"], found["success"]) == (4, 0.75)
     assert found["error_mean"] == approx(0.5 / 3)
     assert found["bias_x"] == approx(0.1)
+    assert found["smoothness"] == approx(0.1)
     assert at_15.summary()["bias_y"] == approx(0.2)
     assert first.throws[0].summary()["throws"] == 0, "the state policy did not throw at 1.5 m"
+
+
+def test_policies_of_one_name_are_told_apart():
+    names = [entry.name for entry in from_runs.entries([log(sha="a"), log(sha="b")])]
+    assert names == ["vision aaaaaaaa", "vision bbbbbbbb"]
 
 
 def test_a_goal_to_the_side_of_another_hover_point():

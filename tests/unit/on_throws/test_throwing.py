@@ -26,7 +26,7 @@ from visthrow.task import contract_of, plant_of
 from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
 from visthrow.throws.flight import Flight
-from visthrow.throws.loading import load_policy
+from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
 from visthrow.throws.plants import flown as flown_payload
@@ -316,6 +316,10 @@ def test_compare_prints_and_writes(dropper, tmp_path, capsys):
     assert summary["error_mean"] == approx(np.mean(first), rel=1e-4)
     assert f"{summary['error_mean']:.3f} ± {summary['error_std']:.3f}" in told
     assert (out / "compare-hybrid.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_policy_that_is_compared_with_itself_is_numbered(dropper):
+    assert unique_names([load_policy(dropper)] * 2) == ["dropper 1", "dropper 2"]
 
 
 def test_compare_throws_under_the_conditions_of_its_options(dropper, tmp_path, capsys, monkeypatch):
