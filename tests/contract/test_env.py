@@ -78,7 +78,8 @@ def test_the_papers_recipe_and_nothing_else(name):
     """
     paper = load_experiment(name)
     env = ThrowEnv(paper, count=32, seed=1)
-    seen, reward, _, _ = env.step(torch.zeros(32, 5))
+    seen, reward, _, extras = env.step(torch.zeros(32, 5))
+    assert extras == {}, "the time limit is a negative end; time_outs would bootstrap it"
     assert seen["actor"].shape == (32, 61 if "vision" in name else 35)
     assert seen["critic"].shape == (32, 38)
     assert_array_equal(seen["critic"][:, -4:-1].numpy(), env.views.out["payload_vel_w"].numpy())
@@ -91,6 +92,10 @@ def test_the_papers_recipe_and_nothing_else(name):
         "a second costs 2 as in Table II; what is left are speeds and commands"
     )
     assert paper.ppo.environments * paper.ppo.steps * paper.ppo.iterations == approx(2e8, rel=1e-3)
+    kept = seen.clone()
+    env.step(torch.zeros(32, 5))
+    for group in ("actor", "critic"):
+        assert torch.equal(seen[group], kept[group]), "the next step writes tensors of its own"
 
 
 def test_the_critic_sees_what_is_named():

@@ -23,8 +23,13 @@ def kept(tmp_path, monkeypatch) -> Path:
     return tmp_path
 
 
+TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
+RECORDS = sorted(measurements.FOLDER.glob("*.json"))
+
+
 def test_shipped_records_are_well_formed():
-    for path in sorted(measurements.FOLDER.glob("*.json")):
+    assert RECORDS
+    for path in RECORDS:
         record = measurements.load(path)
         for table in record["tables"]:
             assert table["rows"], path.name
@@ -35,10 +40,6 @@ def test_shipped_records_are_well_formed():
         assert record["provenance"]["versions"]["warp-lang"], path.name
         assert measurements.body(record).startswith(f"### {record['title']}")
         assert measurements.origin(record)
-
-
-TORCHRUN = "torchrun --nproc-per-node 2 -m visthrow.cli"
-RECORDS = sorted(measurements.FOLDER.glob("*.json"))
 
 
 @mark.parametrize("path", RECORDS, ids=lambda path: path.stem)

@@ -1,4 +1,4 @@
-"""Renderer, overlay and image side: what is drawn lies where the keypoints say."""
+"""Overlay and straight views: what is drawn lies where the keypoints and the view say."""
 
 import math
 from dataclasses import replace

@@ -85,6 +85,15 @@ def test_each_mistake_is_suspected_and_put_right(logs, name):
         )
 
 
+def test_mistakes_that_come_together_are_all_suspected(logs):
+    degrees = 180.0 / np.pi
+    turned = [
+        changed(log, lambda u: u[:, [0, 1, 3, 2]] * [1000.0 / GRAVITY, -degrees, degrees, degrees])
+        for log in logs
+    ]
+    assert [m.name for m in suspected(turned, PLANT)] == ["rate_axes", "rate_unit", "thrust_unit"]
+
+
 def test_good_logs_and_logs_that_disagree_are_not_suspected(logs):
     assert suspected(logs, PLANT) == []
     mixed = [changed(logs[0], WRONG["rate_axes"]), *logs[1:]]

@@ -1,6 +1,4 @@
-"""The parts of the fakes: the witness catches what it is there for, options are checked, the MSP
-port takes peer after peer.
-"""
+"""The parts of the fakes: the witness catches what it is there for, options are checked."""
 
 import math
 
