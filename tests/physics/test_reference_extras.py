@@ -10,6 +10,7 @@ from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import paper_plant, plain_plant
+from visthrow import config
 
 WEIGHT = 0.272 * GRAVITY
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -57,6 +58,35 @@ def test_payload_drag_slows_by_its_equation():
     free = hover(start(ReferenceExtras(), speed=speed), 7, True)
     assert not flying.attached[0]
     assert flying.payload_vel_w[0, 0] < free.payload_vel_w[0, 0] - 0.01
+
+
+def test_wind_pushes_vehicle_and_payload():
+    extras = ReferenceExtras(payload_drag=2e-3, wind_mean_w=(3.0, 0.0, 0.0))
+    state = hover(start(extras, paper_plant()), 5)
+    still = hover(start(ReferenceExtras(payload_drag=2e-3), paper_plant()), 5)
+    assert state.vel_w[0, 0] > still.vel_w[0, 0] + 0.03
+    assert state.payload_vel_w[0, 0] > still.payload_vel_w[0, 0] + 0.02
+
+
+def test_joint_damping_calms_the_swing():
+    rates = []
+    for damping in (0.0, 4e-3):
+        reference = start(ReferenceExtras(extra_joint_damping=damping))
+        bent = np.array([[[0.5, 0.0, -0.8], [-0.5, 0.0, -0.8]]])
+        still = np.zeros((1, 3))
+        reference.reset(np.array([[0.0, 0.0, 1.5]]), LEVEL[None], still, still, bent)
+        hover(reference, 2)
+        rates.append(np.abs(np.diff(reference._rope_of(reference._state)[1], axis=1)).max())
+    assert rates[1] < 0.9 * rates[0]
+
+
+def test_a_seed_draws_the_same_realistic_flight_again():
+    realistic = config.load(ReferenceExtras, config.find("vehicle", "reference_realistic"))
+    ends = [
+        hover(start(realistic, paper_plant(), 3, seed=seed), 2).payload_pos_w for seed in (1, 1, 2)
+    ]
+    assert_array_equal(ends[0], ends[1])
+    assert np.all(ends[0] != ends[2])
 
 
 def test_wind_has_its_deviation_and_memory():

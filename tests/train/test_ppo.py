@@ -16,6 +16,7 @@ from torch.testing import assert_close
 from tests.configs import load_experiment
 from visthrow import config
 from visthrow.task import Experiment, PPOParams
+from visthrow.training.ppo.network import CapturableGaussian
 from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
@@ -147,6 +148,15 @@ def test_products_in_bfloat16_follow_those_in_float32():
     ).norm()
     way = torch.cat([(a - b).flatten() for a, b in zip(plain.actor.parameters(), start)]).norm()
     assert 0.0 < off < 0.3 * way
+
+
+def test_the_sample_is_the_gaussians():
+    gaussian = CapturableGaussian(5, init_std=0.5, std_type="log")
+    gaussian.update(torch.ones(4000, 5))
+    torch.manual_seed(1)
+    drawn = gaussian.sample().detach()
+    assert abs(float(drawn.mean()) - 1.0) < 0.02
+    assert abs(float(drawn.std()) - 0.5) < 0.02
 
 
 def test_the_critic_learns_alone_while_the_actor_is_held():
