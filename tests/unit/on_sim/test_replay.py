@@ -159,8 +159,7 @@ def test_commands_switch_where_they_should(flight):
         )
         for x in late
     ]
-    seen, _ = replay(flight, plants, count=4, plant=np.array([0, 1, 2, 0]))
-    assert_array_equal(seen["pos"][:, 0], seen["pos"][:, 3])
+    seen, _ = replay(flight, plants, count=3, plant=np.arange(3))
     small, large = ((seen["pos"][:, i] - seen["pos"][:, 0]) / late[i] for i in (1, 2))
     assert np.abs(large - small).max() < 0.05 * np.abs(large).max()
 
