@@ -149,9 +149,8 @@ def ball_extremes_c(
     q = (slope * centre[:, 2] - g) / (s * s)
     lateral = centre[:, :2]
     tangent = torch.cat([lateral * q.unsqueeze(-1), -slope.unsqueeze(-1)], -1)
-    gradient = (
-        lateral.unsqueeze(-1) * tangent.unsqueeze(-2) + g[:, None, None] * axes
-    )  # (E, 2, 3): of u, of v
+    # (E, 2, 3): of u, of v
+    gradient = lateral.unsqueeze(-1) * tangent.unsqueeze(-2) + g[:, None, None] * axes
     tx, ty, tz = gradient.unbind(-1)
     size = (tx * tx + ty * ty + tz * tz + AXIS_EPSILON).sqrt()
     step = gradient * (sine.unsqueeze(-1) / size).unsqueeze(-1)

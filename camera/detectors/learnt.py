@@ -34,10 +34,8 @@ REACH = {"ball": 2.2, "goal": 1.9}
 middle to its corners.
 """
 
-LEAST_REACH = {
-    "ball": 0.05,
-    "goal": 0.05,
-}  # half side of a patch at least, as a tangent: what is far is looked at with its surroundings
+LEAST_REACH = {"ball": 0.05, "goal": 0.05}
+"""Half side of a patch at least, as a tangent: what is far is looked at with its surroundings."""
 
 PLACES = 3  # of a kind that are looked at closely
 

@@ -113,9 +113,8 @@ class RenderedEyes:
         self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
         self.seen: tuple[np.ndarray, np.ndarray] | None = None
         self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
-        self._hits = {
-            name: np.zeros(count, int) for name in THINGS
-        }  # looks of each vehicle in which it was found
+        # looks of each vehicle in which it was found
+        self._hits = {name: np.zeros(count, int) for name in THINGS}
 
     def look(
         self, snapshot: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray

@@ -489,9 +489,8 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
             error = _angle_between(
                 views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1], labels.corners
             ).amin(-1)
-        clear = labels.seen[kind] | (
-            _angle_between(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
-        )  # else half in view
+        apart = _angle_between(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
+        clear = labels.seen[kind] | apart  # else half in view
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
         scores[kind] = rows[clear.expand(len(rows))]
     return scores

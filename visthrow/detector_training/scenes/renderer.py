@@ -90,9 +90,8 @@ class Renderer:
             wp.synchronize_device(self.device)
             return image
         wp.load_module(device=self.device, module="visthrow.detector_training.scenes.scene_kernel")
-        share = -(
-            -scenes.count // torch.get_num_threads()
-        )  # Warp runs a launch on the CPU in the thread that asks for it
+        # Warp runs a launch on the CPU in the thread that asks for it
+        share = -(-scenes.count // torch.get_num_threads())
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
             list(
                 threads.map(

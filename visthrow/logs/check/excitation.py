@@ -60,9 +60,8 @@ def look(log: FlightLog) -> list[Row]:
     elif figures.get("idle"):
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
         rows.append(Row("excited", "", "bad", text, {"idle": 1}))
-    concern = [
-        q for q in QUESTIONS if any(name in log for name in q.needs[0])
-    ]  # not things of which the log holds nothing at all
+    # not things of which the log holds nothing at all
+    concern = [q for q in QUESTIONS if any(name in log for name in q.needs[0])]
     return rows + [_answer(question, log, figures) for question in concern]
 
 

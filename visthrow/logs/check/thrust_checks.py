@@ -22,12 +22,8 @@ INPUTS = (
 ROTORS = ("motor_speed", "motor_command", "motor_output", "pwm")
 NAMES = ("front left", "front right", "rear left", "rear right")
 
-UNITS = {
-    "N": 1.0,
-    "g of thrust": 9.80665e-3,
-    "mN": 1e-3,
-    "kg of thrust": 9.80665,
-}  # units of a thrust, in newtons
+UNITS = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.80665}
+"""Units of a thrust, in newtons."""
 _UNIT = 0.25  # of the logarithm of a ratio from a unit's
 _SPAN = 0.1  # over which both forces are averaged: vibration goes [s]
 _VARIES = 0.003  # of the mean, that a force must vary by before it says whether it follows

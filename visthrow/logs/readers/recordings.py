@@ -371,9 +371,8 @@ def _c3d(path: Path) -> Table:
     if not frames or not labels:
         raise LogError(f"{path}: a C3D file without markers")
     numbers = np.array([number for number, _ in frames], dtype=float)
-    points = np.array(
-        [frame for _, frame in frames]
-    )  # x, y, z, residual: below 0 where it is hidden
+    # x, y, z, residual: below 0 where it is hidden
+    points = np.array([frame for _, frame in frames])
     hidden = points[:, :, 3] < 0.0
     table = Columns({"time [s]": (numbers - numbers[0]) / reader.point_rate})
     for i, label in enumerate(labels):

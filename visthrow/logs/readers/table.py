@@ -444,9 +444,8 @@ def log_of_export(table: Table, path: Path) -> FlightLog:
     try:
         for name, (place, cells) in read.items():
             spec = STANDARD_CHANNELS.get(name)
-            unit, frame = (
-                place if spec is None else (spec.unit, spec.frame)
-            )  # a standard unit may hold a comma
+            # a standard unit may hold a comma
+            unit, frame = place if spec is None else (spec.unit, spec.frame)
             shape = tuple(np.max(list(cells), axis=0) + 1) if () not in cells else ()
             if len(cells) != math.prod(shape):
                 raise LogError(
@@ -455,9 +454,8 @@ def log_of_export(table: Table, path: Path) -> FlightLog:
             values = np.full((len(time), *shape), np.nan)
             for index, column in cells.items():
                 values[(slice(None), *index)] = column
-            present = np.all(
-                np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1
-            )  # not where it is NaN
+            # not where it is NaN
+            present = np.all(np.abs(values.reshape(len(time), -1)) < _LARGEST, axis=1)
             channels[name] = Channel(time[present], values[present], unit, frame)
         return FlightLog(channels, {"source": str(path), **_metadata(path)})
     except LogError as error:

@@ -102,9 +102,8 @@ def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: fl
     k3 = derivative(model, state + (0.5 * period) * k2, control)
     k4 = derivative(model, state + period * k3, control)
     out = state + (period / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-    out[DIR] /= np.sqrt(
-        (out[DIR] * out[DIR]).sum(0)
-    )  # written without conjugates for the complex step
+    # written without conjugates for the complex step
+    out[DIR] /= np.sqrt((out[DIR] * out[DIR]).sum(0))
     out[RATE] -= out[DIR] * (out[DIR] * out[RATE]).sum(0)
     out[QUAT] /= np.sqrt((out[QUAT] * out[QUAT]).sum(0))
     return out

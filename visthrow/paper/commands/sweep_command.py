@@ -113,9 +113,8 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
     def say(text: str) -> None:
         print(f"{time.monotonic() - begin:6.0f} s  {text}", flush=True)
 
-    before = signal.signal(
-        signal.SIGTERM, signal.default_int_handler
-    )  # so that a batch system's signal also ends in checkpoints
+    # so that a batch system's signal also ends in checkpoints
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         if args.slurm is not None:
             outcome = ProcessPool(work, out, _cluster(args, out, jobs, changes), say).run()

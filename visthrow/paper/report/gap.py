@@ -196,9 +196,8 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
     for series, plant in enumerate(plants):
         full = thrown.seeds("vision", "full", plant, TARGET, {})
         for variant, title in TRAINED.items():
-            nominal = (
-                {} if plant == "hybrid" else ANY
-            )  # a reference plant is what it is, whatever the training had
+            # a reference plant is what it is, whatever the training had
+            nominal = {} if plant == "hybrid" else ANY
             if variant == "full":
                 results = full
             else:

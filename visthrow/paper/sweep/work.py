@@ -185,7 +185,6 @@ def load(unit: ThrowUnit, out: Path) -> Loaded:
     not allow what differs.
     """
     layout = unit.experiments(out)[0]["task"]["observation"]["layout"]
-    name, changes = unit.flown_in(
-        layout
-    )  # a training's from the list: that of its file may have fields of another version
+    # a training's from the list: that of its file may have fields of another version
+    name, changes = unit.flown_in(layout)
     return load_policy(unit.source.policy(out), name or None, changes, unit.params.allow)

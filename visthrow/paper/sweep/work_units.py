@@ -21,10 +21,8 @@ from visthrow.task import Experiment
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
 
-FULL = {
-    "state": "state",
-    "vision": "vision_ideal",
-}  # layout -> the training config whose variants are compared with it
+FULL = {"state": "state", "vision": "vision_ideal"}
+"""Layout -> the training config whose variants are compared with it."""
 
 POLICY = "policy.npz"
 SUMMARY = "summary.json"
@@ -242,9 +240,8 @@ def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
 def _trained(
     name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str
 ) -> ResultSource:
-    stated = config.to_dict(
-        _experiment(name, changes), defaults=False
-    )  # a field that is added later changes no key
+    # without defaults, so that a field that is added later changes no key
+    stated = config.to_dict(_experiment(name, changes), defaults=False)
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
     return ResultSource(f"{Path(name).stem}-{mark}{seed}", name, changes, seed, key)
 

@@ -17,12 +17,8 @@ from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.readers.table import Table, make_channel
 from visthrow.logs.unit_names import G
 
-MOTOR_ORDER = (
-    3,
-    1,
-    2,
-    0,
-)  # Betaflight's motor of each of ours: front left, front right, rear left, rear right
+MOTOR_ORDER = (3, 1, 2, 0)
+"""Betaflight's motor of each of ours: front left, front right, rear left, rear right."""
 
 _CLOCK_TURN = 2**32
 _UNIT = re.compile(r"\s*\([^()]*\)$")

@@ -16,12 +16,8 @@ TAG2_3S32 = 7
 TAG8_4S16 = 8
 NULL = 9
 TAG2_3SVARIABLE = 10
-_GROUP = {
-    TAG8_8SVB: 8,
-    TAG2_3S32: 3,
-    TAG8_4S16: 4,
-    TAG2_3SVARIABLE: 3,
-}  # encoding -> largest number of fields packed together
+# encoding -> largest number of fields packed together
+_GROUP = {TAG8_8SVB: 8, TAG2_3S32: 3, TAG8_4S16: 4, TAG2_3SVARIABLE: 3}
 
 _LONGEST_VB = 5  # bytes of a 32-bit number, seven bits a byte
 

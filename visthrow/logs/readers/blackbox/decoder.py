@@ -292,9 +292,9 @@ class _Decoder:
         steps = []
         if self.at_time is not None and self.last_time is not None:
             passed = values[self.at_time] - self.last_time
-            steps.append(
-                (passed + (1 << 32) if passed < -(1 << 31) else passed, _LONGEST_GAP_US)
-            )  # the 32-bit clock turned over
+            if passed < -(1 << 31):  # the 32-bit clock turned over
+                passed += 1 << 32
+            steps.append((passed, _LONGEST_GAP_US))
         if self.at_iteration is not None and self.last_iteration is not None:
             steps.append((values[self.at_iteration] - self.last_iteration, _MOST_ITERATIONS))
         if all(0 <= passed <= limit for passed, limit in steps):
