@@ -11,9 +11,8 @@ from bench.report import Report, Table, device_name, rate
 
 TARGET = 2.0  # [m]
 
-THROWS = 400
-IN_A_ROW = 3
-"""Throws of an evaluation, and evaluations in a row within an error that hold it for good."""
+THROWS = 400  # of an evaluation
+IN_A_ROW = 3  # evaluations within an error that hold it for good
 
 
 def train(

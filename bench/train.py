@@ -27,9 +27,8 @@ from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.training.compute_device import rounded_products
 
-WARM_UP = (
-    3  # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
-)
+# iterations before measuring: the first runs eagerly, the second captures the CUDA graph
+WARM_UP = 3
 
 PARTS = {
     "simulation": "the fused kernel",

@@ -275,7 +275,7 @@ def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
     between = state.dimension - len(vehicle) - len(goal) - 1
     columns = torch.tensor([*vehicle, *goal, *[none] * between, places - vision.validity - 1])
     learnt = torch.ones(state.dimension, dtype=torch.bool)
-    learnt[ob.VEHICLE : ob.VEHICLE + 5] = learnt[-1] = (
-        False  # the action before and the latch are known
-    )
+    # the action before and the latch are known
+    learnt[ob.VEHICLE : ob.VEHICLE + 5] = False
+    learnt[-1] = False
     return columns, learnt

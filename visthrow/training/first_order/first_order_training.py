@@ -24,13 +24,11 @@ from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch,
 from visthrow.training.ppo.network import Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
-ALTITUDE = 0.15
-GROUND = 0.1
-ABOVE = 0.08
-UPRIGHT = 0.15
-"""Reach of the barriers: of altitude and distance, payload over ground, payload below vehicle [m],
-cosine of the tilt.
-"""
+# Reach of the barriers
+ALTITUDE = 0.15  # of altitude and distance [m]
+GROUND = 0.1  # of the payload over the ground [m]
+ABOVE = 0.08  # of the vehicle above the payload [m]
+UPRIGHT = 0.15  # of the cosine of the tilt
 BARRIER = 600.0  # cost of the square of how far a state is within it
 ROUND = 0.02
 """Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
@@ -158,9 +156,8 @@ class FirstOrder:
         up = x.load_vel[..., 2]
         fall = fall_time(x.load_pos[..., 2] - release.landing_height, up, floor=1e-6)
         landing = x.load_pos[..., :2] + x.load_vel[..., :2] * fall[..., None]
-        landing = (
-            landing + (flights.landing[: len(fall)] - landing).detach()
-        )  # the simulator's value, the slope of flight without drag
+        # the simulator's values, the slopes of flight without drag
+        landing = landing + (flights.landing[: len(fall)] - landing).detach()
         fall = fall + (flights.time[: len(fall)] - fall).detach()
         share = (
             torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
@@ -227,9 +224,8 @@ class FirstOrder:
         latch_input = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
         smooth = torch.sigmoid(latch_input / self._width)
         cut = k[:K] + lag + 2 > steps
-        hazard = (
-            smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
-        )  # the slope stays that of the smooth one
+        # the slope stays that of the smooth one
+        hazard = smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
         hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
         reward = torch.where(cut, -p.termination, reward)
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
@@ -339,9 +335,8 @@ class FirstOrder:
         rate = cosine_rate(self.optimizer, done, highest, lowest)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
-        limit = (
-            OUTLIER * size.kthvalue(len(size) // 2 + 1).values
-        )  # a few wild flights must not outweigh the rest
+        # a few wild flights must not outweigh the rest
+        limit = OUTLIER * size.kthvalue(len(size) // 2 + 1).values
         self.layers.gradients(
             self.flights.obs[:T], self.flights.flown()[:T], (limit / size).clamp(max=1.0)
         )

@@ -54,9 +54,8 @@ class CapturedPPO(PPO):
             self._epochs()
         else:
             if self._graph is None:
-                self._graph = captured(
-                    self._epochs, capture_error_mode="thread_local"
-                )  # NCCL's watchdog asks beside
+                # NCCL's watchdog queries the device from another thread meanwhile
+                self._graph = captured(self._epochs, capture_error_mode="thread_local")
             self._graph.replay()
         self._updates += 1
         for model in (self.actor, self.critic):
