@@ -34,10 +34,8 @@ CALM = 0.15  # speed below which a hover counts as steady [m/s]
 LIFTED = 0.3  # height above which a vehicle counts as flying [m]
 SETTLING = 50  # ticks at the beginning of a hover that are left out: a second
 FOR_EVER = 1e9  # [s]
-LISTEN, CARRY = (
-    5.0,
-    180.0,
-)  # how long poses are looked at, and a vehicle is carried about, where nothing else is said [s]
+LISTEN = 5.0  # how long poses are looked at, where nothing else is said [s]
+CARRY = 180.0  # how long a vehicle is carried about, likewise [s]
 
 
 def check(args: argparse.Namespace) -> int:

@@ -188,9 +188,8 @@ class Windows:
         self.first = first
         self.rows = np.stack([rows[at : at + count] for at in first])  # (E, T, fields)
         lead = round(0.1 / PERIOD)
-        self.earlier = np.stack(
-            [rows[at - lead : at, 14:18] for at in first]
-        )  # commands before a window, for the queue
+        # commands before a window, for the queue
+        self.earlier = np.stack([rows[at - lead : at, 14:18] for at in first])
         plant = plant_of(load_policy(policy).experiment)
         self.plant = dataclasses.replace(
             plant, sim=dataclasses.replace(plant.sim, control_period=PERIOD)

@@ -58,9 +58,8 @@ class Wire(threading.Thread):
         """Listen until the process ends."""
         while True:
             data, more, _, where = self._socket.recvmsg(65536, 256)
-            if (
-                where[2] == socket.PACKET_OUTGOING
-            ):  # each packet is seen as it goes out and as it comes in
+            # each packet is seen as it goes out and as it comes in
+            if where[2] == socket.PACKET_OUTGOING:
                 continue
             seconds, nanoseconds = STAMP.unpack(more[0][2])
             self._take(data[ETHER:], seconds + 1e-9 * nanoseconds)

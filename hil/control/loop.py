@@ -79,9 +79,8 @@ class Loop:
     _ended: float = -math.inf
     _state: str = ""
     _waits: str = ""
-    _announced: dict[str, float] = field(
-        default_factory=dict
-    )  # reasons to wait, without their numbers, and when they were said [s]
+    # reasons to wait, without their numbers, and when they were said [s]
+    _announced: dict[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         grid = None if self.team is None else self.team.offset
@@ -107,9 +106,7 @@ class Loop:
                 except KeyboardInterrupt as error:
                     runner.fail(clock.now(), error)
                     break
-                except (
-                    Exception
-                ) as error:  # of what stands around the runner: it ends in abort all the same
+                except Exception as error:  # around the runner: it ends in abort all the same
                     runner.fail(clock.now(), error)
                     clock.sleep_until(clock.now() + runner.pilot.period)
         return self.summary()

@@ -31,13 +31,8 @@ class State(StrEnum):
     DONE = "done"
 
 
-FLYING = (
-    State.READY,
-    State.ARMED,
-    State.THROW,
-    State.RECOVER,
-    State.LAND,
-)  # states in which the runner commands the vehicle
+# states in which the runner commands the vehicle
+FLYING = (State.READY, State.ARMED, State.THROW, State.RECOVER, State.LAND)
 
 
 @dataclass(frozen=True)

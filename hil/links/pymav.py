@@ -54,9 +54,7 @@ class Parser:
         self.forged = []
         try:
             found = self._mav.parse_buffer(data) or []
-        except (
-            Exception
-        ):  # whatever pymavlink stumbles over, its state is not to be trusted afterwards
+        except Exception:  # pymavlink's state is not to be trusted afterwards
             self.errors += 1
             self._fresh()
             return []

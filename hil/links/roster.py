@@ -28,9 +28,8 @@ MOST_KEPT = 256
 MOST_SAID = 20  # senders that are said while a run goes on; the summary has the others
 # why a message of a party is not taken that has not been heard as the one that it is to be
 NOT_YET = "before its first"
-SHARED = frozenset(
-    {"TIMESYNC", "NAMED_VALUE_INT"}
-)  # messages that a party may send beside its own: its clock, and whether it is simulated
+# messages that a party may send beside its own: its clock, and whether it is simulated
+SHARED = frozenset({"TIMESYNC", "NAMED_VALUE_INT"})
 SIMULATED = "SIMULATED"  # name of the NAMED_VALUE_INT by which a fake says that nothing real flies
 
 
@@ -195,9 +194,8 @@ class Roster:
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
         seen = Seen(address, system, component, kind, why or "")
-        if why is not None and not why.startswith(
-            NOT_YET
-        ):  # that of no stranger: its first one is on its way
+        # a message before a party's first is no stranger's
+        if why is not None and not why.startswith(NOT_YET):
             self.refuse(seen)
         else:
             self._count(seen)

@@ -69,10 +69,8 @@ class Detections:
         self._hold = hold
         self._points = torch.zeros(KEYPOINTS, 2)
         self._valid = torch.zeros(KEYPOINTS, dtype=torch.bool)
-        self._times = {
-            "goal": -np.inf,
-            "ball": -np.inf,
-        }  # of the last frame, where it holds the thing
+        # of the last frame, where it holds the thing
+        self._times = {"goal": -np.inf, "ball": -np.inf}
         self._newest = -np.inf
         self._turn: np.ndarray | None = None  # from the camera as it is mounted to that of training
         self._scale = 0.0

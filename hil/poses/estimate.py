@@ -25,9 +25,8 @@ MOST_SAMPLES = 32  # in a window, whatever the source's rate: the fit's cost sta
 class EstimateParams(Bounded):
     """The filter."""
 
-    window: Annotated[
-        float, Bound(0.0, MOST_GAP, "(]")
-    ]  # age of the oldest sample, where there are enough younger ones [s]
+    # age of the oldest sample, where there are enough younger ones [s]
+    window: Annotated[float, Bound(0.0, MOST_GAP, "(]")]
     order: Annotated[int, Bound(1, 2)]  # 1: line, 2: parabola
 
 

@@ -58,9 +58,8 @@ class Frames:
         self.params = params
         half = math.radians(params.yaw_offset_deg) / 2.0
         yaw = (0.0, 0.0, math.sin(half), math.cos(half))
-        self._world = multiply(
-            yaw, _quaternion(turn_of(params.axes))
-        )  # from the source's world to ours
+        # from the source's world to ours
+        self._world = multiply(yaw, _quaternion(turn_of(params.axes)))
         self._body = _quaternion(turn_of(params.body_axes))  # from the source's body to ours
         self._offset = tuple(float(x) for x in params.marker_offset_b)
 

@@ -20,10 +20,9 @@ from hil.poses.sources.pose_source import Source
 from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
 from visthrow.logs.axes import OURS, TURNS, turn_of
 
-SPEED, RATE = (
-    0.06,
-    0.25,
-)  # below both the vehicle rests [m/s], [rad/s]: noise of a millimetre and of 0.3 deg stays below
+# below both the vehicle rests: noise of a millimetre and of 0.3 deg stays below
+SPEED = 0.06  # [m/s]
+RATE = 0.25  # [rad/s]
 SPAN = 0.2  # over which speed and rate are taken [s]
 REST_TIME = 0.5  # shortest rest [s]
 LEAST_WAY = 0.2  # of a move [m]

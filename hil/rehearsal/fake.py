@@ -76,9 +76,8 @@ class FakeOptions(Bounded):
     armed: bool = True  # at the start
     arming: bool = True  # whether it can be armed
     mode: int | None = None  # custom mode at the start, where there are modes; None: the usual one
-    parameters: dict[str, float] = field(
-        default_factory=dict
-    )  # that differ from a well set-up vehicle's
+    # that differ from a well set-up vehicle's
+    parameters: dict[str, float] = field(default_factory=dict)
     # from a set-point's arrival to its effect [s]; None: the kind's
     command_delay: NotNegative | None = None
     answer_delay: NotNegative = 0.002  # 1 to 3 ms were measured [s]
@@ -486,14 +485,8 @@ class Bridge(Fake):
     process by.
     """
 
-    unknown = (
-        "followed",
-        "ignored",
-        "commands",
-        "worst",
-        "breaches",
-        "last_command",
-    )  # of a report
+    # entries of a report
+    unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")
 
     def take(self) -> None:
         """Do nothing: the pilot is the autopilot's."""

@@ -26,10 +26,8 @@ from hil.rehearsal.fake_mavlink import SERVO, FakeMavlink
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
-ANSWERS = {
-    "denied": mav.MAV_RESULT_DENIED,
-    "in-progress": mav.MAV_RESULT_IN_PROGRESS,
-}  # to a release, where it is not accepted
+# to a release, where it is not accepted
+ANSWERS = {"denied": mav.MAV_RESULT_DENIED, "in-progress": mav.MAV_RESULT_IN_PROGRESS}
 
 
 class FakeArduPilot(FakeMavlink):

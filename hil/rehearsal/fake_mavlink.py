@@ -13,9 +13,8 @@ from hil.links.mavlink_link import IGNORE_ATTITUDE, OUR_COMPONENT, OUR_SYSTEM
 from hil.links.pymav import mav
 from hil.rehearsal.fake import VEHICLE_ID, Fake
 
-FORCE = values("ardupilot")[
-    "force"
-]  # second parameter of COMPONENT_ARM_DISARM that disarms in flight
+# second parameter of COMPONENT_ARM_DISARM that disarms in flight
+FORCE = values("ardupilot")["force"]
 OUTPUTS = 16  # of SERVO_OUTPUT_RAW
 FLIES = 0.3  # height above which it counts as flying [m]
 SERVO = 9  # output of the mechanism, from 1
@@ -35,9 +34,8 @@ class FakeMavlink(Fake):
         self.mode = self.usual_mode if self.options.mode is None else self.options.mode
         self.parameters = {**self.defaults, **self.options.parameters}
         self._next_beat = 0.0
-        self._streams: dict[
-            int, tuple[float, float]
-        ] = {}  # by message: time of the next one, and period [s]
+        # by message: time of the next one, and period [s]
+        self._streams: dict[int, tuple[float, float]] = {}
         self.refusals: list[str] = []
         self.link.listen(self._hear)
 

@@ -91,11 +91,8 @@ def serve(
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
     asked = StopRequest((signal.SIGINT,))
-    with (
-        contextlib.suppress(KeyboardInterrupt),
-        asked as stop,
-        collected(),
-    ):  # a collection of all takes a tenth of a second
+    # a collection of all takes a tenth of a second
+    with contextlib.suppress(KeyboardInterrupt), asked as stop, collected():
         while plant.time - begun < most and not stop.asked:
             time = plant.time + plant.period
             due = start + time

@@ -173,9 +173,8 @@ class _Lazy(argparse.ArgumentParser):
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         self.add_module_arguments()
         namespace_out, unknown = super().parse_known_args(args, namespace)
-        if (
-            unknown and self._subparsers is None
-        ):  # else the command's own parser would say it, without its options
+        # else the command's own parser would say it, without its options
+        if unknown and self._subparsers is None:
             options = [option for option in self._option_string_actions if option.startswith("--")]
             if unknown[0].startswith("-"):
                 hint = f"; {suggest(unknown[0].split('=')[0], options)}"

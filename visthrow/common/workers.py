@@ -49,9 +49,8 @@ class Workers:
         self._running = {}
         self._taken = context.Value("i", 0)
         self._shares = context.Array("d", len(tasks), lock=False)
-        work = pickle.dumps(
-            (function, tasks)
-        )  # here: multiprocessing's own pickler would send tensors as shared memory
+        # here: multiprocessing's own pickler would send tensors as shared memory
+        work = pickle.dumps((function, tasks))
         for _ in range(min(processes, len(tasks))):
             ours, theirs = context.Pipe(duplex=False)
             process = context.Process(

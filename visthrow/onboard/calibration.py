@@ -163,9 +163,8 @@ class Calibration:
         )
 
 
-UNKNOWN_YAW = math.radians(
-    2.0
-)  # standard deviation of the camera's yaw above which it is said to be unknown [rad]
+# standard deviation of the camera's yaw above which it is said to be unknown [rad]
+UNKNOWN_YAW = math.radians(2.0)
 
 
 class CalibrationError(VisthrowError):

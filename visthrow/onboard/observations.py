@@ -162,20 +162,8 @@ def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tens
     """Which products of quaternion entries make the entries of the matrix, two each, their signs,
     and what they add to.
     """
-    one, two = (
-        [5, 1, 2, 1, 0, 6, 2, 6, 0],
-        [
-            10,
-            11,
-            7,
-            11,
-            10,
-            3,
-            7,
-            3,
-            5,
-        ],
-    )  # of xx, xy, xz, xw, yx, ...
+    # of xx, xy, xz, xw, yx, ...
+    one, two = ([5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5])
     signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
     identity = torch.eye(3, device=device, dtype=dtype).flatten()
     return (

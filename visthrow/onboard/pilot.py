@@ -172,14 +172,10 @@ class Pilot:
         self._fresh = np.ones(self.count, dtype=bool)
         self._goal_fit = goal_motion.empty_sums(self.count).numpy()
         self._steps = 0
-        self._times: tuple[
-            float, ...
-            # of the rows of history and response, newest first; those beyond are copies of the
-            # oldest [s]
-        ] = ()
-        self._unasked = self._previous[
-            :, 4
-        ]  # what the action before the last one said of the release
+        # of the rows of history and response, newest first; rows beyond copy the oldest [s]
+        self._times: tuple[float, ...] = ()
+        # what the action before the last one said of the release
+        self._unasked = self._previous[:, 4]
 
     @property
     def previous_action(self) -> np.ndarray:

@@ -29,13 +29,9 @@ OF_CLOCK = ("transport", "arrival", "late", "ack")
 real time.
 """
 
-SHORTEST, GROWTH, BINS = (
-    1e-6,
-    1.01,
-    1640,
-    # lower edge of the first bin [s], ratio of two edges, number of bins: up to 12 s, within 1 per
-    # cent
-)
+SHORTEST = 1e-6  # lower edge of the first bin [s]
+GROWTH = 1.01  # ratio of two edges: within 1 %
+BINS = 1640  # up to 12 s
 CLOCK_STEP = 0.3  # a change of a source's clock against ours by more than this is a step of it [s]
 
 

@@ -84,15 +84,8 @@ class Playback:
         )
 
 
-COMPARED = (
-    "state",
-    "command",
-    "action",
-    "observation",
-    "keypoints",
-    "valid",
-    "release",
-)  # what a replay must give again, bit for bit
+# what a replay must give again, bit for bit
+COMPARED = ("state", "command", "action", "observation", "keypoints", "valid", "release")
 
 
 def replay(folder: str | Path) -> dict[str, Any]:

@@ -212,21 +212,14 @@ def load_run(
     policy = Policy.load(folder / POLICY)
     ticks = list(lines(folder / TICKS))
     poses = read_poses(folder)
-    if not (
-        folder / SUMMARY
-    ).is_file():  # killed: the two files may end at different ticks, with half of its poses
+    # killed: the two files may end at different ticks, with half of its poses
+    if not (folder / SUMMARY).is_file():
         ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
     return params, policy, ticks, poses
 
 
-PARTS = (
-    CONFIG,
-    POLICY,
-    POSES,
-    TICKS,
-    SUMMARY,
-    PROVENANCE,
-)  # files of a bundle, beside the links' own records
+# files of a bundle, beside the links' own records
+PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)
 
 RECORDS = ("*.tlog", "*.msp")
 

@@ -21,10 +21,8 @@ from hil.links.device import check_device, open_port
 from hil.links.writer import MSP_LOG, LoggedPort
 from visthrow.onboard.hover import GRAVITY
 
-AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {
-    "ardupilot": ArduPilot,
-    "px4": Px4,
-}  # back-ends that speak MAVLink
+# back-ends that speak MAVLink
+AUTOPILOTS: dict[str, type[MavlinkAutopilot]] = {"ardupilot": ArduPilot, "px4": Px4}
 # shares of the thrust, and of the rates, that the policy was trained with: what a vehicle must
 # reach at least
 THRUST_SHORT = 0.98

@@ -62,9 +62,8 @@ class AutopilotParams(Bounded):
     take: bool
     arm: bool  # arm it when it is taken: bench and software only; else the pilot arms
     audit: bool  # read parameters at connect and refuse to fly on a mismatch
-    servo_output: Annotated[
-        int, Bound(0, 16)
-    ]  # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    # output of SERVO_OUTPUT_RAW that the mechanism hangs on, from 1; 0: not read back
+    servo_output: Annotated[int, Bound(0, 16)]
     servo_open_us: Annotated[int, Bound(500, 2500)]  # there, with the mechanism open [us]
     # whether the motion capture's poses are sent to it as well; else it knows its place by itself
     poses: bool

@@ -103,9 +103,8 @@ class BetaflightParams(Bounded):
     thrust: HoverThrustParams
     rates: RatesParams
     minimum_us: Annotated[int, Bound(900, 1200)]  # min_check: throttle that counts as 0 [us]
-    arm_channel: Annotated[
-        int, Bound(0, 12)
-    ]  # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    # AUX that arms, from 1; 0: the pilot arms and hands over by MSP OVERRIDE
+    arm_channel: Annotated[int, Bound(0, 12)]
     release_channel: Annotated[int, Bound(1, 12)]  # AUX that opens the mechanism, from 1
     servo_output: int  # of MSP_SERVO that the mechanism hangs on, from 1; 0: not read back
     servo_open_us: int  # there, with the mechanism open [us]

@@ -43,13 +43,11 @@ MOST_LOSS = 0.5  # of COM_OF_LOSS_T [s]: at a throw's rates a vehicle turns over
 class Px4Params(AutopilotParams):
     """The vehicle on the other side."""
 
-    hold: Literal[
-        "hold", "position"
-    ]  # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
+    # who holds after the throw: Hold (AUTO.LOITER), or Position with the pilot's sticks
+    hold: Literal["hold", "position"]
     release: Literal["gripper", "actuator"]  # DO_GRIPPER or DO_SET_ACTUATOR
-    gripper: Annotated[
-        int, Bound(1, 6)
-    ]  # number of the gripper, or of the actuator set from 1 to 6
+    # number of the gripper, or of the actuator set from 1 to 6
+    gripper: Annotated[int, Bound(1, 6)]
     actuator_open: Annotated[float, Bound(-1.0, 1.0)]  # value of DO_SET_ACTUATOR that opens
     # that says what drives the mechanism's output, such as PWM_AUX_FUNC1; "" to leave it unread
     output_parameter: str

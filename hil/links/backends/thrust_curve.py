@@ -38,9 +38,8 @@ class HoverThrustParams(Bounded):
 
     weight: Positive  # thrust of the hover that was measured [N]
     hover: Inside  # share of full thrust in that hover, 0 to 1
-    slope: Annotated[
-        float, Bound(0.3, 2.0)
-    ]  # of the thrust over the share around hover, relative to weight / hover
+    # of the thrust over the share around hover, relative to weight / hover
+    slope: Annotated[float, Bound(0.3, 2.0)]
     tolerance: Inside  # of a measured share of hover, relative; beyond it the runner does not fly
     voltage: NotNegative  # of the battery in that hover [V]; 0: no correction for its voltage
     # of thrust over the motors' command, where the autopilot does not straighten it

@@ -84,9 +84,8 @@ class MocapParams(Bounded):
     local: str = "127.0.0.1"  # natnet: address of our own network card
     multicast: bool = True  # natnet: as Motive's transmission type
     timeout: Positive = 5.0  # to connect [s]
-    settings: dict[str, str] = field(
-        default_factory=dict
-    )  # further options of motioncapture.connect; for ros2 domain
+    # further options of motioncapture.connect; for ros2 domain
+    settings: dict[str, str] = field(default_factory=dict)
 
     @property
     def options(self) -> dict[str, str]:

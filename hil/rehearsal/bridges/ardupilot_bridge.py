@@ -32,9 +32,8 @@ from hil.rehearsal.fake_mocap import FakeMocapParams
 
 FACTS = values("ardupilot")
 SERVOS = FACTS["json_port"]  # UDP port on which ArduPilot finds the simulation
-HEAD = struct.Struct(
-    "<HHI"
-)  # magic, frames a second that it would like, number of the frame; outputs [us] follow
+# magic, frames a second that it would like, number of the frame; outputs [us] follow
+HEAD = struct.Struct("<HHI")
 # outputs of a packet by its magic
 MAGIC = {FACTS[f"json_magic_{size}"]: FACTS[f"json_outputs_{size}"] for size in ("16", "32")}
 OURS = FACTS["motor_order"]

@@ -103,9 +103,8 @@ class Firmware:
         it ends, does not listen in time, or another one is there.
         """
         end = time.monotonic() + FREED
-        while "failed" in (
-            words := self._started()
-        ):  # a connection of the last one may still be in TIME_WAIT
+        # a connection of the last one may still be in TIME_WAIT
+        while "failed" in (words := self._started()):
             self.stop()
             if time.monotonic() > end:
                 raise RunError(f"the firmware cannot listen: {words!r}")
@@ -127,9 +126,8 @@ class Firmware:
                 " this one"
             ) from None
         self.stands, said = os.pipe()
-        library = compiled(
-            self.folder
-        ).name  # by its place in the folder that it runs in: a path may hold no space
+        # by its place in the folder that it runs in: a path may hold no space
+        library = compiled(self.folder).name
         environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
         # its errors; of what it prints, most are the words of its memory
         told = self.folder / "firmware.txt"

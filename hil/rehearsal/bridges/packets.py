@@ -27,14 +27,11 @@ from hil.links.facts import values
 FACTS = values("betaflight")
 GRAVITY = FACTS["gravity"]  # of the firmware's accelerometer [m/s^2]
 SENSORS = FACTS["sensor_port"]  # UDP port that samples go to
-FDM = struct.Struct(
-    "<18d"
-)  # stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
-TIME, MOTORS, LARGEST_ANSWER = (
-    8,
-    4,
-    4096,
-)  # bytes of the firmware's time before its answers; motors in one; bytes of all
+# stamp, rates (3), acceleration (3), attitude (4), velocity (3), position (3), pressure
+FDM = struct.Struct("<18d")
+TIME = 8  # bytes of the firmware's time before its answers
+MOTORS = 4  # in an answer
+LARGEST_ANSWER = 4096  # bytes of all
 OURS = FACTS["motor_order"]
 SEA_LEVEL = 101325.0  # [Pa]
 
@@ -156,9 +153,8 @@ def at_rest(stands: int) -> Iterator[None]:
     sensors = Sensors(stands)
 
     def feed() -> None:
-        with suppress(
-            RunError
-        ):  # the firmware has ended, as it does where it is told to keep its settings
+        # the firmware ends where it is told to keep its settings
+        with suppress(RunError):
             while not done.wait(STILL / 10.0):
                 sensors.rest(STILL)
 
