@@ -287,6 +287,36 @@ def test_evidence_is_the_integral():
     )
 
 
+@mark.parametrize("active", [[], [0], [1, 2]])
+def test_gains_are_differences_of_the_evidence(active):
+    count = 5
+    priors = _priors(count)
+    information = _information(count)
+    score = information @ np.arange(count)
+    singles = evidence.additions(information, score, priors, active)
+    pairs = evidence.pair_additions(information, score, priors, active)
+    before = evidence.log_evidence(information, score, priors, active)
+    for i, j in np.ndindex(count, count):
+        names = {i, j} - set(active)
+        expected = evidence.log_evidence(information, score, priors, [*active, *names]) - before
+        assert pairs[i, j] == approx(expected if len(names) == 2 else -np.inf)
+        if i == j:
+            assert singles[i] == approx(expected if names else -np.inf)
+
+
+@mark.filterwarnings("error")
+@mark.parametrize("active", [[], [0]])
+@mark.parametrize("seed", range(20, 60, 10))
+def test_gains_are_numbers_where_information_differs_by_ten_orders(active, seed):
+    rng = default_rng(seed)
+    slopes = rng.standard_normal((2, 4)) * 10.0 ** rng.uniform(0.0, 5.0, 4)
+    information = slopes.T @ slopes
+    one = np.ones(4)
+    priors = Priors(one, 20.0 * one, -50.0 * one, 50.0 * one, one > 0.0)
+    for gains in (evidence.additions, evidence.pair_additions):
+        assert not np.isnan(gains(information, information @ (300.0 * one), priors, active)).any()
+
+
 def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
     rng = default_rng(0)
     few, many = (_threshold(count) for count in (4, 400))

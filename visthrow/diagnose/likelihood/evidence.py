@@ -175,9 +175,12 @@ def pair_additions(
     Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the
     diagonal."""
     size = len(score)
-    pairs = np.stack(np.divmod(np.arange(size * size), size), axis=1)
-    gain = _naming(information, score, priors, active, pairs)
-    return np.where(pairs[:, 0] == pairs[:, 1], -np.inf, gain).reshape(size, size)
+    rows, columns = np.triu_indices(size, 1)
+    gain = np.full((size, size), -np.inf)
+    gain[rows, columns] = _naming(
+        information, score, priors, active, np.stack((rows, columns), axis=1)
+    )
+    return np.maximum(gain, gain.T)
 
 
 def _naming(
@@ -197,9 +200,10 @@ def _naming(
     unit = np.eye(sets.shape[1])
     taken = np.linalg.inv(variance + unit / change[:, None])
     wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
-    wide_sd = np.sqrt(
-        np.maximum((variance - variance @ taken @ variance).diagonal(axis1=1, axis2=2), 1e-300)
-    )
+    # A name widens its prior and so the posterior; what comes out narrower is a set with a name that
+    # is there already, which is left out below.
+    wide = np.maximum(variance - variance @ taken @ variance, variance)
+    wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
     gain = (
         -np.log(priors.slab / SPIKE)[sets].sum(1)
         - 0.5 * np.linalg.slogdet(unit + change[..., None] * variance)[1]
