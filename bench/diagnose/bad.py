@@ -21,10 +21,9 @@ from visthrow.logs.flightlog import Channel, FlightLog
 
 Logs = list[FlightLog]
 HOURS = 2.0
-GRAVITY = 9.81
-MASS = 0.21
-DRAG = 0.06
-"""[m/s^2]; of configs/vehicle/paper.toml: [kg], rotor drag [kg/s]."""
+GRAVITY = 9.81  # [m/s^2]
+MASS = 0.21  # of configs/vehicle/paper.toml [kg]
+DRAG = 0.06  # of the rotors, from the same file [kg/s]
 WANDER = 0.15
 """Of a hover, to either side [m]."""
 FULL_THRUST = 14.0

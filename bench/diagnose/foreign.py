@@ -31,10 +31,10 @@ from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
-G = 9.80665
-TICK = 0.01
-STEP = 5e-3
-SHOT = 1.0 / 120.0  # [m/s^2]; of commands, integration, pictures [s]
+G = 9.80665  # [m/s^2]
+TICK = 0.01  # between commands [s]
+STEP = 5e-3  # of the integration [s]
+SHOT = 1.0 / 120.0  # between pictures [s]
 # configs/vehicle and configs/rope; body [kg, kg m^2], full thrust [N], lag [s], rotor drag [kg/s],
 # cable [m], ball [kg]
 CRAFT = {
@@ -82,8 +82,8 @@ did; to the left or right by its way.
 """
 STRENGTH = {"swirl": 0.25, "beat": 0.2, "wake": 0.25, "side": 0.15}
 """In the whole mass: [1/s], [m/s^2], [1/s], [m/s^2]."""
-REMEMBERS = 0.5
-BEATS = 4.5  # [s], [rad/s]
+REMEMBERS = 0.5  # [s]
+BEATS = 4.5  # [rad/s]
 ONE_SIDED = ("cmd_delay", "parasitic", "payload_drag")
 FLIGHTS = 4
 FLOORS = 10.0

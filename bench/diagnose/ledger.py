@@ -59,12 +59,10 @@ likelihood, that count as harm.
 """
 NINE = math.log(9.0)
 DECADE = math.log(10.0)
-WIDTHS = (0.05, 3.0)
-GRID = 160
-"""From 50 to 90 % in log size: what is possible; points of the grid of curves."""
-FEWEST = 6
-BINNED = 30
-"""Worlds of an effect for a curve of its own, and for counts in bins."""
+WIDTHS = (0.05, 3.0)  # from 50 to 90 % in log size: what is possible
+GRID = 160  # points of the grid of curves
+FEWEST = 6  # worlds of an effect for a curve of its own
+BINNED = 30  # worlds of an effect for counts in bins
 SEEN = ", camera"
 
 

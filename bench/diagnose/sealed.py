@@ -521,7 +521,7 @@ def _alone(numbers) -> None:
     cores = sorted(os.sched_getaffinity(0))
     with numbers.get_lock():
         mine = numbers.value
-        numbers.value = numbers.value + 1
+        numbers.value += 1
     os.sched_setaffinity(0, {cores[mine % len(cores)]})
 
 

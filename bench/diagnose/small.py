@@ -22,9 +22,9 @@ from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 
-G = 9.80665
-ROD = 0.25
-GREASE = 0.03  # [m/s^2], [m], [1/s]
+G = 9.80665  # [m/s^2]
+ROD = 0.25  # [m]
+GREASE = 0.03  # [1/s]
 LINES = 2.0 * np.pi / 8192
 SWING = PendulumParams(G, ROD, 0.0, GREASE, 0.0, 0.0, 1.0, 0.02, 4)
 CRAFT = dict(

@@ -95,6 +95,19 @@ def test_the_test_that_failed_is_told_with_the_flight_that_would_settle_it(monke
     assert "fly once more, such as: swing" in diagnosis.reasons[0]
 
 
+def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
+    """One flight alone holds it, such as a payload that was tracked once."""
+    monkeypatch.setattr(held_out, "compares_phases", lambda point: False)
+    _, low, high = held_out.jackknifed(np.array([3.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]))
+    once = result.ChannelGain("one", "m", 0.02, 0.01, 0.01, float("nan"), 0.5, low, high, ())
+    often = replace(once, channel="often", low=0.3, high=0.6)
+    assert (once.interval, often.interval) == ("[no interval]", "[30, 60]")
+    truth = {"effect_05": 40.0}
+    with monkeypatch.context() as patch:
+        assert list(judged(patch, truth, channels=(once, often)).theta) == ["effect_05"]
+    assert not judged(monkeypatch, truth, channels=(once,)).theta
+
+
 def test_nothing_is_named_over_an_interval_that_holds_zero():
     """Also where the evidence for it is overwhelming."""
     diagnosis = search.explain(

@@ -96,10 +96,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     units = tuple(model.effects[i].unit for i in columns)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
     channel = np.concatenate([w.channel for w in before])
-    measured = (
-        [w.residual for w in before],
-        after,
-    )
+    measured = ([w.residual for w in before], after)
     rms = [
         {
             name: float(np.sqrt(np.mean(value[channel == i] ** 2)))

@@ -48,12 +48,13 @@ UPS = ("", "x,-z,y")
 """Axes of a world whose z is up, and of one whose y is, as Motive's."""
 _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
 """Unit of commands of motors by what they exceed."""
+# Of a path's derivative with what may be it: correlations that settle it, and that suggest it,
 _FIRMLY = 0.8
-_BELONGS = 0.6  # correlations of what is the derivative of what
-_REACH = 0.2
-_LATEST = 0.15  # delays between them that are tried, and that count [s]
-_SPAN = 0.1
-_COARSE = 0.02  # over which a path is differentiated; of the grid of many pairs [s]
+_BELONGS = 0.6
+_REACH = 0.2  # delays that are tried [s]
+_LATEST = 0.15  # the longest delay that counts [s]
+_SPAN = 0.1  # over which a path is differentiated [s]
+_COARSE = 0.02  # step of the grid on which many pairs are compared [s]
 _COMPARED = 1000  # rows on which the distance of two paths is judged
 _TURN = 7.0  # above a full turn in radians: degrees
 
@@ -287,7 +288,7 @@ def _without_names(numbers: Table) -> list[list[str]]:
         length = np.linalg.norm(four, axis=1)
         if four.shape[1] == 4 and np.nanmax(np.abs(length - 1.0)) < 0.05:
             groups.append(names[i : i + 4])
-            i = i + 4
+            i += 4
             run = []
             continue
         run.append(names[i])
@@ -378,7 +379,7 @@ class _Chooser:
         values = group.values
         if np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5:
             entry = replace(entry, held=True)
-            why = why + "; its values are held between measurements"
+            why += "; its values are held between measurements"
         try:
             channel, _ = make_channel(self.time, values, entry, "table")
         except (ConfigError, LogError):
@@ -449,7 +450,7 @@ class _Chooser:
         if not {"quat_wb", "pos_w"} <= self.made.keys():
             return
         entry = self.made["quat_wb"][0]
-        (place, path) = self.made["pos_w"]
+        place, path = self.made["pos_w"]
         named = entry.kind != "quaternion" or any("w" in c.lower() for c in entry.columns)
         group = next(g for g in self.groups if g.columns == entry.columns)
         orders = (entry.order,) if named else ("wxyz", "xyzw")
@@ -756,7 +757,7 @@ class _Chooser:
     ) -> relations.Relation | None:
         """Relate a group's columns to what was derived of other ones."""
         good = np.all(np.isfinite(group.values), axis=1)
-        return relations.relate(stamps, derived, self.time[good], group.values[good], reach=0.2)
+        return relations.relate(stamps, derived, self.time[good], group.values[good], reach=_REACH)
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
@@ -879,7 +880,7 @@ class _Chooser:
             listed = ", ".join(group.columns)
             if group.columns == ("gyro.x", "gyro.y", "gyro.z"):
                 unit = "deg/s"
-                why = why + "; a Crazyflie's gyro.x is in deg/s"
+                why += "; a Crazyflie's gyro.x is in deg/s"
             self.found.questions.append(
                 f"are the rates {listed} in rad/s or deg/s? '{unit}' is taken: no attitude says"
             )
@@ -1107,8 +1108,8 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     mass = thrust_checks.mass_of(log)
     gap = None
     if "payload_pos_w" in log:
-        (time, pos) = log["pos_w"].samples()
-        (time_p, pos_p) = log["payload_pos_w"].samples()
+        time, pos = log["pos_w"].samples()
+        time_p, pos_p = log["payload_pos_w"].samples()
         gap = float(np.median(np.linalg.norm(pos_p - relations.on_grid(time, pos, time_p), axis=1)))
     name, _, total = applied
     motors = 1 if name in ("thrust_command", "throttle") else 4

@@ -258,7 +258,7 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     knots = len(factor)
     groups = gram.latents // len(factor)
     part = slice(gram.nuisances, gram.nuisances + gram.latents)
-    (channels, size) = gram.cross.shape
+    channels, size = gram.cross.shape
     inner = gram.inner.copy()
     inner[:, part] = (factor.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
         channels, -1, size

@@ -57,10 +57,10 @@ WIDE = (
 
 ITERATIONS = 40
 ENOUGH_NATS = 0.2
-ROUGHLY_NATS = 1.0
 """A step that promises less is the last in the search for the levels, and leaves some twentieth of
-it; while correlation times are compared.
+it.
 """
+ROUGHLY_NATS = 1.0  # the same while correlation times are compared
 LONGEST_FALL = (
     1.0  # of the logarithm of a level in one step: its variance may be predicted to fall below 0
 )

@@ -256,7 +256,7 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     """
     covariance = _inverse(shape.factor)
     variance = covariance.diagonal(dim1=1, dim2=2).clone()
-    (count, channels) = batch.count.shape
+    count, channels = batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
     spread = (batch.hidden * scaled[:, None]).sum(
@@ -308,7 +308,7 @@ class _Integrated:
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
         weight = noise.scale**-2.0
-        (count, n, columns) = self.half.shape
+        count, n, columns = self.half.shape
         hidden = np.zeros((count, n))
         effects = np.zeros((count, columns))
         for w, (gram, kept_columns) in enumerate(zip(grams, self.left)):
@@ -365,7 +365,7 @@ class Integrals:
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     shape = _shape(batch, noise)
-    (_, channels, n) = batch.cross.shape
+    _, channels, n = batch.cross.shape
     sizes = [gram.nuisances + gram.latents for gram in batch.grams]
     inner = [gram.inner for gram in batch.grams]
     width = len(batch.grams[0].inner[0]) - sizes[0]

@@ -27,8 +27,8 @@ PIECES = 4  # of what is to be done, for each thread
 # tasks side by side that mostly wait for a GPU: 2 are as good, with 4 a diagnosis took an eighth
 # longer
 THREADS_BESIDE_GPU = 3
-TRIM_THRESHOLD = -1
-MMAP_THRESHOLD = -3  # numbers of glibc's ``malloc.h``
+TRIM_THRESHOLD = -1  # options of ``mallopt``, as glibc's ``malloc.h`` numbers them
+MMAP_THRESHOLD = -3
 BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
 MAPPED = (
     2**30

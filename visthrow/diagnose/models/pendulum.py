@@ -122,7 +122,7 @@ class PendulumModel(NumericModel):
         still.
         """
         length = self.params.length
-        (angle, rate) = state.T
+        angle, rate = state.T
         direction = np.zeros((len(state), 3))
         vel = np.zeros((len(state), 3))
         upright = np.zeros((len(state), 4))

@@ -104,7 +104,7 @@ class TrimModel(NumericModel):
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
         data = stretch.data
-        (start, end) = np.unique(stretch.latent_time)
+        start, end = np.unique(stretch.latent_time)
         thrust = self.params.mass * self.params.gravity * data["lift"]
         return {
             "time": np.array([start, end]),
@@ -133,8 +133,8 @@ def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
     window = params.slowest_window
     stamps = log[params.command].time
     nothing = (np.zeros(0), np.zeros(0))
-    (time, sent) = log[params.command].samples()
-    (time_p, pos) = log[params.position].samples()
+    time, sent = log[params.command].samples()
+    time_p, pos = log[params.position].samples()
     time_v, vel = (
         log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
     )

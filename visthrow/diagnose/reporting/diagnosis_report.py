@@ -70,8 +70,8 @@ def _gain_line(c: ChannelGain) -> str:
     errors = f"{before} -> {after} {unit}".rstrip()
     comparison = f"noise alone {floor}" + (f", black box {box}" if box else "")
     return (
-        f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less [{percent(c.low)},"
-        f" {percent(c.high)}]; {comparison}"
+        f"held-out error of {c.channel}: {errors}, {percent(c.gain)} % less {c.interval};"
+        f" {comparison}"
     )
 
 
@@ -263,7 +263,7 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
     rows = []
     for c in gain.channels:
         unit, before, after, floor, box = _errors(c)
-        less = f"{percent(c.gain, 1)} % [{percent(c.low)}, {percent(c.high)}]"
+        less = f"{percent(c.gain, 1)} % {c.interval}"
         rows.append(
             (
                 c.channel,
@@ -288,7 +288,7 @@ def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
     note = (
         f"Root mean square errors of {channels}, {gain.left_out} left out in {gain.folds} "
         f"folds, the"
-        f" selection repeated in each ({named}). Interval: 95 %, bootstrap over flights."
+        f" selection repeated in each ({named}). Interval: 95 %, jackknife over flights."
         f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
     )
     header = (

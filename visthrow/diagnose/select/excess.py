@@ -25,12 +25,8 @@ LANDING = 5e-3
 matter: a cause that moves a landing by less is below its floor as well.
 """
 
-STEP = 1.4
-MOST_STEPS = 60
-"""Factor from one level to the next above the best, until one is too high.
-
-A level that nothing holds up lies anywhere below.
-"""
+STEP = 1.4  # factor from one level to the next above the best, until one is too high
+MOST_STEPS = 60  # a level that nothing bounds from above ends here
 
 
 def levels(problem: Problem, before: Point, after: Point, threshold: float) -> tuple[Level, ...]:

@@ -319,7 +319,7 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             reason,
         )
     falls = [c.low if uncompared else c.gain for c in measured.channels]
-    confirmed = not measured.channels or max(falls) > 0.0
+    confirmed = not measured.channels or any(fall > 0.0 for fall in falls)
     if not (measured.low > 0.0 and confirmed):
         failed = _share(measured) if not measured.low > 0.0 else _no_gain(measured)
         reason = f"held-out {measured.left_out} do not confirm {', '.join(names)} ({failed})"
@@ -482,10 +482,7 @@ def _share(measured: HeldOut) -> str:
 
 def _no_gain(measured: HeldOut) -> str:
     """Return the gains of all channels, of which none is sure."""
-    gains = (
-        f"{c.channel} {100 * c.gain:.0f} % [{100 * c.low:.0f}, {100 * c.high:.0f}]"
-        for c in measured.channels
-    )
+    gains = (f"{c.channel} {100 * c.gain:.0f} % {c.interval}" for c in measured.channels)
     return f"no channel's error falls for sure: {', '.join(gains)}"
 
 

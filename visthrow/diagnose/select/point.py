@@ -48,11 +48,8 @@ SMALL_STEP = 0.5 * OWN_FLOOR
 its bound.
 """
 
-TURNS = 8
-TURNED = 0.5
-"""Times that sizes and noise levels are estimated in turn, while the levels leave a step of the
-sizes worth so many nats.
-"""
+TURNS = 8  # times at most that sizes and noise levels are estimated in turn
+TURNED = 0.5  # nats that a step of the sizes must be worth for another turn
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ Plain data, ready for JSON.
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from math import isnan
 from typing import Any
 
 from visthrow.diagnose.select.scatter import Scatter
@@ -129,10 +130,18 @@ class ChannelGain:
     floor: float  # of sensor noise and of the initial state's uncertainty
     blackbox: float  # NaN where none can be, or was, trained
     gain: float  # 1 - after / before
-    low: float  # 95 % interval of the gain, by bootstrap over flights
+    low: float  # 95 % interval of the gain, by the jackknife over flights; NaN where one has all
     high: float
     # horizon [s], before, after, floor, in sigmas
     horizons: tuple[tuple[float, float, float, float], ...]
+
+    @property
+    def interval(self) -> str:
+        """Return the interval in per cent as text; a single flight with the channel gives none."""
+        if isnan(self.low):
+            return "[no interval]"
+        low, high = (round(100.0 * share, 0) + 0.0 for share in (self.low, self.high))  # no -0
+        return f"[{low:.0f}, {high:.0f}]"
 
 
 @dataclass(frozen=True)

@@ -29,16 +29,15 @@ from visthrow.diagnose.likelihood.evidence import (
 )
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-FLIGHT = "flight"
+FLIGHT = "flight"  # what may differ: from flight to flight, from day to day, among commands
 DAY = "day"
-COMMAND = "command"  # what has a share of its own
+COMMAND = "command"
 # before these, at the end of the names of effects that differ and are none of the catalogue's
 # random effects
 FORM = "_by_"
 LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
-REACH = np.geomspace(0.02, 6.0, 25)
-LOOK = 5
-"""Deviations that are tried, in their prior's; every which of them, where flights are left out."""
+REACH = np.geomspace(0.02, 6.0, 25)  # deviations that are tried, in their prior's
+LOOK = 5  # every fifth of them is tried where flights are left out
 UNRELIABLE_FLOORS = (
     3.0  # floors of a flight's own estimate from which its derivative is not relied upon
 )

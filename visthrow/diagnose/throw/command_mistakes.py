@@ -25,9 +25,9 @@ from visthrow.logs.flightlog import Channel, FlightLog
 FOLLOWS = 0.8
 MOVES = 0.3  # rates that say something about their axes [rad/s]
 LIFTED = 0.15  # above where it stood, from which a vehicle flies [m]
-VARIED = 0.05
-LATE = 0.05
-SLOPES = (0.3, 2.0)  # of the throttle's hover, motors [s], plausible slopes of thrust over throttle
+VARIED = 0.05  # of the throttle's hover, from which its variation tells the slope of thrust
+LATE = 0.05  # by which motors lag behind throttle [s]
+SLOPES = (0.3, 2.0)  # plausible slopes of thrust over throttle
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight
 
 LENGTH = 1.0  # of a window, about [s]
 SHORTEST = 0.25  # of a window [s]
-BEFORE = 0.55
-AFTER = 0.45  # of the separation, that the window of the throw reaches [s]
+BEFORE = 0.55  # the separation, from which the window of the throw reaches [s]
+AFTER = 0.45  # the separation, up to which it reaches [s]
 QUIET_SPEED = 0.35  # of hover [m/s]
 GROUND_MARGIN = 0.05  # above the landing height, below which a payload is left alone [m]
 # by which the release may lag more than expected, before a payload counts as free where the rope

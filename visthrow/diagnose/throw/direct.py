@@ -311,7 +311,7 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
 def _interpolated(view: dict, name: str, time: np.ndarray) -> np.ndarray:
     """A smoothed track at times: points [m], or rotations from xyzw."""
     grid = view["grid"]
-    (values, slopes) = view[name]
+    values, slopes = view[name]
     k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
     h = time - grid[k]
     s = (h / GRID)[:, None]

@@ -53,11 +53,9 @@ SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from
 elsewhere lead to the goal.
 """
-TRUE = 0.5
-WHOLE = 0.8
-"""Of what a step promised, that it must bring, and of what the least damped one promised, for
-derivatives to be used further.
-"""
+# What a step must bring for derivatives to be used further:
+TRUE = 0.5  # of what it promised
+WHOLE = 0.8  # of what the least damped step promised
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 FITTED_SPAN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
@@ -230,7 +228,7 @@ class InitialFit:
             for w, its in zip(windows, dampings)
         ]
         tries = np.concatenate(dampings)
-        (steps, hoped) = map(np.concatenate, zip(*trials))
+        steps, hoped = map(np.concatenate, zip(*trials))
         states_moved = moved_along(rows_of(states, which), self.directions, steps)
         states_moved[MOVED] = states_moved[MOVED] + steps
         left_over = self._residuals(states_moved, which)
@@ -334,7 +332,7 @@ class InitialFit:
         ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape
         (T,). Returns steps, shape (T, directions); falls of the cost, shape (T,)."""
         ds = self._free[w]
-        (sd, scaled, bend) = self._scaled(w)
+        sd, scaled, bend = self._scaled(w)
         off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):

@@ -15,8 +15,8 @@ from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
-SMOOTH_BEFORE = 0.06
-SMOOTH_AFTER = 0.08  # of a window's start, over which measurements are smoothed [s]
+SMOOTH_BEFORE = 0.06  # a window's start, from which measurements are smoothed [s]
+SMOOTH_AFTER = 0.08  # a window's start, up to which they are [s]
 LEAST_SAMPLES = 6
 MODES = 4  # half waves of a bent rope
 INTEGRAL = 1.0

@@ -129,7 +129,7 @@ class Plan:
         w = self.window
         f = flights
         c = f.cuts[w]
-        (effects, states, latents) = slopes
+        effects, states, latents = slopes
         values = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
         return Window(
             c.flight,

@@ -166,7 +166,7 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
         )
     pos = _samples(log, "pos_w")
     quat = _samples(log, "quat_wb")
-    (landing, landing_point) = _landing(log)
+    landing, landing_point = _landing(log)
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)
