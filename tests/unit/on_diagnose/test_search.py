@@ -177,13 +177,16 @@ def test_a_simulation_that_fails_is_out_of_domain():
     assert len(diagnosis.findings) == 12
 
 
-@mark.slow
-def test_a_few_windows_that_fail_are_left_out():
+def test_a_few_windows_that_fail_are_left_out_and_counted():
     some = altered(
         lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
         truth={"effect_03": 10.0},
     )
-    assert search.explain(some, laws=False).named == ("effect_03",)
+    diagnosis = search.explain(some, laws=False)
+    assert diagnosis.named == ("effect_03",)
+    windows = some.windows({})
+    failed = sum(w.flight == 5 for w in windows)
+    assert diagnosis.reasons[-1].startswith(f"{failed} of {len(windows)} windows are left out")
 
 
 def test_an_estimate_stays_within_its_physical_bounds():

@@ -39,9 +39,8 @@ DEFAULT_FREE = {
 its prior.
 """
 ROUNDS = 4
-UNKNOWN_SHARE = (
-    0.5  # an effect whose deviation is still this share of its prior was not told by the logs
-)
+# an effect whose deviation is still this share of its prior was not told by the logs
+UNKNOWN_SHARE = 0.5
 
 
 @dataclass(frozen=True)

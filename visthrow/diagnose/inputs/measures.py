@@ -10,9 +10,8 @@ import numpy as np
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.models.model_interface import Effect
 
-CERTAIN_DEVIATIONS = (
-    3.0  # deviations of a measurement beyond which the configured value cannot be off
-)
+# deviations of a measurement beyond which the configured value cannot be off
+CERTAIN_DEVIATIONS = 3.0
 
 
 @dataclass(frozen=True)

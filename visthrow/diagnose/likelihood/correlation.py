@@ -50,9 +50,8 @@ SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
 what doubles hold.
 """
 
-LOOKED_AT = (
-    8  # windows that the estimate is made of, and that tell whether a question is worth asking all
-)
+# windows that the estimate is made of, and that tell whether a question is worth asking all
+LOOKED_AT = 8
 
 
 @dataclass(frozen=True)

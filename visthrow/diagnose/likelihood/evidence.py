@@ -200,8 +200,8 @@ def _naming(
     unit = np.eye(sets.shape[1])
     taken = np.linalg.inv(variance + unit / change[:, None])
     wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
-    # A name widens its prior and so the posterior. What comes out narrower is a set with a name that
-    # is there already; it is left out below.
+    # A name widens its prior and so the posterior. What comes out narrower is a set with a name
+    # that is there already; it is left out below.
     wide = np.maximum(variance - variance @ taken @ variance, variance)
     wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
     gain = (

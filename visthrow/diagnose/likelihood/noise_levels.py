@@ -51,9 +51,8 @@ where windows stand far out.
 """
 
 CLEANINGS = 4  # rounds in which outliers lose weight
-WIDE = (
-    30.0  # latent forces while outliers are looked for, in the level at which they become visible
-)
+# latent forces while outliers are looked for, in the level at which they become visible
+WIDE = 30.0
 
 ITERATIONS = 40
 ENOUGH_NATS = 0.2
@@ -61,9 +60,8 @@ ENOUGH_NATS = 0.2
 it.
 """
 ROUGHLY_NATS = 1.0  # the same while correlation times are compared
-LONGEST_FALL = (
-    1.0  # of the logarithm of a level in one step: its variance may be predicted to fall below 0
-)
+# of the logarithm of a level in one step: its variance may be predicted to fall below 0
+LONGEST_FALL = 1.0
 HALVINGS = 8
 STALLED = 1e-9  # of the step: limits and levels count as met within this
 

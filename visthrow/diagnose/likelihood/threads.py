@@ -30,9 +30,8 @@ THREADS_BESIDE_GPU = 3
 TRIM_THRESHOLD = -1  # options of ``mallopt``, as glibc's ``malloc.h`` numbers them
 MMAP_THRESHOLD = -3
 BYTES_KEPT = 2**31 - 1  # bytes at the top of the heap, up to which none go back to the system
-MAPPED = (
-    2**30
-)  # bytes from which an array has a mapping of its own, which goes back when it is freed
+# bytes from which an array has a mapping of its own, which goes back when it is freed
+MAPPED = 2**30
 
 _aside = Event()
 

@@ -21,9 +21,8 @@ FINE = 16
 KNOTS = 8  # of the latent forces over a window
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
-_MOST_THRUST = (
-    5.0  # median thrust over the weight, by the map: a map may be far off, a unit is off by more
-)
+# median thrust over the weight, by the map: a map may be far off, a unit is off by more
+_MOST_THRUST = 5.0
 _IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 

@@ -22,9 +22,8 @@ CHANNEL = "marker_pos_c"
 NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")
 MOST_APART = 0.25  # share of the detections that may be of something else than the payload
 KNOTS = 11  # of the slow wander of detections over a window
-MARGIN = (
-    1.0  # poses are kept this long before and after a window [s], so that a delay can look them up
-)
+# poses are kept this long before and after a window [s], so that a delay can look them up
+MARGIN = 1.0
 
 
 @dataclass(frozen=True)

@@ -43,9 +43,8 @@ TRACKING = HoverParams(max_speed=8.0, max_tilt=0.9, integral_limit=2.0)
 """A controller that follows a moving reference: the hover controller with room for it."""
 
 LOST = 10.0  # the same of a vehicle that flies off
-THREAD = (
-    1e-3  # mass of a setup's cable, in that of its payload: the setup's model has it without mass
-)
+# mass of a setup's cable, in that of its payload: the setup's model has it without mass
+THREAD = 1e-3
 
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 

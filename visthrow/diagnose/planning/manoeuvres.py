@@ -13,9 +13,8 @@ import numpy as np
 
 PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
-HEIGHT = (
-    1.5  # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
-)
+# height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
+HEIGHT = 1.5
 
 RUN = 3.6
 """Way of a throw from rest to rest [m], released half way: over a shorter one the payload would

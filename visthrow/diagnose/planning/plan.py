@@ -25,9 +25,8 @@ DECISIVE = 11.0
 mean as variance, and exceed the 3 nats of a class in 95 % of flights.
 """
 
-NAMEABLE = (
-    0.2  # deviation of an effect, in that of its prior, from which on its usual size is named
-)
+# deviation of an effect, in that of its prior, from which on its usual size is named
+NAMEABLE = 0.2
 
 MOST_REPEATS = 10
 

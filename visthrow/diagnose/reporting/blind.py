@@ -13,9 +13,8 @@ from visthrow.diagnose.select.result import Diagnosis
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
 
 DRAWS = 200
-FEWEST_FLIGHTS = (
-    6  # fewer give too few patterns of signs; noise is then drawn from its fitted level
-)
+# fewer give too few patterns of signs; noise is then drawn from its fitted level
+FEWEST_FLIGHTS = 6
 NAMED = 0.9
 
 

@@ -50,9 +50,8 @@ FIRM = 2.0 / 3.0
 """More of the folds than this share must name a cause, or one of its class: of three folds that
 leave a flight out, all.
 """
-TELLING = (
-    0.1  # of what flights promise in the mean, from which one counts among those that can tell
-)
+# of what flights promise in the mean, from which one counts among those that can tell
+TELLING = 0.1
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 

@@ -38,9 +38,8 @@ FORM = "_by_"
 LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
 REACH = np.geomspace(0.02, 6.0, 25)  # deviations that are tried, in their prior's
 LOOK = 5  # every fifth of them is tried where flights are left out
-UNRELIABLE_FLOORS = (
-    3.0  # floors of a flight's own estimate from which its derivative is not relied upon
-)
+# floors of a flight's own estimate from which its derivative is not relied upon
+UNRELIABLE_FLOORS = 3.0
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at

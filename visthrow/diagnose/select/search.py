@@ -119,8 +119,9 @@ def explain(
     if not windows:
         raise DiagnoseError("the model found no stretch of flight to look at in these logs")
     simulated = parallel_map(finite, windows)
-    usable = tuple(i for i, w in enumerate(windows) if simulated[i] and w.flight not in without)
-    if len(usable) < 0.5 * sum(w.flight not in without for w in windows) or not usable:
+    considered = [i for i, w in enumerate(windows) if w.flight not in without]
+    usable = tuple(i for i in considered if simulated[i])
+    if len(usable) < 0.5 * len(considered) or not usable:
         return out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, usable)
     priors = problem.priors
@@ -149,10 +150,10 @@ def explain(
             search = Selector(problem, nominal, threshold_nats, say, laws)
     diagnosis = held_out.judged(conclude(search))
     reasons = diagnosis.reasons
-    left_out = len(usable) - len(problem.kept)
+    left_out = len(considered) - len(problem.kept)
     if left_out:
         reasons += (
-            f"{left_out} of {len(usable)} windows are left out, which the simulation does not"
+            f"{left_out} of {len(considered)} windows are left out, which the simulation does not"
             " follow: a cause that acts in these alone does not show",
         )
     return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)

@@ -45,9 +45,8 @@ from visthrow.diagnose.select.scatter import CHAIN, Varies, deviations
 from visthrow.diagnose.select.search_state import SearchState, SetMove
 
 MOST_NAMES = 3 * CHAIN  # a longer list of causes is a wrong form, not a finding
-SHORTLIST = (
-    3  # sets of a kind whose simulation is run again in each round, of exchanges twice as many
-)
+# sets of a kind whose simulation is run again in each round, of exchanges twice as many
+SHORTLIST = 3
 
 DOUBT = 15.0
 """Nats behind up to which a set is simulated, where statistics of other sizes may be wrong; up to

@@ -23,9 +23,8 @@ LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 
 
 UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
 BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
-SUFFICIENT_RATE = (
-    250.0  # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
-)
+# samples of the gyro a second: faster ones tell a model of 500 steps a second no more
+SUFFICIENT_RATE = 250.0
 AT_START = 0.25  # of a log, whose voltages tell how much charge was used before [s]
 
 

@@ -28,12 +28,10 @@ KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
 FINENESS = {"throw": 0.25}  # step in a phase against the one asked for: the rope whips in throws
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
-ROUGHER = (
-    3.0  # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
-)
-STABLE = (
-    1.75  # shortest lags of the vehicle's filters and rotors, above which a rough step may not go
-)
+# added to the square of the step, in the nominal one, of rough lanes: twice as long steps
+ROUGHER = 3.0
+# shortest lags of the vehicle's filters and rotors, above which a rough step may not go
+STABLE = 1.75
 BATCH, CUDA_BATCH = (
     4096,
     32768,
