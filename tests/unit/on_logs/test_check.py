@@ -18,7 +18,7 @@ from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
 from visthrow.logs.check import physics, thrust_checks
-from visthrow.logs.check.excitation import excitation
+from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
@@ -474,6 +474,25 @@ def test_no_more_seconds_are_flown_than_there_are():
         columns["time"] = np.arange(2000) // 2 * 0.02 + np.arange(2000) % 2 * nearer
         figures = excitation(log_of(columns))
         assert figures["seconds_flown"] == approx(figures["seconds"], abs=0.1)
+
+
+def test_a_flight_that_excites_everything_answers_every_question():
+    """No question asks for a channel or a figure that does not exist."""
+    columns = flight(20.0)
+    time = columns["time"]
+    columns["pos_w"] -= [0.0, 0.0, 2.9]
+    angle = 0.5 * np.sin(4.0 * time)
+    cable = 0.4 * np.column_stack([np.sin(angle), 0.0 * time, -np.cos(angle)])
+    columns["payload_pos_w"] = columns["pos_w"] + cable
+    columns["motor_command"] = np.repeat(columns["command"][:, :1] / 4.0, 4, axis=1)
+    log = log_of(
+        columns,
+        battery_voltage=Channel(time, 16.0 - 0.05 * time, "V"),
+        release_command=Channel(time, time > 15.0, "1"),
+        keypoints=Channel(time, np.zeros((len(time), 8, 2)), "1", "image"),
+    )
+    answers = {row.channel: row.text for row in check([log])[0].rows if row.topic == "answers"}
+    assert answers == {question.name: "can be answered" for question in QUESTIONS}
 
 
 def test_long_and_constant_logs():
