@@ -1,6 +1,7 @@
 """What an autopilot's log says of itself: validity, vehicle, motors, speeds, clocks, damage."""
 
 import math
+import re
 import struct
 
 import numpy as np
@@ -9,6 +10,8 @@ from pytest import approx, mark
 from tests import logfiles
 from visthrow.logs import read
 from visthrow.logs.check.run import check, contradictions
+from visthrow.logs.readers.autopilot_logs import fields_of_autopilots
+from visthrow.logs.readers.vehicles import Vehicle, X
 
 LOCAL = ["uint64_t timestamp", *(f"float {x}" for x in ["x", "y", "z", "vx", "vy", "vz", "eph"])]
 LOCAL += [f"uint8_t {name}" for name in ["xy_valid", "z_valid", "v_xy_valid", "v_z_valid"]]
@@ -327,3 +330,17 @@ def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, goo
     ]
     logfiles.write_bin(tmp_path / "a.BIN", {"VISP": logfiles.VISP}, rows)
     assert np.all(read(tmp_path / "a.BIN")[0]["mocap_pos_w"].valid == good)
+
+
+def test_telemetry_is_read_from_fields_that_mavlink_has():
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    fields_of = {message.msgname: message.fieldnames for message in dialect.mavlink_map.values()}
+    tables = fields_of_autopilots()
+    for tap in tables["taps"]["telemetry"]:
+        columns = tap.entry(Vehicle("quadrotor", X, X)).columns
+        names = [re.sub(r"\[\d\]", "", column) for column in columns] + tap.good.split()
+        names += tap.only[:1] if tap.only else []
+        assert set(names) <= set(fields_of[tap.message]), tap
+    for message, name, *_ in tables["flying"]["telemetry"]:
+        assert name in fields_of[message], message
