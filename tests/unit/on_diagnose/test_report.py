@@ -185,13 +185,15 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
     assert len(r.csv().splitlines()) == 1 + len(r.time)
 
 
-@mark.parametrize("used", [0.0, 0.9, 1.2])
-def test_a_flight_that_nears_the_ground_has_no_model(used):
+@mark.parametrize(
+    ("part", "used"), [(0.0, 0.0), (0.9, 0.9), (1.2, 1.2), (np.nan, fly_manoeuvres.LOST)]
+)
+def test_a_flight_that_nears_the_ground_has_no_model(part, used):
     """It hovers 0.11 m high and is aborted at half of it."""
     chosen = next(m for m in manoeuvres.catalogue() if m.name == "hover low without payload")
     reference = chosen.reference()
     assert reference.lowest == approx(0.055)
-    place = np.repeat(reference.pos_w, 4, axis=0) - [0.0, 0.0, used * reference.lowest]
+    place = np.repeat(reference.pos_w, 4, axis=0) - [0.0, 0.0, part * reference.lowest]
     flight = fly_manoeuvres.SimulatedFlight(chosen, reference, None, {"pos_w": place}, None, None)
     simulated = flight.simulated(lambda _: "a model")
     assert simulated.used == approx(used)

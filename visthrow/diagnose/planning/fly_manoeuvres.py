@@ -202,11 +202,9 @@ class SimulatedFlight:
         """
         off = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)] - self.reference.pos_w
         height = self.reference.pos_w[:, 2] - self.reference.lowest
-        used = max(
-            self.swing / HIGHEST,
-            float(np.linalg.norm(off, axis=1).max()) / ASTRAY,
-            float((-off[:, 2] / height).max()),
-        )
+        sunk = -off[:, 2] / height
+        astray = np.linalg.norm(off, axis=1) / ASTRAY
+        used = float(np.max([self.swing / HIGHEST, astray.max(), sunk.max()]))  # NaN counts
         used = min(used, LOST) if np.isfinite(used) else LOST
         try:
             return Simulated(model_of(self) if used < 1.0 else None, used)
