@@ -197,6 +197,13 @@ def test_one_seed_one_flight(seed):
     assert np.all(first.get("pos_w") != other.get("pos_w"))
 
 
+def test_draws_do_not_depend_on_the_batch():
+    large, small = HybridSim(paper_plant(), COUNT, seed=3), HybridSim(paper_plant(), 2, seed=3)
+    for sim in (large, small):
+        sim.randomize(start_spreads())
+    assert_same(everything(small), everything(large), slice(None), slice(0, 2))
+
+
 @mark.parametrize("place", range(4))
 def test_a_bad_command_raises_a_bit_and_does_not_spread(place):
     """Not a number in one environment: its bit is set, its last command is held, the others never

@@ -46,6 +46,15 @@ def assert_uniform(values: np.ndarray, low: float, high: float) -> None:
     assert kstest((values - low) / span, "uniform").pvalue > SIGNIFICANCE
 
 
+def test_the_file_holds_the_numbers_of_the_paper():
+    """Sec. III-C, [m], [m/s], [deg], [deg/s]; six cables over 6 %."""
+    z = spreads()
+    assert z.position == z.velocity == (0.5, 0.5, 0.3)
+    assert (z.attitude_deg, z.rate_deg) == ((20.0,) * 3, (30.0,) * 3)
+    assert (z.mass, z.tether_variants, z.tether_spread) == (0.05, 6, 0.06)
+    assert (z.cable_angle_deg, z.cable_rate_deg, z.goal_radius) == (15.0, 15.0, 2.0)
+
+
 @mark.parametrize("axis", range(3))
 def test_position_velocity_and_rates(axis):
     sim, z = started(), spreads()
