@@ -81,6 +81,11 @@ def test_landings_are_told_in_millimetres(found, measured):
     assert report.to_json(found[1], measured)["gain"]["landing"]["after"] == landing.after
 
 
+def test_a_share_of_nothing_has_no_sign():
+    texts = [report.percent(share) for share in (-1e-6, -0.0, 0.496, -0.02)]
+    assert texts == ["0", "0", "50", "-2"]
+
+
 @fixture(scope="module")
 def measured(found):
     return gain.measure(found[1])
