@@ -90,6 +90,11 @@ def test_deviations_are_found_with_their_size():
     assert abs(np.median([w["gust"].size for w in gusts]) - 0.25) < 0.06
 
 
+def test_three_flights_say_nothing():
+    statistics = flights(default_rng(7), count=3, release_lag=0.05)
+    assert varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) == ()
+
+
 def test_training_draws_what_varies():
     for v in random_effects():
         assert all(

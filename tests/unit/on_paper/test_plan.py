@@ -98,6 +98,12 @@ def test_plan_ends_in_the_release_on_the_grid_and_within_bounds(plan):
     assert inputs[:, 0].max() < soft * bounds.max_thrust
 
 
+def test_past_its_end_the_path_goes_on_straight(plan):
+    beyond = plan.path.sample(np.array([plan.path.duration + 0.3]))[0]
+    assert np.allclose(beyond[0], plan.release.pos_w + 0.3 * plan.release.vel_w)
+    assert np.allclose(beyond[2:], 0.0)
+
+
 def test_flat_inputs_flown_open_loop_stay_on_the_path(plan):
     step = 0.002
     count = round(plan.path.duration / step)
