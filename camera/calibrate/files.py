@@ -230,7 +230,9 @@ def _uniform(tree: Node) -> Node:
     """
     lenses = tree.get("intrinsics") if "resolution" in tree else None
     if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
-        pairs = zip_longest(lenses, tree["resolution"][: len(lenses)])
+        sizes = tree["resolution"]
+        sizes = sizes[: len(lenses)] if isinstance(sizes, list) else [sizes]
+        pairs = zip_longest(lenses, sizes)
         return {f"cam{i}": {**lens, "resolution": size} for i, (lens, size) in enumerate(pairs)}
     if {"model", "fx", "cols"} <= tree.keys():
         return {f"Camera.{key}": entry for key, entry in tree.items()}

@@ -476,6 +476,10 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
     assert read(path)[2].model == "pinhole-radtan"
 
 
+LENS = dict.fromkeys(("fx", "fy", "k1", "k2", "k3", "k4"), 1.0)
+SIZELESS = basalt("kb4", **LENS).replace(f"[[{W}, {H}]]", "5")
+
+
 @mark.parametrize(
     ("text", "message"),
     [
@@ -489,6 +493,7 @@ def test_a_fifth_coefficient_confirms_the_label(tmp_path):
         (svo("pinhole", WIDE[:3], "none", []), "'pinhole' with 3 intrinsics"),
         ("model: kannala_brandt\npinhole: {fx: 1.0}\n", "model is 'kannala_brandt'"),
         ("resolution: [2, 2]\nintrinsics: []\ndistortion_model: omni\nomni_affine: [0]", "Kimera"),
+        (SIZELESS, "image size is 5; expected 2 numbers"),
         ("a: [1, 2", "no complete YAML"),
         ("<a><b>", "no complete XML"),
     ],
