@@ -124,18 +124,23 @@ def write_run_folder(
     next free ``provenance_<n>.json``. Raises StorageError if the folder holds a run already and
     ``resume`` is not set, or cannot be written."""
     folder = Path(folder)
+    config = folder / "config.toml"
     record = {**collect(), **extra}
     writable(folder)
     if not resume:
         try:
-            (folder / "config.toml").touch(exist_ok=False)  # of two that begin at once one succeeds
+            config.touch(exist_ok=False)  # of two that begin at once one succeeds
         except FileExistsError:
             check_free(folder)
-    elif (folder / "config.toml").exists():
+    elif config.exists():
         count = len(list(folder.glob("provenance*.json")))
         write_json(folder / f"provenance_{count}.json", record)
         return record
-    atomic_write(folder / "config.toml", config_text)
+    try:
+        atomic_write(config, config_text)
+    except StorageError:
+        config.unlink(missing_ok=True)  # an empty one would count as a run
+        raise
     write_json(folder / "provenance.json", record)
     return record
 

@@ -6,10 +6,10 @@ from time import perf_counter
 
 import numpy as np
 
-from hil.control.dead_reckoning import DeadReckoning
 from hil.control.safety import Guard, box_violation
 from hil.control.state_machine import FLYING, Inputs, State, TickRecord
 from hil.control.tick.body_estimate import Estimate
+from hil.control.tick.dead_reckoning import DeadReckoning
 from hil.control.tick.flight_parts import FlightParts
 from hil.links.backends.base import FOLLOW, LAND, Command, Status
 from hil.links.backends.base import HOLD as HOLDING

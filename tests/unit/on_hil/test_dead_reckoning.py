@@ -4,8 +4,8 @@ import math
 
 from pytest import approx, mark
 
-from hil.control.dead_reckoning import RESPONSE, DeadReckoning
 from hil.control.tick.body_estimate import Estimate
+from hil.control.tick.dead_reckoning import RESPONSE, DeadReckoning
 from hil.poses.body_track import BodyState
 
 TICK, AGE, MASS = 0.02, 0.01, 0.27

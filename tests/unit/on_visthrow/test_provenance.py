@@ -106,3 +106,14 @@ def test_of_runs_that_begin_at_once_in_a_folder_one_goes_on(tmp_path):
         (seed,) = [seed for seed in pool.map(begin, range(8)) if seed is not None]
     assert json.loads((tmp_path / "provenance.json").read_text())["seed"] == seed
     assert tomllib.loads((tmp_path / "config.toml").read_text())["seed"] == seed
+
+
+def test_a_folder_whose_config_cannot_be_written_stays_free(tmp_path, monkeypatch):
+    def disk_is_full(path, content):
+        raise StorageError(f"cannot write {path}: No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(provenance, "atomic_write", disk_is_full)
+        with raises(StorageError, match="No space"):
+            provenance.write_run_folder(tmp_path, "seed = 1\n")
+    provenance.check_free(tmp_path)
