@@ -278,6 +278,41 @@ def test_a_pose_stream_of_another_clock_is_told():
     assert row.figures["delay_s"] == approx(0.035, abs=0.002)
 
 
+def carrying(share: float = 0.2, length: float = 0.5) -> dict[str, np.ndarray]:
+    """Columns of a vehicle that carries a payload along a smooth path, on a cable without mass."""
+    time = np.arange(0.0, 10.0, 0.01)
+    below = 0.5 * np.sin(np.outer(time, [1.9, 2.3, 1.1]) + [0.0, 1.0, 2.0]) + [0, 0, 2]
+
+    def pull(path: np.ndarray) -> np.ndarray:
+        return np.gradient(np.gradient(path, time, axis=0), time, axis=0) + [0, 0, G]
+
+    hung = pull(below)
+    above = below + length * hung / norm(hung, axis=1, keepdims=True)
+    thrust = (1.0 - share) * pull(above) + share * hung
+    up = thrust / norm(thrust, axis=1, keepdims=True)
+    side = np.cross(up, [1.0, 0.0, 0.0])
+    side /= norm(side, axis=1, keepdims=True)
+    turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+    rng = default_rng(3)
+    columns = {"time": time, "pos_w": above, "payload_pos_w": below}
+    noisy = {n: v + rng.normal(0, 3e-4, v.shape) for n, v in columns.items() if n != "time"}
+    return {"time": time, "quat_wb": turn.as_quat(), **noisy}
+
+
+def test_positions_with_exchanged_axes_are_caught_below_a_payload():
+    columns = carrying()
+    assert not faults(log_of(columns))
+    swapped = {n: columns[n][:, [1, 0, 2]] for n in ("pos_w", "payload_pos_w")}
+    assert "fit with (y,x,z) of positions" in faults(log_of(columns | swapped))
+
+
+def test_commands_that_come_after_the_rates_are_caught_however_late():
+    columns = flight()
+    time = columns["time"] + 0.5
+    late = Channel(time, columns["command"], *UNITS["command"])
+    assert "the commands' clock is late" in faults(log_of(columns, command=late))
+
+
 def test_a_drifting_clock_is_told():
     columns = flight(40.0)
     stretched = columns["time"] * 1.001

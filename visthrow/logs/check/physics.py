@@ -34,6 +34,7 @@ CLEARLY = 0.12
 _LIVELY = 0.2  # rates that noise and draught alone do not make [rad/s]
 _DELAY_WARN = 0.02  # between measurements of one motion [s]
 _DELAY_BAD = 0.05
+_RESPONSE = 0.1  # half of the longest that rates take to follow their commands [s]
 DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [s]
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
@@ -45,6 +46,8 @@ _OTHER_CABLE = 0.25  # likewise: another cable
 _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
+_TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
+_HEAVIEST = 0.9  # share of the mass that a payload may have
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
 
@@ -314,10 +317,10 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     """Hold what pushes the vehicle, by accelerometer and attitude, against how its velocity
     changes.
 
-    Without an accelerometer the push is a multirotor's thrust, along body z; then a payload must
-    not pull as well."""
+    Without an accelerometer the push is a multirotor's thrust, along body z, on vehicle and payload
+    together."""
     sensed = "acc_b" in log
-    if path not in log or (not sensed and "payload_pos_w" in log and "attached" not in log):
+    if path not in log:
         return []
     time_p, p = log[path].samples()
     time_q, q = log[quat].samples()
@@ -328,7 +331,13 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         return []
     turn = relations.attitude_at(time_q, q, time)
     if not sensed:
-        return _leaning(time, acc, turn, f"d({path})/dt, {quat} thrust along z")
+        carried = _carried(log, quat, time, acc)
+        hangs = carried[0]
+        if np.sum(hangs) < 50:
+            return []
+        turn = turn[hangs]
+        acc = _together(acc[hangs], carried[1][hangs], turn)
+        return _leaning(time[hangs], acc, turn, f"d({path})/dt, {quat} thrust along z")
     time_a, force_b = log["acc_b"].samples()
     if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
         return []
@@ -344,6 +353,41 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
         expected_b = rotate_back(turn, acc + gravity)
         wrong = _exchanged_body(time, expected_b, time_a, force_b, channels)
     return [wrong] if wrong is not None else _pushed(relation, acc, pushed, channels, True)
+
+
+def _carried(
+    log: FlightLog, quat: str, time: np.ndarray, acc: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return at which times the payload hangs on its cable, shape (N,), and its acceleration less
+    the vehicle's [m/s^2], shape (N, 3); always and 0 where no payload is measured.
+    """
+    pos = quat.replace("quat_wb", "pos_w")
+    if "payload_pos_w" not in log or np.sum(log["payload_pos_w"].valid) < 50 or pos not in log:
+        return np.ones(len(time), bool), np.zeros_like(acc)
+    time_p, p = log["payload_pos_w"].samples()
+    gap = relations.on_grid(time_p, p, time) - relations.on_grid(*log[pos].samples(), time)
+    length = np.linalg.norm(gap, axis=1)
+    stamps, acc_p = accelerations(time_p, p, "m")
+    if not len(stamps):
+        return np.zeros(len(time), bool), np.zeros_like(acc)
+    hangs = np.abs(length - np.median(length)) < _TAUT * np.median(length)
+    hangs &= (time > stamps[0]) & (time < stamps[-1])
+    return hangs, relations.on_grid(stamps, acc_p, time) - acc
+
+
+def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Return the acceleration of vehicle and payload together [m/s^2]: with the payload's share of
+    the mass that makes it follow the thrust best, in whatever axes.
+    """
+    up = matrix_of_quat(turn)[:, :, 2]
+    lean = (up / np.maximum(up[:, 2:], 0.2))[:, :2]
+    moved, added = (np.einsum("kij,nj->kni", MATRICES, a) for a in (acc, relative))
+    off = moved[..., :2] - lean * (moved[..., 2:] + GRAVITY)
+    slope = added[..., :2] - lean * added[..., 2:]
+    power = np.maximum(np.sum(slope**2, axis=(1, 2)), 1e-12)
+    share = np.clip(-np.sum(off * slope, axis=(1, 2)) / power, 0.0, _HEAVIEST)
+    left = np.sum((off + share[:, None, None] * slope) ** 2, axis=(1, 2))
+    return acc + share[np.argmin(left)] * relative
 
 
 def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> list[Row]:
@@ -537,10 +581,36 @@ def _commands(log: FlightLog) -> list[Row]:
             usable(time, set_points, MOVES)
             and (relation := relations.relate(time, set_points, *rates)) is not None
         ):
-            rows += _followed(
-                relation, f"{name}, {turning}", float(np.max(np.std(rates[1], axis=0)))
-            )
+            channels = f"{name}, {turning}"
+            spread = float(np.max(np.std(rates[1], axis=0)))
+            if relation.axes_delay < -_DELAY_BAD and relation.axes_correlation > FIRMLY:
+                rows += _early(relation, time, set_points, rates, channels)
+            else:
+                rows += _followed(relation, channels, spread)
     return rows
+
+
+def _early(
+    relation: relations.Relation,
+    time: np.ndarray,
+    set_points: np.ndarray,
+    rates: tuple[np.ndarray, np.ndarray],
+    channels: str,
+) -> list[Row]:
+    """Report rates that go before their commands: if no delay that a controller has fits them as
+    well, the clock of the commands is late.
+    """
+    later = relations.relate(time + _RESPONSE, set_points, *rates, reach=_RESPONSE)
+    if later is None:
+        return []
+    before, behind = (min(r.axes_correlation, 0.999) for r in (relation, later))
+    independent = float(np.ptp(time)) / relations.INDEPENDENT
+    nats = 0.5 * independent * np.log((1.0 - behind**2) / (1.0 - before**2))
+    early = -1e3 * relation.axes_delay
+    text = f"the rates go {early:.0f} ms or more before their commands, correlation {before:.2f}"
+    text += f" (behind them {behind:.2f}, {nats:.0f} nats): the commands' clock is late"
+    figures = {"delay_s": relation.axes_delay, "nats": float(nats)}
+    return [Row("delay", channels, "bad" if nats > _NATS else "warn", text, figures)]
 
 
 def _followed(relation: relations.Relation, channels: str, spread: float) -> list[Row]:
@@ -562,13 +632,15 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
                 figures | {"axes": relation.axes, "nats": relation.nats},
             )
         ]
-    late = relation.delay < -0.005
+    known = relation.delay_sd < _UNTOLD
+    late = known and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
     weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
+    when = f"{1e3 * relation.delay:.1f} ms later" if known else "at a delay that cannot be told"
     text = (
-        f"the rates follow {1e3 * relation.delay:.1f} ms later,"
-        f" correlation {relation.correlation:.2f}, gain {relation.scale:.2f}"
+        f"the rates follow {when}, correlation {relation.correlation:.2f}, gain"
+        f" {relation.scale:.2f}"
     )
     text += (
         ": before they were commanded"
