@@ -70,6 +70,11 @@ class Runner:
         except Exception as error:  # as in tick
             self._early_error = error
 
+    def warm(self) -> None:
+        """Have the policy ready in the caches where it ran in the last tick."""
+        if "policy" in self.parts.spent:
+            self.pilot.warm()
+
     def tick(
         self,
         time: float,

@@ -149,6 +149,7 @@ class Pilot:
         self.count = count
         self.camera = None if camera_params is None else KeypointCamera(camera_params)
         self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
+        self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._time = np.zeros(count, dtype=np.float32)
         self._observe, self._observe_given = Compiled(self._observed), Compiled(self._observed)
         self._decide = Compiled(self._decision)
@@ -214,6 +215,7 @@ class Pilot:
         attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
         inputs = () if keypoints is None else tuple(map(np.asarray, keypoints))
+        self._inputs = inputs
         observation, *state = self._seen(views, inputs)
         if now is not None and self._bridged(now, state):
             observation, *state = self._seen(views, inputs)
@@ -231,6 +233,13 @@ class Pilot:
         points, valid = frame if frame else (None, None)
         self.spent = (decided - begin, time.perf_counter() - decided)
         return PilotOutput(action, command, release, observation, points, valid)
+
+    @torch.inference_mode()
+    def warm(self) -> None:
+        """Compute the last step again and forget it, so that programs and weights are in the caches
+        when the next step comes.
+        """
+        self._decide(self._seen(self._views, self._inputs)[0], self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of
