@@ -7,6 +7,7 @@ whose vector and scalar paths agree are used (``atan``, not ``atan2``, whose rem
 otherwise), so that a batch of N equals N singles bit for bit on the CPU."""
 
 import torch
+from torch import Tensor
 
 from camera.params import FisheyeParams
 
@@ -65,13 +66,11 @@ class Fisheye:
             and params.cy - reach_y >= top
             and params.cy + reach_y <= bottom
         )
-        self._constants: dict[
-            tuple[torch.device, torch.dtype], tuple[torch.Tensor, torch.Tensor]
-        ] = {}
+        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
 
     def angle(
-        self, points_c: torch.Tensor, epsilon: float = AXIS_EPSILON
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        self, points_c: Tensor, epsilon: float = AXIS_EPSILON
+    ) -> tuple[Tensor, Tensor, Tensor]:
         """Angle off the optical axis of points.
 
         Args:
@@ -93,7 +92,7 @@ class Fisheye:
         tangent = torch.where(backward, reach, radius) / torch.where(backward, radius, reach)
         return tangent.atan() * 2.0, radius, distance
 
-    def radius_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
+    def radius_from_angle(self, theta: Tensor) -> Tensor:
         """theta_d [rad], shape of theta; past the field of view it goes on along its tangent."""
         if self._equidistant:
             return theta
@@ -105,7 +104,7 @@ class Fisheye:
             + (theta - inner) * self._edge_slope
         )
 
-    def slope_from_angle(self, theta: torch.Tensor) -> torch.Tensor:
+    def slope_from_angle(self, theta: Tensor) -> Tensor:
         """d theta_d / d theta [-], shape of theta; constant past the field of view."""
         if self._equidistant:
             return torch.ones_like(theta)
@@ -114,9 +113,7 @@ class Fisheye:
         t2 = inner * inner
         return t2 * (t2 * (t2 * (t2 * (9 * k4) + 7 * k3) + 5 * k2) + 3 * k1) + 1.0
 
-    def project_normalized(
-        self, points_c: torch.Tensor, clip: bool = False
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def project_normalized(self, points_c: Tensor, clip: bool = False) -> tuple[Tensor, Tensor]:
         """Project points to normalised image coordinates.
 
         Args:
@@ -136,7 +133,7 @@ class Fisheye:
             valid = valid & self.on_sensor(self.denormalize(normalized))
         return normalized, valid
 
-    def project(self, points_c: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
         """Project points to pixels.
 
         Args:
@@ -151,7 +148,7 @@ class Fisheye:
         scale = (self.radius_from_angle(theta) / radius).unsqueeze(-1)
         return points_c[..., :2] * scale * focal + centre, theta <= self.half_fov
 
-    def unproject(self, pixels: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         """Turn pixels into unit rays.
 
         Args:
@@ -171,17 +168,17 @@ class Fisheye:
         lateral = plane * (theta.sin() / radius).unsqueeze(-1)
         return torch.cat([lateral, theta.cos().unsqueeze(-1)], -1), valid
 
-    def normalize(self, pixels: torch.Tensor) -> torch.Tensor:
+    def normalize(self, pixels: Tensor) -> Tensor:
         """Normalised image coordinates [-] of pixels [px], both shape (..., 2)."""
         focal, centre = self._pixel_constants(pixels)
         return (pixels - centre) / (focal * self.edge_radius)
 
-    def denormalize(self, normalized: torch.Tensor) -> torch.Tensor:
+    def denormalize(self, normalized: Tensor) -> Tensor:
         """Pixels [px] of normalised image coordinates [-], both shape (..., 2)."""
         focal, centre = self._pixel_constants(normalized)
         return normalized * (focal * self.edge_radius) + centre
 
-    def on_sensor(self, pixels: torch.Tensor) -> torch.Tensor:
+    def on_sensor(self, pixels: Tensor) -> Tensor:
         """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
         bool, shape (...).
         """
@@ -189,7 +186,7 @@ class Fisheye:
         u, v = pixels.unbind(-1)
         return (u >= low) & (u <= right) & (v >= top) & (v <= bottom)
 
-    def _angle_from_radius(self, radius: torch.Tensor) -> torch.Tensor:
+    def _angle_from_radius(self, radius: Tensor) -> Tensor:
         """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last
         step.
         """
@@ -207,7 +204,7 @@ class Fisheye:
                 theta = torch.where((step < low) | (step > high), (low + high) * 0.5, step)
         return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
 
-    def _pixel_constants(self, like: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def _pixel_constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be
         captured later.
         """

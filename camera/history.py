@@ -5,9 +5,10 @@ first value on reset, so that a history never mixes two episodes and never holds
 measurement."""
 
 import torch
+from torch import Tensor
 
 
-def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> torch.Tensor:
+def push(history: Tensor, new: Tensor, reset_mask: Tensor) -> Tensor:
     """Return the history with a value put in front and the oldest dropped.
 
     Args:
@@ -23,7 +24,7 @@ def push(history: torch.Tensor, new: torch.Tensor, reset_mask: torch.Tensor) -> 
     return torch.where(mask, front, torch.cat([front, history[:, :-1]], 1))
 
 
-def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
+def at_latency(history: Tensor, latency: Tensor) -> Tensor:
     """Value that is ``latency`` steps old, linear between the two stored neighbours.
 
     Written as hat-function weights over the whole (short) history: no gather, latencies may differ
@@ -44,7 +45,7 @@ def at_latency(history: torch.Tensor, latency: torch.Tensor) -> torch.Tensor:
     return value
 
 
-def latency_weights(length: int, latency: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+def latency_weights(length: int, latency: Tensor, like: Tensor) -> Tensor:
     """Weight of each stored age: shape (E, H), rows sum to 1; (1, H) for a scalar latency."""
     ages = torch.arange(length, device=like.device, dtype=like.dtype)
     age = latency.to(like.dtype).reshape(-1, 1).clamp(0.0, length - 1.0)

@@ -7,6 +7,7 @@ them on refilled buffers and the HIL runner can pass zeros."""
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
 from camera.history import at_latency, latency_weights
 from camera.params import KeypointNoiseParams
@@ -19,18 +20,18 @@ class StepDraw(NamedTuple):
     ``wrong``: uniforms of wrong points, shape (E, K, 3): whether, and where; None where there are
     none."""
 
-    normals: torch.Tensor
-    uniforms: torch.Tensor
-    wrong: torch.Tensor | None = None
+    normals: Tensor
+    uniforms: Tensor
+    wrong: Tensor | None = None
 
 
 def apply_noise(
     params: KeypointNoiseParams,
-    keypoints: torch.Tensor,
-    valid: torch.Tensor,
-    bias: torch.Tensor,
+    keypoints: Tensor,
+    valid: Tensor,
+    bias: Tensor,
     draw: StepDraw,
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Add noise and bias, drop points out, and set what invalid points read.
 
     Args:
@@ -63,9 +64,7 @@ def apply_noise(
     )
 
 
-def apply_latency(
-    history: torch.Tensor, valid_history: torch.Tensor, latency: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tuple[Tensor, Tensor]:
     """Keypoints as they were ``latency`` steps ago.
 
     Args:

@@ -5,6 +5,7 @@ ball.
 the HIL runner with a batch of one."""
 
 import torch
+from torch import Tensor
 
 from camera.fisheye import AXIS_EPSILON, Fisheye
 from camera.mount import nominal_rot_cb, points_c_from_w, rotate, rotation_from_vector
@@ -52,15 +53,13 @@ class KeypointCamera:
         self.fisheye = Fisheye(params.fisheye)
         self.rot_cb = nominal_rot_cb(params.mount).to(device=device, dtype=dtype)
         self.position_b = torch.tensor(params.mount.position_b, device=device, dtype=dtype)
-        self.radius: float | torch.Tensor = params.payload_radius
+        self.radius: float | Tensor = params.payload_radius
         self.square_w = goal_square(params.goal_side).to(device=device, dtype=dtype)
         self.edge_reads = params.noise.invalid_reads == "edge"
         self._axes = torch.eye(2, 3, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
-    def extrinsics(
-        self, rotation_error: torch.Tensor, position_error: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    def extrinsics(self, rotation_error: Tensor, position_error: Tensor) -> tuple[Tensor, Tensor]:
         """Extrinsics with an error per environment:
 
         ``rot_bc = exp(rotation_error) rot_bc_nominal``, in the body frame.
@@ -78,7 +77,7 @@ class KeypointCamera:
         return rotate(turn, self.rot_cb.expand(turn.shape)), self.position_b + position_error
 
 
-def goal_square(side: float) -> torch.Tensor:
+def goal_square(side: float) -> Tensor:
     """Corners of the goal square from its centre [m], float64, shape (4, 3), world frame.
 
     Convention: (+x, +y), (+x, -y), (-x, -y), (-x, +y), so clockwise seen from above and, from a
@@ -90,9 +89,7 @@ def goal_square(side: float) -> torch.Tensor:
     )
 
 
-def goal_corners_w(
-    goal_w: torch.Tensor, side: float = 0.25, square_w: torch.Tensor | None = None
-) -> torch.Tensor:
+def goal_corners_w(goal_w: Tensor, side: float = 0.25, square_w: Tensor | None = None) -> Tensor:
     """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
 
     Args:
@@ -111,10 +108,10 @@ def goal_corners_w(
 
 def ball_extremes_c(
     fisheye: Fisheye,
-    ball_c: torch.Tensor,
-    radius: float | torch.Tensor,
-    axes: torch.Tensor | None = None,
-) -> torch.Tensor:
+    ball_c: Tensor,
+    radius: float | Tensor,
+    axes: Tensor | None = None,
+) -> Tensor:
     """Rays to the leftmost, topmost, rightmost and bottommost point of a ball's outline in the
     image.
 
@@ -158,7 +155,7 @@ def ball_extremes_c(
     return torch.cat([middle - step, middle + step], -2)
 
 
-def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
+def box_midpoints(extremes: Tensor) -> Tensor:
     """Edge midpoints of the axis-aligned box through four extreme points.
 
     A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a
@@ -177,19 +174,17 @@ def box_midpoints(extremes: torch.Tensor) -> torch.Tensor:
     bottom = extremes[:, 3, 1]
     u = (low + right) * 0.5
     v = (top + bottom) * 0.5
-    middles: torch.Tensor = torch.stack([low, v, u, top, right, v, u, bottom], -1).unflatten(
-        -1, (4, 2)
-    )
+    middles: Tensor = torch.stack([low, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
     return middles
 
 
 def corrected_keypoints(
     camera: KeypointCamera,
-    points: torch.Tensor,
-    valid: torch.Tensor,
-    turn_b: torch.Tensor,
-    scale: torch.Tensor,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    points: Tensor,
+    valid: Tensor,
+    turn_b: Tensor,
+    scale: Tensor,
+) -> tuple[Tensor, Tensor]:
     """Keypoints of a camera that is turned and whose focal length is another one, as the nominal
     camera would see them.
 
@@ -215,9 +210,7 @@ def corrected_keypoints(
     return projected * valid.unsqueeze(-1), valid
 
 
-def payload_keypoints(
-    camera: KeypointCamera, ball_c: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def payload_keypoints(camera: KeypointCamera, ball_c: Tensor) -> tuple[Tensor, Tensor]:
     """Payload keypoints alone: what a detector's box around the ball would give.
 
     Args:
@@ -236,12 +229,12 @@ def payload_keypoints(
 
 def keypoints(
     camera: KeypointCamera,
-    pos_w: torch.Tensor,
-    rot_wb: torch.Tensor,
-    goal_w: torch.Tensor,
-    payload_w: torch.Tensor,
-    extrinsics: tuple[torch.Tensor, torch.Tensor] | None = None,
-) -> tuple[torch.Tensor, torch.Tensor]:
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    goal_w: Tensor,
+    payload_w: Tensor,
+    extrinsics: tuple[Tensor, Tensor] | None = None,
+) -> tuple[Tensor, Tensor]:
     """Keypoints of goal and payload as the camera sees them, without noise.
 
     Args:
@@ -275,9 +268,7 @@ def keypoints(
     return by_rule(camera, points, valid)
 
 
-def by_rule(
-    camera: KeypointCamera, points: torch.Tensor, valid: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def by_rule(camera: KeypointCamera, points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
     """Apply ``invalid_reads`` to points that are clipped to the edge.
 
     Args:

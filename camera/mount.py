@@ -8,6 +8,7 @@ the onboard batch of one bit for bit."""
 import math
 
 import torch
+from torch import Tensor
 
 from camera.params import MountParams
 
@@ -17,7 +18,7 @@ axis) = -z_b.
 """
 
 
-def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
+def rotation_from_vector(vector: Tensor) -> Tensor:
     """Rotation matrix of a rotation vector (Rodrigues), finite and differentiable at zero.
 
     Args:
@@ -42,21 +43,21 @@ def rotation_from_vector(vector: torch.Tensor) -> torch.Tensor:
         b * y * z + a * x,
         1.0 - b * (x * x + y * y),
     ]
-    rot: torch.Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
+    rot: Tensor = torch.stack(rows, -1).unflatten(-1, (3, 3))
     return rot
 
 
-def nominal_rot_cb(mount: MountParams) -> torch.Tensor:
+def nominal_rot_cb(mount: MountParams) -> Tensor:
     """rot_cb of the mount without error, float64, shape (3, 3)."""
     roll, pitch, yaw = (math.radians(a) for a in mount.rpy_deg)
     axes = torch.diag(torch.tensor([roll, pitch, yaw], dtype=torch.float64))
     about_x, about_y, about_z = rotation_from_vector(axes)
     down = torch.tensor(DOWNWARD_ROT_CB, dtype=torch.float64)
-    rot_cb: torch.Tensor = down @ (about_z @ about_y @ about_x).T
+    rot_cb: Tensor = down @ (about_z @ about_y @ about_x).T
     return rot_cb
 
 
-def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
+def rotate(rot: Tensor, vectors: Tensor) -> Tensor:
     """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
 
     Args:
@@ -74,12 +75,12 @@ def rotate(rot: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 
 
 def points_c_from_w(
-    points_w: torch.Tensor,
-    pos_w: torch.Tensor,
-    rot_wb: torch.Tensor,
-    rot_cb: torch.Tensor,
-    position_b: torch.Tensor,
-) -> torch.Tensor:
+    points_w: Tensor,
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    rot_cb: Tensor,
+    position_b: Tensor,
+) -> Tensor:
     """Bring world points into the camera frame.
 
     Args:

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
@@ -24,8 +25,8 @@ def draw_overlay(
     camera: KeypointCamera,
     keypoints: torch.Tensor,
     valid: torch.Tensor,
-    image: np.ndarray | None = None,
-) -> np.ndarray:
+    image: ndarray | None = None,
+) -> ndarray:
     """Draw keypoints, field of view and body axes.
 
     Goal corners are joined to a green square and the payload's edge midpoints to a red box; where
@@ -66,7 +67,7 @@ def draw_overlay(
     return canvas
 
 
-def _fixed(points: np.ndarray) -> np.ndarray:
+def _fixed(points: ndarray) -> ndarray:
     """Pixels as OpenCV's fixed-point integers; far outside the image they are cut off before they
     overflow.
     """

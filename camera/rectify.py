@@ -7,6 +7,7 @@ import math
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
@@ -26,7 +27,7 @@ class ViewParams:
     pitch_deg: float = 0.0  # [deg]
 
 
-def view_rotation(view: ViewParams) -> torch.Tensor:
+def view_rotation(view: ViewParams) -> Tensor:
     """Rotation from the view's frame to the fisheye's camera frame, float64, shape (3, 3)."""
     yaw = math.radians(view.yaw_deg)
     pitch = math.radians(view.pitch_deg)
@@ -45,7 +46,7 @@ def view_focal(view: ViewParams) -> float:
     return view.width / 2.0 / math.tan(math.radians(view.fov_deg) / 2.0)
 
 
-def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tensor]:
+def view_map(lens: Fisheye, view: ViewParams) -> tuple[Tensor, Tensor]:
     """Return the place in the fisheye frame that each pixel of a view comes from.
 
     Returns pixels [px], float64, shape (H, W, 2), and whether they lie in the field of view and on
@@ -59,7 +60,7 @@ def view_map(lens: Fisheye, view: ViewParams) -> tuple[torch.Tensor, torch.Tenso
     return pixels, valid & lens.on_sensor(pixels)
 
 
-def rectify(frames: torch.Tensor, lens: Fisheye, view: ViewParams) -> torch.Tensor:
+def rectify(frames: Tensor, lens: Fisheye, view: ViewParams) -> Tensor:
     """Cut a rectified (pinhole) view out of fisheye frames.
 
     Raises ValueError: the frames do not have the lens's size, or the view is no pinhole.

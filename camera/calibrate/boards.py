@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams, monotonic_limit
@@ -53,7 +54,7 @@ class BoardParams:
                 f" square's {self.square_size} m"
             )
 
-    def corners_m(self) -> np.ndarray:
+    def corners_m(self) -> ndarray:
         """Points row by row [m], float64, shape (rows * columns, 3), board frame."""
         x, y = np.meshgrid(np.arange(self.columns), np.arange(self.rows))
         return np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) * self.square_size
@@ -79,8 +80,8 @@ class View:
     [px], shape (N, 2).
     """
 
-    points_m: np.ndarray
-    pixels: np.ndarray
+    points_m: ndarray
+    pixels: ndarray
 
 
 @dataclass(frozen=True)
@@ -100,7 +101,7 @@ class BoardReport:
     left_out: dict[int, str] = field(default_factory=dict)
 
 
-def find_board(image: np.ndarray, board: BoardParams) -> View | None:
+def find_board(image: ndarray, board: BoardParams) -> View | None:
     """Find a board in a picture.
 
     Args:
@@ -139,7 +140,7 @@ def find_board(image: np.ndarray, board: BoardParams) -> View | None:
     return None
 
 
-def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.ndarray:
+def _refine(grey: ndarray, corners: ndarray, share: float = 0.45) -> ndarray:
     """Corners at sub-pixel accuracy, from windows that reach a share of the way to the nearest
     other corner.
 
@@ -162,7 +163,7 @@ def _refine(grey: np.ndarray, corners: np.ndarray, share: float = 0.45) -> np.nd
 
 
 def calibrate_from_boards(
-    images: list[np.ndarray], board: BoardParams, fov_deg: float = 180.0
+    images: list[ndarray], board: BoardParams, fov_deg: float = 180.0
 ) -> tuple[FisheyeParams, BoardReport]:
     """Calibrate a fisheye from pictures of a board.
 
@@ -253,9 +254,7 @@ def _solved(views: list[View], width: int, height: int, fov_deg: float) -> Fishe
     return FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, min(fov_deg, widest, 360.0))
 
 
-def check_boards(
-    images: list[np.ndarray], board: BoardParams, fisheye: FisheyeParams
-) -> BoardReport:
+def check_boards(images: list[ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:
     """Reprojection error of a given lens on pictures of a board: each board's pose is fitted, the
     lens is left as it is.
 
@@ -277,7 +276,7 @@ def check_boards(
 
 
 def find_boards(
-    images: list[np.ndarray], board: BoardParams
+    images: list[ndarray], board: BoardParams
 ) -> tuple[tuple[int, int], list[View | None]]:
     """Size (height, width) of all pictures, and what each shows of the board.
 
@@ -298,7 +297,7 @@ def find_boards(
     return sizes[0], views
 
 
-def board_pose(lens: Fisheye, view: View) -> np.ndarray:
+def board_pose(lens: Fisheye, view: View) -> ndarray:
     """Pose of a board by least squares of its pixels: rotation vector [rad] and place of its first
     point [m], shape (6,), camera frame.
     """
@@ -318,7 +317,7 @@ def board_pose(lens: Fisheye, view: View) -> np.ndarray:
         view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
     )
 
-    def residual(pose: np.ndarray) -> np.ndarray:
+    def residual(pose: ndarray) -> ndarray:
         return _residual(lens, view, pose)
 
     return np.asarray(
@@ -326,14 +325,14 @@ def board_pose(lens: Fisheye, view: View) -> np.ndarray:
     )
 
 
-def reprojected(lens: Fisheye, view: View) -> np.ndarray:
+def reprojected(lens: Fisheye, view: View) -> ndarray:
     """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was
     fitted.
     """
     return np.asarray(view.pixels + _residual(lens, view, board_pose(lens, view)).reshape(-1, 2))
 
 
-def _residual(lens: Fisheye, view: View, pose: np.ndarray) -> np.ndarray:
+def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:
     """Reprojected less seen pixels [px], shape (2 N,), of a board at a pose (rotation vector,
     place).
     """
@@ -343,7 +342,7 @@ def _residual(lens: Fisheye, view: View, pose: np.ndarray) -> np.ndarray:
     return np.asarray(lens.project(torch.from_numpy(points_c))[0].numpy() - view.pixels).ravel()
 
 
-def _report(residuals: list[np.ndarray | None]) -> BoardReport:
+def _report(residuals: list[ndarray | None]) -> BoardReport:
     """Errors of pictures from their residuals, shape (2 N,) each."""
     together = np.concatenate([r for r in residuals if r is not None])
     errors = (np.nan if r is None else float(np.sqrt(2.0 * np.mean(r * r))) for r in residuals)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.detectors.edges import (
     circles_of,
@@ -72,7 +73,7 @@ class DetectorParams(BoundedFields):
 class BallSeen:
     """The ball as a cone of rays."""
 
-    ray_c: np.ndarray  # unit, to the centre, shape (3,), camera frame
+    ray_c: ndarray  # unit, to the centre, shape (3,), camera frame
     half_angle: float  # [rad]
     score: float  # share of the outline seen, less the misfit, less the way from where it was
 
@@ -82,7 +83,7 @@ class GoalSeen:
     """The goal square by its corners."""
 
     # unit, to the outer corners, clockwise in the image, shape (4, 3), camera frame
-    rays_c: np.ndarray
+    rays_c: ndarray
     score: float
 
 
@@ -99,18 +100,18 @@ class FrameDetections:
 class Prior:
     """Prior knowledge of a frame; each part may be missing."""
 
-    up_c: np.ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
+    up_c: ndarray | None = None  # the world's up in the camera frame, unit, shape (3,)
     height: float | None = (
         None  # of the lens above the ground [m]; with up_c the goal's size is checked
     )
     ball_distance: tuple[float, float] | None = (
         None  # of the ball from the lens [m], narrower than the parameters'
     )
-    ball_ray_c: np.ndarray | None = None  # to where the ball is expected, unit, shape (3,)
+    ball_ray_c: ndarray | None = None  # to where the ball is expected, unit, shape (3,)
     ball_within: float = math.radians(12.0)  # of ball_ray_c, `GATE` standard deviations [rad]
-    goal_ray_c: np.ndarray | None = None  # to where the goal's middle is expected, unit, shape (3,)
+    goal_ray_c: ndarray | None = None  # to where the goal's middle is expected, unit, shape (3,)
     goal_within: float = math.radians(12.0)  # of goal_ray_c, likewise [rad]
-    north_c: np.ndarray | None = None  # the world's x in the camera frame, unit, shape (3,)
+    north_c: ndarray | None = None  # the world's x in the camera frame, unit, shape (3,)
 
 
 class Detector:
@@ -142,7 +143,7 @@ class Detector:
         )
         self._in_view = (plane < edge).astype(np.uint8)
 
-    def detect(self, image: np.ndarray, prior: Prior | None = None) -> FrameDetections:
+    def detect(self, image: ndarray, prior: Prior | None = None) -> FrameDetections:
         """Find ball and goal. Raises ValueError: an image of another size or type.
 
         Args:
@@ -162,7 +163,7 @@ class Detector:
         squares = self._squares(*goal, colours.bright, prior)
         return FrameDetections(self._ball(*ball, prior), squares[0] if squares else None, squares)
 
-    def check(self, image: np.ndarray) -> None:
+    def check(self, image: ndarray) -> None:
         """Raise ValueError for an image of another size or type."""
         shape = (*self._in_view.shape, 3)
         if image.shape != shape or image.dtype != np.uint8:
@@ -171,7 +172,7 @@ class Detector:
                 " uint8"
             )
 
-    def _ball(self, mask: np.ndarray, level: np.ndarray, prior: Prior) -> BallSeen | None:
+    def _ball(self, mask: ndarray, level: ndarray, prior: Prior) -> BallSeen | None:
         """The blob whose edge is the best cone; where none is, what stands out by its colour from
         where the ball is expected.
         """
@@ -181,7 +182,7 @@ class Detector:
         return best
 
     def _best_cone(
-        self, circles: list[tuple[np.ndarray, float]], level: np.ndarray, prior: Prior
+        self, circles: list[tuple[ndarray, float]], level: ndarray, prior: Prior
     ) -> BallSeen | None:
         best: BallSeen | None = None
         for centre, radius in circles:
@@ -199,7 +200,7 @@ class Detector:
                 best = BallSeen(cone.ray_c, cone.half_angle, score)
         return best
 
-    def _expected(self, level: np.ndarray, prior: Prior) -> BallSeen | None:
+    def _expected(self, level: ndarray, prior: Prior) -> BallSeen | None:
         """A ball on a ground or beside a thing that has its colour too, about where it
         is expected.
         """
@@ -219,7 +220,7 @@ class Detector:
         circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
         return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, prior)
 
-    def _cone(self, level: np.ndarray, centre: np.ndarray, radius: float) -> BallSeen | None:
+    def _cone(self, level: ndarray, centre: ndarray, radius: float) -> BallSeen | None:
         """The cone about a circle [px]; looked for again from where it was found, as part of a ball
         may hide.
         """
@@ -242,7 +243,7 @@ class Detector:
             radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
         return best
 
-    def _in_place(self, ray: np.ndarray, half_angle: float, prior: Prior) -> bool:
+    def _in_place(self, ray: ndarray, half_angle: float, prior: Prior) -> bool:
         """Whether a ball can be where a cone puts it: its true radius says how far off it is."""
         distance = self.radius / max(math.sin(half_angle), 1e-9)
         low, high = prior.ball_distance or self.params.ball_distance
@@ -258,7 +259,7 @@ class Detector:
         return prior.height + distance * float(ray @ prior.up_c) > -DISTANCE_ERROR * distance
 
     def _squares(
-        self, mask: np.ndarray, level: np.ndarray, bright: np.ndarray, prior: Prior
+        self, mask: ndarray, level: ndarray, bright: ndarray, prior: Prior
     ) -> tuple[GoalSeen, ...]:
         """The blobs that are squares with a rim, the best first."""
         fits = [
@@ -270,7 +271,7 @@ class Detector:
         ]
         return tuple(sorted(squares, key=lambda square: -square.score))
 
-    def _right_size(self, rays_c: np.ndarray, prior: Prior) -> bool:
+    def _right_size(self, rays_c: ndarray, prior: Prior) -> bool:
         """Whether the corners lie on the ground, a goal's side from one another; true where that
         cannot be told.
         """
@@ -284,7 +285,7 @@ class Detector:
         return bool(np.all(np.abs(sides / self.side - 1.0) < self.params.side_tolerance))
 
 
-def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
+def ordered_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
     """Corners in the order of `camera.keypoints.goal_square`, by where they lie on the ground.
 
     Args:
@@ -307,7 +308,7 @@ def ordered_corners(rays_c: np.ndarray, rot_wc: np.ndarray) -> np.ndarray:
 
 
 def detected_keypoints(
-    camera: KeypointCamera, detections: FrameDetections, rot_wb: np.ndarray
+    camera: KeypointCamera, detections: FrameDetections, rot_wb: ndarray
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Keypoints of the training camera from what was seen, by the functions that training calls.
 

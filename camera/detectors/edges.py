@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.fisheye import Fisheye
 
@@ -37,12 +38,12 @@ LEAST_LEVEL = 8.0  # colour inside an edge that is too faint to have one, of 255
 class Colours:
     """A frame, smoothed against the sensor's noise: what all looks at it share."""
 
-    bgr: tuple[np.ndarray, np.ndarray, np.ndarray]  # uint8, shape (H, W) each
-    hsv: np.ndarray  # uint8, hue 256 a turn, shape (H, W, 3)
-    bright: np.ndarray  # greatest channel, uint8, shape (H, W)
+    bgr: tuple[ndarray, ndarray, ndarray]  # uint8, shape (H, W) each
+    hsv: ndarray  # uint8, hue 256 a turn, shape (H, W, 3)
+    bright: ndarray  # greatest channel, uint8, shape (H, W)
 
 
-def colours_of(image: np.ndarray) -> Colours:
+def colours_of(image: ndarray) -> Colours:
     """Smooth a frame, BGR, uint8, shape (H, W, 3)."""
     import cv2
 
@@ -60,9 +61,9 @@ def colour_maps(
     hue_deg: tuple[float, float],
     saturation: float,
     brightness: float,
-    in_view: np.ndarray,
+    in_view: ndarray,
     kind: Literal["yellow", "green"],
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[ndarray, ndarray]:
     """A colour's place in an image, and its amount.
 
     Args:
@@ -90,7 +91,7 @@ def colour_maps(
     return mask, cv2.subtract(*pair, dtype=cv2.CV_32F)
 
 
-def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
+def outlines_of(mask: ndarray) -> list[ndarray]:
     """Outlines of the blobs of a mask [px], shape (N, 2) each."""
     import cv2
 
@@ -102,7 +103,7 @@ def outlines_of(mask: np.ndarray) -> list[np.ndarray]:
     ]
 
 
-def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
+def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
     """Circles about the blobs of a mask, and about pairs of near ones, which may be one thing with
     something across it.
 
@@ -128,11 +129,11 @@ def circles_of(mask: np.ndarray) -> list[tuple[np.ndarray, float]]:
 class Edge:
     """Points of an edge."""
 
-    points: np.ndarray  # [px], shape (N, 2)
+    points: ndarray  # [px], shape (N, 2)
     share: float  # of the places where it was looked for
 
 
-def polar_edge(level: np.ndarray, centre: np.ndarray, radius: float) -> Edge:
+def polar_edge(level: ndarray, centre: ndarray, radius: float) -> Edge:
     """Edge of a disc, looked for outwards from its centre.
 
     Args:
@@ -150,7 +151,7 @@ def polar_edge(level: np.ndarray, centre: np.ndarray, radius: float) -> Edge:
     return Edge(points, float(hit.mean()))
 
 
-def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
+def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
     """Circular cone through rays: they meet the plane ``ray . n = 1`` where n is the axis over the
     cosine of the half-angle.
 
@@ -194,8 +195,8 @@ def cone_fit(rays: np.ndarray) -> tuple[np.ndarray, float, float, float]:
 
 
 def fit_goal(
-    lens: Fisheye, field_share: float, outline: np.ndarray, level: np.ndarray, bright: np.ndarray
-) -> tuple[np.ndarray, float] | None:
+    lens: Fisheye, field_share: float, outline: ndarray, level: ndarray, bright: ndarray
+) -> tuple[ndarray, float] | None:
     """The goal by a blob's outline.
 
     Args:
@@ -232,7 +233,7 @@ def fit_goal(
     )
 
 
-def _quadrangle(points: np.ndarray) -> np.ndarray | None:
+def _quadrangle(points: ndarray) -> ndarray | None:
     """Four corners about points of the tangent plane, clockwise in the image, shape (4, 2)."""
     import cv2
 
@@ -255,8 +256,8 @@ def _quadrangle(points: np.ndarray) -> np.ndarray | None:
 
 
 def _refined(
-    lens: Fisheye, corners: np.ndarray, frame: np.ndarray, level: np.ndarray
-) -> tuple[np.ndarray, float, float] | None:
+    lens: Fisheye, corners: ndarray, frame: ndarray, level: ndarray
+) -> tuple[ndarray, float, float] | None:
     """Corners by lines through the edges near each side; with the misfit over the side's length and
     the share found.
     """
@@ -301,7 +302,7 @@ def _refined(
     return met, float(np.max(misfit)), float(np.mean(share))
 
 
-def _line(points: np.ndarray) -> tuple[np.ndarray, float]:
+def _line(points: ndarray) -> tuple[ndarray, float]:
     """Line ``a x + b y = c`` (unit normal) through points, robustly, and their RMS from it."""
     weights = np.ones(len(points))
     for _ in range(6):
@@ -316,7 +317,7 @@ def _line(points: np.ndarray) -> tuple[np.ndarray, float]:
     )
 
 
-def _meet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _meet(first: ndarray, second: ndarray) -> ndarray:
     """Return the intersection of two lines; NaN if they are parallel."""
     matrix = np.array([first[:2], second[:2]])
     if abs(np.linalg.det(matrix)) < 1e-3:
@@ -324,7 +325,7 @@ def _meet(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.linalg.solve(matrix, [first[2], second[2]])
 
 
-def _scaled(corners: np.ndarray, factor: float) -> np.ndarray:
+def _scaled(corners: ndarray, factor: float) -> ndarray:
     """Corners of a square about its centre made larger, as the perspective that shows it has it."""
     import cv2
 
@@ -335,7 +336,7 @@ def _scaled(corners: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _rim_contrast(
-    lens: Fisheye, corners: np.ndarray, frame: np.ndarray, bright: np.ndarray, share: float
+    lens: Fisheye, corners: ndarray, frame: ndarray, bright: ndarray, share: float
 ) -> float:
     """Return the rim's brightness relative to its surroundings, minus one; the median along all
     sides.
@@ -344,7 +345,7 @@ def _rim_contrast(
     """
     part = np.linspace(0.15, 0.85, 8)[:, None]
 
-    def around(factor: float) -> np.ndarray:
+    def around(factor: float) -> ndarray:
         ring = _scaled(corners, factor)
         points = np.concatenate(
             [a + part * (b - a) for a, b in zip(ring, np.roll(ring, -1, axis=0))]
@@ -364,7 +365,7 @@ def _rim_contrast(
     return float(np.median(rim[readable] / np.maximum(surroundings[readable], 1.0) - 1.0))
 
 
-def _pixels(lens: Fisheye, plane: np.ndarray, frame: np.ndarray) -> np.ndarray | None:
+def _pixels(lens: Fisheye, plane: ndarray, frame: ndarray) -> ndarray | None:
     """Pixels of points of a tangent plane, shape (N, 2); None where one lies outside of
     the view.
     """
@@ -373,12 +374,12 @@ def _pixels(lens: Fisheye, plane: np.ndarray, frame: np.ndarray) -> np.ndarray |
     return pixels.numpy() if bool((valid & lens.on_sensor(pixels)).all()) else None
 
 
-def rays_of(lens: Fisheye, pixels: np.ndarray) -> np.ndarray:
+def rays_of(lens: Fisheye, pixels: ndarray) -> ndarray:
     """Unit rays through pixels [px], shape (N, 2): shape (N, 3), camera frame."""
     return lens.unproject(torch.from_numpy(np.ascontiguousarray(pixels, np.float64)))[0].numpy()
 
 
-def _basis(ray: np.ndarray) -> np.ndarray:
+def _basis(ray: ndarray) -> ndarray:
     """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to
     the camera.
     """
@@ -388,7 +389,7 @@ def _basis(ray: np.ndarray) -> np.ndarray:
     return np.column_stack([x, np.cross(ray, x), ray])
 
 
-def _sample(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
     """Bilinear values of a picture at pixels, shape of u."""
     import cv2
 
@@ -403,7 +404,7 @@ def _sample(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return values.reshape(u.shape)
 
 
-def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     """Outermost fall of each row from the level just inside to that just outside; whether there is
     one, and where.
 
@@ -430,7 +431,7 @@ def _last_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, n
     return hit, _between(values, reach, np.minimum(window[rows[:, 0], index], peak - 1), level)
 
 
-def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     """First fall of each row through half of its level at the start; whether there is one, and
     where.
     """
@@ -440,9 +441,7 @@ def _first_crossing(values: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, 
     return hit, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)
 
 
-def _between(
-    values: np.ndarray, reach: np.ndarray, index: np.ndarray, level: np.ndarray
-) -> np.ndarray:
+def _between(values: ndarray, reach: ndarray, index: ndarray, level: ndarray) -> ndarray:
     """Place between two samples where a level is crossed."""
     rows = np.arange(len(values))
     high = values[rows, index]

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy import ndarray
 
 from camera.detectors.contours import GATE, BallSeen, FrameDetections, GoalSeen, Prior
 
@@ -54,7 +55,7 @@ class BallTrack:
     across it.
     """
 
-    def __init__(self, ray_w: np.ndarray, stamp: float, spread: float, rate: float) -> None:
+    def __init__(self, ray_w: ndarray, stamp: float, spread: float, rate: float) -> None:
         """Begin with a unit ray, shape (3,), at a time [s], and standard deviations about each axis
         of it [rad] and its rate [rad/s].
         """
@@ -68,7 +69,7 @@ class BallTrack:
         """Standard deviation of the direction about each axis [rad]."""
         return math.sqrt(self._covariance[0, 0])
 
-    def predict(self, stamp: float, driven_w: np.ndarray) -> None:
+    def predict(self, stamp: float, driven_w: ndarray) -> None:
         """Turn on to a time [s]; ``driven_w``: acceleration of the direction [rad/s^2],
         shape (3,).
         """
@@ -80,7 +81,7 @@ class BallTrack:
         self.rate_w = _perpendicular(self.rate_w + dt * driven_w, self.ray_w)
         self._covariance = moved @ self._covariance @ moved.T + DRIVEN**2 * np.outer(push, push)
 
-    def correct(self, ray_w: np.ndarray) -> None:
+    def correct(self, ray_w: ndarray) -> None:
         """Take in where it was seen, shape (3,), at the time that was predicted."""
         gain = self._covariance[:, 0] / (self._covariance[0, 0] + READ**2)
         off = _perpendicular(ray_w - self.ray_w, self.ray_w)
@@ -95,7 +96,7 @@ class Square:
     log-odds by the frames so far.
     """
 
-    place_w: np.ndarray
+    place_w: ndarray
     stamp: float
     log_odds: float = 0.0
 
@@ -103,7 +104,7 @@ class Square:
 class BallGoalTracker:
     """Tracks of ball and goal in one camera."""
 
-    def __init__(self, radius: float, side: float, ball_w: np.ndarray | None = None) -> None:
+    def __init__(self, radius: float, side: float, ball_w: ndarray | None = None) -> None:
         """Begin with sizes of ball and goal [m], and a ball that hangs still at a place from the
         lens [m], shape (3,), or with none.
         """
@@ -119,9 +120,9 @@ class BallGoalTracker:
 
     def prior(
         self,
-        rot_wc: np.ndarray,
-        up_w: np.ndarray,
-        eye_w: np.ndarray,
+        rot_wc: ndarray,
+        up_w: ndarray,
+        eye_w: ndarray,
         distance: tuple[float, float] | None,
         stamp: float,
     ) -> Prior:
@@ -165,7 +166,7 @@ class BallGoalTracker:
         return Prior(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(
-        self, detections: FrameDetections, rot_wc: np.ndarray | None, stamp: float
+        self, detections: FrameDetections, rot_wc: ndarray | None, stamp: float
     ) -> FrameDetections:
         """Return the detections of a frame, with a ball that was missed where it is predicted, and
         of the squares the one that is the goal.
@@ -192,7 +193,7 @@ class BallGoalTracker:
             )
         return detections
 
-    def _goal(self, detections: FrameDetections, rot_wc: np.ndarray) -> GoalSeen | None:
+    def _goal(self, detections: FrameDetections, rot_wc: ndarray) -> GoalSeen | None:
         """Add up what a frame says of squares, of which two are no nearer than a side; returns the
         goal, unless it was missed.
         """
@@ -220,10 +221,10 @@ class BallGoalTracker:
         return max(self._squares, key=lambda square: square.log_odds)
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
+def _unit(vector: ndarray) -> ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _perpendicular(vector: np.ndarray, ray: np.ndarray) -> np.ndarray:
+def _perpendicular(vector: ndarray, ray: ndarray) -> ndarray:
     """The part of a vector across a unit ray."""
     return vector - ray * (ray @ vector)

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from numpy import ndarray
 
 from visthrow import config
 from visthrow.onboard import actions as act
@@ -63,16 +64,14 @@ class ThrowVectorEnv(VectorEnv):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[ndarray, dict[str, Any]]:
         """Start all throws; with a seed, repeatably."""
         super().reset(seed=seed)
         if seed is not None:
             self._build(seed)
         return self._numpy(self._env.reset()["actor"]), {}
 
-    def step(
-        self, actions: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+    def step(self, actions: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray, dict[str, Any]]:
         """Fly one control period with normalised actions, shape (E, 5)."""
         flown = torch.as_tensor(np.asarray(actions, np.float32), device=self._device)
         observations, rewards, dones, _ = self._env.step(flown)
@@ -87,7 +86,7 @@ class ThrowVectorEnv(VectorEnv):
         return actor, self._numpy(rewards), terminated, truncated, infos
 
     @staticmethod
-    def _numpy(values: torch.Tensor) -> np.ndarray:
+    def _numpy(values: torch.Tensor) -> ndarray:
         return values.detach().cpu().numpy().copy()
 
 
@@ -104,13 +103,13 @@ class SingleThrowEnv(gymnasium.Env):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[np.ndarray, dict[str, Any]]:
+    ) -> tuple[ndarray, dict[str, Any]]:
         """Start a throw; with a seed, repeatably."""
         super().reset(seed=seed)
         observations, infos = self._batch.reset(seed=seed)
         return observations[0], infos
 
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+    def step(self, action: ndarray) -> tuple[ndarray, float, bool, bool, dict[str, Any]]:
         """Fly one control period with a normalised action, shape (5,)."""
         observations, rewards, terminated, truncated, infos = self._batch.step(action[None])
         ended = {key: values[0] for key, values in infos.get("final_info", {}).items()}

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import PolicyError
 from visthrow.common.storage import atomic_write
@@ -65,7 +66,7 @@ class _Graph:
         self.nodes: list = []
         self.constants: list = []
 
-    def constant(self, values: np.ndarray) -> str:
+    def constant(self, values: ndarray) -> str:
         """Add an array and return its name."""
         import onnx
 
@@ -81,7 +82,7 @@ class _Graph:
         self.nodes.append(onnx.helper.make_node(operator, list(inputs), [output], **attributes))
         return output
 
-    def linear(self, x: str, weight: np.ndarray, bias: np.ndarray, output: str = "") -> str:
+    def linear(self, x: str, weight: ndarray, bias: ndarray, output: str = "") -> str:
         """Add ``x W^T + b``."""
         names = self.constant(weight), self.constant(bias)
         return self.node("Gemm", x, *names, output=output, transB=1)
@@ -130,7 +131,7 @@ def _add_estimator(graph: _Graph, estimator: Estimator) -> str:
     return graph.node("Add", direct, correction)
 
 
-def _gates(torch_gates: np.ndarray) -> np.ndarray:
+def _gates(torch_gates: ndarray) -> ndarray:
     """Return torch's gates (reset, update, new) in ONNX's order, with its axis of directions."""
     reset, update, new = np.split(torch_gates, 3)
     return np.concatenate([update, reset, new])[None]

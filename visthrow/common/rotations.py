@@ -8,6 +8,7 @@ would handle ten times slower and which give the same bits for the same input.""
 import math
 
 import numpy as np
+from numpy import ndarray
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -16,14 +17,14 @@ _SUCCESSOR = np.array([1, 2, 0])
 _LAST = np.array([2, 0, 1])
 
 
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: ndarray, b: ndarray) -> ndarray:
     """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
     vectors.
     """
     return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
-def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
+def matrix_of_quat(quat: ndarray) -> ndarray:
     """Return rotation matrices ``rot_wb``, shape (..., 3, 3), of quaternions of any length, shape
     (..., 4).
     """
@@ -42,7 +43,7 @@ def matrix_of_quat(quat: np.ndarray) -> np.ndarray:
     return out
 
 
-def quat_of_matrix(rot: np.ndarray) -> np.ndarray:
+def quat_of_matrix(rot: ndarray) -> ndarray:
     """Return unit quaternions, shape (..., 4), w not negative, of rotation matrices, shape
     (..., 3, 3): the eigenvectors of the largest eigenvalues of symmetric matrices.
 
@@ -58,13 +59,13 @@ def quat_of_matrix(rot: np.ndarray) -> np.ndarray:
     return np.where(quat[..., 3:] < 0.0, -quat, quat)
 
 
-def quat_of_vector(vector: np.ndarray) -> np.ndarray:
+def quat_of_vector(vector: ndarray) -> ndarray:
     """Return unit quaternions, shape (..., 4), of axes times angles [rad], shape (..., 3)."""
     half = 0.5 * np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([0.5 * vector * np.sinc(half / np.pi), np.cos(half)], axis=-1)
 
 
-def vectors_between(first: np.ndarray, last: np.ndarray) -> np.ndarray:
+def vectors_between(first: ndarray, last: ndarray) -> ndarray:
     """Return axes times angles, below half a turn [rad], shape (T, 3), from attitudes to others,
     quaternions of any length, shape (T, 4).
     """
@@ -75,7 +76,7 @@ def vectors_between(first: np.ndarray, last: np.ndarray) -> np.ndarray:
     return turn[:, :3] * angle / np.maximum(sine, 1e-300)
 
 
-def rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def rotate(quat: ndarray, vector: ndarray) -> ndarray:
     """Turn vectors, shape (..., 3), by unit quaternions, shape (..., 4):
 
     ``v + 2 w q x v + q x (2 q x v)``.
@@ -86,12 +87,12 @@ def rotate(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
     return vector + w * twice + cross(axis, twice)
 
 
-def rotate_back(quat: np.ndarray, vector: np.ndarray) -> np.ndarray:
+def rotate_back(quat: ndarray, vector: ndarray) -> ndarray:
     """Turn vectors, shape (..., 3), by the inverse of unit quaternions, shape (..., 4)."""
     return rotate(quat * [-1.0, -1.0, -1.0, 1.0], vector)
 
 
-def continuous(quat: np.ndarray) -> np.ndarray:
+def continuous(quat: ndarray) -> ndarray:
     """Return a series of quaternions, shape (T, 4), with signs under which neighbours
     differ least.
     """
@@ -99,7 +100,7 @@ def continuous(quat: np.ndarray) -> np.ndarray:
     return quat * np.cumprod(np.append(1.0, signs))[:, None]
 
 
-def turned(quat: np.ndarray, angle: np.ndarray) -> np.ndarray:
+def turned(quat: ndarray, angle: ndarray) -> ndarray:
     """Return unit quaternions, shape (N, 4), turned about body axes by small angles [rad], shape
     (N, 3).
     """

@@ -15,13 +15,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 # bootstrap samples: the ends of a 95 % interval then vary by a few per cent of its width
 DRAWS = 4000
 
 LEVEL = 0.95
 
-Groups = Sequence[np.ndarray]
+Groups = Sequence[ndarray]
 """One array of throws a training run, shape (N,) or (N, ...)."""
 
 
@@ -43,7 +44,7 @@ class Interval:
         return f"{form.format(self.value)} [{form.format(self.low)}, {form.format(self.high)}]"
 
 
-def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -> np.ndarray:
+def _resampled(groups: list[ndarray], rng: np.random.Generator, draws: int) -> ndarray:
     """Means of bootstrap samples, shape (draws, ...): runs drawn first, then throws within each."""
     count = len(groups)
     # means of resampled throws, for each run as many independent ones as it can be drawn
@@ -62,9 +63,9 @@ def _resampled(groups: list[np.ndarray], rng: np.random.Generator, draws: int) -
     return stacked[index, chosen, np.arange(count)[None]].mean(1)
 
 
-def _checked(groups: Groups | np.ndarray) -> list[np.ndarray]:
+def _checked(groups: Groups | ndarray) -> list[ndarray]:
     """List of runs that have throws; ValueError where there is nothing to average."""
-    listed = [groups] if isinstance(groups, np.ndarray) else list(groups)
+    listed = [groups] if isinstance(groups, ndarray) else list(groups)
     groups_with_data = [np.asarray(group, dtype=float) for group in listed if len(group)]
     if not groups_with_data or any(not np.all(np.isfinite(group)) for group in groups_with_data):
         raise ValueError(
@@ -74,7 +75,7 @@ def _checked(groups: Groups | np.ndarray) -> list[np.ndarray]:
     return groups_with_data
 
 
-def _interval(value: float, samples: np.ndarray, runs: int) -> Interval:
+def _interval(value: float, samples: ndarray, runs: int) -> Interval:
     tail = 0.5 * (1.0 - LEVEL)
     low, high = np.quantile(samples, (tail, 1.0 - tail))
     return Interval(
@@ -82,12 +83,12 @@ def _interval(value: float, samples: np.ndarray, runs: int) -> Interval:
     )
 
 
-def _mean(groups: list[np.ndarray]) -> np.ndarray:
+def _mean(groups: list[ndarray]) -> ndarray:
     """Mean of the runs' means: each run counts the same."""
     return np.mean([group.mean(0) for group in groups], axis=0)
 
 
-def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
+def mean(groups: Groups | ndarray, seed: int = 0, draws: int = DRAWS) -> Interval:
     """Mean over runs and throws, shape (N,) each, or one array for one run, with its interval by so
     many bootstrap samples.
     """
@@ -96,14 +97,12 @@ def mean(groups: Groups | np.ndarray, seed: int = 0, draws: int = DRAWS) -> Inte
     return _interval(float(_mean(groups_with_data)), samples, len(groups_with_data))
 
 
-def difference(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
+def difference(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` minus mean of ``b``, independent throws."""
     return _of_both(np.subtract, a, b, draws)
 
 
-def _of_both(
-    function: np.ufunc, a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int
-) -> Interval:
+def _of_both(function: np.ufunc, a: Groups | ndarray, b: Groups | ndarray, draws: int) -> Interval:
     first = _checked(a)
     second = _checked(b)
     rng = np.random.default_rng(0)
@@ -111,7 +110,7 @@ def _of_both(
     return _interval(function(_mean(first), _mean(second)), samples, max(len(first), len(second)))
 
 
-def paired(a: np.ndarray, b: np.ndarray) -> Interval:
+def paired(a: ndarray, b: ndarray) -> Interval:
     """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a
     failed throw are left out.
 
@@ -123,12 +122,12 @@ def paired(a: np.ndarray, b: np.ndarray) -> Interval:
     return mean(differences[np.isfinite(differences)])
 
 
-def ratio(a: Groups | np.ndarray, b: Groups | np.ndarray, draws: int = DRAWS) -> Interval:
+def ratio(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
     """Mean of ``a`` over mean of ``b``, independent throws; both positive."""
     return _of_both(np.divide, a, b, draws)
 
 
-def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
+def correlation(x: ndarray, y: ndarray) -> Interval:
     """Pearson's correlation of pairs with its interval over pairs.
 
     Raises ValueError: fewer than three pairs, or one side that never varies.
@@ -144,7 +143,7 @@ def correlation(x: np.ndarray, y: np.ndarray) -> Interval:
     return _interval(float(_pearson(x[None], y[None])[0]), samples[np.isfinite(samples)], 1)
 
 
-def _pearson(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def _pearson(x: ndarray, y: ndarray) -> ndarray:
     """Row by row; NaN where a row of one side is constant."""
     x = x - x.mean(1, keepdims=True)
     y = y - y.mean(1, keepdims=True)
@@ -176,7 +175,7 @@ class Bias:
         return ", ".join(words) or "none that shows"
 
 
-def bias(groups: Groups | np.ndarray) -> Bias:
+def bias(groups: Groups | ndarray) -> Bias:
     """Split misses of each run, shape (N, 2) [m], along the throw and to the left, into a common
     offset and scatter.
 
@@ -194,7 +193,7 @@ def bias(groups: Groups | np.ndarray) -> Bias:
     return Bias(along, lateral, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
 
 
-def pareto(points: np.ndarray) -> np.ndarray:
+def pareto(points: ndarray) -> ndarray:
     """Return the Pareto front of points (N, 2), smaller is better in both: their indices, by the
     first coordinate.
     """

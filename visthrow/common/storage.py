@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import StorageError
 
@@ -90,7 +91,7 @@ def write_json(path: str | Path, value: Any) -> None:
     atomic_write(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
 
-def savez(path: str | Path, arrays: dict[str, np.ndarray]) -> None:
+def savez(path: str | Path, arrays: dict[str, ndarray]) -> None:
     """Write named arrays as a compressed ``.npz``, atomically and without pickle; ValueError if one
     holds Python objects.
     """
@@ -142,7 +143,7 @@ def counted(lines: Iterable[str], length: int, name: str) -> Iterator[str]:
             print(f"{name}: {done / length:.0%} read", file=sys.stderr, flush=True)
 
 
-def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.ndarray]:
+def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, ndarray]:
     """Read all arrays of an ``.npz`` without pickle.
 
     Raises Exception: of class ``error``: no such file, cut short, damaged, not what it should be,
@@ -172,14 +173,14 @@ def loadz(path: str | Path, error: type[Exception], what: str) -> dict[str, np.n
         ) from cause
 
 
-def json_array(value: Any) -> np.ndarray:
+def json_array(value: Any) -> ndarray:
     """Pack a JSON-able value into an array of bytes, for storage in an ``.npz``."""
     return np.frombuffer(
         json.dumps(value, sort_keys=True, allow_nan=False).encode("utf-8"), dtype=np.uint8
     )
 
 
-def from_json_array(array: np.ndarray) -> Any:
+def from_json_array(array: ndarray) -> Any:
     """Undo ``json_array``; ValueError if the array holds no JSON."""
     return json.loads(np.asarray(array, dtype=np.uint8).tobytes().decode("utf-8"))
 
@@ -189,6 +190,6 @@ def _without_nan(value: Any) -> Any:
         return {str(key): _without_nan(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_without_nan(item) for item in value]
-    if isinstance(value, np.generic | np.ndarray):
+    if isinstance(value, np.generic | ndarray):
         return _without_nan(value.tolist())
     return None if isinstance(value, float) and not np.isfinite(value) else value

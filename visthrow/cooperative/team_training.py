@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
@@ -68,7 +69,7 @@ class TeamTraining(PPOTraining):
 @torch.inference_mode()
 def fly(
     experiment: TeamExperiment,
-    policy: Callable[[torch.Tensor], torch.Tensor],
+    policy: Callable[[Tensor], Tensor],
     *,
     fault: str = "none",
     target: float = 2.0,
@@ -95,7 +96,7 @@ def fly(
         env = TeamEnv(as_flown(experiment, fault), device, seed, rows, build)
         env.fix_goal(torch.tensor([target, 0.0, 0.0], device=device))
         observations = env.reset()
-        results: dict[str, torch.Tensor] = {}
+        results: dict[str, Tensor] = {}
         waiting = torch.ones(count, dtype=torch.bool, device=device)
         for _ in range(env.max_episode_length + 1):
             if record is not None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from visthrow.common import style
 from visthrow.common.free_fall import free_flight
@@ -29,15 +30,15 @@ class ThrowTrack:
     World frame, [m] and [s].
     """
 
-    time: np.ndarray  # (T,)
-    pos_w: np.ndarray  # (T, V, 3)
-    frames_w: np.ndarray  # of :data:`DIAGONALS`, (T, V, 2, 2, 3)
-    cables_w: np.ndarray  # joints, (T, V, L + 1, 3)
-    attached: np.ndarray  # (T, V), bool
-    load_w: np.ndarray  # (T, 3)
-    flight_time: np.ndarray  # after the last separation, (N,)
-    flight_w: np.ndarray  # of the load, (N, 3)
-    goal_w: np.ndarray  # (3,)
+    time: ndarray  # (T,)
+    pos_w: ndarray  # (T, V, 3)
+    frames_w: ndarray  # of :data:`DIAGONALS`, (T, V, 2, 2, 3)
+    cables_w: ndarray  # joints, (T, V, L + 1, 3)
+    attached: ndarray  # (T, V), bool
+    load_w: ndarray  # (T, 3)
+    flight_time: ndarray  # after the last separation, (N,)
+    flight_w: ndarray  # of the load, (N, 3)
+    goal_w: ndarray  # (3,)
     landing_error: float
     released: bool
 
@@ -46,7 +47,7 @@ def record_throw(
     experiment: TeamExperiment, policy: Callable[[torch.Tensor], torch.Tensor], **options: Any
 ) -> ThrowTrack:
     """Fly one throw; options as of :func:`visthrow.cooperative.team_training.fly`."""
-    rows: list[tuple[np.ndarray, ...]] = []
+    rows: list[tuple[ndarray, ...]] = []
 
     def record(env: TeamEnv) -> None:
         state = env.views.state
@@ -111,11 +112,11 @@ def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
 
     from visthrow.view.rerun_view import TIMELINE, colour_code, recording
 
-    def lines(name: str, strips: np.ndarray, width: float, colour: str) -> None:
+    def lines(name: str, strips: ndarray, width: float, colour: str) -> None:
         strip = rr.LineStrips3D(strips, radii=width, colors=[colour_code(colour)])
         stream.log(f"world/{name}", strip)
 
-    def ball(name: str, place_w: np.ndarray, size: float, colour: str) -> None:
+    def ball(name: str, place_w: ndarray, size: float, colour: str) -> None:
         point = rr.Points3D([place_w], radii=size, colors=[colour_code(colour)])
         stream.log(f"world/{name}", point)
 

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
+from torch import Tensor
 
 from camera.detectors.contours import Detector, FrameDetections, detected_keypoints
 from camera.detectors.following import BallGoalTracker
@@ -33,12 +35,12 @@ THINGS = ("ball", "goal")  # what they look for
 
 def render_hall(
     params: CameraParams,
-    pos_w: torch.Tensor,
-    rot_wb: torch.Tensor,
-    ball_w: torch.Tensor,
-    goal_w: torch.Tensor,
+    pos_w: Tensor,
+    rot_wb: Tensor,
+    ball_w: Tensor,
+    goal_w: Tensor,
     samples: int,
-) -> np.ndarray:
+) -> ndarray:
     """Render a grey hall with vehicle, ball and goal square.
 
     Args:
@@ -110,15 +112,15 @@ class RenderedEyes:
         self._looks = 0
         self._hall: Scenes | None = None
         self._followed: list[BallGoalTracker] = []
-        self.frames: list[tuple[np.ndarray, torch.Tensor, torch.Tensor]] = []
-        self.seen: tuple[np.ndarray, np.ndarray] | None = None
+        self.frames: list[tuple[ndarray, Tensor, Tensor]] = []
+        self.seen: tuple[ndarray, ndarray] | None = None
         self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
         # looks of each vehicle in which it was found
         self._hits = {name: np.zeros(count, int) for name in THINGS}
 
     def look(
-        self, snapshot: Any, measured: Any, goal_w: np.ndarray, carried: Sequence[bool] | np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, snapshot: Any, measured: Any, goal_w: ndarray, carried: Sequence[bool] | ndarray
+    ) -> tuple[ndarray, ndarray]:
         """Take and look at a picture of each vehicle: normalised keypoints, float32, shape (E, 8,
         2), and validity, shape (E, 8).
 
@@ -163,7 +165,7 @@ class RenderedEyes:
         self.found["refused"] = len(lost)
         return lost
 
-    def _hanging(self, rot_wb: np.ndarray) -> BallGoalTracker:
+    def _hanging(self, rot_wb: ndarray) -> BallGoalTracker:
         """Return a ball that hangs still below a vehicle: where it is looked for first."""
         from_lens = rot_wb @ (self._mount_b - np.array(self.params.mount.position_b))
         return BallGoalTracker(
@@ -172,10 +174,10 @@ class RenderedEyes:
 
     def _looked(
         self,
-        picture: np.ndarray,
+        picture: ndarray,
         e: int,
-        pos_w: np.ndarray,
-        rot_wb: np.ndarray,
+        pos_w: ndarray,
+        rot_wb: ndarray,
         carried: bool,
         stamp: float,
     ) -> FrameDetections:
@@ -212,7 +214,7 @@ class RenderedEyes:
         atomic_write(path, cv2.imencode(".png", sheet)[1].tobytes())
         return path
 
-    def _scenes(self, snapshot: Any, goal_w: np.ndarray, carried: np.ndarray) -> Scenes:
+    def _scenes(self, snapshot: Any, goal_w: ndarray, carried: ndarray) -> Scenes:
         """Return the halls with vehicles, balls and squares where they are."""
         tensor = lambda value: torch.from_numpy(np.array(value, float)).float()  # noqa: E731
         rot = rotation_from_quat(tensor(snapshot.quat_wb))

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from camera.keypoints import (
@@ -100,17 +101,17 @@ class Spreads(Bounded):
 class Hovered:
     """The measurements of a hover, a row for each step, on one clock."""
 
-    time: np.ndarray  # [s], shape (N,)
-    pos_w: np.ndarray  # [m], shape (N, 3)
-    quat_wb: np.ndarray  # xyzw, shape (N, 4)
-    vel_w: np.ndarray  # [m/s], shape (N, 3)
-    rate_b: np.ndarray  # [rad/s], shape (N, 3)
-    thrust: np.ndarray  # commanded, collective [N], shape (N,)
-    keypoints: np.ndarray  # normalised [-], shape (N, 8, 2)
-    valid: np.ndarray  # shape (N, 8), bool
-    goal_w: np.ndarray  # [m], shape (3,)
+    time: ndarray  # [s], shape (N,)
+    pos_w: ndarray  # [m], shape (N, 3)
+    quat_wb: ndarray  # xyzw, shape (N, 4)
+    vel_w: ndarray  # [m/s], shape (N, 3)
+    rate_b: ndarray  # [rad/s], shape (N, 3)
+    thrust: ndarray  # commanded, collective [N], shape (N,)
+    keypoints: ndarray  # normalised [-], shape (N, 8, 2)
+    valid: ndarray  # shape (N, 8), bool
+    goal_w: ndarray  # [m], shape (3,)
     # of the keypoints beyond the poses', as far as it is stated [s], shape (N,); None: 0
-    age: np.ndarray | None = None
+    age: ndarray | None = None
 
 
 @dataclass(frozen=True)

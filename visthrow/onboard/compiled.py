@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 Shapes = tuple[tuple[tuple[int, ...], np.dtype[Any]], ...]
@@ -25,7 +26,7 @@ class Compiled:
         self.plain = function
         self._programs: dict[Shapes, Callable[..., tuple[Tensor, ...]]] = {}
 
-    def __call__(self, *arrays: np.ndarray) -> tuple[np.ndarray, ...]:
+    def __call__(self, *arrays: ndarray) -> tuple[ndarray, ...]:
         """Run the function; results share no memory with the arguments."""
         shapes = tuple((array.shape, array.dtype) for array in arrays)
         program = self._programs.get(shapes)
@@ -33,7 +34,7 @@ class Compiled:
             program = self._programs[shapes] = self._compile(arrays)
         return tuple(tensor.numpy().copy() for tensor in program(*map(torch.from_numpy, arrays)))
 
-    def _compile(self, arrays: tuple[np.ndarray, ...]) -> Callable[..., tuple[Tensor, ...]]:
+    def _compile(self, arrays: tuple[ndarray, ...]) -> Callable[..., tuple[Tensor, ...]]:
         examples = tuple(torch.from_numpy(array.copy()) for array in arrays)
         with warnings.catch_warnings(), torch.inference_mode(False), torch.no_grad():
             warnings.simplefilter("ignore")  # of branches that depend on shapes alone

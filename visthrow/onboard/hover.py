@@ -7,6 +7,7 @@ one on board."""
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
@@ -68,7 +69,7 @@ class HoverController:
         self.period = period
         self._integral_w = np.zeros((count, 3))
 
-    def reset(self, mask: np.ndarray | None = None) -> None:
+    def reset(self, mask: ndarray | None = None) -> None:
         """Empty the integrals of the vehicles where ``mask`` (E,) is true, of all
         without a mask.
         """
@@ -76,13 +77,13 @@ class HoverController:
 
     def step(
         self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray,
-        vel_w: np.ndarray,
-        goal_w: np.ndarray,
-        mass: float | np.ndarray,
-        yaw: float | np.ndarray = 0.0,
-    ) -> np.ndarray:
+        pos_w: ndarray,
+        quat_wb: ndarray,
+        vel_w: ndarray,
+        goal_w: ndarray,
+        mass: float | ndarray,
+        yaw: float | ndarray = 0.0,
+    ) -> ndarray:
         """Return the command that brings the vehicles to their goals.
 
         Args:
@@ -110,7 +111,7 @@ class HoverController:
         command[:, 1:] = np.clip(rates_b, np.negative(params.max_rate), params.max_rate)
         return command
 
-    def _acceleration(self, pos_w: np.ndarray, vel_w: np.ndarray, goal_w: np.ndarray) -> np.ndarray:
+    def _acceleration(self, pos_w: ndarray, vel_w: ndarray, goal_w: ndarray) -> ndarray:
         params = self.params
         error_w = np.asarray(goal_w, dtype=float) - pos_w
         asked_w = params.position_gain * error_w
@@ -130,7 +131,7 @@ class HoverController:
         return acceleration_w
 
 
-def _tilt_limited(thrust_w: np.ndarray, max_tilt: float) -> np.ndarray:
+def _tilt_limited(thrust_w: ndarray, max_tilt: float) -> ndarray:
     """Shorten the horizontal part until the thrust (E, 3) leans no more than ``max_tilt`` [rad]
     from the vertical.
     """
@@ -140,9 +141,7 @@ def _tilt_limited(thrust_w: np.ndarray, max_tilt: float) -> np.ndarray:
     return np.column_stack((thrust_w[:, :2] * scale[:, None], up))
 
 
-def _rates(
-    rot_wb: np.ndarray, thrust_w: np.ndarray, yaw: np.ndarray, params: HoverParams
-) -> np.ndarray:
+def _rates(rot_wb: ndarray, thrust_w: ndarray, yaw: ndarray, params: HoverParams) -> ndarray:
     """Return body rates (E, 3) [rad/s] that turn body z onto the thrust on the shortest way, and
     the heading to yaw.
     """

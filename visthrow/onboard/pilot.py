@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy import ndarray
 from torch import Tensor
 
 from camera.history import push
@@ -50,13 +51,13 @@ millimetres in it.
 class PilotOutput:
     """The decision and the observation of one control step. NumPy, shape (E, ...)."""
 
-    action: np.ndarray  # normalised, clipped, shape (E, 5)
-    command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
-    release: np.ndarray  # whether the latch is to trip, shape (E,), bool
-    observation: np.ndarray  # shape (E, D)
+    action: ndarray  # normalised, clipped, shape (E, 5)
+    command: ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
+    release: ndarray  # whether the latch is to trip, shape (E,), bool
+    observation: ndarray  # shape (E, D)
     # normalised image coordinates, shape (E, 8, 2); None without a camera
-    keypoints: np.ndarray | None
-    valid: np.ndarray | None  # which of them are seen, shape (E, 8), bool
+    keypoints: ndarray | None
+    valid: ndarray | None  # which of them are seen, shape (E, 8), bool
 
 
 def camera_conditions(params: CameraParams) -> dict[str, Any]:
@@ -77,9 +78,7 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
     return replace(params, noise=replace(params.noise, invalid_reads=rule))
 
 
-def _resampled(
-    history: np.ndarray, sample: np.ndarray, ages: list[float], period: float
-) -> np.ndarray:
+def _resampled(history: ndarray, sample: ndarray, ages: list[float], period: float) -> ndarray:
     """`visthrow.onboard.observations.resampled`, of arrays; ``sample``: history with this
     step in it.
     """
@@ -179,21 +178,21 @@ class Pilot:
         self._unasked = self._previous[:, 4]
 
     @property
-    def previous_action(self) -> np.ndarray:
+    def previous_action(self) -> ndarray:
         """Clipped action of the last call, hover before the first one, shape (E, 5)."""
         return self._previous
 
     @torch.inference_mode()
     def act(
         self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray,
-        vel_w: np.ndarray,
-        rate_b: np.ndarray,
-        payload_w: np.ndarray,
-        goal_w: np.ndarray,
-        attached: np.ndarray | bool = True,
-        keypoints: tuple[np.ndarray, np.ndarray] | None = None,
+        pos_w: ndarray,
+        quat_wb: ndarray,
+        vel_w: ndarray,
+        rate_b: ndarray,
+        payload_w: ndarray,
+        goal_w: ndarray,
+        attached: ndarray | bool = True,
+        keypoints: tuple[ndarray, ndarray] | None = None,
         now: float | None = None,
     ) -> PilotOutput:
         """Decide one control step. Raises ValueError: an array of another shape.
@@ -247,11 +246,11 @@ class Pilot:
         """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
-    def _seen(self, views: np.ndarray, inputs: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+    def _seen(self, views: ndarray, inputs: tuple[ndarray, ...]) -> tuple[ndarray, ...]:
         """Return the observation of a step from its measurements and the memory; ``inputs``:
         keypoints of a detector.
         """
-        carried: tuple[np.ndarray, ...] = (self._previous, self._history, self._fresh)
+        carried: tuple[ndarray, ...] = (self._previous, self._history, self._fresh)
         if self.layout.response:
             carried += (self._answers,)
         if self.layout.fits:
@@ -259,7 +258,7 @@ class Pilot:
             carried += (self._goal_fit, self._time)
         return (self._observe_given if inputs else self._observe)(views, *carried, *inputs)
 
-    def _bridged(self, timestamp: float, frame: Sequence[np.ndarray]) -> bool:
+    def _bridged(self, timestamp: float, frame: Sequence[ndarray]) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps
         before this one were late or missing.
 
@@ -288,7 +287,7 @@ class Pilot:
         self._times = (timestamp, *times[: rows - 1])
         return late
 
-    def _measured(self, *views: np.ndarray | bool) -> np.ndarray:
+    def _measured(self, *views: ndarray | bool) -> ndarray:
         """Return the measurements of one step side by side, shape (E, 20): the columns of
         :data:`VIEWS`.
 
@@ -373,8 +372,8 @@ class Pilot:
 
     @torch.inference_mode()
     def see(
-        self, pos_w: np.ndarray, quat_wb: np.ndarray, payload_w: np.ndarray, goal_w: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, pos_w: ndarray, quat_wb: ndarray, payload_w: ndarray, goal_w: ndarray
+    ) -> tuple[ndarray, ndarray]:
         """Keypoints alone, as in :meth:`act`, without a decision: shape (E, 8, 2) and validity,
         shape (E, 8).
 

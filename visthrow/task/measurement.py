@@ -8,6 +8,7 @@ landed; one that ends otherwise has no landing error and counts against the succ
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import RandomizationParams
 from visthrow import config
@@ -27,15 +28,15 @@ class Throws:
     """Results of N throws at one target; entries of failed throws are NaN."""
 
     target: float  # [m] along x
-    success: np.ndarray  # shape (N,), bool
-    landing_w: np.ndarray  # [m], shape (N, 2)
-    error: np.ndarray  # [m], shape (N,)
-    duration: np.ndarray  # [s], shape (N,)
-    clearance: np.ndarray  # [m], shape (N,)
+    success: ndarray  # shape (N,), bool
+    landing_w: ndarray  # [m], shape (N, 2)
+    error: ndarray  # [m], shape (N,)
+    duration: ndarray  # [s], shape (N,)
+    clearance: ndarray  # [m], shape (N,)
     # root mean square change of the normalised commands from step to step, shape (N,)
-    smoothness: np.ndarray
+    smoothness: ndarray
     # where a moving goal is at impact [m], shape (N, 2); None where goals stand still
-    goal_w: np.ndarray | None = None
+    goal_w: ndarray | None = None
 
     def within(self, error: float) -> bool:
         """Whether they land so near on average [m], and all but one in twenty land."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.onboard.pilot import Pilot
@@ -36,11 +37,11 @@ class Sight(Protocol):
         seen: keypoints and validity of the last picture, (E, 8, 2) and (E, 8).
     """
 
-    seen: tuple[np.ndarray, np.ndarray] | None
+    seen: tuple[ndarray, ndarray] | None
 
     def look(
-        self, snapshot: Snapshot, measured: Snapshot, goal_w: np.ndarray, carried: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, snapshot: Snapshot, measured: Snapshot, goal_w: ndarray, carried: ndarray
+    ) -> tuple[ndarray, ndarray]:
         """Take a picture on each vehicle and return ``seen``.
 
         Args:
@@ -56,11 +57,11 @@ class Sight(Protocol):
 class Decision:
     """The commands of E vehicles for one period."""
 
-    command: np.ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
-    release: np.ndarray  # whether the latch is to trip, shape (E,), bool
+    command: ndarray  # collective thrust [N] and body rates [rad/s], shape (E, 4)
+    release: ndarray  # whether the latch is to trip, shape (E,), bool
     # the command normalised, and whatever else a policy puts out, shape (E, 4 or 5)
-    action: np.ndarray | None = None
-    observation: np.ndarray | None = None  # of a policy, shape (E, D)
+    action: ndarray | None = None
+    observation: ndarray | None = None  # of a policy, shape (E, D)
 
 
 class Pilots(ABC):
@@ -69,9 +70,9 @@ class Pilots(ABC):
     def __init__(
         self,
         experiment: Experiment,
-        goal_w: np.ndarray,
-        first_action: np.ndarray,
-        goal_vel_w: np.ndarray | None = None,
+        goal_w: ndarray,
+        first_action: ndarray,
+        goal_vel_w: ndarray | None = None,
     ):
         """Begin before the throw, within the experiment's bounds.
 
@@ -86,7 +87,7 @@ class Pilots(ABC):
         self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
 
     @abstractmethod
-    def decide(self, flight: "Flight", snapshot: Snapshot, latched: np.ndarray) -> Decision:
+    def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
         """Decide for all vehicles, of which those of ``flight.flown`` follow; ``latched`` are the
         hover controller's commands.
         """
@@ -106,8 +107,8 @@ class Policies(Pilots):
     def __init__(
         self,
         loaded: Sequence[Loaded],
-        goal_w: np.ndarray,
-        goal_vel_w: np.ndarray | None = None,
+        goal_w: ndarray,
+        goal_vel_w: ndarray | None = None,
         draws: bool = False,
         eyes: Sight | None = None,
     ) -> None:
@@ -144,7 +145,7 @@ class Policies(Pilots):
             }
         return self._lost
 
-    def decide(self, flight: "Flight", snapshot: Snapshot, latched: np.ndarray) -> Decision:
+    def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
         outs = []
         goal_w = flight.goal_at(snapshot.time)
         looked = None
@@ -223,7 +224,7 @@ class Flight:
         plant: Plant,
         pilots: Pilots,
         recorder: FlightObserver | None = None,
-        home_w: np.ndarray | None = None,
+        home_w: ndarray | None = None,
     ) -> None:
         """Take over a plant at its start; each period is told to the recorder.
 
@@ -240,7 +241,7 @@ class Flight:
         self.flown = np.zeros(count, bool)
         self.failed = np.zeros(count, bool)
         self.failures: list[str | None] = [None] * count
-        self.commands: list[np.ndarray] = []
+        self.commands: list[ndarray] = []
         self._refused: dict[int, str] = {}  # by the pilots, in the hover
         max_thrust = pilots.experiment.task.action.max_thrust
         limits = HoverParams(
@@ -264,7 +265,7 @@ class Flight:
         """Whether the phase has lasted for a time [s], to the nearest period."""
         return self.elapsed > time - 0.5 * self.plant.period
 
-    def goal_at(self, time: float | np.ndarray) -> np.ndarray:
+    def goal_at(self, time: float | ndarray) -> ndarray:
         """Goals [m], shape (E, 3), at a time or a time each on the plant's clock [s]."""
         return self.pilots.goal_w + np.reshape(time - self.begin, (-1, 1)) * self.pilots.goal_vel_w
 
@@ -311,7 +312,7 @@ class Flight:
             self.judge(self.now)
         self.recorder.after(self, measurement, sent)
 
-    def _latched_now(self, snapshot: Snapshot) -> np.ndarray:
+    def _latched_now(self, snapshot: Snapshot) -> ndarray:
         """Commands of the hover controller."""
         plant = self.plant.params
         mass = plant.vehicle.body.mass + np.where(snapshot.attached, plant.rope.hanging_mass, 0.0)
@@ -330,7 +331,7 @@ class Flight:
             self.fail(e, f"the payload did not land within {FALL_TIME:g} s of its separation")
         self.open &= ~(self.failed | landing.landed)
 
-    def _causes(self, snapshot: Snapshot) -> dict[str, np.ndarray]:
+    def _causes(self, snapshot: Snapshot) -> dict[str, ndarray]:
         """Which throws have ended early, by cause, the first that holds first: the ends of an
         episode of training.
         """
@@ -356,20 +357,20 @@ class Flight:
 class Smoothness:
     """Root mean square change of normalised commands from step to step."""
 
-    def __init__(self, first: np.ndarray) -> None:
+    def __init__(self, first: ndarray) -> None:
         """Begin with the command before the first, shape (E, 4 or more)."""
         self._last = first
         self._sum = np.zeros(len(first))
         self._steps = np.zeros(len(first))
 
-    def add(self, action: np.ndarray, active: np.ndarray | bool = True) -> None:
+    def add(self, action: ndarray, active: ndarray | bool = True) -> None:
         """Count normalised commands, shape (E, 4 or more), of vehicles that are being flown."""
         self._sum += active * np.mean((action - self._last)[:, :4] ** 2, axis=1)
         self._steps += active
         self._last = action
 
     @property
-    def value(self) -> np.ndarray:
+    def value(self) -> ndarray:
         """Shape (E,)."""
         return np.sqrt(self._sum / np.maximum(self._steps, 1.0))
 
@@ -397,7 +398,7 @@ class Scores(FlightObserver):
         flying = ~state.attached & ~flight.plant.landing.landed
         self.clearance = np.where(flying, np.minimum(self.clearance, distance), self.clearance)
 
-    def columns(self, flight: Flight) -> dict[str, np.ndarray]:
+    def columns(self, flight: Flight) -> dict[str, ndarray]:
         """Return a row a throw, NaN where it failed; ``goal_w`` where goals move."""
         landing = flight.plant.landing
         success = landing.landed & ~flight.failed

@@ -10,6 +10,7 @@ Source: Verlet steps with all links solved for at once (SHAKE; Ryckaert, Ciccott
 Comput. Phys. 23, 1977)."""
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY
 
@@ -32,10 +33,10 @@ class LooseRope:
 
     def __init__(
         self,
-        points_w: np.ndarray,
-        velocity_w: np.ndarray,
-        ball_w: np.ndarray,
-        ball_vel_w: np.ndarray,
+        points_w: ndarray,
+        velocity_w: ndarray,
+        ball_w: ndarray,
+        ball_vel_w: ndarray,
     ) -> None:
         """Take over a rope of joints [m], [m/s], upper end first, shape (L + 1, 3), and its ball's
         centre [m], [m/s], shape (3,).
@@ -75,7 +76,7 @@ class LooseRope:
             self.velocity_w = (moved - self.offset_w) / h
             self.offset_w = moved
 
-    def _with_links(self, moved: np.ndarray) -> np.ndarray:
+    def _with_links(self, moved: ndarray) -> ndarray:
         """Put positions back onto the links, along the links' directions before the step."""
         before = np.diff(np.vstack((self.offset_w, np.zeros(3))), axis=0)
         weight = np.append(np.full(len(before) - 1, 2.0), 1.0)  # the ball does not give way
@@ -90,7 +91,7 @@ class LooseRope:
             moved[1:] -= push[:-1]
         return moved
 
-    def points_w(self, ball_w: np.ndarray) -> np.ndarray:
+    def points_w(self, ball_w: ndarray) -> ndarray:
         """Joints and lower end of the rope [m], shape (L + 1, 3), for a ball at ``ball_w``, shape
         (3,).
         """
@@ -98,7 +99,7 @@ class LooseRope:
         return np.vstack((self.offset_w, knot)) + ball_w
 
 
-def _on_link(joint: np.ndarray, end: np.ndarray, length: float, ground: float) -> np.ndarray:
+def _on_link(joint: ndarray, end: ndarray, length: float, ground: float) -> ndarray:
     """Put a joint to ``length`` from the link's other end, above the ground; all from the ball's
     centre [m].
     """

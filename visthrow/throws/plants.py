@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import AirParams, RandomizationParams, RopeParams
 from sim.reference.snapshot import PayloadLandings as PayloadLandings
@@ -47,12 +48,12 @@ class Plant(Protocol):
     period: float
     time: float
 
-    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+    def reset(self, pos_w: ndarray, cable_dir_w: ndarray | None = None) -> None:
         """Put the vehicles level and at rest to positions [m], shape (E, 3), with stated rope
         directions (E, L, 3).
         """
 
-    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+    def step(self, command: ndarray, release: ndarray | bool = False) -> None:
         """Advance one control period under commands [N, rad/s], shape (E, 4)."""
 
     @property
@@ -133,7 +134,7 @@ class HybridPlant:
             self._command_bias = noise.command_bias * self._rng.standard_normal((count, 4))
             self._begin()
 
-    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+    def reset(self, pos_w: ndarray, cable_dir_w: ndarray | None = None) -> None:
         self._sim.place(pos_w=pos_w, cable_dir_w=cable_dir_w)
         self._begin()
 
@@ -151,7 +152,7 @@ class HybridPlant:
         # newest first
         self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)
 
-    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+    def step(self, command: ndarray, release: ndarray | bool = False) -> None:
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
         if np.any(self._age):
             self._past = [self.state, *self._past[:-1]]
@@ -173,7 +174,7 @@ class HybridPlant:
                 self._ropes[e] = loose
         self.time += self.period
 
-    def hold(self, names: dict[str, np.ndarray] | None = None) -> dict[str, np.ndarray]:
+    def hold(self, names: dict[str, ndarray] | None = None) -> dict[str, ndarray]:
         """Put bodies and ropes back to where an earlier call found them, or only look; motors and
         battery go on.
 
@@ -186,7 +187,7 @@ class HybridPlant:
             self._sim.adopt()
         return names or {name: getattr(self._sim.state, name).numpy().copy() for name in BODIES}
 
-    def look(self, *names: str) -> list[np.ndarray]:
+    def look(self, *names: str) -> list[ndarray]:
         """Arrays of the simulator's state, environment first: a snapshot's price is many times
         that.
         """
@@ -207,7 +208,7 @@ class HybridPlant:
             np.where(waits, timer + time, timer).astype(timer.dtype)
         )
 
-    def _disturbed(self, command: np.ndarray) -> np.ndarray:
+    def _disturbed(self, command: ndarray) -> ndarray:
         """Commands with the training's noise, which is on their normalised form."""
         import torch
 
@@ -229,14 +230,14 @@ class HybridPlant:
         arrays = self.look("payload_pos_w", "payload_vel_w", "cable_dir_w", "cable_vel_w")
         ball, ball_vel, direction, turn = (array[e] for array in arrays)
 
-        def upwards(end: np.ndarray, step: np.ndarray) -> np.ndarray:
+        def upwards(end: ndarray, step: ndarray) -> ndarray:
             knot = end - rope.payload_offset * step[-1]
             above = knot - rope.segment_length * np.cumsum(step[::-1], axis=0)[::-1]
             return np.vstack((above, knot))
 
         return LooseRope(upwards(ball, direction), upwards(ball_vel, turn), ball, ball_vel)
 
-    def _ball(self) -> tuple[np.ndarray, np.ndarray]:
+    def _ball(self) -> tuple[ndarray, ndarray]:
         """Ball in flight: position and velocity; at rest after landing."""
         landing = self.landing
         since = np.nan_to_num(self.time - self._separation)
@@ -337,7 +338,7 @@ class ReferenceAdapter:
         self._plant = ReferencePlant(self.params, extras, seed, count)
         self.reset(np.tile([0.0, 0.0, experiment.task.start.spawn_height], (count, 1)))
 
-    def reset(self, pos_w: np.ndarray, cable_dir_w: np.ndarray | None = None) -> None:
+    def reset(self, pos_w: ndarray, cable_dir_w: ndarray | None = None) -> None:
         level = np.tile([0.0, 0.0, 0.0, 1.0], (self.count, 1))
         zero = np.zeros((self.count, 3))
         self._plant.reset(pos_w, level, zero, zero, cable_dir_w)
@@ -353,8 +354,8 @@ class ReferenceAdapter:
 
 
 def flown(
-    rope: RopeParams, air: AirParams, pos_w: np.ndarray, vel_w: np.ndarray, time: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+    rope: RopeParams, air: AirParams, pos_w: ndarray, vel_w: ndarray, time: ndarray
+) -> tuple[ndarray, ndarray]:
     """Position [m] and velocity [m/s] of payloads, shape (E, 3), after flights [s], shape (E,),
     under gravity, wind, air forces.
     """
@@ -366,7 +367,7 @@ def flown(
         x / rope.payload_mass for x in (rope.payload_drag, rope.payload_side, rope.payload_lift)
     )
 
-    def acceleration(v: np.ndarray) -> np.ndarray:
+    def acceleration(v: ndarray) -> ndarray:
         airspeed = v - wind
         sideways = np.cross([0.0, 0.0, 1.0], airspeed)
         size = np.maximum(np.linalg.norm(sideways, axis=1, keepdims=True), 1e-12)
@@ -400,7 +401,7 @@ def make_plant(
     return ReferenceAdapter(experiment, count, seed, realistic=name == "reference-realistic")
 
 
-def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
+def _late(states: Sequence[Snapshot], age: ndarray) -> Snapshot:
     """Return measurements, linear between states one control period apart, newest first; age: in
     periods, shape (E,).
     """
@@ -420,7 +421,7 @@ def _late(states: Sequence[Snapshot], age: np.ndarray) -> Snapshot:
     return replace(newest, **late)
 
 
-def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> np.ndarray:
+def random_ropes(rng: np.random.Generator, count: int, segments: int, angle: float) -> ndarray:
     """Straight ropes off the vertical by a normal angle of deviation ``angle`` [rad], shape (E, L,
     3).
     """

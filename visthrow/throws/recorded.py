@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow import config
 from visthrow.common import provenance
@@ -106,7 +107,7 @@ class _Full(LogRecorder):
             self._sampled = sample.time
         self._before = flight.now
 
-    def _rope(self, flight: Flight) -> np.ndarray:
+    def _rope(self, flight: Flight) -> ndarray:
         """Rope now; after the landing it sinks to the ground instead of standing still as the
         plants leave it.
         """
@@ -130,7 +131,7 @@ class _Full(LogRecorder):
 
 def fly(
     loaded: Loaded,
-    goal_w: np.ndarray,
+    goal_w: ndarray,
     plant_name: str = "hybrid",
     seed: int = 0,
     device: str = "cpu",
@@ -185,7 +186,7 @@ def fly(
     return _finished(flight, recording, recovery)
 
 
-def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
+def check_goal(loaded: Loaded, goal_w: ndarray) -> None:
     """Refuse a goal that is not three finite numbers, or further than the vehicle may fly, with a
     ConfigError.
     """
@@ -200,7 +201,7 @@ def check_goal(loaded: Loaded, goal_w: np.ndarray) -> None:
         raise ConfigError(f"{where}, and '{loaded.name}' was trained on goals within {trained:g} m")
 
 
-def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dict[str, Any]:
+def _meta(loaded: Loaded, plant_name: str, goal_w: ndarray, seed: int) -> dict[str, Any]:
     return {
         "policy": loaded.name,
         "layout": loaded.policy.contract["observation"]["layout"],
@@ -214,7 +215,7 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: np.ndarray, seed: int) -> dic
 
 
 def _hovering(
-    quiet: Callable[[Snapshot], bool], home: np.ndarray, shortest: float, longest: float
+    quiet: Callable[[Snapshot], bool], home: ndarray, shortest: float, longest: float
 ) -> Phase:
     """Hover until the vehicle is at its place and quiet for a while; least and most time [s]."""
     calm = 0.0

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
@@ -54,7 +55,7 @@ def batch_plant(
     ), np.random.default_rng(seeds)
 
 
-def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> np.ndarray:
+def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> ndarray:
     """Put the vehicles where a pilot's hover holds them; returns the place they are held at [m],
     shape (3,).
     """
@@ -70,7 +71,7 @@ def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generato
 
 def fly_batch(
     loaded: Sequence[Loaded], plant_name: str, job: Job, eyes: Sight | None = None
-) -> dict[str, np.ndarray]:
+) -> dict[str, ndarray]:
     """Fly one batch of policies that are trained for one plant, on the rendered pictures of
     ``eyes`` where there are any.
 
@@ -99,7 +100,7 @@ class _Scores(Scores):
         progress(min(flight.plant.time / (HOVER_TIME + THROW_TIME), 0.99))
 
 
-def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generator) -> np.ndarray:
+def _goal_velocities(experiment: Experiment, count: int, rng: np.random.Generator) -> ndarray:
     """Velocities of the task's goals [m/s], shape (E, 3); nothing is drawn where they
     stand still.
     """
@@ -189,7 +190,7 @@ class Throwing(Workers):
             for policy in range(self._count)
         ]
 
-    def _throws(self, parts: Sequence[dict[str, np.ndarray]], policy: int, target: float) -> Throws:
+    def _throws(self, parts: Sequence[dict[str, ndarray]], policy: int, target: float) -> Throws:
         """All throws of one policy at one target."""
         units = []
         for job, part in zip(self.jobs, parts):

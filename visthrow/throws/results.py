@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common import provenance
 from visthrow.common.errors import StorageError
@@ -37,7 +38,7 @@ class Result:
     ``duration`` [s] and whatever else was measured; NaN where a throw failed."""
 
     unit: dict[str, Any]  # what they depend on
-    columns: dict[str, np.ndarray]
+    columns: dict[str, ndarray]
     # commit, command, time [UTC], seconds of work
     provenance: dict[str, Any] = field(default_factory=dict)
     extra: dict[str, Any] = field(default_factory=dict)  # further figures of the whole unit
@@ -48,16 +49,16 @@ class Result:
         return key_of(self.unit)
 
     @property
-    def good(self) -> np.ndarray:
+    def good(self) -> ndarray:
         """Throws that landed, shape (N,), bool."""
         return self.columns["success"].astype(bool)
 
-    def of(self, name: str) -> np.ndarray:
+    def of(self, name: str) -> ndarray:
         """Return a column without the failed throws."""
         return self.columns[name][self.good]
 
     @property
-    def miss(self) -> np.ndarray:
+    def miss(self) -> ndarray:
         """Landing points of the successful throws from the target, or where it was at impact [m],
         shape (N, 2): along x, to the left.
         """
@@ -133,7 +134,7 @@ def policy_unit(
     }
 
 
-def columns_of(throws: Any) -> dict[str, np.ndarray]:
+def columns_of(throws: Any) -> dict[str, ndarray]:
     """Per-throw arrays of a dataclass of throws (:class:`visthrow.task.measurement.Throws`,
     :class:`visthrow.paper.baseline.fly_plan.Flown`).
     """
@@ -141,7 +142,7 @@ def columns_of(throws: Any) -> dict[str, np.ndarray]:
     columns = {
         name: np.asarray(value)
         for name, value in vars(throws).items()
-        if isinstance(value, np.ndarray)
+        if isinstance(value, ndarray)
     }
     return {name: value for name, value in columns.items() if value.ndim and len(value) == count}
 
@@ -235,7 +236,7 @@ def pack(results: Iterable[Result], path: str | Path) -> None:
 def work(
     units: Sequence[dict[str, Any]],
     folder: str | Path,
-    function: Callable[[dict], tuple[dict[str, np.ndarray], dict[str, Any]]],
+    function: Callable[[dict], tuple[dict[str, ndarray], dict[str, Any]]],
     recorded: dict[str, Result] | None = None,
     processes: int = 1,
     say: Callable[[str], None] = lambda text: None,
@@ -287,7 +288,7 @@ def _to_json(result: Result) -> dict[str, Any]:
     }
 
 
-def _plain(value: np.ndarray) -> list:
+def _plain(value: ndarray) -> list:
     if value.dtype == bool:
         return value.astype(int).tolist()
     rounded = np.round(value.astype(float), DIGITS)

@@ -7,6 +7,7 @@ its plant from outside.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import changed
 from visthrow.common.free_fall import GRAVITY
@@ -58,7 +59,7 @@ class HybridWirePlant:
         values = {f"{observation}.latency": (0.0, 0.0), f"{observation}.latency_jitter": 0.0}
         return changed(experiment, values | {"sim.control_period": self.period})
 
-    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+    def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under collective thrust [N] and body rates [rad/s], shape (4,).
 
         ``release``: whether the latch trips in this period, so long after its beginning [s], or has
@@ -74,7 +75,7 @@ class HybridWirePlant:
         return self._plant.time
 
     @property
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, ndarray]:
         """pos_w, quat_wb, vel_w, rate_b, payload_pos_w, attached: the truth."""
         state = self._plant.state
         names = ("pos_w", "quat_wb", "vel_w", "rate_b", "payload_pos_w", "attached")
@@ -127,21 +128,21 @@ class HybridMotorPlant(HybridWirePlant):
         self._k_f = thrust.k_f
         self._reference = controller.calibration_voltage if mixing else battery.reference_voltage
         self._plant.stop_motors()
-        self._stand: dict[str, np.ndarray] | None = self._plant.hold()
+        self._stand: dict[str, ndarray] | None = self._plant.hold()
         self._look()
         self.force_b = np.array([0.0, 0.0, GRAVITY])
         self._ground = experiment.vehicle.collision_radius
         self._floor = experiment.rope.payload_radius
         self.touchdown: float | None = None
 
-    def look(self) -> dict[str, np.ndarray]:
+    def look(self) -> dict[str, ndarray]:
         """Place, attitude, velocity, rates, motor_speed [rad/s], voltage [V] and used share of the
         charge now.
         """
         names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed", "voltage", "charge_used")
         return {name: value[0] for name, value in zip(names, self._plant.look(*names))}
 
-    def rope(self) -> list[np.ndarray]:
+    def rope(self) -> list[ndarray]:
         """Directions of the rope's segments and their derivatives [1/s], shapes (L, 3), world
         frame.
         """
@@ -163,14 +164,14 @@ class HybridMotorPlant(HybridWirePlant):
         return self._stand is not None
 
     @property
-    def state(self) -> dict[str, np.ndarray]:
+    def state(self) -> dict[str, ndarray]:
         """Return the state as `HybridWirePlant` does; a hanging ball stays above the ground."""
         state = super().state
         ball = state["payload_pos_w"].copy()
         ball[2] = max(ball[2], self._floor)
         return state | {"payload_pos_w": ball}
 
-    def step(self, command: np.ndarray, release: bool, after: float = 0.0) -> None:
+    def step(self, command: ndarray, release: bool, after: float = 0.0) -> None:
         """Advance by one period under motor commands, 0 to 1, shape (4,); release: see
         `HybridWirePlant`.
         """

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
+from numpy import ndarray
 
 from camera.calibrate import BOARD
 from camera.calibrate.boards import (
@@ -62,7 +63,7 @@ def board_of(words: list[str] | None) -> BoardParams:
         raise ConfigError(f"--board {' '.join(words)}: {error}; expected {expected}") from error
 
 
-def pictures_of(names: list[str]) -> tuple[list[Path], list[np.ndarray]]:
+def pictures_of(names: list[str]) -> tuple[list[Path], list[ndarray]]:
     """Read pictures, and those of folders, as BGR, uint8, shape (H, W, 3); ConfigError where a file
     is none, or there is none.
     """
@@ -246,15 +247,13 @@ def show(args: argparse.Namespace) -> int:
     return 0
 
 
-def _rendered(params: CameraParams, *places: torch.Tensor) -> np.ndarray:
+def _rendered(params: CameraParams, *places: torch.Tensor) -> ndarray:
     """Render a grey hall with vehicle, ball and goal square; BGR, uint8, shape (H, W, 3)."""
     eyes = load_extra("visthrow.detector_training.eyes", "detector", "a picture", ConfigError)
     return eyes.render_hall(params, *places, samples=SAMPLES)
 
 
-def _draw_board(
-    canvas: np.ndarray, image: np.ndarray, lens: Fisheye, args: argparse.Namespace
-) -> None:
+def _draw_board(canvas: ndarray, image: ndarray, lens: Fisheye, args: argparse.Namespace) -> None:
     board = board_of(args.board)
     view = find_board(image, board)
     if view is None:
@@ -270,7 +269,7 @@ def _draw_board(
     print(f"corners found (yellow) and reprojected (blue): {off:.3f} px rms")
 
 
-def _straight(canvas: np.ndarray, lens: Fisheye, fov_deg: float) -> np.ndarray:
+def _straight(canvas: ndarray, lens: Fisheye, fov_deg: float) -> ndarray:
     """Rectified view of a drawn picture, BGR, uint8, square."""
     size = min(lens.params.width, lens.params.height)
     frames = torch.from_numpy(canvas).permute(2, 0, 1)[None].float() / 255.0

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common import style
 from visthrow.common.statistics import Interval, pareto
@@ -55,9 +56,9 @@ class Trade:
 
     title: str
     # series, label, points (N, 2): duration [s], error [m]
-    fronts: tuple[tuple[int, str, np.ndarray], ...]
+    fronts: tuple[tuple[int, str, ndarray], ...]
     stars: tuple[tuple[str, Interval, Interval], ...]  # label, duration [s], error [m]
-    crosses: tuple[tuple[str, np.ndarray], ...] = ()  # the paper's
+    crosses: tuple[tuple[str, ndarray], ...] = ()  # the paper's
 
 
 def _look(series: int) -> tuple[str, str]:
@@ -168,7 +169,7 @@ def _log_axis(axis, name: str) -> None:
 
 
 def scatter(
-    panels: Sequence[tuple[str, Sequence[tuple[str, np.ndarray]]]],
+    panels: Sequence[tuple[str, Sequence[tuple[str, ndarray]]]],
     columns: int = 3,
     heading: str = "",
 ) -> bytes:
@@ -237,7 +238,7 @@ def _target(axis, half: float) -> None:
     axis.set_axisbelow(True)
 
 
-def _landings(axis, points: np.ndarray, half: float, series: int, label: str) -> None:
+def _landings(axis, points: ndarray, half: float, series: int, label: str) -> None:
     """Points outside the panel stand at its edge, hollow; a thick cross marks their mean."""
     colour, marker = _look(series)
     clipped = np.clip(points, -half, half)
@@ -410,7 +411,7 @@ def _curve(axis, line: Line):
     return curve_line
 
 
-def learning(groups: Sequence[tuple[str, Sequence[np.ndarray]]]) -> bytes:
+def learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
     """Landing error over training: a panel a group, each run its environment steps (N,) and errors
     (N,) as rows.
     """

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from numpy import ndarray
 
 from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
@@ -104,7 +105,7 @@ Shapes = dict[str, tuple[Any, ...]]
 """Entity -> what is drawn there for good."""
 
 
-def _scene(goal: np.ndarray, experiment: Any) -> Shapes:
+def _scene(goal: ndarray, experiment: Any) -> Shapes:
     """Ground, goal, ball, rope and trails."""
     reach = 0.5 * np.abs(goal[:2]) + FIELD
     floor = rr.Boxes3D(
@@ -201,7 +202,7 @@ def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -
         stream.send_columns(entity, [column], rr.LineStrips3D.columns(strips=strips))
 
 
-def trail(stream: rr.RecordingStream, name: str, time: float, points: np.ndarray) -> None:
+def trail(stream: rr.RecordingStream, name: str, time: float, points: ndarray) -> None:
     """Send the line that a body has left so far, for flights that are still going on.
 
     Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points
@@ -266,12 +267,12 @@ def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
     _points(stream, log, "camera/invalid", points, ~valid)
 
 
-def _points(stream, log: FlightLog, entity: str, points: np.ndarray, visible: np.ndarray) -> None:
+def _points(stream, log: FlightLog, entity: str, points: ndarray, visible: ndarray) -> None:
     columns = rr.Points2D.columns(positions=points[visible].astype(np.float32))
     _send(stream, entity, log, "keypoints", columns.partition(visible.sum(axis=1)))
 
 
-def _outline(stream, log: FlightLog, name: str, points: np.ndarray, whole: np.ndarray) -> None:
+def _outline(stream, log: FlightLog, name: str, points: ndarray, whole: ndarray) -> None:
     """Closed outline of a group while all of it is seen; the payload's four are the midpoints of a
     box's edges.
     """
@@ -314,7 +315,7 @@ def _paler(colour: str) -> str:
     return "#" + "".join(f"{(int(colour[i : i + 2], 16) + 255) // 2:02x}" for i in (1, 3, 5))
 
 
-def blueprint(goal: np.ndarray, channels: set[str]) -> rrb.Blueprint:
+def blueprint(goal: ndarray, channels: set[str]) -> rrb.Blueprint:
     """Layout of the viewer for a target [m], shape (3,), and the channels that there are."""
     middle = np.array([0.5 * goal[0], 0.5 * goal[1], 0.9])
     eye = rrb.EyeControls3D(

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY
 from visthrow.common.errors import ConfigError, suggest
@@ -52,16 +53,14 @@ class Flown(Throws):
     """Throws of one plan, scored as learnt policies are; the clearance is NaN in the own model."""
 
     # of the payload at separation against the planned release [m], shape (N,)
-    position_error: np.ndarray
-    velocity_error: np.ndarray  # the same [m/s], shape (N,)
+    position_error: ndarray
+    velocity_error: ndarray  # the same [m/s], shape (N,)
     # root mean square distance of the payload from the path until the release [m], shape (N,)
-    tracking: np.ndarray
-    step_times: np.ndarray  # of all steps of the controller [s], shape (K,)
+    tracking: ndarray
+    step_times: ndarray  # of all steps of the controller [s], shape (K,)
 
 
-def _off(
-    plan: ThrowPlan, pos_w: np.ndarray, vel_w: np.ndarray, good: np.ndarray
-) -> dict[str, np.ndarray]:
+def _off(plan: ThrowPlan, pos_w: ndarray, vel_w: ndarray, good: ndarray) -> dict[str, ndarray]:
     """Distances of payloads from the planned release at separation; NaN where a throw failed."""
     blank = np.where(good, 1.0, np.nan)
     return {
@@ -70,13 +69,13 @@ def _off(
     }
 
 
-def _normalised(params: MPCParams, command: np.ndarray) -> np.ndarray:
+def _normalised(params: MPCParams, command: ndarray) -> ndarray:
     """Commands (E, 4) as a policy puts them out."""
     throttle = np.sqrt(np.clip(command[:, :1], 0.0, params.max_thrust) / params.max_thrust)
     return np.hstack([2.0 * throttle - 1.0, command[:, 1:] / np.array(params.max_rate)])
 
 
-def random_starts(plan: ThrowPlan, count: int, seed: int) -> np.ndarray:
+def random_starts(plan: ThrowPlan, count: int, seed: int) -> ndarray:
     """Hover with the rest of a pilot's hover, by ``configs/start/hover.toml``: states, shape (N,
     16).
 
@@ -86,7 +85,7 @@ def random_starts(plan: ThrowPlan, count: int, seed: int) -> np.ndarray:
     start = pilots_hover()
     rng = np.random.default_rng(seed)
 
-    def sample(spread) -> np.ndarray:
+    def sample(spread) -> ndarray:
         return np.asarray(spread) * rng.uniform(-1.0, 1.0, (count, 3))
 
     state, _ = pm.hover(plan.model, np.tile(plan.path.coefficients[0, 0], (count, 1)))
@@ -158,7 +157,7 @@ def fly_pendulum(
     )
 
 
-def pendulum_state(snapshot: Snapshot, mount_b: np.ndarray) -> np.ndarray:
+def pendulum_state(snapshot: Snapshot, mount_b: ndarray) -> ndarray:
     """State of the pendulum as a plant shows it, cable straight from mount to payload, shape (E,
     16).
     """
@@ -217,12 +216,12 @@ def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
 
 def look_ahead(
     model: Pendulum,
-    state: np.ndarray,
-    sent: np.ndarray,
+    state: ndarray,
+    sent: ndarray,
     period: float,
     begin: float,
     end: float = 0.0,
-) -> np.ndarray:
+) -> ndarray:
     """Predict states, shape (E, 16), under the commands that were given from ``begin`` to ``end``
     [s] ago, each held for a period [s].
 
@@ -239,7 +238,7 @@ def look_ahead(
 
 def _started(
     name: str, experiment: Experiment, target: float, batch: int, count: int, seed: int, device: str
-) -> tuple[Plant, np.ndarray]:
+) -> tuple[Plant, ndarray]:
     """Plant at the start of the throws that learnt policies meet, and the place it hovers at [m],
     shape (3,).
     """
@@ -281,10 +280,10 @@ class Controllers(Pilots):
         self._hover = pm.hover(plan.model, np.zeros((count, 3)))[1]
         goal_w = np.tile([plan.target, 0.0, 0.0], (count, 1))
         super().__init__(experiment, goal_w, _normalised(self.params, self._hover))
-        self._estimate: np.ndarray | None = None
+        self._estimate: ndarray | None = None
         self._period = 0
 
-    def decide(self, flight: Flight, snapshot: Snapshot, latched: np.ndarray) -> Decision:
+    def decide(self, flight: Flight, snapshot: Snapshot, latched: ndarray) -> Decision:
         """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has
         failed, and is held.
         """
@@ -310,7 +309,7 @@ class Controllers(Pilots):
             command, np.full(len(command), k >= self.latch), _normalised(self.params, command)
         )
 
-    def _estimated(self, snapshot: Snapshot, sent: np.ndarray, span: float) -> np.ndarray:
+    def _estimated(self, snapshot: Snapshot, sent: ndarray, span: float) -> ndarray:
         """State now: the model's prediction from the period before, corrected by what
         is measured.
         """

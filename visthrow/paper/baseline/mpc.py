@@ -14,6 +14,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from scipy import sparse
 
 from visthrow.common.errors import VisthrowError
@@ -45,7 +46,7 @@ class MPCParams:
     max_rate: tuple[float, float, float] = (10.0, 10.0, 4.0)  # [rad/s]
 
     @property
-    def state_weights(self) -> np.ndarray:
+    def state_weights(self) -> ndarray:
         """Shape (16,)."""
         scale = np.repeat(
             [self.position, self.velocity, self.direction, self.rate, self.attitude],
@@ -54,7 +55,7 @@ class MPCParams:
         return scale**-2.0
 
     @property
-    def input_weights(self) -> np.ndarray:
+    def input_weights(self) -> ndarray:
         """Shape (4,)."""
         return np.array([self.thrust, *[self.body_rate] * 3]) ** -2.0
 
@@ -119,13 +120,13 @@ class MPC:
             (np.ones(len(row)), row[self._order], pointer), shape=shape
         )
 
-    def _fill(self, by_state: np.ndarray, by_input: np.ndarray) -> None:
+    def _fill(self, by_state: ndarray, by_input: ndarray) -> None:
         n = self.params.stages
         blocks = np.concatenate([-by_state, -by_input], axis=2).reshape(n, -1)
         values = np.concatenate([blocks, np.ones((n, STATES))], axis=1).ravel()
         self._matrix.data[:] = np.concatenate([np.ones(STATES), values])[self._order]
 
-    def step(self, state: np.ndarray, reference: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    def step(self, state: ndarray, reference: tuple[ndarray, ndarray]) -> ndarray:
         """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming
         period, shape (4,).
 
@@ -172,7 +173,7 @@ class MPC:
         self.step_time = time.perf_counter() - began
         return command
 
-    def _solve(self, linear: np.ndarray, right: np.ndarray) -> np.ndarray:
+    def _solve(self, linear: ndarray, right: ndarray) -> ndarray:
         if self._ready:
             self._solver.update(c=linear, A=self._matrix, b=right)
         else:
@@ -185,14 +186,14 @@ class MPC:
             )
         return np.asarray(self._solver.result.x)
 
-    def _set_up(self, linear: np.ndarray, right: np.ndarray) -> None:
+    def _set_up(self, linear: ndarray, right: ndarray) -> None:
         """Hand the whole programme over, with its pattern; after that only its numbers change."""
         low, high = self._bounds
         cost = sparse.diags(self._weights, format="csc")
         self._solver.setup(cost, linear, self._matrix, right, x_l=low, x_u=high)
         self._ready = True
 
-    def _move_on(self, states: np.ndarray, inputs: np.ndarray) -> None:
+    def _move_on(self, states: ndarray, inputs: ndarray) -> None:
         """Keep the solution as of one period later, its last input held; directions and quaternions
         back at unit length.
         """
@@ -204,7 +205,7 @@ class MPC:
             self._states[:, part] /= np.linalg.norm(self._states[:, part], axis=1, keepdims=True)
 
 
-def _same_side(target: np.ndarray, reference: np.ndarray) -> np.ndarray:
+def _same_side(target: ndarray, reference: ndarray) -> ndarray:
     """Quaternions with the signs of others': q and -q are one attitude."""
     target = target.copy()
     sign = np.sign((target[:, QUAT] * reference[:, QUAT]).sum(1))

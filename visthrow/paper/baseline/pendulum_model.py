@@ -17,6 +17,7 @@ paper's baseline (Sec. IV-A) uses the same sixteen states; the equations are not
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY, PlantParams
 
@@ -62,7 +63,7 @@ def pendulum_of(plant: PlantParams) -> Pendulum:
     )
 
 
-def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarray:
+def derivative(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
     """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4,
     ...); complex numbers pass through.
     """
@@ -93,7 +94,7 @@ def derivative(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.nd
     return out
 
 
-def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: float) -> np.ndarray:
+def _advance(model: Pendulum, state: ndarray, control: ndarray, period: float) -> ndarray:
     """One step of the classical Runge-Kutta method, then direction and quaternion at unit length, w
     across q.
     """
@@ -110,8 +111,8 @@ def _advance(model: Pendulum, state: np.ndarray, control: np.ndarray, period: fl
 
 
 def step(
-    model: Pendulum, state: np.ndarray, control: np.ndarray, period: float, substeps: int = 1
-) -> np.ndarray:
+    model: Pendulum, state: ndarray, control: ndarray, period: float, substeps: int = 1
+) -> ndarray:
     """Advance states, shape (..., 16), under constant inputs, shape (..., 4), over a period [s] in
     so many Runge-Kutta steps.
 
@@ -126,8 +127,8 @@ def step(
 
 
 def linearise(
-    model: Pendulum, state: np.ndarray, control: np.ndarray, period: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    model: Pendulum, state: ndarray, control: ndarray, period: float
+) -> tuple[ndarray, ndarray, ndarray]:
     """One Runge-Kutta step of states (K, 16) under inputs (K, 4) and its Jacobians by complex
     steps, exact to rounding.
 
@@ -148,7 +149,7 @@ def linearise(
     return moved[:, 0].real.T, slope[:, :, :STATES], slope[:, :, STATES:]
 
 
-def tension(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarray:
+def tension(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
     """Cable force [N], shape (...); below 0 the model's taut cable would push, and the model does
     not hold.
     """
@@ -157,7 +158,7 @@ def tension(model: Pendulum, state: np.ndarray, control: np.ndarray) -> np.ndarr
     return -model.payload_mass * (pull * np.moveaxis(state, -1, 0)[DIR]).sum(0)
 
 
-def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def vehicle(model: Pendulum, state: ndarray) -> tuple[ndarray, ndarray]:
     """Position [m] and velocity [m/s] of the vehicle, shape (..., 3) each."""
     direction = state[..., DIR]
     rate = state[..., RATE]
@@ -166,7 +167,7 @@ def vehicle(model: Pendulum, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     )
 
 
-def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def hover(model: Pendulum, payload_w: ndarray) -> tuple[ndarray, ndarray]:
     """State (..., 16) and input (..., 4) of hover with the payload at places [m], shape
     (..., 3).
     """
@@ -180,7 +181,7 @@ def hover(model: Pendulum, payload_w: np.ndarray) -> tuple[np.ndarray, np.ndarra
     return state, control
 
 
-def _checked(state: np.ndarray, control: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _checked(state: ndarray, control: ndarray) -> tuple[ndarray, ndarray]:
     state = np.asarray(state, dtype=float)
     control = np.asarray(control, dtype=float)
     if (

@@ -18,6 +18,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
 from scipy.optimize import least_squares
 from scipy.special import perm
 
@@ -106,15 +107,15 @@ class Spline:
     its start.
     """
 
-    times: np.ndarray  # of the segments [s], shape (S,)
-    coefficients: np.ndarray  # of t^0 to t^7 in each segment's own time, shape (S, 8, 3)
+    times: ndarray  # of the segments [s], shape (S,)
+    coefficients: ndarray  # of t^0 to t^7 in each segment's own time, shape (S, 8, 3)
 
     @property
     def duration(self) -> float:
         """Time from start to release [s]."""
         return float(self.times.sum())
 
-    def sample(self, time: np.ndarray, derivatives: int = 6) -> np.ndarray:
+    def sample(self, time: ndarray, derivatives: int = 6) -> ndarray:
         """Payload's position and derivatives [m/s^n] at times since the start [s], shape (T,):
         shape (T, 2 or more derivatives, 3).
         """
@@ -132,7 +133,7 @@ class Spline:
         return out
 
 
-def _rows(time: np.ndarray, derivatives: int = SMOOTH) -> np.ndarray:
+def _rows(time: ndarray, derivatives: int = SMOOTH) -> ndarray:
     """Return the derivatives of the monomials t^0 to t^7 at times, shape (T, derivatives, 8)."""
     n = np.arange(derivatives)[:, None]
     k = np.arange(ORDER)
@@ -144,17 +145,17 @@ BEGINS, ENDS = _rows(np.array([0.0, 1.0]))
 
 
 @lru_cache(maxsize=4)
-def _sample_rows(samples: int) -> np.ndarray:
+def _sample_rows(samples: int) -> ndarray:
     return _rows((np.arange(samples) + 0.5) / samples)
 
 
 def _coefficients(
-    start: np.ndarray,
-    waypoints: np.ndarray,
-    end: np.ndarray,
-    velocity: np.ndarray,
-    times: np.ndarray,
-) -> np.ndarray:
+    start: ndarray,
+    waypoints: ndarray,
+    end: ndarray,
+    velocity: ndarray,
+    times: ndarray,
+) -> ndarray:
     """Coefficients in units of each segment's time, which keeps the matrix well conditioned; B
     paths at once.
 
@@ -183,8 +184,8 @@ def _coefficients(
 
 
 def residuals(
-    unit: np.ndarray, times: np.ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
-) -> dict[str, np.ndarray]:
+    unit: ndarray, times: ndarray, params: PlanParams, model: Pendulum, samples: int = SAMPLES
+) -> dict[str, ndarray]:
     """Objective of B planar paths (along the throw, up) as sums of squares.
 
     Args:
@@ -231,9 +232,9 @@ def residuals(
 
 def optimise(
     model: Pendulum,
-    start_w: np.ndarray,
-    end_w: np.ndarray,
-    velocity_w: np.ndarray,
+    start_w: ndarray,
+    end_w: ndarray,
+    velocity_w: ndarray,
     params: PlanParams,
     tick: tuple[float, float] = (0.02, 0.0),
 ) -> Spline:
@@ -264,13 +265,13 @@ def optimise(
     velocity = basis @ velocity_w
     end = basis @ (end_w - start_w) + begin
 
-    def build(x: np.ndarray, total: float) -> tuple[np.ndarray, np.ndarray]:
+    def build(x: ndarray, total: float) -> tuple[ndarray, ndarray]:
         ratio = np.exp(np.concatenate([np.zeros((len(x), 1)), x[:, -(SEGMENTS - 1) :]], axis=1))
         middle = _base(begin, end, velocity, total) + x[:, : -(SEGMENTS - 1)].reshape(len(x), -1, 2)
         times = total * ratio / ratio.sum(1, keepdims=True)
         return _coefficients(begin, middle, end, velocity, times), times
 
-    def objective(x: np.ndarray, total: float, samples: int = SAMPLES) -> np.ndarray:
+    def objective(x: ndarray, total: float, samples: int = SAMPLES) -> ndarray:
         parts = residuals(*build(x, total), params, model, samples).values()
         uneven = x[:, -(SEGMENTS - 1) :]
         limited = np.sqrt(params.penalty) * np.maximum(np.abs(uneven) - MOST_UNEVEN, 0.0)
@@ -286,13 +287,13 @@ def optimise(
     return Spline(times, lifted)
 
 
-def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, np.ndarray]:
+def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, ndarray]:
     """Objective, duration and variables of the best: at several starts on a coarse grid of
     durations, then on the fine one about it.
     """
 
-    def improve(x: np.ndarray, total: float) -> tuple[np.ndarray, float]:
-        def slope(x: np.ndarray) -> np.ndarray:
+    def improve(x: ndarray, total: float) -> tuple[ndarray, float]:
+        def slope(x: ndarray) -> ndarray:
             shifted = objective(x + DIFFERENCE * np.vstack([0.0 * x, np.eye(len(x))]), total)
             return (shifted[1:] - shifted[0]).T / DIFFERENCE
 
@@ -309,7 +310,7 @@ def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, floa
     )
 
 
-def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, np.ndarray]:
+def _descend(improve, x: ndarray, totals: ndarray) -> tuple[float, float, ndarray]:
     """Return the best of a path that is shortened step by step, each from the one before, till the
     objective is :data:`HOPELESS` times the best.
 
@@ -325,14 +326,14 @@ def _descend(improve, x: np.ndarray, totals: np.ndarray) -> tuple[float, float, 
     return best
 
 
-def _ticks(high: float, low: float, period: float, offset: float) -> np.ndarray:
+def _ticks(high: float, low: float, period: float, offset: float) -> ndarray:
     """Offset plus whole periods between two durations, falling."""
     first = np.floor((high - offset) / period + 1e-6)
     last = np.ceil((low - offset) / period - 1e-6)
     return offset + period * np.arange(first, last - 1, -1)
 
 
-def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float) -> np.ndarray:
+def _base(begin: ndarray, end: ndarray, velocity: ndarray, total: float) -> ndarray:
     """Waypoints on the single septic with the same ends, up to the third derivative, that takes a
     total time [s].
     """
@@ -344,7 +345,7 @@ def _base(begin: np.ndarray, end: np.ndarray, velocity: np.ndarray, total: float
     return _rows(np.arange(1, SEGMENTS) / SEGMENTS, 1)[:, 0] @ unit
 
 
-def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def flat_reference(model: Pendulum, path: ndarray) -> tuple[ndarray, ndarray]:
     """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path, position and five
     derivatives, shape (T, 6, 3).
 
@@ -377,8 +378,8 @@ def flat_reference(model: Pendulum, path: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 def _thrust(
-    model: Pendulum, chain: np.ndarray, up: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    model: Pendulum, chain: ndarray, up: ndarray
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path
     (6, T, D).
     """
@@ -390,12 +391,12 @@ def _thrust(
     return force, mass * jerk - model.vehicle_mass * model.length * third, direction, first
 
 
-def _unit(*chain: np.ndarray) -> list[np.ndarray]:
+def _unit(*chain: ndarray) -> list[ndarray]:
     """Return the unit vector of the first and its derivatives, from a vector and its derivatives,
     shape (T, D) each.
     """
 
-    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    def dot(a: ndarray, b: ndarray) -> ndarray:
         return (a * b).sum(1, keepdims=True)
 
     norm = [np.sqrt(dot(chain[0], chain[0]))]  # and its derivatives

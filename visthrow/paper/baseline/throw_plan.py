@@ -7,6 +7,7 @@ release state follows from the drag-free flight to the target. The release is ho
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import ConfigError
 from visthrow.common.free_fall import fall_time
@@ -26,14 +27,12 @@ training simulator; mean of five flights. :func:`measure` reads them off any pol
 class ReleaseState:
     """State at which the payload is let go, and what follows."""
 
-    pos_w: np.ndarray  # [m], shape (3,)
-    vel_w: np.ndarray  # [m/s], shape (3,)
+    pos_w: ndarray  # [m], shape (3,)
+    vel_w: ndarray  # [m/s], shape (3,)
     fall_time: float  # from release to landing [s]
 
 
-def landing_point(
-    pos_w: np.ndarray, vel_w: np.ndarray, landing_height: float
-) -> tuple[np.ndarray, np.ndarray]:
+def landing_point(pos_w: ndarray, vel_w: ndarray, landing_height: float) -> tuple[ndarray, ndarray]:
     """Return landing points (..., 2) [m] and times (...) [s] of payloads released at states, shape
     (..., 3) each; NaN where the landing height is never passed.
     """
@@ -110,7 +109,7 @@ class ThrowPlan:
         """Planned time from start to landing [s]."""
         return self.path.duration + self.release.fall_time
 
-    def reference(self, begin: float, period: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    def reference(self, begin: float, period: float, count: int) -> tuple[ndarray, ndarray]:
         """States (count + 1, 16) at ``begin`` [s] and each period on; inputs (count, 4) in the
         middle of the periods.
         """
