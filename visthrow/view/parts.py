@@ -1,7 +1,7 @@
 """What a section is made of, the same for the page and for Markdown."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 DPI = 150.0  # of pictures
@@ -54,6 +54,26 @@ class Grid:
     rows: tuple[tuple[str, ...], ...]
     note: str = ""
     heads: int = 1
+
+    @classmethod
+    def of(
+        cls,
+        title: str,
+        header: str,
+        rows: Iterable[Mapping[str, str] | tuple[str, ...]],
+        note: str = "",
+        heads: int = 1,
+    ) -> "Grid | None":
+        """Return a table, or None without rows.
+
+        ``header``: headings, with `` | `` between two. ``rows``: cells in their order, or by
+        heading, where "-" stands for what a row lacks."""
+        names = header.split(" | ")
+        cells = tuple(
+            row if isinstance(row, tuple) else tuple(row.get(name, "-") for name in names)
+            for row in rows
+        )
+        return cls(title, tuple(names), cells, note, heads) if cells else None
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""

@@ -97,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.storage import writable
     from visthrow.paper.baseline import thrower
     from visthrow.paper.report import result_set, trade
-    from visthrow.paper.report.throws import SHORT
+    from visthrow.paper.report.result_set import SHORT
     from visthrow.throws import results
     from visthrow.throws.plants import known_plant
     from visthrow.view import page

@@ -3,10 +3,10 @@ reference plants.
 """
 
 import math
+from itertools import product
 
 from visthrow.common import statistics as st
-from visthrow.paper.report.result_set import ANY, ResultSet, errors, landed
-from visthrow.paper.report.throws import SHORT
+from visthrow.paper.report.result_set import ANY, SHORT, WORDS, ResultSet, cells, errors
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
@@ -14,7 +14,11 @@ from visthrow.view.tables import PAPER_ABLATIONS
 
 TARGET = 2.0  # target of Table V [m]
 
+TITLES: dict[str, str] = WORDS["ablations"]
+"""Variant -> its name in tables."""
+
 PAPER_FOUR = tuple(name for name in PAPER_ABLATIONS if name != "full")
+FURTHER = tuple(name for name in TITLES if name not in PAPER_ABLATIONS)  # what the paper leaves out
 # number of throws of each ablation and of the full model (the paper's figure of landing points)
 PAPER_THROWS = 5
 PAPER_FULL_THROWS = 10
@@ -25,19 +29,11 @@ NOTE = (
     " throws."
 )
 
-FURTHER = ("no_delay", "no_battery", "no_release_lag")  # what the paper leaves out
-
-TITLES = {
-    "full": "full model",
-    "no_aerodynamics": "no aerodynamics",
-    "no_motor_lag": "no motor lag",
-    "simple_controller": "simple rate controller",
-    "rigid_cable": "rigid cable",
-    "no_delay": "no command delay",
-    "no_battery": "no battery",
-    "no_release_lag": "no release lag",
-}
-"""Variant -> its name in tables."""
+HEADER = (
+    "configuration | trainings | throws | landed | landing error [m] | ratio to full"
+    " | the paper's ratio | scatter [m] | duration [s] | bias along [m] | bias left [m] | lands"
+    " | the paper: lands"
+)
 
 PLANTS = ("reference-realistic", "reference")
 """Where ablated policies fly without retraining; the first is the stand-in for a vehicle."""
@@ -59,39 +55,31 @@ def section(thrown: ResultSet) -> Section:
         " of a real vehicle."
     )
     grids = []
-    picture = None
     marks = []
     missing = []
     sentences = []
-    for layout in ("state", "vision"):
-        for plant in PLANTS:
-            rows = _rows(thrown, layout, plant, marks, missing, sentences)
-            if rows:
-                head = (
-                    "configuration",
-                    "trainings",
-                    "throws",
-                    "landed",
-                    "landing error [m]",
-                    "ratio to full",
-                    "the paper's ratio",
-                    "scatter [m]",
-                    "duration [s]",
-                    "bias along [m]",
-                    "bias left [m]",
-                    "lands",
-                    "the paper: lands",
-                )
-                title = (
-                    f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:.1f} m on the {SHORT[plant]}"
-                )
-                grids.append(Grid(title, head, tuple(rows), NOTE))
+    for series, (layout, plant) in enumerate(product(SHORT_LAYOUT, PLANTS)):
+        full = thrown.seeds(layout, "full", plant, TARGET, {})
+        if not full:
+            missing.append(f"the full {layout} model's own trainings on the {SHORT[plant]}")
+            continue
+        rows = [_row("full", full) | {"ratio to full": "1", "the paper's ratio": "-"}]
+        for variant in (*PAPER_FOUR, *FURTHER):
+            trainings = thrown.seeds(layout, variant, plant, TARGET)
+            if trainings:
+                ratio = st.ratio(errors(trainings), errors(full))
+                rows.append(_row(variant, trainings) | {"ratio to full": ratio.text(2)})
+                paper = None if series else paper_ratio(variant)
+                marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
+                if not series:
+                    sentences.append(_sentence(variant, ratio, trainings))
+            elif layout == "state" or variant in PAPER_FOUR:
+                missing.append(f"{TITLES[variant]} ({layout}, {SHORT[plant]})")
+        title = f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:.1f} m on the {SHORT[plant]}"
+        grids.append(Grid.of(title, HEADER, rows, NOTE))
+    picture = None
     if marks:
-        series = [
-            f"{SHORT_LAYOUT[layout]},\n{SHORT[plant]}"
-            for layout in SHORT_LAYOUT
-            for plant in PLANTS
-        ]
+        series = [f"{a},\n{SHORT[b]}" for a, b in product(SHORT_LAYOUT.values(), PLANTS)]
         chart = figures.marks(
             marks, "mean landing error over the full model's", series, zero=1.0, log=True
         )
@@ -99,35 +87,11 @@ def section(thrown: ResultSet) -> Section:
             "Error ratio to the full model with 95 % intervals; at 1 the component does not matter."
         )
         picture = Picture("ablations", chart, text)
-    findings = (Text(text, "finding") for text in sentences)
     title = "What each component of the simulator is worth"
+    findings = (Text(text, "finding") for text in sentences)
     return parts.section(
         "ablations", title, lead, picture, *grids, _scatter(thrown), *findings, missing=missing
     )
-
-
-def _rows(
-    thrown: ResultSet, layout: str, plant: str, marks: list, missing: list, sentences: list
-) -> list[tuple[str, ...]]:
-    full = thrown.seeds(layout, "full", plant, TARGET, {})
-    if not full:
-        missing.append(f"the full {layout} model's own trainings on the {SHORT[plant]}")
-        return []
-    rows = [_row("full", full, full)]
-    for variant in (*PAPER_FOUR, *FURTHER):
-        trainings = thrown.seeds(layout, variant, plant, TARGET)
-        if not trainings:
-            if layout == "state" or variant in PAPER_FOUR:
-                missing.append(f"{TITLES[variant]} ({layout}, {SHORT[plant]})")
-            continue
-        rows.append(_row(variant, trainings, full))
-        ratio = st.ratio(errors(trainings), errors(full))
-        series = list(SHORT_LAYOUT).index(layout) * len(PLANTS) + PLANTS.index(plant)
-        paper = paper_ratio(variant) if not series else None
-        marks.append(figures.Mark(TITLES[variant], ratio, series, paper))
-        if layout == "state" and plant == PLANTS[0]:
-            sentences.append(_sentence(variant, ratio, trainings))
-    return rows
 
 
 def paper_ratio(variant: str) -> st.Interval | None:
@@ -138,59 +102,53 @@ def paper_ratio(variant: str) -> st.Interval | None:
         return None
     (mean, std) = PAPER_ABLATIONS[variant][:2]
     (full, full_std) = PAPER_ABLATIONS["full"][:2]
-    relative = math.hypot(
-        std / mean / math.sqrt(PAPER_THROWS), full_std / full / math.sqrt(PAPER_FULL_THROWS)
-    )
     ratio = mean / full
-    half = 1.96 * relative * mean / full
+    half = (
+        1.96
+        * ratio
+        * math.hypot(
+            std / mean / math.sqrt(PAPER_THROWS), full_std / full / math.sqrt(PAPER_FULL_THROWS)
+        )
+    )
     return st.Interval(ratio, ratio - half, ratio + half, "throws")
 
 
-def _row(variant: str, trainings: list[Result], full: list[Result]) -> tuple[str, ...]:
+def _row(variant: str, trainings: list[Result]) -> dict[str, str]:
     paper = paper_ratio(variant)
     bias = st.bias([r.miss for r in trainings])
-    ratio = "1" if variant == "full" else st.ratio(errors(trainings), errors(full)).text(2)
-    axial, lateral = (part.text(sign=True) for part in (bias.along, bias.lateral))
-    return (
-        TITLES[variant],
-        str(len(trainings)),
-        str(sum(len(r.good) for r in trainings)),
-        landed(*trainings),
-        st.mean(errors(trainings)).text(),
-        ratio,
-        "-" if paper is None or variant == "full" else paper.text(1),
-        f"{bias.scatter:.3f}",
-        f"{st.mean([r.of('duration') for r in trainings]).value:.3f}",
-        axial,
-        lateral,
-        bias.direction,
-        PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else "-",
-    )
+    row = cells(*trainings) | {
+        "configuration": TITLES[variant],
+        "scatter [m]": f"{bias.scatter:.3f}",
+        "bias along [m]": bias.along.text(sign=True),
+        "bias left [m]": bias.lateral.text(sign=True),
+        "lands": bias.direction,
+    }
+    if paper is not None:
+        row["the paper's ratio"] = paper.text(1)
+        row["the paper: lands"] = PAPER_ABLATIONS[variant][4]
+    return row
 
 
 def _sentence(variant: str, ratio: st.Interval, trainings: list[Result]) -> str:
     """One sentence: whether the component matters here as the paper says."""
-    paper = paper_ratio(variant)
-    head = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error"
     if 1.0 in ratio:
         verdict = "no effect shows"
+    elif ratio.value > 1.0:
+        verdict = "the component matters"
     else:
-        if ratio.value > 1.0:
-            verdict = "the component matters"
-        else:
-            verdict = "leaving it out did not harm, it helped"
-    distinct = paper is not None and (paper.low > ratio.high or paper.high < ratio.low)
-    agree = "apart from ours" if distinct else "the intervals overlap"
-    comparison = "" if paper is None else f"; the paper: {paper.text(2)}, {agree}"
-    words = PAPER_ABLATIONS[variant][4] if variant in PAPER_ABLATIONS else ""
+        verdict = "leaving it out did not harm, it helped"
     bias = st.bias([r.miss for r in trainings])
+    text = f"**{TITLES[variant]}**: {ratio.text(2)} times the full model's error: {verdict}"
     signs = f" Bias here: {bias.direction}, {100 * bias.share:.0f} % of the mean square miss"
-    signs += f"; the paper's throws: {words}." if words else "."
-    if len(trainings) > 1:
-        seeds = ""
-    else:
-        seeds = " One training: the interval covers throws, not trainings."
-    return f"{head}: {verdict}{comparison}.{signs}{seeds}"
+    paper = paper_ratio(variant)
+    if paper is not None:
+        distinct = paper.low > ratio.high or paper.high < ratio.low
+        agree = "apart from ours" if distinct else "the intervals overlap"
+        text += f"; the paper: {paper.text(2)}, {agree}"
+        signs += f"; the paper's throws: {PAPER_ABLATIONS[variant][4]}"
+    if len(trainings) == 1:
+        signs += ". One training: the interval covers throws, not trainings"
+    return f"{text}.{signs}."
 
 
 def _scatter(thrown: ResultSet) -> Picture | None:
@@ -199,11 +157,11 @@ def _scatter(thrown: ResultSet) -> Picture | None:
     for variant in ("full", *PAPER_FOUR, *FURTHER):
         trainings = thrown.seeds("state", variant, plant, TARGET, {} if variant == "full" else ANY)
         if trainings:
-            words = PAPER_ABLATIONS.get(variant)
-            title = TITLES[variant] + ("" if words is None else f"\npaper: {words[4]}")
-            panels.append(
-                (title, [(f"training {r.unit['train_seed']}", r.miss) for r in trainings])
-            )
+            title = TITLES[variant]
+            if variant in PAPER_ABLATIONS:
+                title += f"\npaper: {PAPER_ABLATIONS[variant][4]}"
+            series = [(f"training {r.unit['train_seed']}", r.miss) for r in trainings]
+            panels.append((title, series))
     if len(panels) < 2:
         return None
     text = (

@@ -2,14 +2,22 @@
 other sight.
 """
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from itertools import product
+
+import numpy as np
 
 from visthrow.common import statistics as st
-from visthrow.paper.report.result_set import ANY, SHIPPED, ResultSet, errors, landed
-from visthrow.paper.report.throws import SHORT
+from visthrow.paper.report.result_set import (
+    ANY,
+    SHIPPED,
+    SHORT,
+    WORDS,
+    ResultSet,
+    cells,
+    errors,
+    line,
+)
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
@@ -26,70 +34,14 @@ class GapSweep:
     title: str
     xlabel: str
     own: float  # in the units of the axis; the value that both policies are flown with
-    scale: Callable[[Any], float] = float
+    scale: float = 1.0  # of the axis; of a range the mean counts
     policies: tuple[str, ...] = ("vision",)
 
 
-SWEEPS = (
-    GapSweep(
-        "camera.noise.step_std", "keypoint noise", "per step, 1 at the edge of the image", 0.01
-    ),
-    GapSweep(
-        "camera.noise.bias_std", "keypoint bias", "per throw, 1 at the edge of the image", 0.001
-    ),
-    GapSweep(
-        "camera.noise.latency",
-        "latency of the keypoints",
-        "[ms] behind the vehicle's own pose",
-        0.0,
-        lambda x: 20.0 * x,
-    ),
-    GapSweep("camera.noise.drop_probability", "drop-out", "share of keypoints lost", 0.0),
-    GapSweep(
-        "camera.mount.rotation_error_std",
-        "camera turned",
-        "[deg] per axis, standard deviation",
-        0.0,
-        math.degrees,
-    ),
-    GapSweep(
-        "camera.mount.position_error_std",
-        "camera displaced",
-        "[mm] per axis, standard deviation",
-        0.0,
-        lambda x: 1e3 * x,
-    ),
-    GapSweep(
-        "task.observation.latency",
-        "age of all poses",
-        "[ms]",
-        10.0,
-        lambda x: 500.0 * (x[0] + x[1]),
-        SHIPPED,
-    ),
-    GapSweep(
-        "task.noise.observation_step",
-        "noise of the vehicle's pose",
-        "per step, SI units",
-        0.01,
-        float,
-        SHIPPED,
-    ),
-)
+SWEEPS = tuple(GapSweep(**table) for table in WORDS["sweeps"])
 """What was swept; values of the lists ``gap`` and ``quick``."""
 
-TRAINED = {
-    "no_validity": "no validity bits",
-    "history_0": "no history",
-    "history_1": "history of 1",
-    "history_2": "history of 2",
-    "full": "full: history of 3, 220 deg, validity",
-    "history_6": "history of 6",
-    "fov_120": "field of view 120 deg",
-    "fov_150": "field of view 150 deg",
-    "fov_180": "field of view 180 deg",
-    "no_latency": "poses without age in training",
-}
+TRAINED: dict[str, str] = WORDS["trained"]
 """Variant of a vision training -> its name, in the order of the table."""
 
 
@@ -101,11 +53,10 @@ def section(thrown: ResultSet) -> Section:
     for sweep in SWEEPS:
         lines = []
         for series, policy in enumerate(SHIPPED[::-1]):
-            if policy in sweep.policies:
-                points = curve(thrown, sweep, policy)
-                if len(points) > 1:
-                    lines.append(_line(sweep, policy, points, series))
-                    rows += _rows(sweep, policy, points)
+            points = curve(thrown, sweep, policy) if policy in sweep.policies else []
+            if len(points) > 1:
+                lines.append(line(f"{policy} policy", points, series, sweep.own))
+                rows += _rows(sweep, points)
         if not lines:
             missing.append(sweep.title)
         panels.append(figures.Panel(sweep.title, sweep.xlabel, tuple(lines), "not thrown yet"))
@@ -119,17 +70,12 @@ def section(thrown: ResultSet) -> Section:
     ]
     if rows:
         text = "Mean landing error of the throws that landed, against one imperfection at a time."
-        head = (
-            "imperfection",
-            "value",
-            "policy",
-            "throws",
-            "landed",
-            "landing error [m]",
-            "added to its own [m]",
+        header = (
+            "imperfection | value | policy | throws | landed | landing error [m]"
+            " | added to its own [m]"
         )
         curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
-        content += [curves, Grid("The curves in figures", head, tuple(rows))]
+        content += [curves, Grid.of("The curves in figures", header, rows)]
     return parts.section(
         "gap", "What vision costs, and why", *content, *_trained(thrown, missing), missing=missing
     )
@@ -140,9 +86,8 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, 
     ascending.
     """
     points = {
-        round(sweep.scale(value), 9): r
+        round(sweep.scale * float(np.mean(value)), 9): r
         for value, r in thrown.by_departure(policy, sweep.key, PLANT, TARGET)
-        if r.good.any()
     }
     nominal = thrown.shipped(policy, PLANT, TARGET)
     if nominal is not None and points:
@@ -150,39 +95,15 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, 
     return sorted(points.items())
 
 
-def _line(
-    sweep: GapSweep, policy: str, points: list[tuple[float, Result]], series: int
-) -> figures.Line:
-    nominal = next((i for i, (value, _) in enumerate(points) if value == sweep.own), None)
-    intervals = [st.mean(r.of("error")) for _, r in points]
-    return figures.Line(
-        f"{policy} policy", [value for value, _ in points], intervals, series, nominal
-    )
-
-
-def _rows(
-    sweep: GapSweep, policy: str, points: list[tuple[float, Result]]
-) -> list[tuple[str, ...]]:
+def _rows(sweep: GapSweep, points: list[tuple[float, Result]]) -> list[dict[str, str]]:
     nominal = dict(points).get(sweep.own)
     rows = []
     for value, r in points:
-        if r is nominal:
-            added = "its own"
-        elif nominal is None:
-            added = "-"
-        else:
+        added = "its own" if r is nominal else "-"
+        if nominal is not None and r is not nominal:
             added = st.difference(errors([r]), errors([nominal])).text(sign=True)
-        rows.append(
-            (
-                f"{sweep.title}, {sweep.xlabel}",
-                f"{value:.3g}",
-                policy,
-                str(len(r.good)),
-                landed(r),
-                st.mean(r.of("error")).text(),
-                added,
-            )
-        )
+        row = cells(r) | {"value": f"{value:.3g}", "added to its own [m]": added}
+        rows.append(row | {"imperfection": f"{sweep.title}, {sweep.xlabel}"})
     return rows
 
 
@@ -193,42 +114,29 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
     marks = []
     rows = []
     plants = ("hybrid", "reference-realistic")
-    for series, plant in enumerate(plants):
+    for (variant, title), (series, plant) in product(TRAINED.items(), enumerate(plants)):
         full = thrown.seeds("vision", "full", plant, TARGET, {})
-        for variant, title in TRAINED.items():
-            # a reference plant is what it is, whatever the training had
-            nominal = {} if plant == "hybrid" else ANY
-            if variant == "full":
-                results = full
-            else:
-                results = thrown.seeds("vision", variant, plant, TARGET, nominal)
-            if not results:
-                missing.append(f"trained with {title} ({SHORT[plant]})")
-                continue
-            error = st.mean(errors(results))
-            marks.append(figures.Mark(title, error, series))
-            if variant == "full" or not full:
-                ratio = "-"
-            else:
-                ratio = st.ratio(errors(results), errors(full)).text(2)
-            rows.append(
-                (title, SHORT[plant], str(len(results)), landed(*results), error.text(), ratio)
-            )
+        # a reference plant is what it is, whatever the training had
+        nominal = {} if plant == "hybrid" or variant == "full" else ANY
+        results = thrown.seeds("vision", variant, plant, TARGET, nominal)
+        if not results:
+            missing.append(f"trained with {title} ({SHORT[plant]})")
+            continue
+        marks.append(figures.Mark(title, st.mean(errors(results)), series))
+        row = cells(*results) | {"trained with": title}
+        if variant != "full" and full:
+            row["ratio to full"] = st.ratio(errors(results), errors(full)).text(2)
+        rows.append(row)
     if not rows:
         return []
-    order = list(TRAINED.values())
-    marks.sort(key=lambda mark: order.index(mark.label))
-    rows.sort(key=lambda row: order.index(row[0]))
-    head = ("trained with", "plant", "trainings", "landed", "landing error [m]", "ratio to full")
+    header = "trained with | plant | trainings | landed | landing error [m] | ratio to full"
     text = (
         "Vision policies trained with other sight; 95 % intervals, over throws alone where there is"
         " one training."
     )
+    axis = "landing error at 2.0 m [m]"
+    picture = figures.marks(marks, axis, [SHORT[plant] for plant in plants])
     return [
-        Picture(
-            "gap_trained",
-            figures.marks(marks, "landing error at 2.0 m [m]", [SHORT[p] for p in plants]),
-            text,
-        ),
-        Grid("Trained with other sight", head, tuple(rows)),
+        Picture("gap_trained", picture, text),
+        Grid.of("Trained with other sight", header, rows),
     ]

@@ -1,22 +1,31 @@
 """The results that are there, and questions to them."""
 
 import json
+import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
+from visthrow.common import statistics as st
 from visthrow.common.errors import StorageError
 from visthrow.paper import RECORDS
 from visthrow.throws.results import PROTOCOL, Result, join, load_all
+from visthrow.view.figures import Line
 
 SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the package
 
 ANY = object()  # any departures
 
 PARTS = ("throws", "training", "findings")  # folders of a folder of records
+
+WORDS = tomllib.loads(Path(__file__).with_name("report.toml").read_text(encoding="utf-8"))
+
+SHORT: dict[str, str] = WORDS["plants"]
+"""Plant -> its name in tables."""
 
 
 @dataclass(frozen=True)
@@ -29,27 +38,18 @@ class ResultSet:
     findings: dict[str, str] = field(default_factory=dict)
 
     def policies(
-        self,
-        plant: str,
-        target: float,
-        *,
-        layout: str | None = None,
-        variant: str | None = None,
-        policy: str | None = None,
-        departures: Any = ANY,
+        self, plant: str, target: float, departures: Any = ANY, **conditions: str
     ) -> list[Result]:
         """Throws of learnt policies at a target [m], one result a policy: of several alike the one
         with most throws.
 
-        What is None does not matter, nor do departures, with which the throws were flown, that are
-        :data:`ANY`."""
-        conditions = {
-            "layout": layout,
-            "variant": variant,
-            "policy": policy,
-            "departures": None if departures is ANY else departures,
-        }
-        conditions = {name: value for name, value in conditions.items() if value is not None}
+        Args:
+            plant, target: of the throws.
+            departures: with which they were flown; :data:`ANY` do not matter.
+            conditions: layout, variant or policy.
+        """
+        if departures is not ANY:
+            conditions |= {"departures": departures}
         best: dict[str, Result] = {}
         for result in self.matching(kind="policy", plant=plant, target=target, **conditions):
             name = result.unit["policy"]
@@ -59,8 +59,7 @@ class ResultSet:
 
     def shipped(self, name: str, plant: str, target: float) -> Result | None:
         """Throws of a shipped policy under its own conditions."""
-        collected = self.policies(plant, target, policy=name, departures={})
-        return collected[0] if collected else None
+        return next(iter(self.policies(plant, target, {}, policy=name)), None)
 
     def seeds(
         self, layout: str, variant: str, plant: str, target: float, departures: Any = ANY
@@ -68,12 +67,9 @@ class ResultSet:
         """Throws of runs that were trained for the comparison, shipped policies left out; one
         result a training seed.
         """
-        collected = self.policies(
-            plant, target, layout=layout, variant=variant, departures=departures
-        )
         return [
             result
-            for result in collected
+            for result in self.policies(plant, target, departures, layout=layout, variant=variant)
             if result.unit["policy"] not in SHIPPED and result.good.any()
         ]
 
@@ -86,20 +82,16 @@ class ResultSet:
         ]
 
     def by_departure(
-        self, policy: str, key: str, plant: str = "hybrid", target: float = 2.0
+        self, policy: str, key: str, plant: str, target: float
     ) -> list[tuple[Any, Result]]:
-        """Return a shipped policy's throws with one value of the config changed: the value and the
-        throws, ascending.
+        """Return a policy's throws with one value of the config changed, where any landed: the
+        value and the throws.
         """
-        collected = [
-            r
+        return [
+            (r.unit["departures"][key], r)
             for r in self.matching(kind="policy", policy=policy, plant=plant, target=target)
-            if list(r.unit["departures"]) == [key]
+            if list(r.unit["departures"]) == [key] and r.good.any()
         ]
-        return sorted(
-            ((r.unit["departures"][key], r) for r in collected),
-            key=lambda pair: float(np.ravel(pair[0])[0]),
-        )
 
 
 def read(records: Iterable[Path] = (RECORDS,), folders: Iterable[Path] = ()) -> ResultSet:
@@ -133,7 +125,7 @@ def runs_of(path: Path) -> list[dict[str, Any]]:
         ) from error
 
 
-def errors(results: Iterable[Result]) -> list[np.ndarray]:
+def errors(results: Iterable[Result]) -> list[ndarray]:
     """Landing errors of each run [m]."""
     return [result.of("error") for result in results if result.good.any()]
 
@@ -141,3 +133,30 @@ def errors(results: Iterable[Result]) -> list[np.ndarray]:
 def landed(*results: Result, digits: int = 1) -> str:
     """Share of throws that landed."""
     return f"{100 * np.mean(np.concatenate([result.good for result in results])):.{digits}f} %"
+
+
+def cells(*results: Result) -> dict[str, str]:
+    """Return what tables say of throws of one kind, of one training or more, by heading."""
+    unit = results[0].unit
+    row = {
+        "policy": unit.get("policy", "-"),
+        "plant": SHORT[unit["plant"]],
+        "target [m]": f"{unit['target']:.1f}",
+        "trainings": str(len(results)),
+        "throws": str(sum(len(result.good) for result in results)),
+        "landed": landed(*results),
+    }
+    if landings := errors(results):
+        durations = [result.of("duration") for result in results if result.good.any()]
+        row["landing error [m]"] = st.mean(landings).text()
+        row["duration [s]"] = f"{np.mean([part.mean() for part in durations]):.3f}"
+    return row
+
+
+def line(
+    label: str, points: list[tuple[float, Result]], series: int, own: float | None = None
+) -> Line:
+    """Return the curve of mean landing errors over values; ``own``: the policy's value."""
+    intervals = [st.mean(result.of("error")) for _, result in points]
+    values = [value for value, _ in points]
+    return Line(label, values, intervals, series, values.index(own) if own in values else None)

@@ -1,10 +1,11 @@
 """Sections on the learnt policies: their throws on each plant, and vision against state."""
 
 import math
+from itertools import product
 
 from visthrow.common import statistics as st
 from visthrow.paper.baseline.front import FRONT_TARGET
-from visthrow.paper.report.result_set import SHIPPED, ResultSet, landed
+from visthrow.paper.report.result_set import SHIPPED, SHORT, ResultSet, cells
 from visthrow.task.measurement import TARGETS
 from visthrow.throws.plants import PLANTS
 from visthrow.throws.results import Result
@@ -12,13 +13,8 @@ from visthrow.view import figures
 from visthrow.view.parts import Grid, Picture, Section, Text, section
 from visthrow.view.tables import PAPER, PAPER_NOTE, of_paper
 
-SHORT = {
-    "pendulum": "own model",
-    "hybrid": "training simulator",
-    "reference": "reference plant",
-    "reference-realistic": "realistic reference plant",
-}
-"""Plant -> its name in tables."""
+ERROR = "landing error [m], mean and 95 % interval"
+VEHICLE = "the paper's vehicle: error [m], duration [s]"
 
 
 def throws_section(thrown: ResultSet) -> Section:
@@ -27,36 +23,22 @@ def throws_section(thrown: ResultSet) -> Section:
     """
     rows = []
     missing = []
-    for name in SHIPPED:
-        for target in TARGETS:
-            for plant in PLANTS:
-                result = thrown.shipped(name, plant, target)
-                if result is None:
-                    if wanted_there(plant, target):
-                        missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
-                    continue
-                rows.append(_row(name, target, plant, result))
+    for name, target, plant in product(SHIPPED, TARGETS, PLANTS):
+        result = thrown.shipped(name, plant, target)
+        if result is not None:
+            rows.append(_row(result))
+        elif wanted_there(plant, target):
+            missing.append(f"{name} at {target:g} m on the {SHORT[plant]}")
     lead = Text(
         "Throws of the shipped policies from hover. In training goals lie within 2 m (`state`) and"
         " 2.5 m (`vision`): for the first 2.5 m is out of distribution. The training simulator has"
         " all noise of the training; the reference plants were never seen in it."
     )
-    head = (
-        "policy",
-        "target [m]",
-        "plant",
-        "throws",
-        "landed",
-        "landing error [m], mean and 95 % interval",
-        "deviation [m]",
-        "duration [s]",
-        "bias along / left [m]",
-        "the paper's vehicle: error [m], duration [s]",
+    header = (
+        f"policy | target [m] | plant | throws | landed | {ERROR} | deviation [m] | duration [s]"
+        f" | bias along / left [m] | {VEHICLE}"
     )
-    if rows:
-        table = Grid("Landing error and duration", head, tuple(rows), PAPER_NOTE, heads=3)
-    else:
-        table = None
+    table = Grid.of("Landing error and duration", header, rows, PAPER_NOTE, heads=3)
     return section(
         "throws",
         "What the policies do",
@@ -75,20 +57,16 @@ def wanted_there(plant: str, target: float) -> bool:
     return plant != "reference" or target == FRONT_TARGET
 
 
-def _row(name: str, target: float, plant: str, result: Result) -> tuple[str, ...]:
-    head = (name, f"{target:.1f}", SHORT[plant], str(len(result.good)), landed(result))
-    paper = of_paper(name, target)
-    if not result.good.any():
-        return (*head, "-", "-", "-", "-", paper)
-    bias = st.bias(result.miss)
-    return (
-        *head,
-        st.mean(result.of("error")).text(),
-        f"{result.of('error').std():.3f}",
-        f"{result.of('duration').mean():.3f}",
-        f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}",
-        paper,
-    )
+def _row(result: Result) -> dict[str, str]:
+    row = cells(result)
+    row[VEHICLE] = of_paper(result.unit["policy"], result.unit["target"])
+    if result.good.any():
+        bias = st.bias(result.miss)
+        row[ERROR] = row["landing error [m]"]
+        row["deviation [m]"] = f"{result.of('error').std():.3f}"
+        offset = f"{bias.along.value:+.3f} / {bias.lateral.value:+.3f}"
+        row["bias along / left [m]"] = offset
+    return row
 
 
 def _scatter(thrown: ResultSet) -> Picture | None:
@@ -117,30 +95,20 @@ def vision_section(thrown: ResultSet) -> Section:
     rows = []
     marks = []
     missing = []
-    for i, plant in enumerate(PLANTS):
-        for target in TARGETS:
-            pair = _groups(thrown, plant, target)
-            if pair is None:
-                if wanted_there(plant, target):
-                    missing.append(f"{target:g} m on the {SHORT[plant]}")
-                continue
-            (vision, state), runs = pair
-            gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
-            paper = _paper(target)
-            comparison = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
-            rows.append(
-                (
-                    SHORT[plant],
-                    f"{target:.1f}",
-                    runs,
-                    gap.text(sign=True),
-                    _sentence(gap),
-                    faster.text(sign=True),
-                    comparison,
-                )
-            )
-            reference = None if paper is None or i else paper[0]
-            marks.append(figures.Mark(f"{target:.1f} m", gap, i, reference))
+    for (i, plant), target in product(enumerate(PLANTS), TARGETS):
+        pair = _groups(thrown, plant, target)
+        if pair is None:
+            if wanted_there(plant, target):
+                missing.append(f"{target:g} m on the {SHORT[plant]}")
+            continue
+        vision, state, runs = pair
+        gap, faster = (_minus(vision, state, name) for name in ("error", "duration"))
+        paper = _paper(target)
+        comparison = "-" if paper is None else f"{paper[0].value:+.3f}, {paper[1]:+.3f}"
+        figures_of_pair = (gap.text(sign=True), _sentence(gap), faster.text(sign=True), comparison)
+        rows.append((SHORT[plant], f"{target:.1f}", runs, *figures_of_pair))
+        reference = None if paper is None or i else paper[0]
+        marks.append(figures.Mark(f"{target:.1f} m", gap, i, reference))
     parts = [
         Text(
             "Vision minus state: positive means that vision lands further off. Where several"
@@ -150,19 +118,14 @@ def vision_section(thrown: ResultSet) -> Section:
         )
     ]
     if rows:
-        head = (
-            "plant",
-            "target [m]",
-            "policies",
-            "error: vision - state [m]",
-            "in words",
-            "duration: vision - state [s]",
-            "the paper's: error [m], duration [s]",
+        header = (
+            "plant | target [m] | policies | error: vision - state [m] | in words"
+            " | duration: vision - state [s] | the paper's: error [m], duration [s]"
         )
         axis = "landing error, vision minus state [m]"
         picture = figures.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
         text = "Difference of mean landing errors with 95 % intervals; left: vision lands nearer."
-        parts += [Grid("Vision against state", head, tuple(rows)), Picture("vision", picture, text)]
+        parts += [Grid.of("Vision against state", header, rows), Picture("vision", picture, text)]
     return section(
         "vision", "Vision against state", *parts, missing=missing, head="Not thrown by both"
     )
@@ -182,17 +145,17 @@ def _minus(vision: list[Result], state: list[Result], name: str) -> st.Interval:
 
 def _groups(
     thrown: ResultSet, plant: str, target: float
-) -> tuple[tuple[list[Result], list[Result]], str] | None:
+) -> tuple[list[Result], list[Result], str] | None:
     """Return the runs of both layouts: those trained for the comparison where two or more of each
     are there, else the shipped ones.
     """
-    trained = [thrown.seeds(layout, "full", plant, target, {}) for layout in ("vision", "state")]
-    if min(map(len, trained)) >= 2:
-        return (trained[0], trained[1]), f"{len(trained[0])} and {len(trained[1])} trainings"
-    shipped = [thrown.shipped(layout, plant, target) for layout in ("vision", "state")]
+    vision, state = (thrown.seeds(name, "full", plant, target, {}) for name in SHIPPED[::-1])
+    if min(len(vision), len(state)) >= 2:
+        return vision, state, f"{len(vision)} and {len(state)} trainings"
+    shipped = [thrown.shipped(name, plant, target) for name in SHIPPED[::-1]]
     if any(result is None or not result.good.any() for result in shipped):
         return None
-    return ([shipped[0]], [shipped[1]]), "shipped"
+    return shipped[:1], shipped[1:], "shipped"
 
 
 def _paper(target: float) -> tuple[st.Interval, float] | None:

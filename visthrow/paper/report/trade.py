@@ -5,14 +5,14 @@ accuracy with the policies on it.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common import statistics as st
 from visthrow.paper import measurements
 from visthrow.paper.baseline import front, thrower
 from visthrow.paper.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.paper.baseline.thrower import BOUNDS
-from visthrow.paper.report.result_set import SHIPPED, ResultSet, landed
-from visthrow.paper.report.throws import SHORT
+from visthrow.paper.report.result_set import SHIPPED, SHORT, ResultSet, cells, landed
 from visthrow.task.measurement import TARGETS
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
@@ -44,18 +44,20 @@ def _default(result: Result) -> bool:
     return all(unit[name] == default[name] for name in ("speed", "w_t", "rho", "bounds"))
 
 
+MODEL = "the paper's own model: error [m], duration [s]"
+
+
 def baseline_section(thrown: ResultSet) -> Section:
     """Throws of the baseline by target, plant and compensation, broken down as in the paper."""
     rows = []
     missing = []
     for target in TARGETS:
-        for plant in (thrower.IDEAL, "hybrid", "reference-realistic"):
-            for compensation in ("none",) if plant == thrower.IDEAL else thrower.MADE_UP:
-                best = _best(thrown, plant, target, compensation)
-                if best:
-                    rows.append(best)
-                elif plant != "reference-realistic" or compensation != "none":
-                    missing.append(f"{SHORT[plant]}, {thrower.MADE_UP[compensation]}, {target:g} m")
+        for plant, made_up in thrower.rows(("hybrid", "reference-realistic")):
+            best = _best(thrown, plant, target, made_up)
+            if best:
+                rows.append(best)
+            elif plant != "reference-realistic" or made_up != "none":
+                missing.append(f"{SHORT[plant]}, {thrower.MADE_UP[made_up]}, {target:g} m")
     lead = Text(
         "Trajectory optimisation and model-predictive control (TO+MPC), as the paper's: release"
         " height and speed from the learnt policy, a septic spline, a nonlinear MPC on a rigid"
@@ -89,79 +91,53 @@ def _of_baseline(
     return thrown.matching(kind="baseline", plant=plant, target=target, **conditions)
 
 
-def by_target(results: Sequence[Result]) -> Grid:
+def by_target(results: Sequence[Result]) -> Grid | None:
     """Table of throws by target and plant, the paper's beside those of the own model."""
-    head = (
-        "target [m]",
-        "plant",
-        "made up for",
-        "throws",
-        "landed",
-        "landing error [m]",
-        "duration [s]",
-        "e_p [cm]",
-        "e_v [cm/s]",
-        "tracking [cm]",
-        "the paper's own model: error [m], duration [s]",
+    header = (
+        "target [m] | plant | made up for | throws | landed | landing error [m] | duration [s]"
+        f" | e_p [cm] | e_v [cm/s] | tracking [cm] | {MODEL}"
     )
     note = (
         "e_p and e_v: payload's position and velocity at separation against the plan; tracking:"
         " root mean square distance from the planned path until the release."
     )
-    return Grid("The baseline by target", head, tuple(map(_row, results)), note, heads=3)
+    return Grid.of("The baseline by target", header, map(_row, results), note, heads=3)
 
 
-def _row(result: Result) -> tuple[str, ...]:
+PARTS = {
+    "position_error": "e_p [cm]",
+    "velocity_error": "e_v [cm/s]",
+    "tracking": "tracking [cm]",
+}
+"""Column of a baseline's throws -> its heading."""
+
+
+def _row(result: Result) -> dict[str, str]:
     unit = result.unit
-    ideal = unit["plant"] == thrower.IDEAL
-    paper = of_paper("TO+MPC", unit["target"]) if ideal else "-"
-    head = (
-        f"{unit['target']:.1f}",
-        SHORT[unit["plant"]],
-        "-" if ideal else thrower.MADE_UP[unit["compensation"]],
-        str(len(result.good)),
-        landed(result, digits=0),
-    )
-    if not result.good.any():
-        return (*head, "-", "-", "-", "-", "-", paper)
-    means = (
-        f"{100 * result.of(name).mean():.1f}"
-        for name in ("position_error", "velocity_error", "tracking")
-    )
-    return (
-        *head,
-        st.mean(result.of("error")).text(),
-        f"{result.of('duration').mean():.3f}",
-        *means,
-        paper,
-    )
+    row = cells(result) | {"landed": landed(result, digits=0)}
+    if unit["plant"] == thrower.IDEAL:
+        row[MODEL] = of_paper("TO+MPC", unit["target"])
+    else:
+        row["made up for"] = thrower.MADE_UP[unit["compensation"]]
+    if result.good.any():
+        row |= {head: f"{100 * result.of(name).mean():.1f}" for name, head in PARTS.items()}
+    return row
 
 
-def _steps() -> list[Grid | Text]:
+def _steps() -> list[Grid | Text | None]:
     """Step times of the controller, from the records of ``python -m bench.mpc``."""
     records = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
     if not records:
-        return [
-            Text(
-                "No step times of the controller: `python -m bench.mpc --record mpc-cpu`.",
-                "missing",
-            )
-        ]
+        command = "`python -m bench.mpc --record mpc-cpu`"
+        return [Text(f"No step times of the controller: {command}.", "missing")]
     grids = []
     for record in records:
         cpu = record["provenance"]["processors"]["cpu"]
         (table,) = record["tables"]
+        title = f"Step of the controller, one core of an {cpu}"
         note = f"{measurements.made_by(record)}. {record['notes'][0]}"
-        rows = tuple(map(tuple, table["rows"]))
-        grids.append(
-            Grid(
-                f"Step of the controller, one core of an {cpu}",
-                tuple(table["header"]),
-                rows,
-                note,
-                heads=2,
-            )
-        )
+        header = " | ".join(table["header"])
+        grids.append(Grid.of(title, header, map(tuple, table["rows"]), note, heads=2))
     return grids
 
 
@@ -181,72 +157,6 @@ def _bar(thrown: ResultSet) -> str:
     return "In its own model: " + "; ".join(words) + "."
 
 
-def _panel(
-    heading: str, plant: str, kinds: Sequence, policies: Sequence[tuple], charts: Sequence[tuple]
-) -> figures.Trade:
-    """Return the panel of a plant: fronts of the baseline, policies, and the paper's points."""
-    stars = [
-        (f"{name} policy", st.mean(result.of("duration")), st.mean(result.of("error")))
-        for name, result in policies
-    ]
-    crosses = _paper_points() if plant == thrower.IDEAL else ()
-    late = {"delay": ", release lag not made up for"}
-    fronts = tuple(
-        (
-            kinds.index((made_up, bounds)),
-            f"TO+MPC, bounds on {bounds}{late.get(made_up, '')}",
-            points_of(selected),
-        )
-        for (made_up, bounds), selected in charts
-    )
-    return figures.Trade(heading, fronts, tuple(stars), crosses)
-
-
-def _front_table(sums: Sequence[tuple]) -> Grid:
-    """Return the fronts in figures."""
-    head = (
-        "plant",
-        "what",
-        "settings",
-        "all landed",
-        "fastest [s]",
-        "most accurate [m]",
-        "hypervolume [s m]",
-        "correlation of landing error with e_v",
-    )
-    time, error = front.CORNER
-    note = (
-        f"Hypervolume: area that is beaten up to {time:g} s and {error:g} m; more is better."
-        " Correlations are over throws of all settings; the paper states that the error follows"
-        " e_v."
-    )
-    return Grid("Fronts in figures", head, tuple(sums), note, heads=2)
-
-
-def _panel_of(
-    thrown: ResultSet, row: tuple, names: Sequence[str], sentences: list, sums: list, missing: list
-) -> figures.Trade:
-    """Return the panel of a row of :data:`PANELS`; add its sentences, its sums, what it lacks."""
-    heading, plant, kinds, policies_on = row
-    title = SHORT[plant]
-    shipped = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
-    policies = [(name, result) for name, result in shipped if result and result.good.any()]
-    charts = []
-    for compensation, bounds in kinds:
-        selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
-        label = f"TO+MPC, bounds on {bounds}"
-        if plant != thrower.IDEAL:
-            label += f", {thrower.MADE_UP[compensation]}"
-        if selected:
-            charts.append(((compensation, bounds), selected))
-            sums.append(_summed(title, label, selected))
-            sentences += _verdicts(title, label, selected, policies, policies_on)
-        elif (plant, bounds) != ("reference-realistic", BOUNDS[1]):
-            missing.append(f"{title}, {label}")
-    sums += [_policy_sum(title, name, result) for name, result in policies]
-    return _panel(heading, plant, kinds, policies, charts)
-
-
 def front_section(
     thrown: ResultSet, rows_of_panels: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
 ) -> Section:
@@ -257,8 +167,7 @@ def front_section(
     sums: list = []
     missing: list = []
     picture = None
-    table = None
-    panels = [_panel_of(thrown, row, names, sentences, sums, missing) for row in rows_of_panels]
+    panels = [_panel(thrown, row, names, sentences, sums, missing) for row in rows_of_panels]
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting"
         " counts where all its throws landed. Plans bound the payload's path alone, as the paper's"
@@ -272,18 +181,62 @@ def front_section(
             " Crosses and grey stars are the paper's."
         )
         picture = Picture("front", figures.trades(panels), text)
-    if sums:
-        table = _front_table(sums)
-    caption = (
+    header = (
+        "plant | what | settings | all landed | fastest [s] | most accurate [m]"
+        " | hypervolume [s m] | correlation of landing error with e_v"
+    )
+    time, error = front.CORNER
+    note = (
+        f"Hypervolume: area that is beaten up to {time:g} s and {error:g} m; more is better."
+        " Correlations are over throws of all settings; the paper states that the error follows"
+        " e_v."
+    )
+    table = Grid.of("Fronts in figures", header, sums, note, heads=2)
+    findings = (Text(text, "finding") for text in sentences)
+    return parts.section(
+        "front",
+        "Agility against accuracy",
         lead,
         picture,
         table,
-        *(Text(text, "finding") for text in sentences),
+        *findings,
         _breakdown(thrown),
+        missing=missing,
+        head="Not swept",
     )
-    return parts.section(
-        "front", "Agility against accuracy", *caption, missing=missing, head="Not swept"
-    )
+
+
+def _panel(
+    thrown: ResultSet, row: tuple, names: Sequence[str], sentences: list, sums: list, missing: list
+) -> figures.Trade:
+    """Return the panel of a row of :data:`PANELS`, fronts, policies and the paper's points; add its
+    sentences, its sums, what it lacks.
+    """
+    heading, plant, kinds, policies_on = row
+    title = SHORT[plant]
+    ideal = plant == thrower.IDEAL
+    shipped = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
+    policies = [(name, result) for name, result in shipped if result and result.good.any()]
+    fronts = []
+    for i, (compensation, bounds) in enumerate(kinds):
+        selected = _swept(_of_baseline(thrown, plant, compensation=compensation, bounds=bounds))
+        label = f"TO+MPC, bounds on {bounds}"
+        late = ", release lag not made up for" if compensation == "delay" else ""
+        entry = (i, label + late, points_of(selected))
+        if not ideal:
+            label += f", {thrower.MADE_UP[compensation]}"
+        if selected:
+            fronts.append(entry)
+            sums.append(_summed(title, label, selected))
+            sentences += _verdicts(title, label, selected, policies, policies_on)
+        elif (plant, bounds) != ("reference-realistic", BOUNDS[1]):
+            missing.append(f"{title}, {label}")
+    stars = []
+    for name, result in policies:
+        sums.append(_policy_sum(title, name, result))
+        duration, error = (st.mean(result.of(column)) for column in ("duration", "error"))
+        stars.append((f"{name} policy", duration, error))
+    return figures.Trade(heading, tuple(fronts), tuple(stars), _paper_points() if ideal else ())
 
 
 def _swept(selected: Sequence[Result]) -> list[Result]:
@@ -291,21 +244,21 @@ def _swept(selected: Sequence[Result]) -> list[Result]:
     return [r for r in selected if r.unit["throws"] <= FRONT_THROWS or not _default(r)]
 
 
-def points_of(selected: Sequence[Result]) -> np.ndarray:
+def points_of(selected: Sequence[Result]) -> ndarray:
     """Mean duration [s] and landing error [m] of settings whose throws all landed, shape (N, 2)."""
-    return np.array(
-        [(r.of("duration").mean(), r.of("error").mean()) for r in selected if r.good.all()]
-    ).reshape(-1, 2)
+    return np.array([_point(r) for r in selected if r.good.all()]).reshape(-1, 2)
 
 
-def _paper_points() -> tuple[tuple[str, np.ndarray], ...]:
+def _point(result: Result) -> tuple[float, float]:
+    return result.of("duration").mean(), result.of("error").mean()
+
+
+def _paper_points() -> tuple[tuple[str, ndarray], ...]:
     swept = np.array([(row[4], row[3]) for row in front.PAPER_FRONT])
-    real = np.array(
-        [(PAPER[(name, FRONT_TARGET)][2], PAPER[(name, FRONT_TARGET)][0]) for name in SHIPPED]
-    )
+    vehicle = [PAPER[(name, FRONT_TARGET)] for name in SHIPPED]
     return (
         ("the paper's TO+MPC, its own model", swept),
-        ("the paper's policies, real vehicle", real),
+        ("the paper's policies, real vehicle", np.array([(row[2], row[0]) for row in vehicle])),
     )
 
 
@@ -317,54 +270,37 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
     if not sets:
         return None
     rng = np.random.default_rng(0)
-    resampled = np.stack(
-        [
-            np.stack([s[rng.integers(len(s), size=len(s))].mean(0) for s in sets])
-            for _ in range(DRAWS)
-        ]
-    )
-    samples = np.array([front.hypervolume(points) for points in resampled])
+    samples = []
+    for _ in range(DRAWS):
+        drawn = [s[rng.integers(len(s), size=len(s))].mean(0) for s in sets]
+        samples.append(front.hypervolume(np.stack(drawn)))
     low, high = np.quantile(samples, (0.025, 0.975))
-    return st.Interval(
-        front.hypervolume(np.stack([s.mean(0) for s in sets])), float(low), float(high), "throws"
-    )
+    value = front.hypervolume(np.stack([s.mean(0) for s in sets]))
+    return st.Interval(value, float(low), float(high), "throws")
 
 
 def _summed(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:
     points = points_of(selected)
     volume = hypervolume(selected)
+    head = (title, label, str(len(selected)), str(len(points)))
     if volume is None:
-        return (title, label, str(len(selected)), "0", "-", "-", "-", "-")
-    good = [r for r in selected if r.good.all()]
+        return (*head, "-", "-", "-", "-")
     error, velocity = (
-        np.concatenate([r.of(name) for r in good]) for name in ("error", "velocity_error")
+        np.concatenate([r.of(name) for r in selected if r.good.all()])
+        for name in ("error", "velocity_error")
     )
     related = st.correlation(velocity, error).text(2) if len(error) > 2 else "-"
-    return (
-        title,
-        label,
-        str(len(selected)),
-        str(len(good)),
-        f"{points[:, 0].min():.3f}",
-        f"{points[:, 1].min():.3f}",
-        volume.text(3),
-        related,
-    )
+    fastest, nearest = points.min(0)
+    return (*head, f"{fastest:.3f}", f"{nearest:.3f}", volume.text(3), related)
 
 
 def _policy_sum(title: str, name: str, result: Result) -> tuple[str, ...]:
     volume = hypervolume([result])
     text = "-" if volume is None else volume.text(3)
-    return (
-        title,
-        f"learnt {name} policy, {SHORT[result.unit['plant']]}",
-        "1",
-        str(int(result.good.all())),
-        f"{result.of('duration').mean():.3f}",
-        f"{result.of('error').mean():.3f}",
-        text,
-        "-",
-    )
+    what = f"learnt {name} policy, {SHORT[result.unit['plant']]}"
+    duration, error = _point(result)
+    landed_all = str(int(result.good.all()))
+    return (title, what, "1", landed_all, f"{duration:.3f}", f"{error:.3f}", text, "-")
 
 
 def _verdicts(
@@ -380,7 +316,7 @@ def _verdicts(
     points = points_of(selected)
     sentences = []
     for name, result in policies:
-        point = np.array([result.of("duration").mean(), result.of("error").mean()])
+        point = np.array(_point(result))
         head = (
             f"**{title}**, {label} against the {name} policy on the {SHORT[policies_on]}"
             f" ({point[0]:.3f} s, {point[1]:.3f} m): "
@@ -389,23 +325,19 @@ def _verdicts(
             sentences.append(head + f"none of {_count(selected)} landed all its throws.")
             continue
         beating = points[np.all(points <= point, axis=1)]
-        faster = points[points[:, 0] < point[0]]
-        nearer = points[points[:, 1] < point[1]]
+        faster, nearer = (points[points[:, i] < point[i]] for i in range(2))
+        claim = "no setting is both as accurate and as fast"
         if len(beating):
             best = beating[np.argmin(beating[:, 0])]
             claim = f"{len(beating)} of {_count(points)} as accurate and as fast at once"
             claim += f", the fastest with {best[0]:.3f} s and {best[1]:.3f} m"
-        else:
-            claim = "no setting is both as accurate and as fast"
-        if not len(faster):
-            speed = "the policy is faster than every setting"
-        else:
+        speed = "the policy is faster than every setting"
+        if len(faster):
             speed = f"faster than the policy: {_count(faster)}"
-        accuracy = f"more accurate: {len(nearer)} of {_count(points)}" + (
-            f", the fastest of which takes {nearer[:, 0].min() / point[0]:.2f} times as long"
-            if len(nearer)
-            else ""
-        )
+        accuracy = f"more accurate: {len(nearer)} of {_count(points)}"
+        if len(nearer):
+            slower = nearer[:, 0].min() / point[0]
+            accuracy += f", the fastest of which takes {slower:.2f} times as long"
         sentences.append(f"{head}{claim}; {speed}; {accuracy}.")
     return sentences
 
@@ -419,52 +351,23 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
     selected = _swept(_of_baseline(thrown, thrower.IDEAL))
     if not selected:
         return None
-    rows = [
-        (
-            f"{v:g}",
-            f"{w_t / 1e3:g}k",
-            f"{rho:g}",
-            "the paper's",
-            f"{e:.3f}",
-            f"{d:.3f}",
-            f"{100 * p:.1f}",
-            f"{100 * u:.1f}",
-        )
-        for v, w_t, rho, e, d, p, u in front.PAPER_FRONT
-    ]
+    rows = []
+    for v, w_t, rho, e, d, p, u in front.PAPER_FRONT:
+        figures_of_row = (f"{e:.3f}", f"{d:.3f}", f"{100 * p:.1f}", f"{100 * u:.1f}")
+        rows.append((*_setting(v, w_t, rho), "the paper's", *figures_of_row))
     for r in sorted(selected, key=lambda r: (r.unit["bounds"], r.unit["speed"], -r.unit["w_t"])):
         unit = r.unit
-        head = (
-            f"{unit['speed']:g}",
-            f"{unit['w_t'] / 1e3:g}k",
-            f"{unit['rho']:g}",
-            f"bounds on {unit['bounds']}",
-        )
+        head = (*_setting(unit["speed"], unit["w_t"], unit["rho"]), f"bounds on {unit['bounds']}")
         if r.good.all():
-            parts = (100 * r.of(name).mean() for name in ("position_error", "velocity_error"))
-            rows.append(
-                (
-                    *head,
-                    st.mean(r.of("error")).text(),
-                    f"{r.of('duration').mean():.3f}",
-                    *(f"{x:.1f}" for x in parts),
-                )
-            )
+            row = _row(r)
+            names = ("landing error [m]", "duration [s]", "e_p [cm]", "e_v [cm/s]")
+            rows.append((*head, *(row[name] for name in names)))
         else:
             rows.append((*head, f"landed {landed(r, digits=0)}", "-", "-", "-"))
-    head = (
-        "v [m/s]",
-        "w_t",
-        "rho",
-        "plan",
-        "landing error [m]",
-        "duration [s]",
-        "e_p [cm]",
-        "e_v [cm/s]",
-    )
-    return Grid(
-        "Breakdown of the front in the own model; the paper's are of ten throws each",
-        head,
-        tuple(rows),
-        heads=0,
-    )
+    header = "v [m/s] | w_t | rho | plan | landing error [m] | duration [s] | e_p [cm] | e_v [cm/s]"
+    title = "Breakdown of the front in the own model; the paper's are of ten throws each"
+    return Grid.of(title, header, rows, heads=0)
+
+
+def _setting(speed: float, w_t: float, rho: float) -> tuple[str, str, str]:
+    return f"{speed:g}", f"{w_t / 1e3:g}k", f"{rho:g}"
