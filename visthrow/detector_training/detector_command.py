@@ -7,7 +7,6 @@ import math
 import time
 from dataclasses import fields
 from functools import partial
-from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -137,14 +136,10 @@ def throw(args: argparse.Namespace) -> int:
         "nuisances": args.nuisances,
     }
     jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
-    parts = [
-        part
-        for _, part in sorted(
-            done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs), key=itemgetter(0)
-        )
-    ]
-    columns = {name: np.concatenate([part[0][name] for part in parts]) for name in parts[0][0]}
-    counts = {name: sum(part[1][name] for part in parts) for name in parts[0][1]}
+    flown = dict(done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs))
+    throws, found = zip(*(flown[i] for i in range(len(jobs))))
+    columns = {name: np.concatenate([part[name] for part in throws]) for name in throws[0]}
+    counts = {name: sum(part[name] for part in found) for name in found[0]}
     share = {name: counts[name] / max(counts["frames"], 1) for name in ("ball", "goal")}
     figures = Throws(args.target, **columns).summary() | share | {"refused": counts["refused"]}
     error = columns["error"][np.isfinite(columns["error"])]

@@ -6,7 +6,7 @@ from pathlib import Path
 import torch
 
 from camera.params import FisheyeParams
-from visthrow.detector_training.scenes.scene import SCENE_ROWS, Scenes
+from visthrow.detector_training.scenes.scene import Scenes
 from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 
@@ -60,9 +60,9 @@ class Renderer:
         image = torch.empty(
             scenes.count, p.height, p.width, 3, dtype=torch.uint8, device=self.device
         )
-        s = scenes.to(self.device)
-        table = torch.cat([getattr(s, name) for name in SCENE_ROWS], -1).float().contiguous()
-        things = s.things.float().contiguous()
+        *tables, things = vars(scenes.to(self.device)).values()
+        table = torch.cat(tables, -1).float().contiguous()
+        things = things.float().contiguous()
 
         def rows(tensor: torch.Tensor, struct: type) -> wp.array:
             """View of a tensor whose last axis holds the numbers of a struct."""
@@ -92,10 +92,7 @@ class Renderer:
         wp.load_module(device=self.device, module="visthrow.detector_training.scenes.scene_kernel")
         # Warp runs a launch on the CPU in the thread that asks for it
         share = -(-scenes.count // torch.get_num_threads())
+        parts = (slice(first, first + share) for first in range(0, scenes.count, share))
         with ThreadPoolExecutor(torch.get_num_threads()) as threads:
-            list(
-                threads.map(
-                    launch, (slice(first, first + share) for first in range(0, scenes.count, share))
-                )
-            )
+            list(threads.map(launch, parts))
         return image

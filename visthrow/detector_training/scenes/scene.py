@@ -4,59 +4,49 @@ picture.
 
 import math
 import tomllib
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn import functional as F
 
 from camera.fisheye import Fisheye
-from camera.keypoints import ball_extremes_c, goal_corners_w
+from camera.keypoints import ball_extremes_c, goal_square
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
 
 THINGS = 10  # most things on the ground and about the hall
 
-SCENE_ROWS = (
-    "lens",
-    "pose",
-    "shutter",
-    "ball",
-    "goal",
-    "ground",
-    "walls",
-    "light",
-    "rope",
-    "sensor",
-)
-"""Tables of `Scenes` with one row a scene, in the order in which the kernel reads them."""
+
+def _table(name: str) -> dict[str, Any]:
+    return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+
+
+ROW_COLUMNS = _table("rows.toml")
+"""Table of :class:`Scenes` -> its columns and their types; the last one's rows are things."""
+
+PLAIN = _table("plain.toml")
+"""Numbers of plain scenes: rows of :class:`Scenes`, or what follows a scene's own numbers there."""
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """A batch of scenes, a row each, float32; angles [rad], lengths [m], times [s],
-    colours 0 to 1.
-    """
+    """A batch of scenes, a row each, float32; `rows.toml` describes the columns."""
 
-    # fx, fy, cx, cy [px], k1 to k4, half field of view, vignetting (power of the cosine of half the
-    # angle)
     lens: Tensor
-    # of the camera: place 3, world from camera xyzw 4, velocity 3, its rates in the camera frame 3
     pose: Tensor
-    # exposure, readout from the first to the last row, defocus (standard deviation [px])
     shutter: Tensor
-    ball: Tensor  # centre 3, radius, velocity 3, turn xyzw 4, colour 3, seam 3
-    # x, y, side, yaw, rim, mark (0 none, 1 cross, 2 disc, 3 ring), field 3, rim 3, mark 3
+    ball: Tensor
     goal: Tensor
-    ground: Tensor  # texture, side of a tile, yaw, offset 2, tint 3
-    walls: Tensor  # texture, half side and height of the hall, side of a tile, brightness
-    light: Tensor  # direction towards it 3, ambient share, colour 3, depth of the shadows
-    rope: Tensor  # its upper end from the lens 3 (world), radius (0: none), colour 3
-    sensor: Tensor  # gain, shot noise, read noise, gamma, free, seed
-    # shape (E, THINGS, 12): kind (0 none, 1 disc, 2 rectangle, 3 ball), place 3, sizes 2, yaw,
-    # colour 3, rim from, rim
-    things: Tensor
+    ground: Tensor
+    walls: Tensor
+    light: Tensor
+    rope: Tensor
+    sensor: Tensor
+    things: Tensor  # shape (E, THINGS, 12)
 
     @property
     def count(self) -> int:
@@ -65,11 +55,11 @@ class Scenes:
 
     def to(self, device: str | torch.device) -> "Scenes":
         """Return the scenes on another device."""
-        return Scenes(*(getattr(self, item.name).to(device) for item in fields(self)))
+        return Scenes(*(table.to(device) for table in vars(self).values()))
 
     def part(self, rows: slice) -> "Scenes":
         """Return some of the scenes."""
-        return Scenes(*(getattr(self, item.name)[rows] for item in fields(self)))
+        return Scenes(*(table[rows] for table in vars(self).values()))
 
 
 def lens_row(lens: FisheyeParams, vignetting: float = 0.5) -> Tensor:
@@ -158,10 +148,6 @@ def random_scenes(
     return dressed(scenes, d, textures, nuisances or Nuisances())
 
 
-PLAIN = tomllib.loads(Path(__file__).with_name("plain.toml").read_text(encoding="utf-8"))
-"""Numbers of plain scenes: rows of :class:`Scenes`, or what follows a scene's own numbers there."""
-
-
 def posed_scenes(
     params: CameraParams,
     pos_w: Tensor,
@@ -188,7 +174,7 @@ def posed_scenes(
     rot_wc = rot_wb @ nominal_rot_cb(params.mount).float().T
     mount = rot_wb @ (torch.tensor([0.0, 0.0, -0.02]) - lens_b)
     radius = 0.0012 * hangs.float()
-    light = torch.nn.functional.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
+    light = F.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
     return Scenes(
         lens=lens_row(params.fisheye, 0.0).repeat(count, 1),
         pose=_flat(eye, _quat(rot_wc), torch.zeros(count, 6)),
@@ -226,17 +212,17 @@ def _coloured(scenes: Scenes, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
     """Return balls and goals with colours, sizes and turns drawn at random."""
     ball = scenes.ball.clone()
     goal = scenes.goal.clone()
-    ball[:, 7:11] = torch.nn.functional.normalize(d.normal(1.0, 4), dim=-1)
-    shade = d.uniform(-0.18, 0.12, 1)
-    hue = shade + d.uniform(-0.08, 0.08, 3)
-    ball[:, 11:14] = (ball[:, 11:14] + n.look * hue).clamp(0.02, 1.0)
-    seam = d.uniform(-0.3, 0.05, 1)
-    ball[:, 14:17] = (ball[:, 14:17] + n.look * seam).clamp(0.02, 1.0)
-    shade = d.uniform(-0.08, 0.12, 1)
-    hue = shade + d.uniform(-0.08, 0.08, 3)
-    goal[:, 6:9] = (goal[:, 6:9] + n.look * hue).clamp(0.02, 1.0)
-    rim = d.uniform(-0.25, 0.07, 1)
-    goal[:, 9:12] = (goal[:, 9:12] + n.look * rim).clamp(0.02, 1.0)
+    ball[:, 7:11] = F.normalize(d.normal(1.0, 4), dim=-1)
+    for table, first, shades, edges in (
+        (ball, 11, (-0.18, 0.12), (-0.3, 0.05)),
+        (goal, 6, (-0.08, 0.12), (-0.25, 0.07)),
+    ):
+        shade = d.uniform(*shades, 1)
+        hue = shade + d.uniform(-0.08, 0.08, 3)
+        edge = d.uniform(*edges, 1)  # of the ball's seam, of the square's rim
+        change = torch.cat([hue, edge.expand(-1, 3)], -1)
+        colours = table[:, first : first + 6]
+        colours.copy_((colours + n.look * change).clamp(0.02, 1.0))
     goal[:, 4] = goal[:, 4] + n.look * d.uniform(-0.008, 0.012)
     marked = d.chance(0.6 * n.look)
     goal[:, 5] = torch.where(marked, d.one_of(4), goal[:, 5])
@@ -264,7 +250,7 @@ def _lit(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     """Return lights drawn at random."""
     slope = d.normal(0.5, 2)
     direction = _flat(slope, torch.ones(len(slope)))
-    direction = torch.nn.functional.normalize(direction, dim=-1)
+    direction = F.normalize(direction, dim=-1)
     colour = 1.0 + n.light * d.uniform(-0.15, 0.15, 3)
     drawn = d.chance(n.light)[:, None]
     direction = torch.where(drawn, direction, scenes.light[:, :3])
@@ -355,34 +341,30 @@ class Truth:
     @property
     def ball_ray(self) -> Tensor:
         """Unit rays to the ball, shape (E, 3)."""
-        return torch.nn.functional.normalize(self.ball_c, dim=-1)
+        return F.normalize(self.ball_c, dim=-1)
 
 
 def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
     """See `Truth`; all scenes have this lens."""
     rot = torch.from_numpy(Rotation.from_quat(scenes.pose[:, 3:7].double().numpy()).as_matrix())
-    c = scenes.goal[:, 3].double().cos()
-    s = scenes.goal[:, 3].double().sin()
+    goal = scenes.goal.double()
+    ball = scenes.ball[:, None].double()
+    c = goal[:, 3].cos()
+    s = goal[:, 3].sin()
     turn = torch.stack([c, -s, s, c], -1).unflatten(-1, (2, 2))
-    square = (
-        goal_corners_w(torch.zeros(1, 2, dtype=torch.float64), 1.0)[:, :, :2]
-        * scenes.goal[:, 2, None, None].double()
-    )
-    corners = torch.nn.functional.pad(
-        square @ turn.transpose(1, 2) + scenes.goal[:, None, :2].double(), (0, 1)
-    )
-    points = torch.cat([corners, scenes.ball[:, None, :3].double()], 1)
-    speed = torch.cat([torch.zeros_like(corners), scenes.ball[:, None, 4:7].double()], 1)
-    eye, vel, rate = (scenes.pose[:, None, a:b].double() for a, b in ((0, 3), (7, 10), (10, 13)))
+    square = goal_square(1.0)[:, :2] * goal[:, 2, None, None]
+    corners = F.pad(square @ turn.transpose(1, 2) + goal[:, None, :2], (0, 1))
+    points = torch.cat([corners, ball[..., :3]], 1)
+    speed = torch.cat([torch.zeros_like(corners), ball[..., 4:7]], 1)
+    eye, _, vel, rate = scenes.pose[:, None].double().split((3, 4, 3, 3), -1)
     time = torch.zeros(*points.shape[:2], 1, dtype=torch.float64)
     for _ in range(3):
         world = points + speed * time - eye - vel * time
         static = world @ rot
         static_c = torch.einsum("ekji,ekj->eki", rotation_from_vector(rate * time), static)
         pixels, visible = lens.project(static_c)
-        time = ((pixels[..., 1:2] + 0.5) / lens.params.height - 0.5) * scenes.shutter[
-            :, None, 1:2
-        ].double()
+        row = (pixels[..., 1:2] + 0.5) / lens.params.height - 0.5
+        time = row * scenes.shutter[:, None, 1:2].double()
     visible = visible & lens.on_sensor(pixels)
     _, sides = lens.project_normalized(
         ball_extremes_c(lens, static_c[:, 4], float(scenes.ball[0, 3])), clip=False

@@ -4,12 +4,15 @@ ground square, ground and walls.
 Each sample of a pixel has its own place in it, spread by the defocus, and its own instant within
 the exposure of its row, so that motion, rolling shutter and defocus need no code of their own.
 Colours are linear up to the sensor, which adds shot and read noise and the gamma. The structs hold
-the rows of `scene.Scenes` beside this file, where their fields are described. The same seed gives
-the same picture."""
+the rows of `scene.Scenes`; `rows.toml` describes their columns. The same seed gives the same
+picture."""
+
+from typing import Any
 
 import warp as wp
 
 from visthrow.detector_training.scenes import textures
+from visthrow.detector_training.scenes.scene import ROW_COLUMNS
 
 LENS_STEPS = wp.constant(12)  # Newton's steps to the angle of a pixel; the lens is monotonic
 
@@ -18,143 +21,21 @@ MIPS = wp.constant(textures.MIPS)
 SIZE = wp.constant(textures.SIZE)
 
 
-@wp.struct
-class LensRow:
-    """A row of ``Scenes.lens``."""
-
-    focus: wp.vec2
-    centre: wp.vec2
-    k: wp.vec4
-    limit: float
-    vignetting: float
+def _struct(name: str, columns: dict[str, Any]) -> Any:
+    """Return a Warp struct of a row."""
+    fields = {"__module__": __name__, "__annotations__": columns}
+    return wp.struct(type(f"{name.title()}Row", (), fields))
 
 
-@wp.struct
-class PoseRow:
-    """A row of ``Scenes.pose``."""
-
-    eye: wp.vec3
-    quat: wp.quat
-    vel: wp.vec3
-    rate: wp.vec3
-
-
-@wp.struct
-class ShutterRow:
-    """A row of ``Scenes.shutter``."""
-
-    exposure: float
-    readout: float
-    defocus: float
-
-
-@wp.struct
-class BallRow:
-    """A row of ``Scenes.ball``."""
-
-    centre: wp.vec3
-    radius: float
-    vel: wp.vec3
-    turn: wp.quat
-    colour: wp.vec3
-    seam: wp.vec3
-
-
-@wp.struct
-class GoalRow:
-    """A row of ``Scenes.goal``."""
-
-    place: wp.vec2
-    side: float
-    yaw: float
-    rim: float
-    mark: float
-    field: wp.vec3
-    edge: wp.vec3
-    dark: wp.vec3
-
-
-@wp.struct
-class GroundRow:
-    """A row of ``Scenes.ground``."""
-
-    texture: float
-    tile: float
-    yaw: float
-    offset: wp.vec2
-    tint: wp.vec3
-
-
-@wp.struct
-class WallsRow:
-    """A row of ``Scenes.walls``."""
-
-    texture: float
-    half: float
-    height: float
-    tile: float
-    brightness: float
-
-
-@wp.struct
-class LightRow:
-    """A row of ``Scenes.light``."""
-
-    dir: wp.vec3
-    ambient: float
-    colour: wp.vec3
-    depth: float
-
-
-@wp.struct
-class RopeRow:
-    """A row of ``Scenes.rope``."""
-
-    top: wp.vec3
-    radius: float
-    colour: wp.vec3
-
-
-@wp.struct
-class SensorRow:
-    """A row of ``Scenes.sensor``."""
-
-    gain: float
-    shot: float
-    read: float
-    gamma: float
-    free: float
-    seed: float
-
-
-@wp.struct
-class SceneRow:
-    """One scene without its things."""
-
-    lens: LensRow
-    pose: PoseRow
-    shutter: ShutterRow
-    ball: BallRow
-    goal: GoalRow
-    ground: GroundRow
-    walls: WallsRow
-    light: LightRow
-    rope: RopeRow
-    sensor: SensorRow
-
-
-@wp.struct
-class ThingRow:
-    """A row of ``Scenes.things``."""
-
-    kind: float
-    place: wp.vec3
-    size: wp.vec2
-    yaw: float
-    colour: wp.vec3
-    rim_from: float
-    rim: float
-
+_ROWS = {
+    name: _struct(name, {column: getattr(wp, kind) for column, kind in columns.items()})
+    for name, columns in ROW_COLUMNS.items()
+}
+GoalRow = _ROWS["goal"]
+LightRow = _ROWS["light"]
+RopeRow = _ROWS["rope"]
+ThingRow = _ROWS.pop("thing")
+SceneRow = _struct("scene", _ROWS)  # without its things
 
 Things = wp.array2d(dtype=ThingRow)
 Textures = wp.array2d(dtype=wp.uint8)
