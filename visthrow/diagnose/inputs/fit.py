@@ -111,7 +111,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
         covariance,
         identified,
         *rms,
-        middle_speed=getattr(model, "middle", 0.0),
+        middle_speed=model.middle_speed,
     )
 
 

@@ -4,14 +4,12 @@ about gravity.
 The log holds no mass: forces are per kilogram, which is what a path can tell.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visthrow.common.rotations import cross
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -52,15 +50,31 @@ class BallParams(Bounded):
 class BallModel(NumericModel):
     """Free flights of a ball, one window each."""
 
-    def __init__(self, logs: Sequence[FlightLog], params: BallParams) -> None:
-        """Cut the free flights out of the logs. Raises LogError where there is none."""
-        self.params = params
-        stretches = [
-            s for i, log in enumerate(logs) if CHANNEL in log for s in _flights(log, i, params)
-        ]
-        super().__init__(effects_of("ball", params), (CHANNEL,), stretches)
-        self._across = np.array([s.data["across"] for s in self.stretches])
-        self._span = np.array([np.ptp(s.data["time"]) for s in self.stretches])
+    table = "ball"
+    channels = needed = (CHANNEL,)
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class."""
+        params = self.params
+        times, path = log[CHANNEL].samples()
+        if len(times) < 40:
+            return []
+        sigma = sigma_of(log[CHANNEL], 1e-5)
+        flights = []
+        for start, end in _free(times, path, params):
+            rows = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
+            time = times[rows]
+            pos = path[rows]
+            fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
+            horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
+            horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
+            across = np.array([-horizontal[1], horizontal[0], 0.0])
+            data = {"time": time, "across": across, "span": np.ptp(time)}
+            layout = latent_layout(time[0], time[-1], KNOTS, (2,))
+            begin = [*fit[0], *fit[1]], [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
+            table = time, pos, sigma
+            flights.append(Stretch.of(number, "ballistic", [table], data, layout, *begin))
+        return flights
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the unknowns are position and velocity at the first stamp.
@@ -69,7 +83,8 @@ class BallModel(NumericModel):
         """
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
-        spin = top[:, None] * self._across[lanes.owner] + side[:, None] * np.array([0.0, 0.0, 1.0])
+        across, spans = self.tables(lanes, "across", "span")
+        spin = top[:, None] * across + side[:, None] * np.array([0.0, 0.0, 1.0])
         push = latent_force(lanes.latent, STEPS, 1)[:, 0]
         gravity = np.array([0.0, 0.0, -self.params.gravity])
         quadratic = (self.params.drag + drag)[:, None]
@@ -84,7 +99,7 @@ class BallModel(NumericModel):
                 acc = acc + exerted(self.laws, _knot_values(state[:, 0], state))["payload force"]
             return np.concatenate([vel, acc], 1)
 
-        step = self._span[lanes.owner, None] / STEPS * (1.0 + clock[:, None])
+        step = spans[:, None] / STEPS * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance.copy(), STEPS, step)
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
@@ -107,33 +122,6 @@ class BallModel(NumericModel):
 def _knot_values(time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
     """Quantities of a law at states, shape (k, 6)."""
     return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
-
-
-def _flights(log: FlightLog, number: int, params: BallParams) -> list[Stretch]:
-    times, path = log[CHANNEL].samples()
-    if len(times) < 40:
-        return []
-    sigma = sigma_of(log[CHANNEL], 1e-5)
-    flights = []
-    for start, end in _free(times, path, params):
-        rows = np.flatnonzero((times >= start) & (times <= end))[:: params.every]
-        time = times[rows]
-        pos = path[rows]
-        fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
-        horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
-        horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
-        flights.append(
-            Stretch.of(
-                number,
-                "ballistic",
-                [(time, pos, sigma)],
-                {"time": time, "across": np.array([-horizontal[1], horizontal[0], 0.0])},
-                latent_layout(time[0], time[-1], KNOTS, (2,)),
-                [*fit[0], *fit[1]],
-                [0.1, 0.1, 0.1, 1.0, 1.0, 1.0],
-            )
-        )
-    return flights
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:

@@ -5,7 +5,7 @@ Where the attitude is measured, the path of the centre of mass follows from thru
 alone, whatever controller flies; where each motor's command is logged, the rates follow too. No
 controller has to be known."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -13,7 +13,7 @@ from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
-from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, spare, stretches_of
 from visthrow.diagnose.models.law_terms import exerted
@@ -29,12 +29,16 @@ from visthrow.diagnose.models.numeric import (
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
+Slope = Callable[[int, np.ndarray], np.ndarray]
+"""Of the half step, and states or velocities of lanes."""
+
 SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
 
 
 class FlyerModel(NumericModel):
     """Windows of flights of one vehicle."""
 
+    table = "flyer"
     latent_step = 1e-2
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
@@ -42,40 +46,43 @@ class FlyerModel(NumericModel):
 
         Raises LogError where no log has the channels, or none flies.
         """
-        self.params = params
-        self.has_voltage = all("battery_voltage" in log for log in logs)
         optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
-        channels = [
-            params.position,
-            *(name for name, simulated in optional.items() if simulated is not None),
-        ]
-        stretches = stretches_of(logs, params, channels)
-        channels_present = [
-            name
-            for name in ("battery_voltage", "acc_b", "rate_b")
-            if all(name in log for log in logs)
-        ]
-        inputs = [params.attitude, params.input, *channels_present]
-        effects = [
-            e
-            for e in effects_of("flyer", params)
-            if not (self.has_voltage and e.name == "thrust_fade")
-        ]
-        super().__init__(effects, channels, stretches, inputs)
+        simulated = [name for name, part in optional.items() if part is not None]
+        self.channels = (params.position, *simulated)
+        drivers = ("battery_voltage", "acc_b", "rate_b")
+        present = [name for name in drivers if all(name in log for log in logs)]
+        self.inputs = (params.attitude, params.input, *present)
+        self.has_voltage = "battery_voltage" in present
+        super().__init__(logs, params)
         self.steps = round(params.window / params.step)
         # see flyer_windows; the stretch is the first axis
-        self._rot, given_inputs, self._volts, self._since, self._lean, self._direction = (
-            np.array([s.data[name] for s in stretches])
+        self._rot, inputs, self._volts, self._since, self._lean, self._direction = (
+            np.array([s.data[name] for s in self.stretches])
             for name in ("rot", "input", "volts", "since", "lean", "direction")
         )
-        self._commanded = params.thrust(given_inputs)  # [N], (S, fine steps, motors)
+        self._commanded = params.thrust(inputs)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
-        self._blocks = 1 + (params.cable is not None) + (params.torque is not None)
-        self._rate_at = 12 if params.cable is not None else 6
+        hangs = params.cable is not None
+        # of the latent forces, in their order
+        self._blocks = (
+            "vehicle force",
+            *["payload force"] * hangs,
+            *["vehicle torque"] * (params.torque is not None),
+        )
+        self._rates = slice(12, 15) if hangs else slice(6, 9)  # of the states
+
+    def catalogue(self) -> list[ModelEffect]:
+        """See the base class; where the voltage is logged, thrust fades with it."""
+        effects = super().catalogue()
+        return [e for e in effects if not (self.has_voltage and e.name == "thrust_fade")]
+
+    def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
+        """See :func:`.flyer_windows.stretches_of`."""
+        return stretches_of(logs, self.params, self.channels)
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
-        """Thrust of each motor by the map at the half steps [N], shape (half steps, B, motors): of
-        held commands through a lag.
+        """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held
+        commands by the map, through a lag.
 
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the
         step's own mean: commands switch there."""
@@ -110,28 +117,22 @@ class FlyerModel(NumericModel):
         thrust, whole = out
         mean = np.diff(whole[::2], axis=0) * (fine / p.step)
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
-        return thrust
+        curve = self.of(lanes, "thrust_curve")[:, None]
+        hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
+        since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
+        faded = 1.0 + self.of(lanes, "thrust_fade") * since
+        curved = 1.0 + curve * (thrust / hover - 1.0)
+        return thrust * self._scale(lanes) * curved * faded[..., None]
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class.
 
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
-        p = self.params
-        forces = latent_force(lanes.latent, self.steps, self._blocks)
         thrust = self._thrusts(lanes)
-        curve = self.of(lanes, "thrust_curve")[:, None]
-        hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
-        since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
-        faded = 1.0 + self.of(lanes, "thrust_fade") * since
-        real = (
-            thrust * self._scale(lanes) * (1.0 + curve * (thrust / hover - 1.0)) * faded[..., None]
-        )
-        dynamics = _Dynamics(self, lanes, real, forces)
-        path = integrate(
-            dynamics, dynamics.start(lanes), self.steps, np.full((len(lanes.owner), 1), p.step)
-        )
-        return np.concatenate([path, real[::2].swapaxes(0, 1)], 2)
+        step = np.full((len(lanes.owner), 1), self.params.step)
+        path = integrate(self._slope(lanes, thrust), self._begin(lanes), self.steps, step)
+        return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
     def _rise(self, thrust: np.ndarray) -> np.ndarray:
         """Slope of the whole thrust at the half steps as knots tell it [N/s], shape (half steps,
@@ -208,11 +209,9 @@ class FlyerModel(NumericModel):
                 continue
             time = stretch.time[rows].reshape(-1, 3)[:, 0]
             if name == "rate_b":
-                rate_index = self._rate_at
                 grid = start + p.step * np.arange(path.shape[1])
-                out[:, rows] = np.array(
-                    [on_grid(grid, x[:, rate_index : rate_index + 3], time) for x in path]
-                ).reshape(len(path), -1)
+                rates = [on_grid(grid, x[:, self._rates], time) for x in path]
+                out[:, rows] = np.reshape(rates, (len(path), -1))
                 continue
             late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
             value = path[..., 0:3]
@@ -232,207 +231,172 @@ class FlyerModel(NumericModel):
             out[:, rows] = pos.reshape(len(path), -1)
         return out
 
-
-class _Dynamics:
-    """Forces and torques of lanes, without the motors' lag."""
-
-    def __init__(
-        self, model: FlyerModel, lanes: Lanes, thrust: np.ndarray, latent: np.ndarray
-    ) -> None:
-        """Take the lanes' sizes; ``thrust`` [N], shape (half steps, B, motors); ``latent`` as
-        :func:`latent_force` gives it.
-        """
-        p = model.params
-        self.thrust = thrust
-        self.total = thrust.sum(2, keepdims=True)
-        self.latent = latent
-        self.rise = model._rise(thrust) if model.laws else None
-
-        def get(name: str) -> np.ndarray:
-            return model.of(lanes, name)
-
-        mass = (p.mass + get("mass_quad"))[:, None]
-        self.model = model
-        self.p = p
-        self.mass = mass
-        self.owner = lanes.owner
-        self.blocks = (
-            "",
-            *["payload force"] * (p.cable is not None),
-            *["vehicle torque"] * (p.torque is not None),
-        )
-        self.turn = model.stack(lanes, "marker_rot_x", "marker_rot_y", "")
-        self.lean = get("estimator_lean")[:, None]
-        self.turns = bool(np.any(self.turn) or np.any(self.lean))
-        self.half = -1
-        tilt = model.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
-        self.gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
-        self.wind = model.stack(lanes, "wind_x", "wind_y", "")
-        self.shift = model._spare + get("attitude_delay") / (0.5 * p.step)
-        added = model.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
-        self.drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
-        self.parasitic = get("parasitic")[:, None]
-        self.lift = get("translational_lift")[:, None]
-        if p.cable is not None:
-            self.length = (p.cable.length + get("rope_length"))[:, None]
-            self.payload = (p.cable.mass + get("mass_payload"))[:, None]
-            self.payload_drag = get("payload_drag")[:, None]
-            self.reduced = 1.0 / (1.0 / self.payload + 1.0 / self.mass)
-        if p.torque is not None:
-            scale = 1.0 + model.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
-            self.inertia = np.array(p.torque.inertia) * scale
-            self.com = model.stack(lanes, "com_x", "com_y")
-
-    def _turn_to(self, half: int) -> None:
-        """Keep the attitudes of a half step, and how thrust and drag stand off them: two slopes in
-        a row are asked for at each.
-        """
-        self.half = half
-        position = half + self.shift
-        index = np.minimum(np.maximum(position.astype(int), 0), self.model._rot.shape[1] - 2)
-        share = (position - index)[:, None, None]
-        before = self.model._rot[self.owner, index]
-        self.rot = before + share * (self.model._rot[self.owner, index + 1] - before)
-        if self.turns:
-            self.off = (
-                self.turn + self.lean * self.model._lean[self.owner, half + self.model._spare]
-            )
-
-    def start(self, lanes: Lanes) -> np.ndarray:
+    def _begin(self, lanes: Lanes) -> np.ndarray:
         """States from the unknowns at the window's start."""
-        parts = [lanes.nuisance[:, :6]]
-        index = 6
-        if self.p.cable is not None:
-            down = self.model._direction[lanes.owner]
-            level = ((0, 0), (0, 1))  # a third component of 0
-            side = np.pad(lanes.nuisance[:, 6:8], level)
-            direction = down + side - down * np.sum(down * side, 1, keepdims=True)
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            swing = np.pad(lanes.nuisance[:, 8:10], level)
-            swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
-            parts += [self.length * direction, self.length * swing]
-            index = 10
-        if self.p.torque is not None:
-            parts.append(lanes.nuisance[:, index : index + 3])
+        unknown = lanes.nuisance
+        if self.params.cable is None:
+            return unknown
+        length = (self.params.cable.length + self.of(lanes, "rope_length"))[:, None]
+        down = self._direction[lanes.owner]
+        level = ((0, 0), (0, 1))  # a third component of 0
+        side = np.pad(unknown[:, 6:8], level)
+        direction = down + side - down * np.sum(down * side, 1, keepdims=True)
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        swing = np.pad(unknown[:, 8:10], level)
+        swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
+        parts = unknown[:, :6], length * direction, length * swing, unknown[:, 10:]
         return np.concatenate(parts, 1)
 
-    def __call__(self, half: int, state: np.ndarray) -> np.ndarray:
-        """Derivative of all but the motors' thrusts."""
-        if half != self.half:
-            self._turn_to(half)
-        total = self.total[half]
-        latent = self.latent[half]
-        vel = state[:, 3:6]
-        vel_b = np.einsum("bji,bj->bi", self.rot, vel - self.wind)
-        level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
-        speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
-        force_b = -(self.drag + self.parasitic * speed) * vel_b
-        force_b[:, 2:3] += total * (1.0 + self.lift * level)
-        if self.turns:
-            force_b = force_b + cross(self.off, force_b)
-        force = np.einsum("bij,bj->bi", self.rot, force_b) + latent[0]
-        if self.model.laws:
-            loads = self._exerted(half, state, force, latent)
-            force = force + loads.get("vehicle force", 0.0)
-            latent = np.stack(
-                [push + loads.get(block, 0.0) for push, block in zip(latent, self.blocks)]
-            )
-        parts = [vel]
-        if self.p.cable is None:
-            parts.append(force / self.mass + self.gravity)
-        else:
-            free_q, free_p, direction, pull = self._pull(state, vel, force, latent[1])
+    def _slope(self, lanes: Lanes, thrust: np.ndarray) -> Slope:
+        """Return the derivative of the states under thrusts [N], shape (half steps, B, motors)."""
+        p = self.params
+        mass = (p.mass + self.of(lanes, "mass_quad"))[:, None]
+        tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
+        gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
+        wind = self.stack(lanes, "wind_x", "wind_y", "")
+        rot = self._rotations(lanes)
+        latent = latent_force(lanes.latent, self.steps, len(self._blocks))
+        force_of = self._force(lanes, thrust, rot)
+        exerted_of = self._exerted(lanes, thrust, rot)
+        pulled = self._pulled(lanes, mass, gravity) if p.cable is not None else None
+        turning = self._turning(lanes, thrust) if p.torque is not None else None
+
+        def slope(half: int, state: np.ndarray) -> np.ndarray:
+            vel = state[:, 3:6]
+            loads = dict(zip(self._blocks, latent[half]))
+            loads["vehicle force"] = loads["vehicle force"] + force_of(half, vel - wind)
+            if self.laws:
+                hung = pulled and pulled(state, vel - wind, loads)
+                for block, load in exerted_of(half, state, hung).items():
+                    loads[block] = loads.get(block, 0.0) + load
+            parts = [vel, loads["vehicle force"] / mass + gravity]
+            if pulled is not None:
+                acc, acc_payload, *_ = pulled(state, vel - wind, loads)
+                parts = [vel, acc, state[:, 9:12], acc_payload - acc]
+            if turning is not None:
+                parts.append(turning(half, state[:, self._rates], loads["vehicle torque"]))
+            return np.concatenate(parts, 1)
+
+        return slope
+
+    def _rotations(self, lanes: Lanes) -> np.ndarray:
+        """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
+        late = self._spare + self.of(lanes, "attitude_delay") / (0.5 * self.params.step)
+        position = np.arange(2 * self.steps + 1)[:, None] + late
+        index = np.clip(position.astype(int), 0, self._rot.shape[1] - 2)
+        before = self._rot[lanes.owner, index]
+        share = (position - index)[..., None, None]
+        return before + share * (self._rot[lanes.owner, index + 1] - before)
+
+    def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
+        """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
+        p = self.params
+        total = thrust.sum(2, keepdims=True)
+        added = self.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
+        drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
+        parasitic = self.of(lanes, "parasitic")[:, None]
+        lift = self.of(lanes, "translational_lift")[:, None]
+        turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")
+        lean = self.of(lanes, "estimator_lean")[:, None]
+        turns = np.any(turn) or np.any(lean)
+
+        def force(half: int, air: np.ndarray) -> np.ndarray:
+            vel_b = np.einsum("bji,bj->bi", rot[half], air)
+            level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
+            speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
+            force_b = -(drag + parasitic * speed) * vel_b
+            force_b[:, 2:3] += total[half] * (1.0 + lift * level)
+            if turns:
+                off = turn + lean * self._lean[lanes.owner, half + self._spare]
+                force_b = force_b + cross(off, force_b)
+            return np.einsum("bij,bj->bi", rot[half], force_b)
+
+        return force
+
+    def _pulled(self, lanes: Lanes, mass: np.ndarray, gravity: np.ndarray) -> Callable:
+        """Return what gives accelerations of vehicle and payload, the cable's direction, and what
+        it pulls with [N], by states, velocity in the air and loads; it never pushes.
+        """
+        payload = (self.params.cable.mass + self.of(lanes, "mass_payload"))[:, None]
+        payload_drag = self.of(lanes, "payload_drag")[:, None]
+        reduced = 1.0 / (1.0 / payload + 1.0 / mass)
+
+        def pulled(state: np.ndarray, air: np.ndarray, loads: Mapping) -> tuple[np.ndarray, ...]:
+            gap = state[:, 6:9]
+            gap_rate = state[:, 9:12]
+            vel = air + gap_rate
+            drag = -payload_drag * np.sqrt(_products(vel, vel)) * vel
+            free = loads["vehicle force"] / mass + gravity
+            free_payload = (drag + loads["payload force"]) / payload + gravity
+            length = np.sqrt(_products(gap, gap))
+            direction = gap / length
+            apart = _products(direction, free_payload - free)
+            relative = apart + _products(gap_rate, gap_rate) / length
+            pull = np.maximum(relative * reduced, 0.0)
             pull_w = pull * direction
-            acc_q = free_q + pull_w / self.mass
-            acc_p = free_p - pull_w / self.payload
-            parts += [acc_q, state[:, 9:12], acc_p - acc_q]
-        if self.p.torque is not None:
-            parts.append(
-                self._turning(
-                    state[:, self.model._rate_at : self.model._rate_at + 3],
-                    self.thrust[half],
-                    total,
-                    latent[-1],
-                )
-            )
-        return np.concatenate(parts, 1)
+            return free + pull_w / mass, free_payload - pull_w / payload, direction, pull
 
-    def _pull(
-        self, state: np.ndarray, vel: np.ndarray, force: np.ndarray, latent: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """Accelerations without the cable, its direction, and what it pulls with [N]; it never
-        pushes.
-        """
-        gap = state[:, 6:9]
-        gap_rate = state[:, 9:12]
-        vel_p = vel + gap_rate - self.wind
-        drag = -self.payload_drag * np.sqrt(_products(vel_p, vel_p)) * vel_p
-        free_q = force / self.mass + self.gravity
-        free_p = (drag + latent) / self.payload + self.gravity
-        length = np.sqrt(_products(gap, gap))
-        direction = gap / length
-        relative = _products(direction, free_p - free_q) + _products(gap_rate, gap_rate) / length
-        return free_q, free_p, direction, np.maximum(relative * self.reduced, 0.0)
+        return pulled
 
-    def _exerted(
-        self, half: int, state: np.ndarray, force: np.ndarray, latent: np.ndarray
-    ) -> dict[str, np.ndarray]:
-        """Return the forces and torques of the laws in each latent block, at the cable's tension
-        without them.
+    def _exerted(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Callable:
+        """Return what gives the forces and torques of the laws in each latent block, by the half
+        step, states and what :meth:`_pulled` gives without them.
         """
-        vel = state[:, 3:6]
-        none = np.zeros((len(state), 3))
-        half_step = half + self.model._spare
-        turn = np.einsum(
-            "bji,bjk->bik",
-            self.model._rot[self.owner, half_step - 1],
-            self.model._rot[self.owner, half_step + 1],
-        )
-        skew = np.stack(
-            [
-                turn[:, 2, 1] - turn[:, 1, 2],
-                turn[:, 0, 2] - turn[:, 2, 0],
-                turn[:, 1, 0] - turn[:, 0, 1],
-            ],
-            1,
-        )
-        values = {
-            "time": none[:, 0],
-            "pos_w": state[:, :3],
-            "vel_w": vel,
-            "rate_b": skew / (2.0 * self.p.step),
-            "thrust": self.total[half, :, 0],
-            "slope": self.rise[half],
-            **{f"axis_{a}": self.rot[:, :, i] for i, a in enumerate("xyz")},
-        }
-        if self.p.cable is not None:
-            _, _, direction, pull = self._pull(state, vel, force, latent[1])
-            values |= {
-                "payload_pos_w": state[:, :3] + state[:, 6:9],
-                "payload_vel_w": vel + state[:, 9:12],
-                "cable_dir_w": direction,
-                "tension": pull[:, 0],
-                "mount_b": none,
+        rise = self._rise(thrust) if self.laws else None
+        total = thrust.sum(2)
+
+        def loads(half: int, state: np.ndarray, hung: tuple | None) -> dict[str, np.ndarray]:
+            none = np.zeros((len(state), 3))
+            at = half + self._spare
+            before, after = (self._rot[lanes.owner, at + side] for side in (-1, 1))
+            turn = np.einsum("bji,bjk->bik", before, after)
+            skew = turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]]
+            values = {
+                "time": none[:, 0],
+                "pos_w": state[:, :3],
+                "vel_w": state[:, 3:6],
+                "rate_b": skew / (2.0 * self.params.step),
+                "thrust": total[half],
+                "slope": rise[half],
+                **{f"axis_{a}": rot[half, :, :, i] for i, a in enumerate("xyz")},
             }
-        return exerted(self.model.laws, values)
+            if hung is not None:
+                values |= {
+                    "payload_pos_w": state[:, :3] + state[:, 6:9],
+                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
+                    "cable_dir_w": hung[2],
+                    "tension": hung[3][:, 0],
+                    "mount_b": none,
+                }
+            return exerted(self.laws, values)
 
-    def _turning(
-        self, rate: np.ndarray, thrust: np.ndarray, total: np.ndarray, latent: np.ndarray
-    ) -> np.ndarray:
-        """Angular acceleration from the motors' thrusts and the offset of the centre of mass."""
-        torque_params = self.p.torque
-        front_left, front_right, rear_left, rear_right = thrust.T
-        torque = np.stack(
-            [
-                torque_params.arm_y * (front_left + rear_left - front_right - rear_right)
-                - self.com[:, 1] * total[:, 0],
-                torque_params.arm_x * (rear_left + rear_right - front_left - front_right)
-                + self.com[:, 0] * total[:, 0],
-                torque_params.torque_ratio * thrust @ np.array(torque_params.spin),
-            ],
-            1,
-        )
-        return (torque - cross(rate, self.inertia * rate) + latent) / self.inertia
+        return loads
+
+    def _turning(self, lanes: Lanes, thrust: np.ndarray) -> Callable:
+        """Return what gives the angular acceleration from the motors' thrusts and the offset of the
+        centre of mass, by the half step, rates and a torque [N m].
+        """
+        p = self.params.torque
+        scale = 1.0 + self.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
+        inertia = np.array(p.inertia) * scale
+        com_x, com_y = self.stack(lanes, "com_x", "com_y").T
+        total = thrust.sum(2)
+
+        def turning(half: int, rate: np.ndarray, push: np.ndarray) -> np.ndarray:
+            front_left, front_right, rear_left, rear_right = thrust[half].T
+            right_up = front_left + rear_left - front_right - rear_right
+            nose_down = rear_left + rear_right - front_left - front_right
+            torque = np.stack(
+                [
+                    p.arm_y * right_up - com_y * total[half],
+                    p.arm_x * nose_down + com_x * total[half],
+                    p.torque_ratio * thrust[half] @ np.array(p.spin),
+                ],
+                1,
+            )
+            return (torque - cross(rate, inertia * rate) + push) / inertia
+
+        return turning
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -4,7 +4,6 @@ Convention: a gimbal under the vehicle turns about its x axis, then about its ow
 stands off along the gimbal's x axis; its optical axis is that x axis, its image's x to the right, y
 down."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
@@ -49,21 +47,50 @@ class GimbalModel(NumericModel):
 
     lawless = "it is geometry, in which no force moves anything"
 
-    def __init__(self, logs: Sequence[FlightLog], params: GimbalParams) -> None:
-        """Cut the logs.
+    table = "gimbal"
+    channels = (CHANNEL,)
+    needed = inputs = NEEDED
 
-        Raises LogError where none has both bodies and the marker, or the marker is not seen at the
-        payload.
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class.
+
+        Raises LogError: the marker is not seen at the payload.
         """
-        self.params = params
-        self.camera = Rotation.from_euler("xyz", params.camera_axes_deg, degrees=True).as_matrix().T
-        stretches = [
-            s
-            for i, log in enumerate(logs)
-            if all(n in log for n in NEEDED)
-            for s in _cut(log, i, params)
-        ]
-        super().__init__(effects_of("gimbal", params), (CHANNEL,), stretches, NEEDED)
+        params = self.params
+        marker = log[CHANNEL]
+        if not all(np.any(log[name].valid) for name in NEEDED):
+            return []
+        table_time, tables = _tables(log, params)
+        stretches = []
+        rejected = 0
+        frames = 0
+        last = marker.time[-1] - MARGIN - params.window
+        for start in np.arange(marker.time[0] + MARGIN, last, params.window):
+            end = start + params.window
+            rows = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < end))
+            rows = rows[:: params.every]
+            in_table = (table_time > start - MARGIN) & (table_time < end + MARGIN)
+            if len(rows) < 10 or np.sum(in_table) < 20:
+                continue
+            near = {name: values[in_table] for name, values in tables.items()}
+            point = marker.values[rows].astype(float)
+            distance = np.median(np.linalg.norm(near["gap"], axis=1))
+            fits = np.abs(np.linalg.norm(point, axis=1) - distance) < params.largest
+            rejected += int(np.sum(~fits))
+            frames += len(fits)
+            if np.sum(fits) < 10:
+                continue
+            sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
+            seen = marker.time[rows][fits], point[fits], sigma
+            data = {"table_time": table_time[in_table], "table": near}
+            layout = latent_layout(start, end, KNOTS, (2,))
+            stretches.append(Stretch.of(number, "view", [seen], data, layout))
+        if rejected > MOST_APART * frames:
+            raise LogError(
+                f"the marker's distance is more than {params.largest:g} m from the payload's in"
+                f" {rejected} of {frames} detections: other axes, another unit, or another marker"
+            )
+        return stretches
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -84,7 +111,8 @@ class GimbalModel(NumericModel):
             "bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b)
         )
         points = points - np.array([self.params.camera_offset, 0.0, 0.0])
-        point = np.einsum("ij,bnj->bni", self.camera, points)
+        axes = Rotation.from_euler("xyz", self.params.camera_axes_deg, degrees=True)
+        point = points @ axes.as_matrix()
         point = point + cross(tilt[:, None], point) - lever[:, None]
         weights = triangles(
             time, np.unique(stretch.latent_time)
@@ -120,44 +148,3 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
         level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
         gimbal = np.swapaxes(rot, 1, 2) @ level @ gimbal
     return time, {"gap": gap, "rot": rot.reshape(-1, 9), "gimbal": gimbal.reshape(-1, 9)}
-
-
-def _cut(log: FlightLog, number: int, params: GimbalParams) -> list[Stretch]:
-    marker = log[CHANNEL]
-    if not all(np.any(log[name].valid) for name in NEEDED):
-        return []
-    table_time, tables = _tables(log, params)
-    stretches = []
-    rejected = 0
-    frames = 0
-    for start in np.arange(
-        marker.time[0] + MARGIN, marker.time[-1] - MARGIN - params.window, params.window
-    ):
-        rows = np.flatnonzero(
-            marker.valid & (marker.time >= start) & (marker.time < start + params.window)
-        )[:: params.every]
-        in_table = (table_time > start - MARGIN) & (table_time < start + params.window + MARGIN)
-        if len(rows) < 10 or np.sum(in_table) < 20:
-            continue
-        time = marker.time[rows]
-        point = marker.values[rows].astype(float)
-        distance = np.linalg.norm(tables["gap"][in_table], axis=1)
-        fits = np.abs(np.linalg.norm(point, axis=1) - np.median(distance)) < params.largest
-        rejected += len(fits) - int(np.sum(fits))
-        frames += len(fits)
-        if np.sum(fits) < 10:
-            continue
-        time = time[fits]
-        point = point[fits]
-        sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
-        near = {name: values[in_table] for name, values in tables.items()}
-        data = {"table_time": table_time[in_table], "table": near}
-        layout = latent_layout(start, start + params.window, KNOTS, (2,))
-        stretches.append(Stretch.of(number, "view", [(time, point, sigma)], data, layout))
-    if rejected > MOST_APART * frames:
-        raise LogError(
-            f"the marker's distance is more than {params.largest:g} m from the payload's in "
-            f"{rejected}"
-            f" of {frames} detections: other axes, another unit, or another marker"
-        )
-    return stretches

@@ -95,6 +95,7 @@ class Model(Protocol):
     # whether what a law does to a window is far from its share at the knots, so that the search
     # must simulate it
     bends: bool = False
+    middle_speed: float = 0.0  # median speed of the rotors [rad/s]; 0 where none is measured
     lawless: str = ""  # why no law outside the catalogue can act in it
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:

@@ -15,10 +15,11 @@ import numpy as np
 
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
+from visthrow.diagnose.models.catalogue import ModelEffect, effects_of
 from visthrow.diagnose.models.law_terms import carries, term_of
-from visthrow.diagnose.models.model_interface import Effect, Linearised, Model, Window
+from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.logs.check.signals import noise
-from visthrow.logs.flightlog import Channel
+from visthrow.logs.flightlog import Channel, FlightLog
 
 EFFECT_STEP = 0.05
 """Step of the differences by effects, in their prior deviations: errors of curvature cancel, those
@@ -34,26 +35,21 @@ ROUNDED = 1e-6
 
 
 @dataclass(frozen=True)
-class Stretch:
-    """One window's measurements, before any simulation.
+class Stretch(Window):
+    """A window before any simulation: its residual is what was measured, and it has no derivatives.
 
     All stretches of a model have the same D and G.
     """
 
-    flight: int
-    phase: str
-    time: np.ndarray  # [s], shape (N,)
-    channel: np.ndarray  # index into the model's channels, shape (N,)
-    measured: np.ndarray  # shape (N,)
-    sigma: np.ndarray  # shape (N,)
-    nuisance: np.ndarray  # first guess of what is not known at the start, shape (D,)
-    nuisance_sd: np.ndarray  # vague, shape (D,)
-    data: Mapping[str, Any] = field(
-        default_factory=dict
-    )  # what simulation and sensors read: inputs, stamps
-    latent_block: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
-    latent_axis: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
-    latent_time: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    start: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    """First guess of what is not known at the start, shape (D,)."""
+    data: Mapping[str, Any] = field(default_factory=dict)
+    """What simulation and sensors read: inputs, stamps."""
+
+    @property
+    def measured(self) -> np.ndarray:
+        """Return the measurements, shape (N,)."""
+        return self.residual
 
     @staticmethod
     def of(
@@ -62,8 +58,8 @@ class Stretch:
         channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
         data: Mapping[str, Any],
         layout: Mapping[str, np.ndarray],
-        nuisance: Sequence[float] = (),
-        nuisance_sd: Sequence[float] = (),
+        start: Sequence[float] = (),
+        start_sd: Sequence[float] = (),
     ) -> "Stretch":
         """Lay out the samples of channels.
 
@@ -78,8 +74,11 @@ class Stretch:
             np.concatenate([part.ravel() for part in parts]) for parts in zip(*samples)
         )
         number = np.repeat(np.arange(len(channels)), [values.size for _, values, _ in channels])
-        start = np.array(nuisance, dtype=float), np.array(nuisance_sd, dtype=float)
-        return Stretch(flight, phase, time, number, measured, sigma, *start, data, **layout)
+        none = np.zeros((len(time), 0))
+        spread = np.array(start_sd, dtype=float)
+        columns = time, number, measured, sigma, none, none, spread
+        guess = np.array(start, dtype=float)
+        return Stretch(flight, phase, *columns, **layout, start=guess, data=data)
 
 
 @dataclass(frozen=True)
@@ -97,43 +96,54 @@ class Lanes:
 
 
 class NumericModel(Model, ABC):
-    """A model whose subclasses give :meth:`simulate` and :meth:`measure`."""
+    """A model whose subclasses give :meth:`windows_of`, :meth:`simulate` and :meth:`measure`."""
 
     cheap = True
     latent_step = 1.0  # of the differences by latent forces [N or N m]
+    table: str  # file of the catalogue
+    needed: Sequence[str] = ()  # channels without which a log holds no window
+    inputs: Sequence[str] = ()  # channels that are there and drive the simulation
 
-    def __init__(
-        self,
-        effects: Sequence[Effect],
-        channels: Sequence[str],
-        stretches: Sequence[Stretch],
-        inputs: Sequence[str] = (),
-    ) -> None:
-        """Take the catalogue, channels that residuals are taken of, windows, and channels that are
-        there and drive the simulation.
+    def __init__(self, logs: Sequence[FlightLog], params: Any) -> None:
+        """Cut the logs into windows; ``params``: of the subclass.
 
-        An effect that needs any other channel cannot be seen. Raises LogError where there is no
-        window."""
-        if not stretches:
+        An effect that needs any other channel than those that residuals are taken of, or that drive
+        the simulation, cannot be seen. Raises LogError where there is no window."""
+        self.params = params
+        self.stretches = self.cut(logs)
+        if not self.stretches:
             raise LogError(
-                f"no stretch of these logs shows {', '.join(channels)} in a way that this model"
-                " explains"
+                f"no stretch of these logs shows {', '.join(self.channels)} in a way that this"
+                " model explains"
             )
-        missing_inputs = set(inputs) - set(channels)
+        driving = set(self.inputs) - set(self.channels)
         self.effects = tuple(
-            replace(e, channels=tuple(c for c in e.channels if c not in missing_inputs))
-            for e in effects
+            replace(e, channels=tuple(c for c in e.channels if c not in driving))
+            for e in self.catalogue()
         )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
-        self.channels = tuple(channels)
-        self.stretches = list(stretches)
-        self._start = np.array([stretch.nuisance for stretch in self.stretches], dtype=float)
+        self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] | None = None
         self._base = np.zeros(
             len(self.effects)
         )  # sizes that the model has before anything is found
         self.laws: tuple[LawParams, ...] = ()  # that act in it besides
         self._flown: NumericModel | None = None  # the same with more laws
+
+    def catalogue(self) -> list[ModelEffect]:
+        """Return the effects of the model in the numbers of its parameters."""
+        return effects_of(self.table, self.params)
+
+    def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
+        """Cut logs into windows; those that lack a channel hold none."""
+        usable = (
+            (i, log) for i, log in enumerate(logs) if all(name in log for name in self.needed)
+        )
+        return [stretch for i, log in usable for stretch in self.windows_of(log, i)]
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """Cut one log, the flight of a number, into windows."""
+        raise NotImplementedError
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
         """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws
@@ -215,6 +225,10 @@ class NumericModel(Model, ABC):
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
         return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
 
+    def tables(self, lanes: Lanes, *names: str) -> list[np.ndarray]:
+        """Return entries of the windows' data, of one shape in all windows, a row for each lane."""
+        return [np.array([s.data[name] for s in self.stretches])[lanes.owner] for name in names]
+
     def of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
         return (
@@ -237,21 +251,13 @@ class NumericModel(Model, ABC):
         self._slopes = slopes
         path = self.simulate(self._lanes(size))
         return [
-            Window(
-                s.flight,
-                s.phase,
-                s.time,
-                s.channel,
-                residuals[i],
-                s.sigma,
-                effects[i],
-                slopes[i],
-                s.nuisance_sd,
-                latent[i],
-                s.latent_block,
-                s.latent_axis,
-                s.latent_time,
-                self.knots(s, path[i]),
+            replace(
+                s,
+                residual=residuals[i],
+                effects=effects[i],
+                nuisance=slopes[i],
+                latent=latent[i],
+                knots=self.knots(s, path[i]),
             )
             for i, s in enumerate(self.stretches)
         ]
@@ -330,7 +336,7 @@ class NumericModel(Model, ABC):
         costs = []
         for s, residual, state in zip(self.stretches, residuals, start):
             value = np.sum((residual / s.sigma) ** 2) + np.sum(
-                ((state - s.nuisance) / s.nuisance_sd) ** 2
+                ((state - s.start) / s.nuisance_sd) ** 2
             )
             costs.append(value if np.isfinite(value) else np.inf)
         return np.array(costs)
@@ -341,11 +347,9 @@ class NumericModel(Model, ABC):
         weight = 1.0 / s.sigma
         prior = 1.0 / s.nuisance_sd
         if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slope))):
-            return np.zeros(
-                len(s.nuisance)
-            )  # no step mends that; the search says which window it is
+            return np.zeros(len(s.start))  # no step mends that; the search says which window it is
         rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
-        aim = np.concatenate([residual * weight, (s.nuisance - self._start[i]) * prior])
+        aim = np.concatenate([residual * weight, (s.start - self._start[i]) * prior])
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]
         return step if 0.5 * aim @ rows @ step > SETTLED else np.zeros_like(step)
 

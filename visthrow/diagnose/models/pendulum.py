@@ -2,14 +2,12 @@
 the encoder.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -64,21 +62,46 @@ class PendulumModel(NumericModel):
     Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg
     at the pendulum's length."""
 
+    table = "pendulum"
+    channels = needed = (CHANNEL,)
     latent_step = 0.1
     bends = True
 
-    def __init__(self, logs: Sequence[FlightLog], params: PendulumParams) -> None:
-        """Cut the logs.
+    @property
+    def _steps(self) -> int:
+        return round(self.params.window / self.params.step)
 
-        Raises LogError where none holds an angle, or one holds angles that are no radians from
-        where it hangs.
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class.
+
+        Raises LogError: the log holds angles that are no radians from where the pendulum hangs.
         """
-        self.params = params
-        stretches = [
-            s for i, log in enumerate(logs) if CHANNEL in log for s in _windows(log, i, params)
-        ]
-        self._steps = round(params.window / params.step)
-        super().__init__(effects_of("pendulum", params), (CHANNEL,), stretches)
+        params = self.params
+        time, angle = log[CHANNEL].samples()
+        angle = angle[:, 0]
+        if len(time) < FEWEST:
+            return []
+        away = np.median(np.abs(angle - params.hanging))
+        if away > FARTHEST:
+            raise LogError(
+                f"the pendulum is {away:.3g} rad from where it hangs ({params.hanging:.3g} rad);"
+                " expected radians within a turn: degrees, or another zero?"
+            )
+        sigma = sigma_of(log[CHANNEL], 1e-5)
+        stretches = []
+        for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
+            rows = np.flatnonzero((time >= start) & (time < start + params.window))
+            rows = rows[:: params.every]
+            if len(rows) < FEWEST:
+                continue
+            t = time[rows]
+            y = angle[rows]
+            fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
+            layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
+            table = t, y[:, None], sigma
+            begin = fit[:2], [0.2, 1.0]
+            stretches.append(Stretch.of(number, "swing", [table], {"start": start}, layout, *begin))
+        return stretches
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the unknowns are angle from hanging and rate at the window's start.
@@ -154,32 +177,3 @@ class PendulumModel(NumericModel):
             rate,
         )[..., 0]
         return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging
-
-
-def _windows(log: FlightLog, number: int, params: PendulumParams) -> list[Stretch]:
-    channel = log[CHANNEL]
-    time, angle = channel.samples()
-    angle = angle[:, 0]
-    if len(time) < FEWEST:
-        return []
-    if np.median(np.abs(angle - params.hanging)) > FARTHEST:
-        raise LogError(
-            f"the pendulum is {np.median(np.abs(angle - params.hanging)):.3g} rad from where it"
-            f" hangs ({params.hanging:.3g} rad); expected radians within a turn: degrees, or"
-            " another zero?"
-        )
-    sigma = sigma_of(channel, 1e-5)
-    stretches = []
-    for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
-        rows = np.flatnonzero((time >= start) & (time < start + params.window))[:: params.every]
-        if len(rows) < FEWEST:
-            continue
-        t = time[rows]
-        y = angle[rows]
-        fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
-        layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
-        table = t, y[:, None], sigma
-        stretches.append(
-            Stretch.of(number, "swing", [table], {"start": start}, layout, fit[:2], [0.2, 1.0])
-        )
-    return stretches

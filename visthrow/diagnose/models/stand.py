@@ -4,17 +4,15 @@ the propeller takes.
 One motor of a kind is not like the other: the latent forces of a test are a share of its thrust and
 of its current."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
 from visthrow.logs.flightlog import FlightLog
 
-CHANNELS = ("thrust", "current")
 NEEDED = ("rotor_speed", "thrust", "supply_voltage", "current")
 
 
@@ -42,17 +40,35 @@ class StandModel(NumericModel):
         " stand for"
     )
 
-    def __init__(self, logs: Sequence[FlightLog], params: StandParams) -> None:
-        """Take the settled steps of the logs.
+    table = "stand"
+    channels = ("thrust", "current")
+    needed = NEEDED
+    inputs = ("rotor_speed", "supply_voltage")
 
-        Raises LogError where none has thrust, speed, voltage and current.
-        """
-        self.params = params
-        stretches = [s for i, log in enumerate(logs) if (s := _steps(log, i, params)) is not None]
-        super().__init__(
-            effects_of("stand", params), CHANNELS, stretches, ("rotor_speed", "supply_voltage")
-        )
-        self.middle = float(np.median(np.concatenate([s.data["speed"] for s in stretches])))
+    @cached_property
+    def middle_speed(self) -> float:
+        """Return the median rotor speed [rad/s]."""
+        return float(np.median(np.concatenate([s.data["speed"] for s in self.stretches])))
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class: the settled steps of a test are one window."""
+        p = self.params
+        if len({len(log[name].time) for name in NEEDED}) != 1:
+            return []
+        rows = settled(log, p)
+        if len(rows) < 4:
+            return []
+        speed, thrust, volts, current = rows.T
+        steps = np.arange(len(rows), dtype=float)
+        thrust_sd = np.hypot(p.thrust_sd, p.thrust_share * thrust)
+        current_sd = np.hypot(p.current_sd, p.current_share * current)
+        channels = [
+            (steps, values[:, None], sd[:, None])
+            for values, sd in ((thrust, thrust_sd), (current, current_sd))
+        ]
+        data = {"speed": speed, "volts": volts}
+        layout = latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1))
+        return [Stretch.of(number, "steps", channels, data, layout)]
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: thrusts [N], then currents [A]."""
@@ -60,15 +76,15 @@ class StandModel(NumericModel):
         gain, exponent, linear, voltage, zero, power_gain, power_exponent, idle, resistance = (
             x[:, None] for x in lanes.theta.T
         )
+        middle = self.middle_speed
         speed = stretch.data["speed"]
         volts = stretch.data["volts"]
         thrust = p.k_f * (
-            speed**2 * (speed / self.middle) ** exponent * (1.0 + gain)
-            + linear * self.middle * speed
+            speed**2 * (speed / middle) ** exponent * (1.0 + gain) + linear * middle * speed
         )
         thrust = thrust * (1.0 + voltage * (volts - p.reference_voltage)) + zero
         power = (
-            p.k_p * (1.0 + power_gain) * speed**3 * (speed / self.middle) ** power_exponent
+            p.k_p * (1.0 + power_gain) * speed**3 * (speed / middle) ** power_exponent
             + p.idle_power
             + idle
         )
@@ -97,25 +113,3 @@ def settled(log: FlightLog, params: StandParams) -> np.ndarray:
         & (rows[:, 3] > 0.0)
     )
     return rows[good]
-
-
-def _steps(log: FlightLog, number: int, params: StandParams) -> Stretch | None:
-    if (
-        any(name not in log for name in NEEDED)
-        or len({len(log[name].time) for name in NEEDED}) != 1
-    ):
-        return None
-    rows = settled(log, params)
-    if len(rows) < 4:
-        return None
-    speed, thrust, volts, current = rows.T
-    steps = np.arange(len(rows), dtype=float)
-    thrust_sd = np.hypot(params.thrust_sd, params.thrust_share * thrust)
-    current_sd = np.hypot(params.current_sd, params.current_share * current)
-    channels = [
-        (steps, values[:, None], sd[:, None])
-        for values, sd in ((thrust, thrust_sd), (current, current_sd))
-    ]
-    data = {"speed": speed, "volts": volts}
-    layout = latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1))
-    return Stretch.of(number, "steps", channels, data, layout)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
 from visthrow.logs.check.relations import derivative
@@ -44,21 +43,51 @@ class TrimParams(Bounded):
 class TrimModel(NumericModel):
     """Means over windows of slow level flight."""
 
+    table = "trim"
+
     def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
-        """Cut the logs. Raises LogError where none flies slowly with motor commands logged."""
-        self.params = params
-        usable = [
-            (i, log)
-            for i, log in enumerate(logs)
-            if params.command in log and params.position in log
-        ]
-        stretches = [s for i, log in usable for s in _cut(log, i, params)]
-        super().__init__(
-            effects_of("trim", params),
-            (params.command,),
-            stretches,
-            (params.position, "battery_voltage"),
-        )
+        """See the base class."""
+        self.channels = (params.command,)
+        self.needed = (params.command, params.position)
+        self.inputs = (params.position, "battery_voltage")
+        super().__init__(logs, params)
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class."""
+        params = self.params
+        window = params.slowest_window
+        nothing = (np.zeros(0), np.zeros(0))
+        stamps = log[params.command].time
+        time, sent = log[params.command].samples()
+        time_p, pos = log[params.position].samples()
+        time_v, vel = derivative(time_p, pos, 0.2)
+        if params.velocity in log:
+            time_v, vel = log[params.velocity].samples()
+        time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
+        stretches = []
+        for start in np.arange(stamps[0], stamps[-1] - window, window):
+            spans = [(t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u)]
+            if min(map(np.count_nonzero, spans[:3])) < 20:
+                continue
+            sent_here, pos_here, vel_here, volts_here = (
+                values[span] for values, span in zip((sent, pos, vel, volts), spans)
+            )
+            fast = np.mean(np.linalg.norm(vel_here, axis=1)) > params.fastest
+            if fast or np.min(pos_here[:, 2]) < params.lowest:
+                continue
+            rise = vel_here[-5:, 2].mean() - vel_here[:5, 2].mean()
+            data = {
+                "volts": float(np.mean(volts_here))
+                if len(volts_here)
+                else params.reference_voltage,
+                "lift": 1.0 + rise / window / params.gravity,
+                "pos": np.mean(pos_here, axis=0),
+                "vel": np.mean(vel_here, axis=0),
+            }
+            table = np.array([start]), np.mean(sent_here, axis=0)[None], np.array(params.spread)
+            layout = _latent(start, start + window)
+            stretches.append(Stretch.of(number, "hover", [table], data, layout))
+        return stretches
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: the commands at which everything balances, shape (B, 4)."""
@@ -127,40 +156,3 @@ def _latent(start: float, end: float) -> dict[str, np.ndarray]:
     push = latent_layout(start, end, 2, (0,), (2,))
     torque = latent_layout(start, end, 2, (1,))
     return {name: np.concatenate([push[name], torque[name]]) for name in push}
-
-
-def _cut(log: FlightLog, number: int, params: TrimParams) -> list[Stretch]:
-    window = params.slowest_window
-    stamps = log[params.command].time
-    nothing = (np.zeros(0), np.zeros(0))
-    time, sent = log[params.command].samples()
-    time_p, pos = log[params.position].samples()
-    time_v, vel = (
-        log[params.velocity].samples() if params.velocity in log else derivative(time_p, pos, 0.2)
-    )
-    time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
-    stretches = []
-    for start in np.arange(stamps[0], stamps[-1] - window, window):
-        rows, window_rows, moving, charged = (
-            (t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u)
-        )
-        if min(np.sum(rows), np.sum(window_rows), np.sum(moving)) < 20:
-            continue
-        speeds = vel[moving]
-        if (
-            np.min(pos[window_rows][:, 2]) < params.lowest
-            or np.mean(np.linalg.norm(speeds, axis=1)) > params.fastest
-        ):
-            continue
-        lift = 1.0 + (speeds[-5:, 2].mean() - speeds[:5, 2].mean()) / window / params.gravity
-        data = {
-            "volts": (
-                float(np.mean(volts[charged])) if np.any(charged) else params.reference_voltage
-            ),
-            "lift": lift,
-            "pos": np.mean(pos[window_rows], axis=0),
-            "vel": np.mean(speeds, axis=0),
-        }
-        table = np.array([start]), np.mean(sent[rows], axis=0)[None], np.array(params.spread)
-        stretches.append(Stretch.of(number, "hover", [table], data, _latent(start, start + window)))
-    return stretches
