@@ -3,14 +3,15 @@ times one vector.
 
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of
 its factors into the kernel that is built for it; its coefficient is a number of the run, so that
-one kernel serves every size of a law. The names are those of
-``visthrow.diagnose.models.law_terms``. A law's force is taken at the start of an integration step
-and held over it.
+one kernel serves every size of a law. The factors are those of ``sim/law_factors.toml``, of which
+``visthrow.diagnose.models.law_terms`` makes the same in NumPy. A law's force is taken at the start
+of an integration step and held over it.
 
 A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that
 does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its
 opposite at the mount. Momentum is conserved."""
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,6 +19,7 @@ import warp as wp
 
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
 from sim.kernels.structs import Types, make_struct
+from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
 
 MOST_LAWS = 4
@@ -183,69 +185,63 @@ def friction(a: Any):
     return turn / wp.sqrt(wp.dot(turn, turn) + type(a.thrust)(SLOWEST * SLOWEST))
 
 
-SCALARS = {
+unit_x = _axis(1.0, 0.0, 0.0)
+unit_y = _axis(0.0, 1.0, 0.0)
+vel_body = _turned_back(vel)
+cable_body = _turned_back(cable)
+QUANTITIES = {
     "thrust": thrust,
-    "thrust_rate": thrust_rate,
-    "abs_thrust_rate": abs_thrust_rate,
-    "speed": _size(vel),
-    "speed_across": _size(vel_across),
-    "speed_across_squared": speed_across_squared,
-    "speed_along": speed_along,
-    "rate": _size(rate),
-    "rate_yaw": rate_yaw,
-    "inverse_height": inverse_height,
+    "slope": thrust_rate,
+    "|slope|": abs_thrust_rate,
     "tension": tension,
-    "payload_speed": _size(payload_vel),
-    "swing_speed": _size(swing),
-    "cable_under_rotors": cable_under_rotors,
-    "joint_rate": _size(joint_rate),
+    "vel_w": vel,
+    "rate_b": rate,
+    "cable_dir_w": cable,
+    "payload_vel_w": payload_vel,
+    "unit_x": unit_x,
+    "unit_y": unit_y,
+    "unit_z": vertical,
+    "axis_x": _turned(unit_x),
+    "axis_y": _turned(unit_y),
+    "axis_z": up,
+    "along": speed_along,
+    "across": vel_across,
+    "speed_across_squared": speed_across_squared,
+    "rate_yaw": rate_yaw,
+    "rate_w": _turned(rate),
+    "inverse_height": inverse_height,
+    "vel_b": vel_body,
+    "cable_dir_b": cable_body,
+    "swing": swing,
+    "swing_b": _turned_back(swing),
+    "under": cable_under_rotors,
+    "sideways": sideways,
+    "joint_rate_b": joint_rate,
+    "friction": friction,
+    "spring": _crossed(vertical, cable_body),
 }
+"""Quantities of ``law_factors.toml`` at a state."""
+
+
+@cache
+def quantity(name: str):
+    """Return the function of a quantity of the table, of a vector's size, or of a cross product."""
+    first, crossed, second = name.partition(" x ")
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    return (
+        _crossed(quantity(first), quantity(second)) if crossed else _size(quantity(name.strip("|")))
+    )
+
+
+def _functions(rows):
+    return {name: quantity(row[2]) for name, row in rows.items()}
+
+
+SCALARS = _functions(LAW_FACTORS["scalars"])
 """Scalars that a law may name."""
 
-_vel_body = _turned_back(vel)
-_cable_body = _turned_back(cable)
-_axis_cross_cable = _crossed(vertical, _cable_body)
-VECTORS = {
-    "vehicle force": {
-        "body_z": up,
-        "body_x": _turned(_axis(1.0, 0.0, 0.0)),
-        "body_y": _turned(_axis(0.0, 1.0, 0.0)),
-        "world_z": vertical,
-        "vel": vel,
-        "vel_across": vel_across,
-        "axis_cross_vel": _crossed(up, vel),
-        "rate_cross_vel": _crossed(_turned(rate), vel),
-        "cable": cable,
-        "swing_vel": swing,
-    },
-    "vehicle torque": {
-        "body_x": _axis(1.0, 0.0, 0.0),
-        "body_y": _axis(0.0, 1.0, 0.0),
-        "body_z": vertical,
-        "rate": rate,
-        "axis_cross_rate": _crossed(vertical, rate),
-        "vel": _vel_body,
-        "axis_cross_vel": _crossed(vertical, _vel_body),
-        "axis_cross_cable": _axis_cross_cable,
-        "axis_cross_swing": _crossed(vertical, _turned_back(swing)),
-    },
-    "payload force": {
-        "payload_vel": payload_vel,
-        "vertical_cross_vel": _crossed(vertical, payload_vel),
-        "world_z": vertical,
-        "body_z": up,
-        "cable": cable,
-        "swing_vel": swing,
-        "cable_cross_swing": _crossed(cable, swing),
-        "vel": vel,
-        "sideways": sideways,
-    },
-    "rope joint": {
-        "joint_rate": joint_rate,
-        "friction": friction,
-        "axis_cross_cable": _axis_cross_cable,
-    },
-}
+VECTORS = {block: _functions(rows) for block, rows in LAW_FACTORS["vectors"].items()}
 """Vectors that a law of each block may name; forces in the world frame, torques in the body's."""
 
 BLOCKS = tuple(VECTORS)

@@ -74,6 +74,7 @@ LANE_FIELDS = {
     "keep": "int",  # first row of its knots' states in the knot arrays, or -1
     "resume": "int",  # row of the knot arrays at which it leaves the lane that kept it, or -1
     "parent": "int",  # that lane, flown before, of the same window, plant and state
+    "skip": "int",  # command in whose place the one before stays, or -1
     # of a lane from a start: so many after it share its flight and differ in what sensors show
     "shared": "int",
 }
@@ -345,7 +346,10 @@ def build_replay(
                 until = wp.min(until, wp.max(knot_time, m.time + tiny))
             count = wp.max(int(wp.ceil((until - m.time) / lanes.substep[lane] - real(1.0e-3))), 1)
             h = (until - m.time) / real(float(count))
-            active = data.command[command]
+            acting = command
+            if command == lanes.skip[lane]:
+                acting = command - 1
+            active = data.command[acting]
             peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
             for j in range(count):
                 k = Steps()

@@ -73,7 +73,7 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
     assert gram.square.sum() == approx(window.residual @ inverse @ window.residual)
     assert 2.0 * gram.log_sigma == approx(np.linalg.slogdet(dense)[1])
     other = default_rng(0).normal(size=len(window.residual)) * window.sigma
-    again = marginal.with_residual(gram, told, floors, other)
+    again = marginal.with_residual(gram, told, other, floors)
     assert_allclose(
         again.cross.sum(0), z.T @ inverse @ other, rtol=1e-6, atol=1e-9 * np.abs(again.cross).max()
     )

@@ -118,6 +118,7 @@ def replay(flight, plants, sensings=None, count=1, stamps=None, end=0.02 * PERIO
         "resume": -1,
         "parent": -1,
         "shared": 0,
+        "skip": -1,
     } | lane
     lanes = {name: np.broadcast_to(value, count).copy() for name, value in lanes.items()}
     plants = [generalised(Setting(p)).plant for p in plants]  # as a diagnosis flies them

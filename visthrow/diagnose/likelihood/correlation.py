@@ -18,6 +18,7 @@ Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -89,7 +90,7 @@ def with_correlations(
     ``correlations_of``: of channels, by number.
     """
     return (
-        parallel_map(lambda window: _with_correlation(window, correlations_of), windows)
+        parallel_map(partial(_with_correlation, correlations_of=correlations_of), windows)
         if correlations_of
         else list(windows)
     )
@@ -115,10 +116,8 @@ def correlations(
     ``slabs``: prior deviation of each effect in its unit, shape (K,); ``channels``: number of the
     model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
-    bare = parallel_map(lambda window: hidden_gram(window, channels), free)
-    residuals = parallel_map(
-        lambda pair: residual_after_fit(*pair), zip(free, noise.widely_fitted(free, bare, "cpu"))
-    )
+    bare = parallel_map(partial(hidden_gram, channels=channels), free)
+    residuals = parallel_map(residual_after_fit, free, noise.widely_fitted(free, bare, "cpu"))
     suspects = {
         c: scale for c in range(channels) if (scale := _suspected(free, residuals, c)) is not None
     }
@@ -242,7 +241,7 @@ def _likelihood(
     from.
     """
     correlated = with_correlations(windows, correlations_of)
-    grams = parallel_map(lambda window: hidden_gram(window, channels), correlated)
+    grams = parallel_map(partial(hidden_gram, channels=channels), correlated)
     shaped = correlated_of(grams, correlated, noise.CORRELATION_TIMES[1])
     levels, value = noise.roughly(shaped, start)
     return value, levels

@@ -17,7 +17,7 @@ matter."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.linalg import lapack
@@ -296,12 +296,12 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
 
 def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Gram]:
     """Reduce windows to their inner products, see :func:`gram_of`."""
-    return parallel_map(lambda w: gram_of(w, floors, channels), windows)
+    return parallel_map(partial(gram_of, floors=floors, channels=channels), windows)
 
 
 def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float) -> list[Gram]:
     """Correlate the latent forces of all windows, see :func:`correlated`."""
-    return parallel_map(lambda pair: correlated(*pair, time), zip(grams, windows))
+    return parallel_map(partial(correlated, time=time), grams, windows)
 
 
 def with_residuals(
@@ -311,12 +311,10 @@ def with_residuals(
     residuals: Sequence[np.ndarray],
 ) -> list[Gram]:
     """Return Gram matrices with other residuals, see :func:`with_residual`."""
-    return parallel_map(
-        lambda of: with_residual(of[0], of[1], floors, of[2]), zip(grams, windows, residuals)
-    )
+    return parallel_map(partial(with_residual, floors=floors), grams, windows, residuals)
 
 
-def with_residual(gram: Gram, window: Window, floors: np.ndarray, residual: np.ndarray) -> Gram:
+def with_residual(gram: Gram, window: Window, residual: np.ndarray, floors: np.ndarray) -> Gram:
     """Return a Gram matrix of the same derivatives with the residuals of another size of the
     effects.
     """
@@ -378,21 +376,16 @@ def gather(
     negative beyond rounding."""
     flights, row = np.unique([gram.flight for gram in grams], return_inverse=True)
     size = len(theta)
-    count = len(flights)
-    information, score, square, samples = (
-        np.zeros((count, *shape)) for shape in ((size, size), (size,), (), ())
-    )
+    information = np.zeros((len(flights), size, size))
+    samples = np.zeros(len(flights))
     total = np.zeros(size)
     for i, gram, part in zip(row, grams, parts):
         information[i] += part.information
-        score[i] += part.score
-        square[i] += part.square
         samples[i] += gram.count.sum()
         total += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
     silent = np.diagonal(information.sum(0)) < ROUNDING * total
     information[:, silent] = 0.0
     information[:, :, silent] = 0.0
-    score[:, silent] = 0.0
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
     lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
     if lowest < -NEGATIVE:
@@ -404,7 +397,9 @@ def gather(
         # rounding, which wide priors of several named effects would turn into evidence; what says
         # nothing of an effect stays silent
         information -= 2.0 * lowest * information * np.eye(size)
-    return Statistics(flights, information, score, square, samples, np.array(theta, dtype=float))
+    none = np.zeros((len(flights), size))
+    silenced = Statistics(flights, information, none, np.zeros(len(flights)), samples, none[0])
+    return rescored(silenced, grams, parts, theta)
 
 
 def rescored(
@@ -417,8 +412,7 @@ def rescored(
 
     ``statistics``: of the same windows; ``theta``: linearisation point in floors, shape (K,).
     """
-    row = {flight: i for i, flight in enumerate(statistics.flights.tolist())}
-    which = [row[gram.flight] for gram in grams]
+    which = np.searchsorted(statistics.flights, [gram.flight for gram in grams])
     score = np.zeros_like(statistics.score)
     square = np.zeros_like(statistics.square)
     np.add.at(score, which, [part.score for part in parts])

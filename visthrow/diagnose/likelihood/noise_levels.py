@@ -8,6 +8,7 @@ it, so that the forces have Student's heavy tails), and every level is bounded."
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.linalg import lapack
@@ -343,7 +344,7 @@ def without_outliers(
     for cleaning in range(CLEANINGS):
         where = "cpu" if cleaning else device  # few are looked at once more
         fits = widely_fitted(starts, bare, where)
-        residuals = parallel_map(lambda pair: residual_after_fit(*pair), zip(starts, fits))
+        residuals = parallel_map(residual_after_fit, starts, fits)
         distances = {
             w: _outlier_distances(windows[w], residual)
             for w, residual in zip(windows_left, residuals)
@@ -354,7 +355,7 @@ def without_outliers(
         for w in windows_left:
             sigmas[w] = windows[w].sigma * np.maximum(distances[w], 1.0)
         starts = [replace(windows[w], sigma=sigmas[w]) for w in windows_left]
-        bare = parallel_map(lambda window: hidden_gram(window, len(grams[0].count)), starts)
+        bare = parallel_map(partial(hidden_gram, channels=len(grams[0].count)), starts)
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 

@@ -75,7 +75,7 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
     were effects.
     """
     whole = integrals(grams, noise, device, latents=True)
-    return parallel_map(lambda pair: _of_latents(*pair), zip(whole.shares(grams, noise), grams))
+    return parallel_map(_of_latents, whole.shares(grams, noise), grams)
 
 
 def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:

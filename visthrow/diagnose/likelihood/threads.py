@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from threading import Event
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
 
@@ -72,17 +72,20 @@ def _pool(name: str, threads: int) -> ThreadPoolExecutor:
     return ThreadPoolExecutor(threads, name, limit_to_one_thread)
 
 
-def parallel_map(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
-    """The function of every item, in order, on all cores; no call may wait for another of these."""
-    items = list(items)
+def parallel_map(function: Callable[..., R], *columns: Iterable[Any]) -> list[R]:
+    """Map a function over items, in order, on all cores; no call may wait for another of these.
+
+    ``columns``: one for each argument, as the built-in ``map`` takes them.
+    """
+    items = list(zip(*columns))
     threads = min(cores(), THREADS_ASIDE if _aside.is_set() else THREADS)
     if min(threads, len(items)) < 2:
-        return [function(item) for item in items]
+        return [function(*item) for item in items]
     pieces = min(
         PIECES * threads, len(items)
     )  # each item by itself would cost as much as the small ones take
     parts = _pool("algebra", threads).map(
-        lambda first: [function(item) for item in items[first::pieces]], range(pieces)
+        lambda first: [function(*item) for item in items[first::pieces]], range(pieces)
     )
     results: list[R] = [None] * len(items)
     for first, part in enumerate(parts):

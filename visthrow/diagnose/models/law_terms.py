@@ -14,15 +14,14 @@ what a pair of forces does,
 so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is
 conserved."""
 
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations_with_replacement
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import cross, rotate, rotate_back
@@ -239,24 +238,22 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
 }
 """What :class:`KnotValues` computes of the quantities at the knots."""
 
-_TABLES = tomllib.loads(Path(__file__).with_name("law_factors.toml").read_text(encoding="utf-8"))
-
 
 def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
     """Return the factors of a table of the file."""
     factors = {}
     for name, (symbol, unit, quantity, words) in rows.items():
-        groups = [_TABLES["groups"].get(word, [word]) for word in words.split()]
+        groups = [LAW_FACTORS["groups"].get(word, [word]) for word in words.split()]
         factors[name] = Factor(symbol, unit, quantity, tuple(chain.from_iterable(groups)))
     return factors
 
 
-SCALARS = _factors(_TABLES["scalars"])
+SCALARS = _factors(LAW_FACTORS["scalars"])
 """Scalars of a term."""
 
 ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
 
-VECTORS = {block: _factors(rows) for block, rows in _TABLES["vectors"].items()}
+VECTORS = {block: _factors(rows) for block, rows in LAW_FACTORS["vectors"].items()}
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
 JOINT_NEEDS = VECTORS[JOINT]["joint_rate"].needs

@@ -117,13 +117,14 @@ class TrimModel(NumericModel):
                 predictions.get("vehicle torque", np.zeros(3)),
             )
         push, roll, pitch, turn = draught.T
-        share = np.outer(off_x, x) / p.arm**2 + np.outer(off_y, y) / p.arm**2 - np.outer(yaw, spin)
-        thrust = 0.25 * (1.0 + share) * (weight * lift)[:, None] - 0.25 * push[:, None]
-        thrust = (
-            thrust
-            - 0.25 * (np.outer(roll, y) - np.outer(pitch, x)) / p.arm**2
-            - 0.25 * np.outer(turn, spin) / p.torque_ratio
-        )
+        lifting = weight * lift
+        wrench = [
+            lifting - push,
+            (lifting * off_x + pitch) / p.arm**2,
+            (lifting * off_y - roll) / p.arm**2,
+            -(lifting * yaw + turn / p.torque_ratio),
+        ]
+        thrust = 0.25 * np.stack(wrench, axis=1) @ np.stack([np.ones(4), x, y, spin])
         volts = 1.0 + (p.voltage_coefficient + sag) * (stretch.data["volts"] - p.reference_voltage)
         per_map = thrust / (
             np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None]

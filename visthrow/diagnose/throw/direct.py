@@ -10,7 +10,8 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation, RotationSpline
 
 from camera.params import CameraParams
 from sim.effects.effect import SettingEffect
@@ -246,8 +247,8 @@ def _reach(camera) -> np.ndarray:
 
 
 def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> dict | None:
-    """Views of one window: stamps, points, what is valid of them, goal, and smoothed poses on a
-    grid about them.
+    """Views of one window: stamps, points, what is valid of them, goal, and splines through poses
+    that are smoothed on a grid about them.
     """
     channel = measured(log, KEYPOINTS)
     during = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
@@ -273,29 +274,26 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         "attitude": (flight.attitude, x.vehicle_delay),
         "payload": (flight.payload, x.payload_delay),
     }
-    sources = {
-        name: replace(track, time=track.time - delay) for name, (track, delay) in tracks.items()
-    }  # at the times that they show
-    table = {
-        name: [smoothed(s, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
-        for name, s in sources.items()
-    }
-    if any(row is None for rows in table.values() for row in rows):
-        return None
+    view = {}
+    for name, (track, delay) in tracks.items():
+        shown = replace(track, time=track.time - delay)  # at the times that they show
+        near = [smoothed(shown, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
+        if any(fit is None for fit in near):
+            return None
+        values = np.array([value for value, _ in near])
+        if name == "attitude":
+            view[name] = RotationSpline(grid, Rotation.from_quat(values))
+        else:
+            view[name] = CubicSpline(grid, values)
     visible = visible[..., None] & MEASURED
     if not np.any(visible):
         return None
-    view = {
+    return view | {
         "time": stamps,
         "points": points[indices],
         "valid": visible,
-        "grid": grid,
         "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
         "sigma": max(_noise(points[indices], visible), LEAST_KEYPOINT_SIGMA),
-    }
-    return view | {
-        name: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows]))
-        for name, rows in table.items()
     }
 
 
@@ -306,31 +304,6 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
     tracks = [points[visible[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
     sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
     return float(np.median(sigmas)) if sigmas else 0.0
-
-
-def _interpolated(view: dict, name: str, time: np.ndarray) -> np.ndarray:
-    """A smoothed track at times: points [m], or rotations from xyzw."""
-    grid = view["grid"]
-    values, slopes = view[name]
-    k = np.clip(np.searchsorted(grid, time) - 1, 0, len(grid) - 2)
-    h = time - grid[k]
-    s = (h / GRID)[:, None]
-    turns = name == "attitude"
-    rotation = Rotation.from_quat(values[k]) if turns else None
-    chord = (
-        (rotation.inv() * Rotation.from_quat(values[k + 1])).as_rotvec()
-        if turns
-        else values[k + 1] - values[k]
-    )
-    # A cubic that meets both ends: a jump there, divided by a small delay, would pass for an effect
-    # of that delay.
-    bend = (
-        s
-        * (1.0 - s)
-        * ((1.0 - s) * (GRID * slopes[k] - chord) - s * (GRID * slopes[k + 1] - chord))
-    )
-    way = s * chord + bend
-    return (rotation * Rotation.from_rotvec(way)).as_quat() if turns else values[k] + way
 
 
 def _visible_keypoints(
@@ -348,16 +321,13 @@ def _visible_keypoints(
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
     frame = Rotation.from_rotvec(x.frame_tilt)
     marker = Rotation.from_rotvec(x.marker_rotation)
-    turned = (
-        frame.inv() * Rotation.from_quat(_interpolated(view, "attitude", vehicle)) * marker.inv()
-    )
+    turned = frame.inv() * view["attitude"](vehicle) * marker.inv()
     # The mount is stated from the centre of mass as it was believed: where the weight really lies
     # moves no lens.
     off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
-    pos = _origin(x, _interpolated(view, "vehicle", vehicle)) - turned.apply(off)
-    ball = _origin(
-        x, _interpolated(view, "payload", time + (x.payload_delay - nominal.sensing.payload_delay))
-    ) - np.array(x.payload_offset)
+    pos = _origin(x, view["vehicle"](vehicle)) - turned.apply(off)
+    payload = time + (x.payload_delay - nominal.sensing.payload_delay)
+    ball = _origin(x, view["payload"](payload)) - np.array(x.payload_offset)
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)

@@ -164,7 +164,7 @@ def _fly(
     for i, c in enumerate(flown):
         first = 2 * int(onward.windows["vehicle_count"][i])
         count = int(onward.windows["payload_count"][i])
-        time = onward.samples["payload"][i].time
+        time = onward.samples[i][2].time
         path = measured[first : first + count, i]
         out[i] = _crossing(
             path[time > looked[c.flight].latch + release.lag], release.landing_height

@@ -43,6 +43,14 @@ class ChannelSamples:
         """Samples with first <= time < last."""
         return slice(*np.searchsorted(self.time, (first, last)))
 
+    def during(self, first: float, last: float) -> "ChannelSamples":
+        """Samples with first <= time < last, by themselves."""
+        span = self.between(first, last)
+        return ChannelSamples(self.time[span], self.values[span], self.sigma)
+
+
+NO_SAMPLES = ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
+
 
 @dataclass(frozen=True)
 class RecordedFlight:

@@ -2,7 +2,6 @@
 of a batch share.
 """
 
-import copy
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -22,7 +21,12 @@ from visthrow.diagnose.throw.initial_states import (
     rows_of,
     stacked,
 )
-from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
+from visthrow.diagnose.throw.recorded_flight import (
+    NEVER,
+    NO_SAMPLES,
+    ChannelSamples,
+    RecordedFlight,
+)
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
@@ -41,6 +45,22 @@ BATCH, CUDA_BATCH = (
 def downloaded(array: wp.array) -> np.ndarray:
     """Copy an array that a replay wrote to the host."""
     return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
+
+
+def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[list[int]]:
+    """Split windows into runs of at most so many lanes, or of one window.
+
+    ``lanes``: of each window.
+    """
+    groups: list[list[int]] = []
+    left = 0
+    for w, count in zip(windows, lanes):
+        if not groups or left < count:
+            groups.append([])
+            left = room
+        groups[-1].append(w)
+        left -= count
+    return groups
 
 
 def rough_step(setting: Setting, substep: float) -> float:
@@ -105,6 +125,7 @@ class Lane(NamedTuple):
     parent: int = -1  # that lane
     shared: int = 0  # lanes after it that share its flight and differ in what sensors show of it
     rough: bool = False  # whether it flies with longer steps
+    skip: int = -1  # command that does not come: the one before stays
 
 
 class ReplayedFlights:
@@ -128,109 +149,83 @@ class ReplayedFlights:
         """
         self.flights = list(flights)
         self.cuts = list(cuts)
-        self.knots = np.array(
-            [int(np.ceil((c.end - c.start) / KNOT_SPACING - 1e-6)) + 1 for c in cuts]
-        )
+        spans = np.array([c.end - c.start for c in cuts])
+        self.knots = np.ceil(spans / KNOT_SPACING - 1e-6).astype(int) + 1
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
-        lengths = np.cumsum([0] + [len(f.command_time) for f in self.flights])
-        names = ("vehicle", "attitude", "payload", "gyro")
-        parts: dict[str, list[ChannelSamples]] = {name: [] for name in names}
-        rows = []
-        for w, c in enumerate(self.cuts):
-            f = self.flights[c.flight]
-            payload = f.payload if c.payload in (ATTACHED, LOOSE) else None
-            sources = (f.vehicle, f.attitude, payload, f.gyro)
-            for name, source, delay in zip(names, sources, (delays[0], *delays)):
-                samples = source or ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
-                span = samples.between(c.start + delay + EARLY, c.end + delay)
-                parts[name].append(
-                    ChannelSamples(samples.time[span], samples.values[span], samples.sigma)
-                )
-            rows.append(
-                {
-                    "start": c.start,
-                    "end": c.end,
-                    "first_knot": c.start,
-                    "knots": self.knots[w],
-                    "payload": c.payload,
-                    "latch": f.latch if c.payload == ATTACHED else NEVER,
-                    "clock_zero": f.start,
-                    "command_first": lengths[c.flight],
-                    "command_last": lengths[c.flight + 1],
-                }
-            )
+        self.samples = [self._samples_in(c, delays) for c in self.cuts]
+        rows = [self._row(w) for w in range(len(self.cuts))]
         fields = {name: np.array([row[name] for row in rows]) for name in rows[0]}
-        for name, pieces in parts.items():
-            counts = np.array([len(piece.time) for piece in pieces])
-            fields |= {f"{name}_first": np.cumsum(counts) - counts, f"{name}_count": counts}
+        for name in ("vehicle", "payload", "gyro"):
+            counts = fields[f"{name}_count"]
+            fields[f"{name}_first"] = np.cumsum(counts) - counts
         self.windows = {
             name: fields[name].astype(int if kind[0] == "int" else float)
             for name, kind in WINDOW_FIELDS.items()
         }
-        self.samples = parts
+        vehicle, attitude, payload, gyro = zip(*self.samples)
         data = {
             "command_time": np.concatenate([f.command_time for f in self.flights]),
             "command": np.concatenate([f.command for f in self.flights]),
-            "vehicle_time": self._joined("vehicle").time,
-            "vehicle_quat": self._joined("attitude").values,
-            "payload_time": self._joined("payload").time,
-            "gyro_time": self._joined("gyro").time,
+            "vehicle_time": np.concatenate([part.time for part in vehicle]),
+            "vehicle_quat": np.concatenate([part.values for part in attitude]),
+            "payload_time": np.concatenate([part.time for part in payload]),
+            "gyro_time": np.concatenate([part.time for part in gyro]),
         }
         self.recording = Recording(self.windows, data)
         self.rows = self.recording.rows
-        self.time = self._of_samples("time", ("vehicle", "vehicle", "payload", "gyro"))
-        self.sigma = self._of_samples("sigma", ("vehicle", "attitude", "payload", "gyro"))
-        pairs = [
-            np.stack((samples.values, np.zeros_like(samples.values)), axis=1).reshape(-1, 3)
-            for samples in parts["vehicle"]
+        self._groups = [_groups_of(*samples) for samples in self.samples]
+        self.sigma = [
+            self.spread(w, *[part.sigma for part in samples])
+            for w, samples in enumerate(self.samples)
         ]
-        self._measured = [
-            np.concatenate((samples, p.values, g.values))
-            for samples, p, g in zip(pairs, parts["payload"], parts["gyro"])
+        self.time = []
+        self._measured = []
+        for groups, (vehicle, _, payload, gyro) in zip(self._groups, self.samples):
+            stamps = np.repeat(vehicle.time, 2), payload.time, gyro.time
+            self.time.append(np.repeat(np.concatenate(stamps), 3))
+            measured = np.zeros((len(groups), 3))  # attitudes are measured against themselves
+            measured[groups != 1] = np.concatenate((vehicle.values, payload.values, gyro.values))
+            self._measured.append(measured)
+
+    def _samples_in(self, c: Cut, delays: tuple[float, float, float]) -> list[ChannelSamples]:
+        """Return the window's samples of vehicle, attitude, payload and gyro."""
+        f = self.flights[c.flight]
+        payload = f.payload if c.payload in (ATTACHED, LOOSE) else None
+        sources = zip((f.vehicle, f.attitude, payload, f.gyro), (delays[0], *delays))
+        return [
+            (source or NO_SAMPLES).during(c.start + delay + EARLY, c.end + delay)
+            for source, delay in sources
         ]
 
-    def _of_samples(self, what: str, names: Sequence[str]) -> list[np.ndarray]:
-        groups = zip(
-            *([getattr(channel, what) for channel in self.samples[name]] for name in names)
-        )
-        return [self.spread(w, *channel) for w, channel in enumerate(groups)]
+    def _row(self, w: int) -> dict[str, float]:
+        """Return a window's fields, without the ranges of its stamps."""
+        c = self.cuts[w]
+        f = self.flights[c.flight]
+        vehicle, _, payload, gyro = self.samples[w]
+        before = sum(len(flight.command_time) for flight in self.flights[: c.flight])
+        return {
+            "start": c.start,
+            "end": c.end,
+            "first_knot": c.start,
+            "knots": self.knots[w],
+            "payload": c.payload,
+            "latch": f.latch if c.payload == ATTACHED else NEVER,
+            "clock_zero": f.start,
+            "command_first": before,
+            "command_last": before + len(f.command_time),
+            "vehicle_count": len(vehicle.time),
+            "payload_count": len(payload.time),
+            "gyro_count": len(gyro.time),
+        }
 
-    def like(self, w: int) -> tuple[int, bool]:
-        """Return what :meth:`alike` depends on: the same of two windows, the same answer."""
+    def kind(self, w: int) -> tuple[int, bool]:
+        """Return the payload at a window's start, and whether the latch holds it until the end."""
         c = self.cuts[w]
         return c.payload, self.flights[c.flight].latch >= c.end
 
-    def alike(self, w: int, setting: Setting, second: Setting) -> bool:
-        """Whether a window is flown alike in two settings, which may be seen otherwise: what
-        differs does nothing in it.
-        """
-        c = self.cuts[w]
-        plant = second.plant
-        if setting.step_square != second.step_square:
-            return False
-        if c.payload == NO_PAYLOAD and not plant.laws:
-            plant = replace(plant, rope=setting.plant.rope, release=setting.plant.release)
-        elif c.payload == ATTACHED and self.flights[c.flight].latch >= c.end:
-            plant = replace(plant, release=setting.plant.release)
-        return plant == setting.plant
-
-    def _joined(self, name: str) -> ChannelSamples:
-        parts = self.samples[name]
-        return ChannelSamples(
-            np.concatenate([p.time for p in parts]), np.concatenate([p.values for p in parts]), 1.0
-        )
-
-    def spread(self, w: int, vehicle, attitude, payload, gyro) -> np.ndarray:
-        """A number for every sample of a window, from one for each row of its groups."""
-        s = self.samples
-        pairs = np.stack(np.broadcast_arrays(vehicle, attitude), axis=-1).ravel()
-        counts = len(s["vehicle"][w].time), len(s["payload"][w].time), len(s["gyro"][w].time)
-        if pairs.size == 2:
-            pairs = np.tile(pairs, counts[0])
-        remaining = [
-            np.broadcast_to(value, count) for value, count in zip((payload, gyro), counts[1:])
-        ]
-        return np.repeat(np.concatenate((pairs, *remaining)), 3)
+    def spread(self, w: int, *values: float) -> np.ndarray:
+        """Give every sample of a window the value of its kind: vehicle, attitude, payload, gyro."""
+        return np.repeat(np.array(values)[self._groups[w]], 3)
 
     def residual(self, measured: np.ndarray, w: int, lane: int) -> np.ndarray:
         """Measured minus simulated, shape (N,); of an attitude the rotation vector from the
@@ -266,18 +261,32 @@ class ReplayedFlights:
             states, recording or self.recording, columns, KNOT_SPACING, knots
         )
 
-    def repeated(self, windows: np.ndarray) -> "ReplayedFlights":
-        """Return the flights as they concern :meth:`fly`, with windows that stand there more than
-        once.
-        """
-        flights = copy.copy(self)
-        flights.knots = self.knots[windows]
-        flights._fineness = self._fineness[windows]
-        return flights
-
     def ended(self, ends: Sequence[float]) -> Recording:
         """The windows that end earlier [s]; what is seen afterwards says nothing."""
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
+
+
+def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: ChannelSamples):
+    """Return which kind each row of a window is of: positions and attitudes in turns, then payload
+    and gyro.
+    """
+    pairs = np.tile([0, 1], len(vehicle.time))
+    return np.concatenate((pairs, np.repeat([2, 3], [len(payload.time), len(gyro.time)])))
+
+
+def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:
+    """Whether windows of a kind are flown alike in two settings, which may be seen otherwise: what
+    differs does nothing in them.
+    """
+    payload, holds = kind
+    plant = second.plant
+    if setting.step_square != second.step_square:
+        return False
+    if payload == NO_PAYLOAD and not plant.laws:
+        plant = replace(plant, rope=setting.plant.rope, release=setting.plant.release)
+    elif payload == ATTACHED and holds:
+        plant = replace(plant, release=setting.plant.release)
+    return plant == setting.plant
 
 
 def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, States]:

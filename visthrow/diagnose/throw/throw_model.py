@@ -52,6 +52,8 @@ from visthrow.diagnose.throw.replay import (
     Simulation,
     carried,
     downloaded,
+    flown_alike,
+    grouped,
 )
 from visthrow.logs.flightlog import FlightLog
 
@@ -430,16 +432,9 @@ class ThrowModel(Model):
 
     def _batches(self) -> list[list[int]]:
         """Windows in groups whose lanes fit a run."""
-        batches = []
-        room = 0
-        for w in self._retained:
-            lanes = 2 + len(self._graded) + len(self._directions) + 9 * int(self.flights.knots[w])
-            if not batches or room < lanes:
-                batches.append([])
-                room = BATCH if self.device == "cpu" else CUDA_BATCH
-            batches[-1].append(w)
-            room -= lanes
-        return batches
+        shared = 2 + len(self._graded) + len(self._directions)
+        lanes = shared + 9 * self.flights.knots[self._retained]
+        return grouped(self._retained, lanes, BATCH if self.device == "cpu" else CUDA_BATCH)
 
     def _linearised(
         self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]
@@ -450,14 +445,13 @@ class ThrowModel(Model):
         plans = []
         lanes = []
         rows_kept = 0
-        computed: dict[tuple, np.ndarray] = {}
+        alike = {
+            kind: np.array([flown_alike(kind, settings[0], x) for x in settings[1:]], dtype=bool)
+            for kind in {f.kind(w) for w in batch}
+        }
         for w in batch:
-            if f.like(w) not in computed:
-                computed[f.like(w)] = np.array(
-                    [f.alike(w, settings[0], setting) for setting in settings[1:]], dtype=bool
-                )
             plan, lanes_of_plan = lanes_of(
-                f, w, computed[f.like(w)], needs, self._directions, len(lanes), rows_kept
+                f, w, alike[f.kind(w)], needs, self._directions, len(lanes), rows_kept
             )
             plans.append(plan)
             lanes += lanes_of_plan
