@@ -128,15 +128,11 @@ class ThrowModel(Model):
             states, _ = self._settled_throughout(self.setting)
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
-        self._latest: dict[frozenset[str], States] = {frozenset(): self._fitted(states)[0]}
+        # by kinds of blocks: the latest states, and what their fit took from windows' residuals
+        self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
+        self._latest[frozenset()] = self._fitted(states)[0], self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
-        self._before: dict[
-            frozenset[str], list[np.ndarray]
-        ] = {}  # what the fits of the latest states took from windows' residuals
         self._lock = threading.Lock()  # residuals may be asked for side by side
-        self._follows: tuple[Linearised, dict[int, list[int]], np.ndarray] | None = (
-            None  # the last that was asked for
-        )
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
     def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
@@ -163,9 +159,7 @@ class ThrowModel(Model):
         """
         setting = apply(self.entries, self.setting, theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
-        states = self._latest[self._switches(theta)] = self._settled_at[_key(theta)] = (
-            self._settled(setting)
-        )
+        states = self._settled_at[_key(theta)] = self._settled(setting)
         entries = self.entries.values()
         steps = np.array(
             [0.0 if e.switch else self._step(e, theta.get(e.name, 0.0)) for e in entries]
@@ -180,9 +174,8 @@ class ThrowModel(Model):
         listed: list[Window] = []
         for batch in self._batches():
             listed += self._linearised(simulation, steps[:graded], begun, batch)
-        self._before[self._switches(theta)] = [
-            x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)
-        ]
+        fitted = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)]
+        self._latest[self._switches(theta)] = states, fitted
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, listed)
@@ -211,13 +204,19 @@ class ThrowModel(Model):
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
         perturbed = apply(self.entries, self.setting, elsewhere)
-        start = self._latest[self._switches(elsewhere)] = self._settled(perturbed)
+        start = self._settled(perturbed)
+        self._latest[self._switches(elsewhere)] = start, self._none
         sign = -1.0 if on else 1.0
-        before = self._before[self._switches(theta)]
+        _, before = self._latest[self._switches(theta)]
         return [
             sign * (x.residual - before_row - after_row)
             for x, before_row, after_row in zip(windows, before, self._flown(perturbed, start))
         ]
+
+    @property
+    def _none(self) -> np.ndarray:
+        """Return a fit that took nothing from any window."""
+        return np.zeros(len(self._retained))
 
     def _moved(self, states: States, w: int) -> np.ndarray:
         """Return how far a window's state is from the middle of its prior, in its directions, shape
@@ -241,23 +240,24 @@ class ThrowModel(Model):
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._latest.get(self._switches(theta), self._fitted()[0])
+        states, fitted = self._latest.get(self._switches(theta), (self._fitted()[0], self._none))
         moves = {}
         if linearised is not None:
             states, moves = self._following(setting, theta, linearised)
+            fitted = self._none
         flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
-        if linearised is None and (before := self._before.get(self._switches(theta))) is not None:
-            flown = [r + offset for r, offset in zip(flown, before)]
-        direct_of = [[kind for kind in self._direct if w in kind.windows] for w in self._retained]
-        direct = [
-            [kind.samples(w)[1] - kind.predicted(w, setting) for kind in offset]
-            for w, offset in zip(self._retained, direct_of)
-        ]
-        full = [np.concatenate((r, *offset)) for r, offset in zip(flown, direct)]
-        return [
-            r + linearised.windows[i].nuisance @ moves[i] if i in moves else r
-            for i, r in enumerate(full)
-        ]
+        residuals = []
+        for i, (w, residual, offset) in enumerate(zip(self._retained, flown, fitted)):
+            direct = [
+                kind.samples(w)[1] - kind.predicted(w, setting)
+                for kind in self._direct
+                if w in kind.windows
+            ]
+            residual = np.concatenate((residual + offset, *direct))
+            if i in moves:
+                residual = residual + linearised.windows[i].nuisance @ moves[i]
+            residuals.append(residual)
+        return residuals
 
     def without_commands(
         self, theta: Mapping[str, float], windows: Sequence[int]
@@ -276,48 +276,36 @@ class ThrowModel(Model):
         """States that belong to other sizes of the effects by the derivatives, and how each
         window's were moved.
         """
-        names = list(self.entries)
-        change = np.array(
-            [theta.get(name, 0.0) - linearised.theta.get(name, 0.0) for name in names]
-        )
+        change = [theta.get(name, 0.0) - linearised.theta.get(name, 0.0) for name in self.entries]
         ways = directions(setting.plant)
         with self._lock:
-            if self._follows is None or self._follows[0] is not linearised:
-                self._follows = linearised, *self._ways(ways, linearised, len(names))
-            _, owns, by_effect = self._follows
-        sizes = by_effect @ change
-        states = moved_along(self._settled_at[_key(linearised.theta)], ways, sizes)
-        moved = sizes + self._settled_at[_key(linearised.theta)][MOVED]
-        return states, {
-            i: moved[self._retained[i], window_slopes] for i, window_slopes in owns.items()
+            if not linearised.ways:
+                linearised.ways.update(self._ways(ways, linearised))
+        begun = self._settled_at[_key(linearised.theta)]
+        sizes = np.zeros((len(self.flights.cuts), len(ways)))
+        for i, (members, by_effect) in linearised.ways.items():
+            sizes[self._retained[i], members] = by_effect @ change
+        moved = sizes + begun[MOVED]
+        return moved_along(begun, ways, sizes), {
+            i: moved[self._retained[i], members] for i, (members, _) in linearised.ways.items()
         }
 
     def _ways(
-        self, directions_of: Sequence[Direction], linearised: Linearised, effects: int
-    ) -> tuple[dict[int, list[int]], np.ndarray]:
-        """Which directions each window's state has, and how it follows the effects in them, shape
-        (W, directions, K).
+        self, directions_of: Sequence[Direction], linearised: Linearised
+    ) -> dict[int, tuple[list[int], np.ndarray]]:
+        """Return which directions each window's state has, and how it follows the effects in them,
+        shape (directions, K).
         """
-        cuts = self.flights.cuts
-        owns = {
-            i: [d for d, x in enumerate(directions_of) if concerns(x, cuts[self._retained[i]])]
-            for i in linearised.windows
-        }
 
-        def way(i: int) -> np.ndarray:
-            free = np.array([directions_of[d].follows for d in owns[i]], dtype=bool)
-            return following(
-                self.flights,
-                self._retained[i],
-                linearised.windows[i],
-                free,
-                self.setting.plant.release.lag,
-            )
+        def way(i: int) -> tuple[list[int], np.ndarray]:
+            w = self._retained[i]
+            cut = self.flights.cuts[w]
+            members = [d for d, x in enumerate(directions_of) if concerns(x, cut)]
+            free = np.array([directions_of[d].follows for d in members], dtype=bool)
+            lag = self.setting.plant.release.lag
+            return members, following(self.flights, w, linearised.windows[i], free, lag)
 
-        by_effect = np.zeros((len(cuts), len(directions_of), effects))
-        for i, moves in zip(owns, parallel_map(way, owns)):
-            by_effect[self._retained[i], owns[i]] = moves
-        return owns, by_effect
+        return dict(zip(linearised.windows, parallel_map(way, linearised.windows)))
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
@@ -344,8 +332,6 @@ class ThrowModel(Model):
         """Return the model of other windows of its flights."""
         model = copy.copy(self)
         model._settled_at = {}
-        model._before = {}
-        model._follows = None
         model._secants = {}  # of other windows
         model.flights = self._cut(self.flights.flights, cuts)
         model._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
