@@ -33,9 +33,6 @@ KNOWN = {
     "long: visthrow.diagnose.reporting.diagnosis_report.sections",
     "long: visthrow.diagnose.select.scatter.varying",
     "long: visthrow.diagnose.select.verdicts.conclude",
-    "long: visthrow.diagnose.throw.linearising.lanes_of",
-    "long: visthrow.diagnose.throw.replay.__init__",
-    "long: visthrow.diagnose.throw.throw_model.__init__",
 }
 """What is still to be mended.
 

@@ -7,6 +7,7 @@ nominal lane of their own, tell most of them as well; residuals always come from
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,10 +16,19 @@ from scipy.spatial.transform import Rotation
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
+from visthrow.diagnose.likelihood.threads import parallel_map
+from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.throw.initial_states import Direction, concerns
+from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, concerns
 from visthrow.diagnose.throw.recorded_flight import NEVER
-from visthrow.diagnose.throw.replay import FINENESS, KNOT_SPACING, Lane, ReplayedFlights
+from visthrow.diagnose.throw.replay import (
+    FINENESS,
+    KNOT_SPACING,
+    Lane,
+    ReplayedFlights,
+    Simulation,
+    flown_alike,
+)
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N].
@@ -77,144 +87,160 @@ class Plan:
     first: int  # lane
     kept: int  # first row of the knots
     fine: int  # lanes of nominal steps
-    order: np.ndarray  # lanes of effects, states and latent forces, from ``first``
-    nuisances: tuple[int, ...]  # directions of the initial state
-    latents: tuple[tuple[int, int], ...]  # axis and knot
+    order: np.ndarray  # of effects, states and latent forces, the lane behind the first one
+    nuisances: list[int]  # directions of the initial state
+    latents: list[tuple[int, int]]  # axis and knot
 
-    def slopes(
-        self, rows: int, steps: np.ndarray, directions: Sequence[Direction], measured: torch.Tensor
-    ) -> list[torch.Tensor]:
-        """Derivatives of the window's samples by effects, states and latent forces, shape (3 rows,
+
+class Linearisation:
+    """What all windows of a linearisation share."""
+
+    def __init__(
+        self,
+        flights: ReplayedFlights,
+        simulation: Simulation,
+        effects: Sequence[SettingEffect],
+        steps: np.ndarray,
+        directions: Sequence[Direction],
+        states: States,
+    ):
+        """Keep it.
+
+        Args:
+            simulation: of the setting that is linearised about, then of one for each effect.
+            steps: of the effects, shape (K,).
+            states: initial ones, then those that are moved along each direction: row
+                ``(1 + d) W + w``.
+        """
+        self._flights = flights
+        self._simulation = simulation
+        self._setting, *others = simulation.settings
+        self._steps = steps
+        self._directions = directions
+        self._states = states
+        self._exact = np.array([exact(e) for e in effects], dtype=bool)
+        self._blocks = [e.block for e in effects]
+        kinds = {flights.kind(w) for w in range(len(flights.cuts))}
+        self._alike = {
+            kind: np.array([flown_alike(kind, self._setting, x) for x in others], dtype=bool)
+            for kind in kinds
+        }
+
+    def windows(self, batch: Sequence[int], channels: Sequence[np.ndarray]) -> list[Window]:
+        """Linearise windows whose lanes fit a run; ``channels``: of the samples of each."""
+        plans: list[Plan] = []
+        lanes: list[Lane] = []
+        kept = 0
+        for w in batch:
+            plan, flown_by = self._plan(w, len(lanes), kept)
+            plans.append(plan)
+            lanes += flown_by
+            kept += 2 * int(self._flights.knots[w])
+        flown = self._flights.fly(self._simulation, self._states, lanes)
+        in_order = map if flown.seen.is_cuda else parallel_map
+        slopes = list(in_order(partial(self._slopes, flown.seen), plans))
+        nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
+        parts = all_to_host([part for of_window in slopes for part in of_window])
+
+        def window(i: int) -> Window:
+            residual = self._flights.residual(nominal, plans[i].window, i)
+            of_window = parts[3 * i : 3 * i + 3]
+            return self._window(plans[i], channels[i], residual, of_window, flown.knots)
+
+        return parallel_map(window, range(len(plans)))
+
+    def _plan(self, w: int, first: int, kept: int) -> tuple[Plan, list[Lane]]:
+        """Return the lanes of one window.
+
+        ``first``: number of the first; ``kept``: first row of the knots; twice as many as the
+        window's are taken."""
+        c = self._flights.cuts[w]
+        knots = int(self._flights.knots[w])
+        alike = self._alike[self._flights.kind(w)]
+        whips = c.phase in FINENESS or c.after_slack
+        fine = alike | self._exact | whips
+        nuisances = [d for d, x in enumerate(self._directions) if concerns(x, c)]
+        axes = range(6 if c.payload == NO_PAYLOAD else 9)
+        latents = [(axis, knot) for axis in axes for knot in range(knots)]
+        # where the rough nominal lane stands, which latent lanes leave
+        parent = first + 1 + np.count_nonzero(fine) + len(nuisances) * whips
+        count = len(self._flights.cuts)
+        lanes = [Lane(w, 1 + k, w, rough=not fine[k]) for k in range(len(fine))]
+        lanes += [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
+        for axis, knot in latents:
+            resume = kept + knots + max(knot - 1, 0)
+            force = axis, knot, LATENT_SIZES[axis]
+            lanes.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
+        # lanes that ride along follow the nominal one
+        order = [*np.argsort(~alike, kind="stable"), *range(len(alike), len(lanes))]
+        nominal = Lane(w, 0, w, keep=kept, shared=int(alike.sum()))
+        rough = Lane(w, 0, w, keep=kept + knots, rough=True)
+        numbers = [-1, *(i for i in order if not lanes[i].rough)]
+        split = len(numbers)
+        numbers += [-1, *(i for i in order if lanes[i].rough)]
+        flown = [nominal, *(lanes[i] for i in numbers[1:split])]
+        flown += [rough, *(lanes[i] for i in numbers[split + 1 :])]
+        places = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
+        return Plan(w, first, kept, split, places, nuisances, latents), flown
+
+    def _slopes(self, measured: torch.Tensor, plan: Plan) -> list[torch.Tensor]:
+        """Derivatives of a window's samples by effects, states and latent forces, shape (3 rows,
         columns) each.
 
         ``measured``: what all lanes of the run saw, shape (rows or more, lanes, 3).
         """
-        sizes = [
-            *steps,
-            *[directions[d].step for d in self.nuisances],
-            *[LATENT_SIZES[axis] for axis, _ in self.latents],
-        ]
-        columns = (
-            measured[:rows, self.first : self.first + len(self.order) + 2]
-            .transpose(1, 2)
-            .reshape(3 * rows, -1)
-        )
-        for part in (columns[:, : self.fine], columns[:, self.fine :]):
+        rows = int(self._flights.rows[plan.window])
+        lanes = slice(plan.first, plan.first + len(plan.order) + 2)
+        columns = measured[:rows, lanes].transpose(1, 2).reshape(3 * rows, -1)
+        for part in (columns[:, : plan.fine], columns[:, plan.fine :]):
             part -= part[:, :1].clone()
-        K = len(steps)
-        D = len(self.nuisances)
-        order = torch.from_numpy(self.order).to(columns.device)
-        sizes = columns.new_tensor(sizes)
+        steps = [
+            self._steps.tolist(),
+            [self._directions[d].step for d in plan.nuisances],
+            [LATENT_SIZES[axis] for axis, _ in plan.latents],
+        ]
+        order = torch.from_numpy(plan.order).to(columns.device)
+        parts = order.split([len(sizes) for sizes in steps])
         return [
-            columns[:, order[part]].div_(sizes[part])
-            for part in (slice(K), slice(K, K + D), slice(K + D, None))
+            columns[:, part].div_(columns.new_tensor(sizes)) for part, sizes in zip(parts, steps)
         ]
 
-    def window_of(
+    def _window(
         self,
-        flights: ReplayedFlights,
-        setting: Setting,
-        directions: Sequence[Direction],
+        plan: Plan,
         channel: np.ndarray,
         residual: np.ndarray,
         slopes: Sequence[np.ndarray],
         knots: Mapping[str, np.ndarray],
-        moved: np.ndarray,
     ) -> Window:
-        """Return the window that the lanes make up.
+        """Return the window that the lanes make up; ``knots``: quantities at those of all lanes.
 
-        ``channel``: of the window's samples; ``slopes``: see :meth:`slopes`; ``knots``: simulated
-        quantities at all its knots; ``moved``: how far each window's state was moved from where its
-        prior has its middle, shape (W, directions): there the residual is taken."""
-        w = self.window
-        f = flights
+        Its residual is that of states in the middle of their prior."""
+        w = plan.window
+        f = self._flights
         c = f.cuts[w]
         effects, states, latents = slopes
-        values = {name: value[self.kept : self.kept + f.knots[w]] for name, value in knots.items()}
-        return Window(
+        axes, places = np.array(plan.latents).T
+        rows = slice(plan.kept, plan.kept + f.knots[w])
+        values = {name: value[rows] for name, value in knots.items()}
+        window = Window(
             c.flight,
             c.phase,
             f.time[w],
             channel,
-            residual + states @ moved[w, list(self.nuisances)],
+            residual + states @ self._states[MOVED][w, plan.nuisances],
             f.sigma[w],
             effects,
             states,
-            np.array([directions[d].spread(c) for d in self.nuisances]),
+            np.array([self._directions[d].spread(c) for d in plan.nuisances]),
             latents,
-            np.array([axis // 3 for axis, _ in self.latents]),
-            np.array([axis % 3 for axis, _ in self.latents]),
-            np.array([c.start + KNOT_SPACING * knot for _, knot in self.latents]),
-            at_knots(f, setting, w, values),
+            axes // 3,
+            axes % 3,
+            c.start + KNOT_SPACING * places,
+            at_knots(f, self._setting, w, values),
             c.after_slack,
         )
-
-
-def lanes_of(
-    flights: ReplayedFlights,
-    w: int,
-    alike: np.ndarray,
-    needs: np.ndarray,
-    directions: Sequence[Direction],
-    first: int,
-    kept: int,
-) -> tuple[Plan, list[Lane]]:
-    """Lanes of one window.
-
-    Args:
-        alike: of each effect, whether it is flown like the nominal lane.
-        needs: of each effect, whether it needs the nominal steps.
-        directions: of initial states; row ``(1 + d) W + w`` of the states is moved along one.
-        first: number of the first lane.
-        kept: first row of the knots; twice as many as the window's are taken.
-    """
-    c = flights.cuts[w]
-    count = len(flights.cuts)
-    knots = int(flights.knots[w])
-    whips = c.phase in FINENESS or c.after_slack
-    nuisances = tuple(d for d, x in enumerate(directions) if concerns(x, c))
-    latents = tuple(
-        (axis, knot) for axis in range(6 if c.payload == NO_PAYLOAD else 9) for knot in range(knots)
-    )
-    fine = alike | needs | whips
-    effects = len(fine)
-    states = len(nuisances)
-    split = (
-        1 + np.count_nonzero(fine) + states * whips
-    )  # where the rough nominal lane stands, which latent lanes leave
-    columns = [
-        (int(k), Lane(w, 1 + int(k), w, rough=not fine[k]))
-        for k in np.argsort(~alike, kind="stable")
-    ]
-    columns += [
-        (effects + i, Lane(w, 0, (1 + d) * count + w, rough=not whips))
-        for i, d in enumerate(nuisances)
-    ]
-    columns += [
-        (
-            effects + states + i,
-            Lane(
-                w,
-                0,
-                w,
-                axis,
-                knot,
-                LATENT_SIZES[axis],
-                resume=kept + knots + max(knot - 1, 0),
-                parent=first + split,
-                rough=True,
-            ),
-        )
-        for i, (axis, knot) in enumerate(latents)
-    ]
-    nominal = [
-        Lane(w, 0, w, keep=kept, shared=int(alike.sum())),
-        Lane(w, 0, w, keep=kept + knots, rough=True),
-    ]
-    parts = [[(-1, lane), *(x for x in columns if x[1].rough == lane.rough)] for lane in nominal]
-    numbers, lanes = zip(*parts[0], *parts[1])
-    order = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
-    return Plan(w, first, kept, len(parts[0]), order, nuisances, latents), list(lanes)
+        return without_calm_speeds(window, self._blocks, self._setting.plant.air.wind_w)
 
 
 def at_knots(

@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import torch
 import warp as wp
 
 from camera.params import CameraParams
@@ -20,7 +19,6 @@ from sim.params import PlantParams, SensingParams
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.threads import limit_threads_beside_gpu, parallel_map
-from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
@@ -42,7 +40,7 @@ from visthrow.diagnose.throw.initial_states import (
     rows_of,
 )
 from visthrow.diagnose.throw.landing import PredictedLandings, landings
-from visthrow.diagnose.throw.linearising import Plan, exact, lanes_of, without_calm_speeds
+from visthrow.diagnose.throw.linearising import Linearisation
 from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, carriers, record_of
 from visthrow.diagnose.throw.replay import (
     BATCH,
@@ -52,7 +50,6 @@ from visthrow.diagnose.throw.replay import (
     Simulation,
     carried,
     downloaded,
-    flown_alike,
     grouped,
 )
 from visthrow.logs.flightlog import FlightLog
@@ -120,12 +117,7 @@ class ThrowModel(Model):
             expect_known(only, concerned, "no effect '{}' for these flights", DiagnoseError)
             concerned = {name: concerned[name] for name in only}
         self._choose(concerned)
-        self._directions = directions(self.setting.plant)
-        self.flights = self._cut(flights, cuts)
-        states, ends = self._settled_throughout(self.setting)
-        if (without_slack := self._without_slack(ends)) != cuts:
-            self.flights = self._cut(flights, without_slack)
-            states, _ = self._settled_throughout(self.setting)
+        states = self._settled_without_slack(flights, cuts)
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         # by kinds of blocks: the latest states, and what their fit took from windows' residuals
@@ -139,6 +131,18 @@ class ThrowModel(Model):
         """Return these windows of flights, in the time of their sensors."""
         x = self.setting.sensing
         return ReplayedFlights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+
+    def _settled_without_slack(
+        self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
+    ) -> States:
+        """Take the windows without the time in which ropes were slack; returns initial states."""
+        self.flights = self._cut(flights, cuts)
+        states, ends = self._settled_throughout(self.setting)
+        without_slack = self._without_slack(ends)
+        if without_slack != cuts:
+            self.flights = self._cut(flights, without_slack)
+            states, _ = self._settled_throughout(self.setting)
+        return states
 
     def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
         """Take these effects: first those that are simulated by degrees, then switches, then what
@@ -169,11 +173,16 @@ class ThrowModel(Model):
             *[setting if e.switch else e.apply(setting, step) for e, step in zip(entries, steps)],
         ]
         graded = len(self._graded)
-        begun = perturbed(states, self._directions)
         simulation = self.simulation(*settings[: 1 + graded], download=wp.to_torch)
+        begun = perturbed(states, self._directions)
+        linearisation = Linearisation(
+            self.flights, simulation, self._graded, steps[:graded], self._directions, begun
+        )
+        lanes = 2 + graded + len(self._directions) + 9 * self.flights.knots[self._retained]
+        room = BATCH if self.device == "cpu" else CUDA_BATCH
         listed: list[Window] = []
-        for batch in self._batches():
-            listed += self._linearised(simulation, steps[:graded], begun, batch)
+        for batch in grouped(self._retained, lanes, room):
+            listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         fitted = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)]
         self._latest[self._switches(theta)] = states, fitted
         for e in self._switched:  # they are screened by these, and judged where they are flown
@@ -415,63 +424,6 @@ class ThrowModel(Model):
         """Step of theta for the derivative: upwards, unless that leaves the bounds."""
         step = e.step * e.floor
         return -step if theta + step > e.bounds[1] else step
-
-    def _batches(self) -> list[list[int]]:
-        """Windows in groups whose lanes fit a run."""
-        shared = 2 + len(self._graded) + len(self._directions)
-        lanes = shared + 9 * self.flights.knots[self._retained]
-        return grouped(self._retained, lanes, BATCH if self.device == "cpu" else CUDA_BATCH)
-
-    def _linearised(
-        self, simulation: Simulation, steps: np.ndarray, states: States, batch: list[int]
-    ) -> list[Window]:
-        f = self.flights
-        settings = simulation.settings
-        needs = np.array([exact(e) for e in self._graded], dtype=bool)
-        plans = []
-        lanes = []
-        rows_kept = 0
-        alike = {
-            kind: np.array([flown_alike(kind, settings[0], x) for x in settings[1:]], dtype=bool)
-            for kind in {f.kind(w) for w in batch}
-        }
-        for w in batch:
-            plan, lanes_of_plan = lanes_of(
-                f, w, alike[f.kind(w)], needs, self._directions, len(lanes), rows_kept
-            )
-            plans.append(plan)
-            lanes += lanes_of_plan
-            rows_kept += 2 * int(f.knots[w])
-        flown = f.fly(simulation, states, lanes)
-
-        def slopes(plan: Plan) -> list[torch.Tensor]:
-            return plan.slopes(int(f.rows[plan.window]), steps, self._directions, flown.seen)
-
-        windows = (
-            [slopes(plan) for plan in plans] if flown.seen.is_cuda else parallel_map(slopes, plans)
-        )
-        nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
-        blocks = [e.block for e in self._graded]
-
-        parts = all_to_host([part for lanes_of_plan in windows for part in lanes_of_plan])
-
-        def window(i: int) -> Window:
-            w = plans[i].window
-            lanes_of_plan = parts[3 * i : 3 * i + 3]
-            arguments = (
-                self._channel(w),
-                f.residual(nominal, w, i),
-                lanes_of_plan,
-                flown.knots,
-                states[MOVED],
-            )
-            return without_calm_speeds(
-                plans[i].window_of(f, settings[0], self._directions, *arguments),
-                blocks,
-                settings[0].plant.air.wind_w,
-            )
-
-        return parallel_map(window, range(len(plans)))
 
     def _channel(self, w: int) -> np.ndarray:
         index = {name: i for i, name in enumerate(self.channels)}
