@@ -7,6 +7,7 @@ interpolated between its ends. A wrench is that of the substep's middle, which i
 second order. After the release the vehicle flies on by itself, without the solver."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 import warp as wp
@@ -96,6 +97,69 @@ class ExchangeKernels:
     Bodies: type
 
 
+def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNamespace:
+    """Build the structs ``Wrench`` and ``Bodies``, their access of :func:`build_body_access` and
+    the kernels that copy between the bodies and the plant."""
+    vec3 = t.vec3
+    L = segments
+    State = parts.State
+    load = parts.load
+    coupled = parts.coupled
+    rope_of = parts.rope_of
+    Ints = wp.array(dtype=wp.int32)
+    Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
+    Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
+    load_bodies, store_bodies = build_body_access(t, L)
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def show_kernel(
+        # Params:
+        first: int,
+        plants: t.Plants,
+        # In:
+        state: State,
+        mask: Ints,
+        # Out:
+        bodies: Bodies,
+        wrench: Wrench,
+    ):
+        """Copy bodies from the state; the payload follows from the rope."""
+        env = wp.tid() + first
+        if mask[env] == 0:
+            return
+        n = wp.zeros(shape=(L,), dtype=vec3)
+        u = wp.zeros(shape=(L,), dtype=vec3)
+        s = load_bodies(state, env, load(state, env), n, u)
+        pos, vel = coupled.payload(rope_of(plants, env), s, n, u)
+        store_bodies(bodies, env, s, n, u, pos, vel)
+        wrench.pull_w[env] = vec3()
+        wrench.twist_b[env] = vec3()
+
+    @wp.kernel(module="unique", enable_backward=False)
+    def payload_kernel(
+        # Params:
+        first: int,
+        # State in:
+        state: State,
+        # In:
+        bodies: Bodies,
+        # Out:
+        out: parts.Output,
+    ):
+        env = wp.tid() + first
+        if state.attached[env] != 0:
+            out.payload_pos_w[env] = bodies.payload_pos_w[env]
+            out.payload_vel_w[env] = bodies.payload_vel_w[env]
+
+    return SimpleNamespace(
+        Wrench=Wrench,
+        Bodies=Bodies,
+        load_bodies=load_bodies,
+        show=show_kernel,
+        payload=payload_kernel,
+    )
+
+
 def build_exchange(
     t: Types, params: PlantParams, step: StepKernels, extensions: frozenset[str]
 ) -> ExchangeKernels:
@@ -111,7 +175,8 @@ def build_exchange(
     load = parts.load
     store = parts.store
     load_rope = parts.load_rope
-    load_bodies, store_bodies = build_body_access(t, L)
+    bodies_access = build_bodies(t, parts, L)
+    load_bodies = bodies_access.load_bodies
     flow = parts.flow
     rate = parts.rate
     motor_advance = parts.motor_advance
@@ -129,8 +194,8 @@ def build_exchange(
     limit = real(st.SPEED_LIMIT)
     Ints = wp.array(dtype=wp.int32)
     Plants = t.Plants
-    Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
-    Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
+    Wrench = bodies_access.Wrench
+    Bodies = bodies_access.Bodies
     tiny = real(1.0e-6)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -325,53 +390,13 @@ def build_exchange(
             hazard_bits = hazards(p, rope_of(plants, env), s, n, out.payload_pos_w[env])
             state.status[env] = state.status[env] | hazard_bits
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def show_kernel(
-        # Params:
-        first: int,
-        plants: Plants,
-        # In:
-        state: State,
-        mask: Ints,
-        # Out:
-        bodies: Bodies,
-        wrench: Wrench,
-    ):
-        """Copy bodies from the state; the payload follows from the rope."""
-        env = wp.tid() + first
-        if mask[env] == 0:
-            return
-        n = wp.zeros(shape=(L,), dtype=vec3)
-        u = wp.zeros(shape=(L,), dtype=vec3)
-        s = load_bodies(state, env, load(state, env), n, u)
-        pos, vel = coupled.payload(rope_of(plants, env), s, n, u)
-        store_bodies(bodies, env, s, n, u, pos, vel)
-        wrench.pull_w[env] = vec3()
-        wrench.twist_b[env] = vec3()
-
-    @wp.kernel(module="unique", enable_backward=False)
-    def payload_kernel(
-        # Params:
-        first: int,
-        # State in:
-        state: State,
-        # In:
-        bodies: Bodies,
-        # Out:
-        out: Output,
-    ):
-        env = wp.tid() + first
-        if state.attached[env] != 0:
-            out.payload_pos_w[env] = bodies.payload_pos_w[env]
-            out.payload_vel_w[env] = bodies.payload_vel_w[env]
-
     return ExchangeKernels(
         begin=begin_kernel,
         wrench=wrench_kernel,
         take=take_kernel,
         end=end_kernel,
-        show=show_kernel,
-        payload=payload_kernel,
+        show=bodies_access.show,
+        payload=bodies_access.payload,
         State=State,
         Wrench=Wrench,
         Bodies=Bodies,

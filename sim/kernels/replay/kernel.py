@@ -6,6 +6,7 @@ exactly; measured stamps lie inside steps and are read from the cubic through bo
 a lane, no atomics."""
 
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import warp as wp
 
@@ -43,6 +44,8 @@ STATE_FIELDS = {
 # share of the payload's weight below which the rope counts as slack: its shape is then anyone's
 # guess
 SLACK = 0.15
+
+TINY = 1.0e-9  # times [s] nearer than this are one
 
 WINDOW_FIELDS = {
     "start": "real",  # [s], clock of the flight
@@ -116,12 +119,8 @@ class ReplayKernel:
     Pointers: type
 
 
-def build_replay(
-    t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()
-) -> ReplayKernel:
-    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
-    numbers are read at run time.
-    """
+def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace) -> SimpleNamespace:
+    """Build Warp functions of what happens to a lane between two steps."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
@@ -130,31 +129,13 @@ def build_replay(
     Rope = t.Rope
     Release = t.Release
     Air = t.Air
-    Plants = t.Plants
-    L = segments
-    State = st.array_struct(t, "ReplayState", STATE_FIELDS)
-    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
-    Lanes = st.array_struct(t, "Lanes", LANE_FIELDS)
-    Knots = st.array_struct(t, "Knots", KNOT_FIELDS)
-    Data = st.array_struct(t, "Recorded", DATA_FIELDS)
-    Sensing = t.from_dataclass(SensingParams, {})
-    flow, rate, motor_advance = build_flow(t, vehicle, EVERYTHING)
-    chain = build_chain(t, L, EVERYTHING)
-    payload = build_payload(t, EVERYTHING)
-    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
-    extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
-    Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
-    load_quad, store_quad = st.build_access(t, State)
-    load_rope, store_rope = st.build_rope_access(t, L)
-    loose = build_loose(t, chain, payload, extra, coupled.mount_velocity)
-    Ball = loose.Ball
-    sampling = build_sampling(t, Sensing, Windows, Data, Ball)
-    Steps = sampling.Steps
-    Pointers = sampling.Pointers
-    Moment = sampling.Moment
+    State = structs.State
+    Windows = structs.Windows
+    Data = structs.Data
+    Moment = structs.Moment
     attached_code = ATTACHED
     loose_code = LOOSE
-    tiny = real(1.0e-9)
+    tiny = real(TINY)
 
     @wp.func
     def push_at(air: Air, axis: int, size: real, share: real):
@@ -187,13 +168,13 @@ def build_replay(
         """A lane at its window's start; n, u and stiffness are filled in."""
         m = Moment()
         m.time = windows.start[w]
-        m.quad = load_quad(starts, start)
-        load_rope(starts, start, n, u, stiffness)
+        m.quad = blocks.load_quad(starts, start)
+        blocks.load_rope(starts, start, n, u, stiffness)
         m.mode = windows.payload[w]
         m.separation = windows.end[w] + real(1.0)
         if m.mode == attached_code:
-            m.rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
-            pos, vel = coupled.payload(m.rope, m.quad, n, u)
+            m.rope = blocks.chain.stretched(natural, natural, stiffness, u, real(0.0))
+            pos, vel = blocks.coupled.payload(m.rope, m.quad, n, u)
             m.pay = pos
             m.pay_vel = vel
             if windows.latch[w] <= m.time:  # the pull at the latch lies before this window
@@ -203,9 +184,9 @@ def build_replay(
             m.rope = natural
             m.pay = starts.payload_pos_w[start]
             m.pay_vel = starts.payload_vel_w[start]
-            m.ball = loose.hang_below(natural, m.pay, m.pay_vel, n, u)
+            m.ball = blocks.loose.hang_below(natural, m.pay, m.pay_vel, n, u)
             m.latched = 1
-        m.total = coupled.momentum(p, m.rope, m.quad, u)
+        m.total = blocks.coupled.momentum(p, m.rope, m.quad, u)
         m.before = m.quad.rate_b
         m.slack_first = m.time - real(1.0)
         m.slack_last = m.slack_first
@@ -227,11 +208,11 @@ def build_replay(
         out = m
         if m.mode == attached_code:
             if latch <= m.time + tiny and m.latched == 0:
-                pull = chain.pull(m.rope, stiffness, u)
-                out.separation = latch + loose.lag(r, m.rope, pull, gravity)
+                pull = blocks.chain.pull(m.rope, stiffness, u)
+                out.separation = latch + blocks.loose.lag(r, m.rope, pull, gravity)
                 out.latched = 1
             if out.separation <= m.time + tiny:
-                out.ball = loose.let_go(r, m.rope, m.quad, n, u)
+                out.ball = blocks.loose.let_go(r, m.rope, m.quad, n, u)
                 out.mode = int(loose_code)
                 out.rope = natural
                 out.pay = out.ball.pos
@@ -265,8 +246,63 @@ def build_replay(
             out.slack_last = t1
         return out
 
+    return SimpleNamespace(
+        push_at=push_at,
+        begin=begin,
+        latch_or_separate=latch_or_separate,
+        next_event=next_event,
+        note_slack=note_slack,
+    )
+
+
+def build_replay(
+    t: Types, vehicle: VehicleParams, segments: int, laws: tuple[LawParams, ...] = ()
+) -> ReplayKernel:
+    """Compose the kernel for a vehicle's kinds of blocks, the rope's segments and the plant's laws;
+    numbers are read at run time.
+    """
+    real = t.real
+    vec3 = t.vec3
+    L = segments
+    State = st.array_struct(t, "ReplayState", STATE_FIELDS)
+    Windows = st.array_struct(t, "Windows", WINDOW_FIELDS)
+    Lanes = st.array_struct(t, "Lanes", LANE_FIELDS)
+    Knots = st.array_struct(t, "Knots", KNOT_FIELDS)
+    Data = st.array_struct(t, "Recorded", DATA_FIELDS)
+    Sensing = t.from_dataclass(SensingParams, {})
+    Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
+    flow, rate, motor_advance = build_flow(t, vehicle, EVERYTHING)
+    chain = build_chain(t, L, EVERYTHING)
+    payload = build_payload(t, EVERYTHING)
+    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
+    extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
+    load_quad, store_quad = st.build_access(t, State)
+    load_rope, store_rope = st.build_rope_access(t, L)
+    loose = build_loose(t, chain, payload, extra, coupled.mount_velocity)
+    sampling = build_sampling(t, Sensing, Windows, Data, loose.Ball)
+    Steps = sampling.Steps
+    Moment = sampling.Moment
+    structs = SimpleNamespace(
+        State=State,
+        Windows=Windows,
+        Lanes=Lanes,
+        Knots=Knots,
+        Data=Data,
+        Sensing=Sensing,
+        Moment=Moment,
+        Ropes=Ropes,
+        Pointers=sampling.Pointers,
+    )
+    blocks = SimpleNamespace(
+        chain=chain, coupled=coupled, loose=loose, load_quad=load_quad, load_rope=load_rope
+    )
+    between = build_lane(t, structs, blocks)
+    attached_code = ATTACHED
+    loose_code = LOOSE
+    tiny = real(TINY)
+
     @wp.func
-    def write_knot(knots: Knots, row: int, p: Vehicle, m: Moment, pull: real):
+    def write_knot(knots: Knots, row: int, p: t.Vehicle, m: Moment, pull: real):
         knots.pos_w[row] = m.quad.pos_w
         knots.vel_w[row] = m.quad.vel_w
         knots.quat_wb[row] = m.quad.quat_wb
@@ -280,7 +316,7 @@ def build_replay(
     @wp.kernel(module="unique", enable_backward=False)
     def replay_kernel(
         # Params:
-        plants: Plants,
+        plants: t.Plants,
         sensings: wp.array(dtype=Sensing),
         knot_spacing: real,
         # State in:
@@ -294,7 +330,7 @@ def build_replay(
         # State out:
         ends: State,
         knots: Knots,
-        marks: wp.array(dtype=Pointers),
+        marks: wp.array(dtype=structs.Pointers),
         moments: wp.array(dtype=Moment),
         moment_ropes: Ropes,
         # Out:
@@ -313,7 +349,7 @@ def build_replay(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        m = begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
+        m = between.begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
         for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
             marks[e] = m.at
         resume = lanes.resume[lane]
@@ -330,8 +366,8 @@ def build_replay(
                 and data.command_time[command + 1] + delay <= m.time + tiny
             ):
                 command = command + 1
-            m = latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
-            until = next_event(m, windows, w, data, command, delay)
+            m = between.latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
+            until = between.next_event(m, windows, w, data, command, delay)
             if m.knot < windows.knots[w]:
                 knot_time = windows.first_knot[w] + real(float(m.knot)) * knot_spacing
                 if knot_time <= m.time + tiny:
@@ -364,7 +400,9 @@ def build_replay(
                 if m.mode == attached_code:
                     hanging = 1
                     m.rope = chain.stretched(natural, m.rope, stiffness, u, h)
-                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
+                pushed = between.push_at(
+                    air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance
+                )
                 pushed = extra.on(p, m.rope, pushed, k.quad, n, u, stiffness, active, hanging)
                 if hanging != 0:
                     quad, total, _fell_back = coupled.step(
@@ -389,7 +427,7 @@ def build_replay(
                     m.pay_vel = vel
                     pull = chain.pull(m.rope, stiffness, u)
                     weight = m.rope.payload_mass * gravity
-                    m = note_slack(m, pull, weight, windows.start[w], k.t0, k.t1)
+                    m = between.note_slack(m, pull, weight, windows.start[w], k.t0, k.t1)
                 else:
                     m.quad = coupled.step_alone(p, pushed, k.quad, active, g, h)
                     if m.mode == loose_code:
@@ -433,6 +471,4 @@ def build_replay(
             ends.slack_last[lane] = m.slack_last
             store_rope(ends, lane, n, u, stiffness)
 
-    return ReplayKernel(
-        replay_kernel, State, Windows, Lanes, Knots, Data, Sensing, Moment, Ropes, Pointers
-    )
+    return ReplayKernel(replay_kernel, **vars(structs))

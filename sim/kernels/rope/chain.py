@@ -81,32 +81,12 @@ def growing(rope: Any, u: Any):
     return (type(rope.strain_rate)(2.0) * rope.strain_rate * rope.segment_length) * u
 
 
-def build_chain(
-    t: Types, segments: int, extensions: frozenset[str] = frozenset()
-) -> SimpleNamespace:
-    """Recursion for a fixed number of segments.
-
-    Args:
-        t: types of the wanted precision.
-        segments: L.
-        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
-
-    Returns:
-        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and
-        force of the whole chain at the mount, at the state and at the predicted state),
-        ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
-        (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
-        alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear
-        momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
-        under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
-    """
+def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNamespace:
+    """Build what belongs to one rod: Warp functions of its index, ``segments`` and ``vec2``."""
     L = segments
     real = t.real
     vec3 = t.vec3
-    Vectors = t.Vectors
-    Reals = t.Reals
     Rope = t.Rope
-    vec2 = wp.types.vector(2, real)
     last = L - 1
     loaded = bool(extensions & LOADS)
     rubbing = "mount_damping" in extensions
@@ -160,139 +140,171 @@ def build_chain(
             return real(0.0)
         return rope.last_mass + real(float(L - 2 - i)) * rope.segment_mass
 
-    def build_stage(second: bool):
-        @wp.func
-        def direction(n: Vectors, n2: Vectors, i: int):
-            return n2[i] if wp.static(second) else n[i]
+    return SimpleNamespace(
+        with_load=with_load,
+        upper_damping=upper_damping,
+        centre_share=centre_share,
+        tip=tip,
+        rod=rod,
+        below=below,
+        segments=L,
+        vec2=wp.types.vector(2, real),
+    )
 
-        @wp.func
-        def rate(u: Vectors, k1: Vectors, h: real, i: int):
-            return u[i] + h * k1[i] if wp.static(second) else u[i]
 
-        @wp.func
-        def up(
-            rope: Rope,
-            n: Vectors,
-            u: Vectors,
-            n2: Vectors,
-            k1: Vectors,
-            stiffness: Reals,
-            root_rate_w: vec3,
-            gravity: vec3,
-            load: vec3,
-            gamma: real,
-            h: real,
-            c1: Vectors,
-            c2: Vectors,
-            hs: wp.array(dtype=vec2),
-        ):
-            l = rope.segment_length
-            l2 = l * l
-            gh = gamma * h
-            two = real(2.0)
-            d = vec3()  # apparent mass of what hangs below: diagonal
-            o = vec3()  # and off-diagonal (xy, xz, yz)
-            b = vec3()
-            ni = direction(n, n2, L - 1)
-            ui = rate(u, k1, h, L - 1)
+def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], second: bool):
+    """Build ``up`` and ``speed`` of the state or, with ``second``, of the predicted state."""
+    L = rods.segments
+    real = t.real
+    vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
+    Rope = t.Rope
+    vec2 = rods.vec2
+    rubbing = "mount_damping" in extensions
+    giving = "compliance" in extensions
+
+    @wp.func
+    def direction(n: Vectors, n2: Vectors, i: int):
+        return n2[i] if wp.static(second) else n[i]
+
+    @wp.func
+    def rate(u: Vectors, k1: Vectors, h: real, i: int):
+        return u[i] + h * k1[i] if wp.static(second) else u[i]
+
+    @wp.func
+    def up(
+        rope: Rope,
+        n: Vectors,
+        u: Vectors,
+        n2: Vectors,
+        k1: Vectors,
+        stiffness: Reals,
+        root_rate_w: vec3,
+        gravity: vec3,
+        load: vec3,
+        gamma: real,
+        h: real,
+        c1: Vectors,
+        c2: Vectors,
+        hs: wp.array(dtype=vec2),
+    ):
+        l = rope.segment_length
+        l2 = l * l
+        gh = gamma * h
+        two = real(2.0)
+        d = vec3()  # apparent mass of what hangs below: diagonal
+        o = vec3()  # and off-diagonal (xy, xz, yz)
+        b = vec3()
+        ni = direction(n, n2, L - 1)
+        ui = rate(u, k1, h, L - 1)
+        n_below = ni
+        u_below = ui
+        for step in range(L):
+            i = L - 1 - step
+            m, c, inertia = rods.rod(rope, i)
+            n_above = ni
+            u_above = ui
+            damping = rods.upper_damping(rope, i)
+            couple = wp.cross(root_rate_w, ni) - ui
+            above = couple
+            if i > 0:
+                n_above = direction(n, n2, i - 1)
+                u_above = rate(u, k1, h, i - 1)
+                couple = viscous(ni, n_above, u_above) - ui
+            if i < L - 1:
+                couple += viscous(ni, n_below, u_below) - ui
+                damping += rope.joint_damping
+            speed2 = wp.dot(ui, ui)
+            a_n = sym_mul(d, o, ni)
+            f = m * gravity
+            cm = c * m
+            g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
+            if wp.static(second):
+                g += (
+                    gh * stiffness[i] * ui
+                    + two * gh * (stiffness[i] * (two * gh - h) + damping) * k1[i]
+                )
+            else:
+                g += -gh * stiffness[i] * ui
+            g = rods.with_load(i, g, rope.payload_arm, load)
+            if wp.static(rubbing):
+                if i == 0:
+                    g += rope.mount_damping * above
+            if wp.static(giving):
+                if rope.compliance != real(0.0):  # lanes of a replay differ in it
+                    growth = growing(rope, ui)
+                    share = rods.centre_share(rope, i)
+                    g = g - l * sym_mul(d, o, growth) - (cm * share) * growth
+                    b = b + sym_mul(d, o, growth) + (m * share) * growth
+            e1, e2 = tangent_basis(ni)
+            a_e1 = sym_mul(d, o, e1)
+            a_e2 = sym_mul(d, o, e2)
+            effective = inertia + gh * (damping + gh * stiffness[i])
+            s11 = effective + l2 * wp.dot(e1, a_e1)
+            s12 = l2 * wp.dot(e1, a_e2)
+            s22 = effective + l2 * wp.dot(e2, a_e2)
+            inv = real(1.0) / (s11 * s22 - s12 * s12)
+            s11 *= inv
+            s12 *= inv
+            s22 *= inv
+            b1 = cm * e1 + l * a_e1
+            b2 = cm * e2 + l * a_e2
+            q1 = s22 * b1 - s12 * b2
+            q2 = s11 * b2 - s12 * b1
+            g1 = wp.dot(e1, g)
+            g2 = wp.dot(e2, g)
+            h1 = s22 * g1 - s12 * g2
+            h2 = s11 * g2 - s12 * g1
+            b = (
+                b
+                - rods.with_load(i, f, real(1.0), load)
+                - speed2 * (cm * ni + l * a_n)
+                + h1 * b1
+                + h2 * b2
+            )
+            d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
+            o = o - vec3(
+                b1[0] * q1[1] + b2[0] * q2[1],
+                b1[0] * q1[2] + b2[0] * q2[2],
+                b1[1] * q1[2] + b2[1] * q2[2],
+            )
+            c1[i] = q1
+            c2[i] = q2
+            hs[i] = vec2(h1, h2)
             n_below = ni
             u_below = ui
-            for step in range(L):
-                i = L - 1 - step
-                m, c, inertia = rod(rope, i)
-                n_above = ni
-                u_above = ui
-                damping = upper_damping(rope, i)
-                couple = wp.cross(root_rate_w, ni) - ui
-                above = couple
-                if i > 0:
-                    n_above = direction(n, n2, i - 1)
-                    u_above = rate(u, k1, h, i - 1)
-                    couple = viscous(ni, n_above, u_above) - ui
-                if i < L - 1:
-                    couple += viscous(ni, n_below, u_below) - ui
-                    damping += rope.joint_damping
-                speed2 = wp.dot(ui, ui)
-                a_n = sym_mul(d, o, ni)
-                f = m * gravity
-                cm = c * m
-                g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
-                if wp.static(second):
-                    g += (
-                        gh * stiffness[i] * ui
-                        + two * gh * (stiffness[i] * (two * gh - h) + damping) * k1[i]
-                    )
-                else:
-                    g += -gh * stiffness[i] * ui
-                g = with_load(i, g, rope.payload_arm, load)
-                if wp.static(rubbing):
-                    if i == 0:
-                        g += rope.mount_damping * above
-                if wp.static(giving):
-                    if rope.compliance != real(0.0):  # lanes of a replay differ in it
-                        growth = growing(rope, ui)
-                        share = centre_share(rope, i)
-                        g = g - l * sym_mul(d, o, growth) - (cm * share) * growth
-                        b = b + sym_mul(d, o, growth) + (m * share) * growth
-                e1, e2 = tangent_basis(ni)
-                a_e1 = sym_mul(d, o, e1)
-                a_e2 = sym_mul(d, o, e2)
-                effective = inertia + gh * (damping + gh * stiffness[i])
-                s11 = effective + l2 * wp.dot(e1, a_e1)
-                s12 = l2 * wp.dot(e1, a_e2)
-                s22 = effective + l2 * wp.dot(e2, a_e2)
-                inv = real(1.0) / (s11 * s22 - s12 * s12)
-                s11 *= inv
-                s12 *= inv
-                s22 *= inv
-                b1 = cm * e1 + l * a_e1
-                b2 = cm * e2 + l * a_e2
-                q1 = s22 * b1 - s12 * b2
-                q2 = s11 * b2 - s12 * b1
-                g1 = wp.dot(e1, g)
-                g2 = wp.dot(e2, g)
-                h1 = s22 * g1 - s12 * g2
-                h2 = s11 * g2 - s12 * g1
-                b = (
-                    b
-                    - with_load(i, f, real(1.0), load)
-                    - speed2 * (cm * ni + l * a_n)
-                    + h1 * b1
-                    + h2 * b2
-                )
-                d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
-                o = o - vec3(
-                    b1[0] * q1[1] + b2[0] * q2[1],
-                    b1[0] * q1[2] + b2[0] * q2[2],
-                    b1[1] * q1[2] + b2[1] * q2[2],
-                )
-                c1[i] = q1
-                c2[i] = q2
-                hs[i] = vec2(h1, h2)
-                n_below = ni
-                u_below = ui
-                ni = n_above
-                ui = u_above
-            return d, o, b
+            ni = n_above
+            ui = u_above
+        return d, o, b
 
-        @wp.func
-        def speed(
-            rope: Rope,
-            mount_vel_w: vec3,
-            u: Vectors,
-            k1: Vectors,
-            h: real,
-        ):
-            """Velocity of the payload's centre [m/s], world frame."""
-            vel = mount_vel_w
-            for i in range(L):
-                vel += rope.segment_length * rate(u, k1, h, i)
-            return vel + rope.payload_offset * rate(u, k1, h, L - 1)
+    @wp.func
+    def speed(
+        rope: Rope,
+        mount_vel_w: vec3,
+        u: Vectors,
+        k1: Vectors,
+        h: real,
+    ):
+        """Velocity of the payload's centre [m/s], world frame."""
+        vel = mount_vel_w
+        for i in range(L):
+            vel += rope.segment_length * rate(u, k1, h, i)
+        return vel + rope.payload_offset * rate(u, k1, h, L - 1)
 
-        return up, speed
+    return up, speed
 
-    up_first, speed_first = build_stage(second=False)
-    up_second, speed_second = build_stage(second=True)
+
+def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
+    """Build ``down_first``, ``down_second`` and ``fall_back``, which advance the rods."""
+    L = rods.segments
+    real = t.real
+    vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
+    Rope = t.Rope
+    vec2 = rods.vec2
+    giving = "compliance" in extensions
 
     @wp.func
     def acceleration(ni: vec3, ui: vec3, a: vec3, c1: vec3, c2: vec3, hs: vec2):
@@ -327,7 +339,7 @@ def build_chain(
             k1[i] = k
             n2[i] = wp.normalize(ni + h * (ui + (gamma * h) * k))
             fastest = wp.max(fastest, wp.max(wp.dot(ui, ui), wp.dot(u2, u2)))
-            a = tip(rope, a + rope.segment_length * k, ui)
+            a = rods.tip(rope, a + rope.segment_length * k, ui)
         return fastest
 
     @wp.func
@@ -358,7 +370,7 @@ def build_chain(
         half = real(0.5) * h
         total = vec3()
         for i in range(L):
-            m, c, inertia = rod(rope, i)
+            m, c, inertia = rods.rod(rope, i)
             ni = n2[i]
             old_u = u[i]
             first = k1[i]
@@ -367,17 +379,17 @@ def build_chain(
             f = m * gravity
             centre = a + c * k
             if wp.static(giving):
-                centre += centre_share(rope, i) * growing(rope, ui)
-            pull = pull + with_load(i, f, real(1.0), load) - m * centre
-            moment = with_load(i, c * (f - m * a) - l * pull, rope.payload_arm, load)
+                centre += rods.centre_share(rope, i) * growing(rope, ui)
+            pull = pull + rods.with_load(i, f, real(1.0), load) - m * centre
+            moment = rods.with_load(i, c * (f - m * a) - l * pull, rope.payload_arm, load)
             stiffness[i] = wp.max(wp.dot(ni, moment), real(0.0))
-            a = tip(rope, a + l * k, ui)
+            a = rods.tip(rope, a + l * k, ui)
             new_n = wp.normalize(n[i] + half * (old_u + ui + gh * (k - first)))
             new_u = old_u + half * (first + k)
             new_u = new_u - new_n * wp.dot(new_n, new_u)
             n[i] = new_n
             u[i] = new_u
-            total += (below(rope, i) * l + c * m) * new_u
+            total += (rods.below(rope, i) * l + c * m) * new_u
         return total
 
     @wp.func
@@ -395,6 +407,40 @@ def build_chain(
             new_u = u[i] + h * k1[i]
             n[i] = n2[i]
             u[i] = new_u - n2[i] * wp.dot(n2[i], new_u)
+
+    return down_first, down_second, fall_back
+
+
+def build_chain(
+    t: Types, segments: int, extensions: frozenset[str] = frozenset()
+) -> SimpleNamespace:
+    """Recursion for a fixed number of segments.
+
+    Args:
+        t: types of the wanted precision.
+        segments: L.
+        extensions: names of :data:`sim.kernels.structs.EXTENSIONS` to build in.
+
+    Returns:
+        Namespace of Warp functions. ``up_first``, ``up_second`` (leaf to root: apparent mass and
+        force of the whole chain at the mount, at the state and at the predicted state),
+        ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
+        (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
+        alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear
+        momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
+        under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
+    """
+    L = segments
+    real = t.real
+    vec3 = t.vec3
+    Vectors = t.Vectors
+    Reals = t.Reals
+    Rope = t.Rope
+    giving = "compliance" in extensions
+    rods = build_rods(t, segments, extensions)
+    up_first, speed_first = build_stage(t, rods, extensions, second=False)
+    up_second, speed_second = build_stage(t, rods, extensions, second=True)
+    down_first, down_second, fall_back = build_descent(t, rods, extensions)
 
     @wp.func
     def payload(
@@ -418,8 +464,8 @@ def build_chain(
         """Linear momentum [N s] of the chain in a frame that moves with the mount."""
         total = vec3()
         for i in range(L):
-            m, c, inertia = rod(rope, i)
-            total += (below(rope, i) * rope.segment_length + c * m) * u[i]
+            m, c, inertia = rods.rod(rope, i)
+            total += (rods.below(rope, i) * rope.segment_length + c * m) * u[i]
         return total
 
     @wp.func
@@ -487,10 +533,10 @@ def build_chain(
         speed_first=speed_first,
         speed_second=speed_second,
         momentum=momentum,
-        upper_damping=upper_damping,
+        upper_damping=rods.upper_damping,
         com_velocity=com_velocity,
         pull=pull,
         stretched=stretched,
         segments=L,
-        vec2=vec2,
+        vec2=rods.vec2,
     )
