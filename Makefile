@@ -44,14 +44,15 @@ $(FIRMWARE)/.built: pyproject.toml
 
 # PhysX in an environment of its own, which takes all else from .venv: ovphysx asks for packaging<24, what tests and builds for a newer one.
 # It runs with the newer one. Then: .venv-physx/bin/python -m visthrow.cli compare state --solver physx
-physx: .venv-physx/.installed
-.venv-physx/.installed: $(STAMP)
+# Nothing of .venv is needed to install it, so that both are installed at once.
+physx: $(STAMP) .venv-physx/.installed
+.venv-physx/.installed: constraints.txt
 	@echo "make: PhysX (ovphysx, ovstage, physx-usd-schemas; 200 MB) comes under NVIDIA's Software License and Omniverse terms, not under"
 	@echo "make: visthrow's licence: by installing it you agree to them. It needs glibc 2.35 or newer."
-	$(BIN)/python -m venv .venv-physx
+	$(PYTHON) -m venv .venv-physx
 	.venv-physx/bin/python -m pip install --quiet --no-deps -c constraints.txt ovphysx ovstage physx-usd-schemas newton-usd-schemas
 	.venv-physx/bin/python -c "import sysconfig; print(sysconfig.get_path('purelib'))" > .venv-physx/.site
-	{ $(BIN)/python -c "import sysconfig; print(sysconfig.get_path('purelib'))"; echo "$(CURDIR)"; } > "$$(cat .venv-physx/.site)/visthrow.pth"
+	{ sed "s|/.venv-physx/|/$(VENV)/|" .venv-physx/.site; echo "$(CURDIR)"; } > "$$(cat .venv-physx/.site)/visthrow.pth"
 	touch $@
 
 test-physx: physx

@@ -138,8 +138,8 @@ def both(
 
 @mark.parametrize("policy", ["vision", "vision_located"])
 def test_poses_of_a_vision_policy(policy, tmp_path):
-    seen, shown = both(policy, 40, 60, tmp_path / "a")
-    assert seen.shape[:2] == (40, 60)
+    seen, shown = both(policy, 20, 60, tmp_path / "a")
+    assert seen.shape[:2] == (20, 60)
     assert_array_equal(seen, shown)
     layout = layout_of(SimpleNamespace(**Policy.load(find_policy(policy)).contract["observation"]))
     valid = seen[..., layout.columns("validity")]

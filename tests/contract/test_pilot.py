@@ -17,7 +17,7 @@ from visthrow.task import Experiment, contract_of
 from visthrow.throws.loading import load_policy
 from visthrow.training.env import ThrowEnv
 
-STEPS = 200
+STEPS = 120
 
 
 def quiet(name: str) -> Experiment:
