@@ -259,19 +259,6 @@ def test_out_of_view_tells_nothing_but_that():
     assert (shown[~told] == 0.0).all()
 
 
-def test_batch_of_many_equals_batch_of_one_bit_for_bit():
-    camera = KeypointCamera(PARAMS)
-    arguments = scene(1003)
-    extrinsics = camera.extrinsics(0.02 * torch.ones(1003, 3), 0.001 * torch.ones(1003, 3))
-    points, valid = keypoints(camera, *arguments, extrinsics)
-    for i in range(0, 1003, 13):
-        one, seen = keypoints(
-            camera, *(a[i : i + 1] for a in arguments), tuple(e[i : i + 1] for e in extrinsics)
-        )
-        assert torch.equal(one[0], points[i])
-        assert torch.equal(seen[0], valid[i])
-
-
 @mark.parametrize(
     ("field", "value"),
     [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))],

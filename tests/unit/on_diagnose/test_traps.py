@@ -155,26 +155,3 @@ def test_a_rotor_sensor_that_reads_wrong(factor, words):
     assert "reads" not in faults(log_of(columns, motor_speed=rotors))
     wrong = Channel(columns["time"], speed * [1.0, 1.0, factor, 1.0], "rad/s")
     assert words in faults(log_of(columns, motor_speed=wrong))
-
-
-def test_explain_leaves_a_copy_out(tmp_path, capsys):
-    from visthrow import cli
-
-    files = [REAL / "payload_cf_single" / "log204.csv.gz"]
-    copy = tmp_path / "copy.csv.gz"
-    copy.write_bytes(files[0].read_bytes())
-    names = [
-        *map(str, files),
-        str(copy),
-        "--config",
-        "cf_payload",
-        "--only",
-        "rotor_drag_xy",
-        "--no-report",
-        "--out",
-        str(tmp_path),
-    ]
-    assert cli.main(["diagnose", "explain", *names]) == 0
-    out = capsys.readouterr().out
-    assert "left out: copy.csv.gz: a copy of another log, which counts once" in out
-    assert "2 log(s)" in out

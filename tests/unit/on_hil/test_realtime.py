@@ -3,10 +3,7 @@
 import ctypes
 import os
 
-from pytest import raises
-
 from hil.control.realtime import RealtimeParams, keep, prepare
-from visthrow.common.errors import ConfigError
 
 
 def test_nothing_is_asked_for_by_default(monkeypatch):
@@ -32,8 +29,3 @@ def test_a_refusal_is_said_with_its_reason(monkeypatch):
     memory, priority = prepare(RealtimeParams(priority=50, lock_memory=True))
     assert memory == f"memory is not locked: {os.strerror(12)}"
     assert "no real-time priority: [Errno 1] Operation not permitted" in priority
-
-
-def test_a_priority_out_of_range():
-    with raises(ConfigError, match="priority is 100; expected 0 to 99"):
-        RealtimeParams(priority=100)

@@ -18,7 +18,7 @@ from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
 from tests.configs import load_run
 from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
-from visthrow.common.errors import ConfigError, MismatchError
+from visthrow.common.errors import ConfigError
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -475,19 +475,6 @@ def test_a_release_outside_of_the_fence_is_refused():
     assert not pilot.backend.release_times
 
 
-def test_a_failed_recording_prevents_the_next_throw_only():
-    pilot, decisions = thrown(recording=lambda t: t < 0.5, seconds=5.0)
-    assert decisions[-1].state == "ready"
-    assert not pilot.backend.release_times
-    _, decisions = thrown(action=NEVER, recording=lambda t: t < START, seconds=5.0)
-    assert decisions[-1].state == "throw"
-
-
-def test_another_camera_is_refused():
-    with raises(MismatchError, match="goal_side"):
-        Runner(params("camera.goal_side=0.3"), simple_policy(layout="vision"), Spy())
-
-
 @mark.parametrize(
     ("override", "message"),
     [
@@ -515,16 +502,6 @@ def test_another_camera_is_refused():
 def test_wrong_configs(override, message):
     with raises(ConfigError, match=message):
         load_run("dry_run", [override])
-
-
-def test_operators_abort_in_mid_throw():
-    pilot, decisions = thrown(
-        action=NEVER,
-        words=lambda t, s: OperatorInput(arm=s == "ready", abort=s == "throw" and t > 3.0),
-        seconds=8.0,
-    )
-    assert ("abort", "the operator said abort") in changes(decisions)
-    assert pilot.backend.aborts > 0
 
 
 @mark.parametrize("repeat", [False, True])
@@ -591,35 +568,6 @@ def test_payload_lost_but_not_the_vehicle():
     assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
 
 
-def spoiled(change, until=99.0):
-    return lambda time, poses: [change(p) if START < time < until else p for p in poses]
-
-
-@mark.parametrize("name", BAD)
-def test_bad_poses_are_no_poses(name):
-    """Each ends as if none came: the throw is over after 0.1 s, the run after 0.25 s."""
-    pilot, decisions = thrown(action=NEVER, poses=spoiled(BAD[name]), seconds=6.0)
-    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
-    assert sum(pilot.tracks["vehicle"].gate.refused.values()) > 10
-
-
-HARMLESS = {
-    "clock step": lambda time, poses: [replace(p, stamp=p.stamp + (time > START)) for p in poses],
-    "clock step back": lambda time, poses: [
-        replace(p, stamp=p.stamp - (time > START)) for p in poses
-    ],
-    "doubled": lambda time, poses: [p for p in poses for _ in range(2)],
-    "one bad": spoiled(BAD["jump"], START + 0.02),
-}
-
-
-@mark.parametrize("name", HARMLESS)
-def test_harmless_faults_end_no_throw(name):
-    _, decisions = thrown(action=NEVER, poses=HARMLESS[name], seconds=6.0)
-    assert decisions[-1].state == "throw"
-
-
 @mark.parametrize("gap", [0.0, 0.15])
 def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
     """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the
@@ -650,28 +598,3 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
 
     pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
     assert pilot.tracks["payload"].gate.refused["cable"] > 10
-
-
-@mark.parametrize(
-    ("status", "reason"),
-    [
-        (
-            lambda t: Status(t < START, "silent"),
-            "the autopilot is silent, disarmed or in another mode: silent",
-        ),
-        (
-            lambda t: Status(True, "", "failed" if t > START else "idle"),
-            "the release was refused or not answered",
-        ),
-    ],
-)
-def test_an_autopilot_that_goes(status, reason):
-    _, decisions = thrown(action=NEVER, status=status, seconds=5.0)
-    assert changes(decisions)[-1] == ("abort", reason)
-    assert when(decisions, "abort") == approx(START, abs=1.5 * TICK)
-
-
-def test_a_policy_that_saturates_stays_within_its_limits_and_the_fence_ends_it():
-    _, decisions = thrown(action=(1.0, 1.0, -1.0, 1.0, -1.0), seconds=6.0)
-    assert changes(decisions)[-1][0] == "abort"
-    assert changes(decisions)[-1][1].startswith("fence: ")

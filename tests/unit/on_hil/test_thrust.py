@@ -46,21 +46,6 @@ def test_a_share_above_the_calibrations_is_said_as_a_surplus():
 
 
 @mark.parametrize(
-    "wrong",
-    [
-        (0.0, 0.3, 1.0, 0.1, 0.0),
-        (1.0, 1.2, 1.0, 0.1, 0.0),
-        (1.0, 0.3, 0.1, 0.1, 0.0),
-        (1.0, 0.3, 1.0, 0.0, 0.0),
-        (1.0, 0.3, 1.0, 0.1, -1.0),
-    ],
-)
-def test_calibrations_that_are_none(wrong):
-    with raises(ConfigError, match=r"weight|hover|slope|tolerance|voltage"):
-        HoverThrustParams(*wrong)
-
-
-@mark.parametrize(
     ("off", "good"), [(0.0, True), (0.07, True), (-0.07, True), (0.09, False), (-0.2, False)]
 )
 def test_the_measured_hover_is_held_against_the_calibration(off, good):
@@ -136,12 +121,3 @@ def test_a_curve_of_the_rotors_is_inverted_exactly():
     assert params.share(0.0) == 0.0
     for thrust in (0.5, 2.0, 7.0):
         assert params.thrust(params.share(thrust)) == approx(thrust)
-
-
-@mark.parametrize("wrong", [(0.5, 0.0), (2.0, 0.6), (2.0, -0.1)])
-def test_curves_that_no_rotor_has_are_refused(wrong):
-    with raises(
-        ConfigError,
-        match=r"exponent is 0.5; expected 1 to 3|idle is .*; expected 0 or more and below 0.5",
-    ):
-        HoverThrustParams(2.668, 0.36, 1.0, 0.08, 0.0, *wrong)
