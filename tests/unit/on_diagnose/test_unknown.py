@@ -160,6 +160,27 @@ def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     assert len(set(formulas)) == len(formulas)
 
 
+class PassedBy(SyntheticModel):
+    """Flights below another vehicle, which pushes down for a moment: no law of the state."""
+
+    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
+        force = np.zeros((2, 3, len(motion["time"])))
+        moment, width = self._rng.uniform(0.0, 1.0), self._rng.uniform(0.1, 0.3)
+        size = self.law_size * self._rng.uniform(0.3, 1.0)
+        since = motion["time"] - motion["time"][0] - moment
+        force[0, 2] = -size * np.exp(-0.5 * (since / width) ** 2)
+        return force.ravel()
+
+
+def test_a_law_that_other_flights_do_not_repeat_is_not_told():
+    diagnosis = search.explain(PassedBy(EFFECTS, law="passing", law_size=0.4, seed=3))
+    assert diagnosis.overall == result.UNKNOWN
+    assert "left out do not repeat it" in " ".join(diagnosis.reasons)
+    assert not any(" = c " in reason for reason in diagnosis.reasons)
+    assert not diagnosis.laws
+    assert not diagnosis.explanations
+
+
 def with_a_name_for_the_law(most: float) -> SyntheticModel:
     """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and
     cannot exceed ``most``.

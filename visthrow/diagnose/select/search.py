@@ -14,6 +14,7 @@ from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select import held_out
 from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
+from visthrow.diagnose.select.repeated import with_repeated_laws
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
 from visthrow.diagnose.select.selector import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
@@ -148,7 +149,7 @@ def explain(
         threshold_nats = _threshold(nominal, priors, seed, say)
         if not search.stands_without(windows_lost, problem, nominal, threshold_nats):
             search = Selector(problem, nominal, threshold_nats, say, laws)
-    diagnosis = held_out.judged(conclude(search))
+    diagnosis = with_repeated_laws(held_out.judged(conclude(search)))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(problem.kept)
     if left_out:
