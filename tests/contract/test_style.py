@@ -27,7 +27,6 @@ KNOWN = {
     "long: visthrow.diagnose.inputs.proposal._flyer",
     "long: visthrow.diagnose.inputs.proposal._positions",
     "long: visthrow.diagnose.inputs.proposal._weighed",
-    "long: visthrow.diagnose.planning.fly_manoeuvres.simulator_of",
     "long: visthrow.diagnose.planning.manoeuvres.catalogue",
     "long: visthrow.diagnose.reporting.plan_cli.run",
     "long: visthrow.diagnose.reporting.diagnosis_report.sections",

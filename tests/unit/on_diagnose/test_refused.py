@@ -37,7 +37,7 @@ def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
 @mark.parametrize(
     ("data", "change", "words"),
     [
-        (SWING, nothing("theta_rad"), "no stretch of these logs"),
+        (SWING, nothing("theta_rad"), "missing everywhere: angle"),
         (SWING, times(180.0 / np.pi, "theta_rad"), "degrees, or another zero"),
         (
             CABLE,
@@ -45,7 +45,7 @@ def times(factor: float, *names: str) -> Callable[[table.Table], dict]:
             "missing everywhere: payload_pos_w",
         ),
         (CABLE, times(1e3, "ctrlLee.thrustSI"), "times the weight"),
-        (CAMERA, nothing("l_px", "l_py", "l_pz"), "no stretch of these logs"),
+        (CAMERA, nothing("l_px", "l_py", "l_pz"), "missing everywhere: payload_pos_w"),
         (
             CAMERA,
             lambda t: {"d_px": t["d_py"], "d_py": t["d_px"]},

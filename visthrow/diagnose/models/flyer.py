@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
-from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, spare, stretches_of
+from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, expect_thrust, spare, windows_of
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -52,6 +52,7 @@ class FlyerModel(NumericModel):
         drivers = ("battery_voltage", "acc_b", "rate_b")
         present = [name for name in drivers if all(name in log for log in logs)]
         self.inputs = (params.attitude, params.input, *present)
+        self.needed = (params.position, params.attitude, params.input, *simulated)
         self.has_voltage = "battery_voltage" in present
         super().__init__(logs, params)
         self.steps = round(params.window / params.step)
@@ -77,8 +78,22 @@ class FlyerModel(NumericModel):
         return [e for e in effects if not (self.has_voltage and e.name == "thrust_fade")]
 
     def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
-        """See :func:`.flyer_windows.stretches_of`."""
-        return stretches_of(logs, self.params, self.channels)
+        """See the base class; at most ``most_windows``, spread evenly.
+
+        Raises LogError: commands are of another size than carries the vehicle.
+        """
+        stretches = super().cut(logs)
+        most = self.params.most_windows
+        if stretches:
+            expect_thrust(stretches, self.params)
+        if len(stretches) <= most:
+            return stretches
+        chosen = np.linspace(0, len(stretches) - 1, most).round().astype(int)
+        return [stretches[i] for i in chosen]
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class."""
+        return windows_of(log, number, self.params, self.channels)
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
         """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held

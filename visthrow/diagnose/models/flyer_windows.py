@@ -26,38 +26,11 @@ _MOST_THRUST = 5.0
 _IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
-def stretches_of(
-    logs: Sequence[FlightLog], params: FlyerParams, channels: Sequence[str]
-) -> list[Stretch]:
-    """Windows of all logs, at most ``most_windows``, spread evenly.
+def expect_thrust(stretches: Sequence[Stretch], params: FlyerParams) -> None:
+    """Refuse commands of another unit: they carry neither the vehicle nor anything like it.
 
-    Raises LogError where no log has the channels, or commands are of another size than carries the
-    vehicle."""
-    needed = [params.position, params.attitude, params.input, *channels[1:]]
-    usable = [(i, log) for i, log in enumerate(logs) if all(_holds(log, name) for name in needed)]
-    if not usable:
-        lacking = [name for name in needed if not any(_holds(log, name) for log in logs)]
-        raise LogError(
-            f"no log has all of {', '.join(needed)}; missing everywhere:"
-            f" {', '.join(lacking) or 'none'}"
-        )
-    stretches = [s for number, log in usable for s in _windows(log, number, params, channels)]
-    if stretches:
-        _expect_thrust(stretches, params)
-    if len(stretches) > params.most_windows:
-        stretches = [
-            stretches[i]
-            for i in np.linspace(0, len(stretches) - 1, params.most_windows).round().astype(int)
-        ]
-    return stretches
-
-
-def _holds(log: FlightLog, name: str) -> bool:
-    return name in log and bool(np.any(log[name].valid))
-
-
-def _expect_thrust(stretches: Sequence[Stretch], params: FlyerParams) -> None:
-    """Refuse commands of another unit: they carry neither the vehicle nor anything like it."""
+    Raises LogError: they are.
+    """
     weight = params.gravity * params.total_mass
     inputs = np.concatenate([s.data["input"] for s in stretches])
     ratio = float(np.median(params.thrust(inputs).sum(axis=1))) / weight
@@ -68,9 +41,10 @@ def _expect_thrust(stretches: Sequence[Stretch], params: FlyerParams) -> None:
         )
 
 
-def _windows(
+def windows_of(
     log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]
 ) -> list[Stretch]:
+    """Cut a log, the flight of a number, into windows that fly."""
     sigma = {
         name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels
     }  # no less is believed

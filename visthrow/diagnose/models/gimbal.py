@@ -58,8 +58,6 @@ class GimbalModel(NumericModel):
         """
         params = self.params
         marker = log[CHANNEL]
-        if not all(np.any(log[name].valid) for name in NEEDED):
-            return []
         table_time, tables = _tables(log, params)
         stretches = []
         rejected = 0

@@ -135,11 +135,19 @@ class NumericModel(Model, ABC):
         return effects_of(self.table, self.params)
 
     def cut(self, logs: Sequence[FlightLog]) -> list[Stretch]:
-        """Cut logs into windows; those that lack a channel hold none."""
-        usable = (
-            (i, log) for i, log in enumerate(logs) if all(name in log for name in self.needed)
-        )
-        return [stretch for i, log in usable for stretch in self.windows_of(log, i)]
+        """Cut logs into windows; those that lack a channel hold none.
+
+        Raises LogError: all lack one.
+        """
+        held = [[name for name in self.needed if _holds(log, name)] for log in logs]
+        usable = [i for i, names in enumerate(held) if len(names) == len(self.needed)]
+        if not usable:
+            lacking = sorted(set(self.needed).difference(*held))
+            raise LogError(
+                f"no log has all of {', '.join(self.needed)}; missing everywhere:"
+                f" {', '.join(lacking) or 'none'}"
+            )
+        return [stretch for i in usable for stretch in self.windows_of(logs[i], i)]
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """Cut one log, the flight of a number, into windows."""
@@ -381,6 +389,10 @@ class NumericModel(Model, ABC):
             np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T
             for i, s in enumerate(self.stretches)
         ]
+
+
+def _holds(log: FlightLog, name: str) -> bool:
+    return name in log and bool(np.any(log[name].valid))
 
 
 def sigma_of(channel: Channel, floor: float) -> np.ndarray:

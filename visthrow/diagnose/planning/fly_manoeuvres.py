@@ -4,6 +4,7 @@ them in one batch.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial, singledispatch
 
 import numpy as np
 
@@ -78,57 +79,63 @@ def simulator_of(
     ``diagnosis``: for the sizes of what was found and the sensors' noise; ``build``: gives a
     setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
     """
-    if isinstance(model, ThrowModel):
-        plant = apply(model.entries, model.setting, diagnosis.theta).plant
-        device = model.device
-        requested = {e.name for e in model.effects}
-
-        def model_of_flight(flight: "SimulatedFlight") -> Model:
-            log = flight.log(noise)
-            carries = flight.manoeuvre.payload
-            effects = effects_for(
-                model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
-            )
-            return ThrowModel(
-                [log],
-                model.setting.plant,
-                sensing=model.setting.sensing,
-                camera=model.setting.camera,
-                device=device,
-                substep=COARSE * model.substep,
-                only=[n for n in effects if n in requested],
-                carries=carries,
-            )
-
-    elif isinstance(model, FlyerModel) and build is not None:
-        plant = vehicle_of(
-            model.params, plant_of(config.load(Experiment, config.find("train", "state")))
-        )
-        device = "cpu"
-
-        def model_of_flight(flight: "SimulatedFlight") -> Model:
-            return build(
-                [flight.setup_log(model.params, noise, ("battery_voltage",) * model.has_voltage)]
-            )
-
-    else:
-        raise DiagnoseError(
-            "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
-            " with or without payload"
-        )
+    plant, model_of, adapted = vehicle_in(model, diagnosis, build)
     noise = _sensor_noise(diagnosis)
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
-        return [
-            flight.simulated(model_of_flight) for flight in fly(plant, manoeuvres, seed, device)
-        ]
+        flights = fly(plant, manoeuvres, seed, model.device)
+        return [flight.simulated(partial(model_of, noise)) for flight in flights]
 
-    return (
-        simulate,
-        lambda manoeuvre: (
-            carried(manoeuvre, model.params) if isinstance(model, FlyerModel) else manoeuvre
-        ),
+    return simulate, adapted
+
+
+@singledispatch
+def vehicle_in(model: Model, diagnosis: Diagnosis, build: Callable | None) -> tuple:
+    """Return the plant that flies in a model, a function that gives the model of a simulated
+    flight by the sensors' noise, and one that adapts a manoeuvre to it, or gives None.
+
+    Raises DiagnoseError: no vehicle flies in the model.
+    """
+    raise DiagnoseError(
+        "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
+        " with or without payload"
     )
+
+
+@vehicle_in.register
+def _(model: ThrowModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
+    requested = {e.name for e in model.effects}
+
+    def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
+        log = flight.log(noise)
+        carries = flight.manoeuvre.payload
+        effects = effects_for(
+            model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
+        )
+        return ThrowModel(
+            [log],
+            model.setting.plant,
+            sensing=model.setting.sensing,
+            camera=model.setting.camera,
+            device=model.device,
+            substep=COARSE * model.substep,
+            only=[n for n in effects if n in requested],
+            carries=carries,
+        )
+
+    plant = apply(model.entries, model.setting, diagnosis.theta).plant
+    return plant, model_of, lambda manoeuvre: manoeuvre
+
+
+@vehicle_in.register
+def _(model: FlyerModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
+    def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
+        extra = ("battery_voltage",) * model.has_voltage
+        return build([flight.setup_log(model.params, noise, extra)])
+
+    known = plant_of(config.load(Experiment, config.find("train", "state")))
+    plant = vehicle_of(model.params, known)
+    return plant, model_of, partial(carried, params=model.params)
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:

@@ -13,7 +13,6 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from camera.params import CameraParams
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.params import SensingParams
@@ -63,17 +62,6 @@ class DirectMeasurement(Protocol):
         ...
 
 
-def channels_of(
-    logs: Sequence[FlightLog], flights: Sequence[RecordedFlight], camera: CameraParams | None
-) -> list[str]:
-    """Channels of the direct measurements that the logs hold."""
-    landed = any(f.landing_point is not None and f.latch != NEVER for f in flights)
-    looked = camera is not None and any(
-        seen_by_camera(log) and f.payload is not None for log, f in zip(logs, flights)
-    )
-    return [LANDING] * landed + [KEYPOINTS] * looked
-
-
 def direct_measurements(
     logs: Sequence[FlightLog],
     flights: Sequence[RecordedFlight],
@@ -81,9 +69,10 @@ def direct_measurements(
     setting: Setting,
 ) -> list[DirectMeasurement]:
     """All that the logs hold of windows that count."""
-    channels = channels_of(logs, flights, setting.camera)
-    heights: list[DirectMeasurement] = [LandingHeight(flights, cuts)] if LANDING in channels else []
-    return heights + ([CameraView(logs, flights, cuts, setting)] if KEYPOINTS in channels else [])
+    kinds: list[DirectMeasurement] = [LandingHeight(flights, cuts)]
+    if setting.camera is not None:
+        kinds.append(CameraView(logs, flights, cuts, setting))
+    return [kind for kind in kinds if kind.windows]
 
 
 def needs_no_flight(e: SettingEffect) -> bool:

@@ -23,7 +23,6 @@ from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.throw.command_columns import without_each_command
 from visthrow.diagnose.throw.cutting import RINGING, Cut, around_slack, cut, thinned
 from visthrow.diagnose.throw.direct import (
-    channels_of,
     direct_measurements,
     needs_no_flight,
     with_direct,
@@ -110,22 +109,22 @@ class ThrowModel(Model):
                 f"{len(flights)} flights hold no stretch of poses and commands long enough to"
                 " replay"
             )
-        self.channels = [*_measured(flights, carries), *channels_of(logs, flights, camera)]
+        states = self._settled_without_slack(flights, cuts)
+        self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
+        self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
+        self.channels = [*_measured(flights, carries), *(kind.channel for kind in self._direct)]
         thrown = any(f.latch != NEVER for f in flights)
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
         if only is not None:
             expect_known(only, concerned, "no effect '{}' for these flights", DiagnoseError)
             concerned = {name: concerned[name] for name in only}
         self._choose(concerned)
-        states = self._settled_without_slack(flights, cuts)
-        self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
         # by kinds of blocks: the latest states, and what their fit took from windows' residuals
         self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
         self._latest[frozenset()] = self._fitted(states)[0], self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
-        self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
 
     def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
         """Return these windows of flights, in the time of their sensors."""
