@@ -14,7 +14,7 @@ left out, the angle that the farthest corner of the image sees."""
 import json
 import math
 import re
-from collections.abc import Callable
+import tomllib
 from dataclasses import replace
 from itertools import chain, zip_longest
 from pathlib import Path
@@ -55,10 +55,6 @@ LABELS = {
 NOT_A_ROTATION = 1e-3  # largest entry of R R^T - 1
 
 
-class _Missing(ValueError):
-    """A key that a file should hold."""
-
-
 def read(
     path: str | Path, camera: int | str = 0, fov_deg: float | None = None, model: str | None = None
 ) -> tuple[str, FisheyeParams, FitReport]:
@@ -87,7 +83,7 @@ def read(
             )
         box, node, name = _chosen(cameras, camera)
         node = {**node, "asked_model": model} if model else node
-        lens, report = _lens(*BOXES[box][1](node), node, fov_deg)
+        lens, report = _lens(*_camera(box, node), node, fov_deg)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     if len(cameras) > 1:
@@ -210,10 +206,9 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
         named = [(str(i), entry) for i, entry in enumerate(tree)]
     elif isinstance(tree, dict):
         tree = _uniform(tree)
-        keys = {str(key) for key in tree}
-        box = next((box for box, (matches, _) in BOXES.items() if matches(keys)), "")
-        if box:
-            return [(box, tree, str(tree.get("label", name) or name))]
+        for box, tool in BOXES.items():
+            if all(_has(tree, names) for names in tool["has"]):
+                return [(box, tree, str(tree.get("label", name) or name))]
         named = [(str(key), entry) for key, entry in tree.items()]
     else:
         return []
@@ -226,7 +221,7 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
 
 def _uniform(tree: Node) -> Node:
     """Put basalt's cameras, whose intrinsics and resolutions stand in two lists, one beside the
-    other, and ``Camera.`` before the keys of stella_vslam.
+    other; call ORB-SLAM's first of two cameras as its only one.
     """
     lenses = tree.get("intrinsics") if "resolution" in tree else None
     if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
@@ -234,57 +229,88 @@ def _uniform(tree: Node) -> Node:
         sizes = sizes[: len(lenses)] if isinstance(sizes, list) else [sizes]
         pairs = zip_longest(lenses, sizes)
         return {f"cam{i}": {**lens, "resolution": size} for i, (lens, size) in enumerate(pairs)}
-    if {"model", "fx", "cols"} <= tree.keys():
-        return {f"Camera.{key}": entry for key, entry in tree.items()}
-    return tree
+    return {re.sub(r"^Camera1\.", "Camera.", str(key)): entry for key, entry in tree.items()}
 
 
 # Numbers in it
 
 
-def _any(node: Node, *names: str) -> Any:
-    """Return the value of the first key that exists; a dot leads into a mapping."""
-    for name in names:
+def _find(node: Node, names: str) -> Any:
+    """Return the value of the first key that exists, or None; a dot leads into a mapping, or with
+    a number into a list.
+    """
+    for name in names.split():
         value: Any = node
-        for part in name.split("."):
-            value = value.get(part) if isinstance(value, dict) else None
+        for part in [name] if name in node else name.split("."):
+            if isinstance(value, list) and part.isdigit():
+                value = value[int(part)] if int(part) < len(value) else None
+            else:
+                value = value.get(part) if isinstance(value, dict) else None
         if value is not None:
             return value
-    raise _Missing(
-        f"lacks the key {' or '.join(map(repr, names))} (cut short?); it has"
-        f" {sorted(map(str, node))}"
-    )
+    return None
 
 
-def _floats(value: Any, name: str, counts: tuple[int, ...] | None = None) -> list[float]:
+def _has(node: Node, names: str) -> bool:
+    return any(name in node for name in names.split()) or _find(node, names) is not None
+
+
+def _any(node: Node, names: str) -> Any:
+    """Return what `_find` does; ValueError where none of the keys exists."""
+    value = _find(node, names)
+    if value is None:
+        keys = " or ".join(map(repr, names.split()))
+        raise ValueError(f"lacks the key {keys} (cut short?); it has {sorted(map(str, node))}")
+    return value
+
+
+def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
     """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
     flat = value.get("data", value) if isinstance(value, dict) else value
     if isinstance(flat, list) and all(isinstance(row, list) for row in flat):
         flat = list(chain.from_iterable(flat))
     try:
         numbers = [float(cell) for cell in flat if not isinstance(cell, bool)]
-        if isinstance(flat, str) or (counts and len(numbers) not in counts):
+        if isinstance(flat, str) or (count and len(numbers) != count):
             raise ValueError
     except (TypeError, ValueError):
-        expected = " or ".join(map(str, counts or ("some",)))
         text = repr(value)
         text = text if len(text) <= 80 else text[:77] + "..."
-        raise ValueError(f"{name} is {text}; expected {expected} numbers") from None
+        raise ValueError(f"{name} is {text}; expected {count or 'some'} numbers") from None
     return numbers
 
 
-def _named(node: Node, names: str, section: str = "") -> Values:
-    """Numbers that stand under their own names."""
-    section_node = _any(node, section) if section else node
-    words = names.split()
-    return dict(zip(words, _floats([_any(section_node, word) for word in words], names)))
+def _number(node: Node, place: str) -> float:
+    """Return the number at a place as `tools.toml` writes it."""
+    if place.replace(".", "").isdigit():
+        return float(place)
+    name = place.removesuffix("?")
+    value = _find(node, name) if name != place else _any(node, name)
+    return 0.0 if value is None else _floats([value], name)[0]
 
 
-def _label(node: Node, *names: str) -> str:
+def _values(node: Node, numbers: list[str]) -> Values:
+    """Return the numbers of a camera by our names."""
+    values: Values = {}
+    for spec in numbers:
+        places, listed, names = spec.rpartition(": ")
+        if listed:
+            cells = _floats(_any(node, places), places.split()[0], len(names.split()))
+            values |= dict(zip(names.split(), cells))
+        else:
+            for word in spec.split():
+                ours, _, theirs = word.partition("=")
+                values[ours] = _number(node, theirs or ours)
+    values.pop("_", None)
+    return values
+
+
+def _label(node: Node, tool: Node) -> str:
     """Distortion model by whatever name a tool gives it."""
-    model_name = node.get("asked_model")
-    word = str(model_name if model_name else _any(node, *names))
+    word = str(node.get("asked_model") or _any(node, tool["label"]))
     plain = re.sub(r"[^a-z0-9]", "", word.lower())
+    if not node.get("asked_model"):
+        plain = tool.get("labels", {}).get(plain, plain)
     for model, words in LABELS.items():
         if plain in words.split():
             return model
@@ -318,187 +344,79 @@ def _model(core: str, distortion: str, values: Values, coefficients: list[float]
 # Boxes: where the numbers of one camera stand
 
 
-def _kalibr(node: Node) -> Camera:
-    core = str(node.get("camera_model", node.get("model", "pinhole"))).lower()
-    if "omni_affine" in node:
-        raise ValueError("Kimera's omni, a polynomial that is not read; expected omni-radtan")
-    names = {"pinhole": "", "omni": "xi", "ds": "xi alpha", "eucm": "alpha beta"}
-    if core not in names:
-        raise ValueError(f"camera_model is {core!r}; expected one of {list(names)}")
-    words = f"{names[core]} fx fy cx cy".split()
-    values = dict(zip(words, _floats(_any(node, "intrinsics"), "intrinsics", (len(words),))))
-    if core in ("ds", "eucm"):
+BOXES: dict[str, Node] = tomllib.loads(
+    Path(__file__).with_name("tools.toml").read_text(encoding="utf-8")
+)
+"""Tool -> where its numbers stand."""
+
+
+def _camera(box: str, node: Node) -> Camera:
+    """Model and numbers of a camera in a tool's file."""
+    tool = BOXES[box]
+    if "kind" in tool:
+        word = str(_find(node, tool["kind"]) or tool.get("default", ""))
+        kind = word.lower()
+        models = tool["models"]
+        if kind not in models and "otherwise" not in tool:
+            name = next((name for name in tool["kind"].split() if name in node), tool["kind"])
+            raise ValueError(f"{name} is {word!r}; expected one of {list(models)}")
+        kind = kind if kind in models else tool["otherwise"]
+        tool = {"model": kind} | tool | models[kind]
+    for key, reason in tool.get("refuses", {}).items():
+        if key in node:
+            raise ValueError(reason)
+    if box == "ocam":
+        return "ocam", _ocam(node)
+    if tool.get("flat"):
+        inner = [part for key, part in node.items() if isinstance(part, dict) and "inv" not in key]
+        node = {key: value for part in (node, *inner) for key, value in part.items()}
+    section = node[tool["within"]] if "within" in tool else node
+    values = _values(section, [*tool["numbers"], tool.get("more", "")])
+    core = tool.get("model", "pinhole")
+    places = tool.get("coefficients", "")
+    if not places or (tool.get("optional") and _find(node, places) is None):
         return core, values
-    coefficients_node = _any(node, "distortion_coeffs", "distortion_coefficients")
-    coefficients = _floats(coefficients_node, "distortion_coeffs")
-    return _model(core, _label(node, "distortion_model"), values, coefficients)
+    if tool.get("terms"):
+        coefficients = [_number(node, place) for place in places.split()]
+    else:
+        coefficients = _floats(_any(node, places), places.split()[0])
+    if box == "ros or opencv":
+        node = _labelled(node, len(coefficients))
+        coefficients += [0.0] * (4 - len(coefficients))
+    elif box == "vikit" and values["fx"] < 10.0:
+        values = _unshared(values, _size(node) or (0, 0))
+    return _model(core, tool.get("distortion") or _label(node, tool), values, coefficients)
 
 
-CAMODOCAL = {
-    "kannala_brandt": ("kb4", "k1=k2 k2=k3 k3=k4 k4=k5 fx=mu fy=mv cx=u0 cy=v0"),
-    "mei": ("omni-radtan", "xi k1 k2 p1 p2 fx=gamma1 fy=gamma2 cx=u0 cy=v0"),
-    "pinhole": ("pinhole-radtan", "k1 k2 p1 p2 fx fy cx cy"),
-    "pinhole_full": ("pinhole-radtan", "k1 k2 p1 p2 k3 k4 k5 k6 fx fy cx cy"),
-    "polyfisheye": ("polyfisheye", "k2 k3 k4 k5 k6 k7 fx=A11 skew=A12 fy=A22 cx=u0 cy=v0"),
-    "fishpoly": ("polyfisheye", "k2 k3 k4 k5 k6 k7 fx=A11 skew=A12 fy=A22 cx=u0 cy=v0"),
-    "scaramuzza": ("ocam", "fx=ac skew=ad shear=ae cx cy a0=p0 a1=p1 a2=p2 a3=p3 a4=p4"),
-}
-"""``model_type`` -> our model, and its numbers, with the file's names where they differ."""
-
-
-def _camodocal(node: Node) -> Camera:
-    kind = str(_any(node, "model_type", "cam_model")).lower()
-    if kind not in CAMODOCAL:
-        raise ValueError(f"model_type is {kind.upper()!r}; expected one of {[*CAMODOCAL]}")
-    model, names = CAMODOCAL[kind]
-    inner = [entry for key, entry in node.items() if isinstance(entry, dict) and "inv" not in key]
-    flat = {key: entry for section in (node, *inner) for key, entry in section.items()}
-    pairs = [word.partition("=") for word in names.split()]
-    values = {ours: _floats([_any(flat, his or ours)], his or ours)[0] for ours, _, his in pairs}
-    return model, values | ({"fy": 1.0} if model == "ocam" else {})
-
-
-def _svo(node: Node) -> Camera:
-    core = str(node["type"]).lower()
-    numbers = _floats(_any(node, "intrinsics"), "intrinsics")
-    if core == "omni" and len(numbers) == 24:
-        values = {f"a{i}": a for i, a in enumerate(numbers[:5])}
-        cx, cy, c, d, e = numbers[5:10]
-        return "ocam", values | {"cx": cx, "cy": cy, "fx": 1.0, "skew": e, "shear": d, "fy": c}
-    if core != "pinhole" or len(numbers) != 4:
-        raise ValueError(
-            f"type is {core!r} with {len(numbers)} intrinsics; expected 'pinhole' with 4 or 'omni'"
-            " with 24"
-        )
-    values = dict(zip(KB4.split(), numbers))
-    if "distortion" not in node and "distortion_coefficients" not in node:
-        return "pinhole", values
-    coefficients = _any(node, "distortion.parameters", "distortion_coefficients", "distortion.data")
-    label = "fov" if _any(node, "distortion.type") == "fisheye" else _label(node, "distortion.type")
-    return _model(core, label, values, _floats(coefficients, "distortion.parameters"))
-
-
-def _okvis(node: Node) -> Camera:
-    fx, fy = _floats(node["focal_length"], "focal_length", (2,))
-    cx, cy = _floats(_any(node, "principal_point"), "principal_point", (2,))
-    coefficients_node = _any(node, "distortion_coefficients")
-    coefficients = _floats(coefficients_node, "distortion_coefficients")
-    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return _model("pinhole", _label(node, "distortion_type"), values, coefficients)
-
-
-VIKIT = {
-    "pinhole": "radtan",
-    "pinholeradialtangential": "radtan",
-    "pinholenodistortion": "none",
-    "pinholeequidistant": "kb4",
-    "atan": "fov",
-    "pinholeatan": "fov",
-}
-"""``cam_model`` -> distortion."""
-
-
-def _vikit(node: Node) -> Camera:
-    kind = str(node["cam_model"]).lower()
-    if kind not in VIKIT:
-        raise ValueError(f"cam_model is {node['cam_model']!r}; expected one of {list(VIKIT)}")
-    fx, fy, cx, cy = _floats([_any(node, f"cam_{k}") for k in KB4.split()[:4]], "cam_fx ...")
-    if fx < 10.0:  # shares of the image, which count from its corner
-        width, height = _size(node) or (0, 0)
-        fx = fx * width
-        fy = fy * height
-        cx = cx * width - 0.5
-        cy = cy * height - 0.5
-    coefficients = [_floats([node.get(f"cam_d{i}", 0.0)], f"cam_d{i}")[0] for i in range(5)]
-    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
-    return _model(
-        "pinhole", VIKIT[kind], values, coefficients[: 1 if VIKIT[kind] == "fov" else None]
+def _labelled(node: Node, count: int) -> Node:
+    """Return ROS' camera_info or OpenCV's FileStorage with the name of its distortion, which a flag
+    or the number of coefficients may tell.
+    """
+    flag = node.get("fisheye_model")
+    if flag is not None:
+        return {**node, "distortion_model": "fisheye" if int(flag) else "radtan"}
+    if node.get("distortion_model") or node.get("asked_model"):
+        return node
+    if count in (5, 8, 12, 14):
+        return {**node, "distortion_model": "radtan"}
+    raise ValueError(
+        f"{count} distortion coefficients and no name of their model; say it with"
+        " --model kb4 or --model radtan"
     )
 
 
-MATRICES = "camera_matrix cameraMatrix Camera_Matrix K k mtx matrix intrinsic_matrix"
-COEFFICIENTS = (
-    "distortion_coefficients Distortion_Coefficients dist_coeffs dist_coeff distCoeffs D d dist"
-    " distortion"
-)
-"""Keys of a camera matrix and of its coefficients, as OpenCV's samples and ROS write them."""
+def _unshared(values: Values, size: tuple[int, int]) -> Values:
+    """Return pixels for shares of the image, which count from its corner."""
+    width, height = size
+    pixels = {"fx": values["fx"] * width, "fy": values["fy"] * height}
+    return pixels | {"cx": values["cx"] * width - 0.5, "cy": values["cy"] * height - 0.5}
 
 
-def _matrix(node: Node) -> Camera:
-    """ROS camera_info and OpenCV's FileStorage: a camera matrix and coefficients."""
-    matrix = _any(node, *MATRICES.split())
-    fx, skew, cx, _, fy, cy, *_ = _floats(matrix, "camera_matrix", (9,))
-    coefficients = _floats(_any(node, *COEFFICIENTS.split()), "distortion_coefficients")
-    flag = node.get("fisheye_model")
-    if flag is not None:
-        node = {**node, "distortion_model": "fisheye" if int(flag) else "radtan"}
-    elif not node.get("distortion_model") and len(coefficients) in (5, 8, 12, 14):
-        node = {**node, "distortion_model": "radtan"}
-    if not node.get("distortion_model") and not node.get("asked_model"):
-        raise ValueError(
-            f"{len(coefficients)} distortion coefficients and no name of their model; say it with"
-            " --model kb4 or --model radtan"
-        )
-    label = _label(node, "distortion_model")
-    values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "skew": skew}
-    return _model("pinhole", label, values, coefficients + [0.0] * (4 - len(coefficients)))
-
-
-def _orbslam(node: Node) -> Camera:
-    head = "Camera1" if "Camera1.fx" in node else "Camera"
-    kind = str(node.get("Camera.type", node.get("Camera.model", ""))).lower()
-    fisheye = "kannala" in kind or kind == "fisheye"
-    plain = {
-        key.partition(".")[2]: entry for key, entry in node.items() if key.startswith(head + ".")
-    }
-    names = KB4.split()[4:] if fisheye else DISTORTIONS["radtan"][0].split()[:5]
-    coefficients = [_floats([plain.get(name, 0.0)], name)[0] for name in names]
-    values = _named(plain, "fx fy cx cy")
-    return _model("pinhole", "kb4" if fisheye else "radtan", values, coefficients)
-
-
-BOOFCV = {
-    "pinhole": ("pinhole", ""),
-    "pinhole_radial_tangential": ("pinhole", ""),
-    "omnidirectional_universal": ("omni", "mirror_offset"),
-}
-"""``model`` -> our core, and where its parameter stands."""
-
-
-def _boofcv(node: Node) -> Camera:
-    kind = str(node["model"])
-    if kind not in BOOFCV:
-        raise ValueError(f"model is {kind!r}; expected one of {list(BOOFCV)}")
-    core, offset = BOOFCV[kind]
-    values = _named(node, "fx fy cx cy skew", "pinhole")
-    if offset:
-        values["xi"] = _floats([_any(node, offset)], offset)[0]
-    bent = node.get("radial_tangential") or {}
-    radial = [*_floats(bent.get("radial") or [], "radial"), 0.0, 0.0, 0.0][:3]
-    tangential = _floats([bent.get("t1", 0.0), bent.get("t2", 0.0)], "t1 t2")
-    return _model(core, "radtan", values, [*radial[:2], *tangential, radial[2]])
-
-
-def _basalt(node: Node) -> Camera:
-    kind = str(node["camera_type"])
-    core, distortion = ("pinhole", "radtan") if kind == "pinhole-radtan8" else (kind, "none")
-    names = {"kb4": KB4, "pinhole": "fx fy cx cy"}.get(kind, "")
-    if distortion == "radtan":
-        names = "fx fy cx cy " + DISTORTIONS["radtan"][0]
-    elif core in DENOMINATORS and not names:
-        names = f"fx fy cx cy {DENOMINATORS[core][0]}"
-    if not names:
-        models = ["kb4", "pinhole-radtan8", *DENOMINATORS]
-        raise ValueError(f"camera_type is {kind!r}; expected one of {models}")
-    return kind.replace("radtan8", "radtan"), _named(node, names, "intrinsics")
-
-
-def _ocam(node: Node) -> Camera:
-    """OCamCalib's "export data" (rows before columns, depth below zero); py-OCamCalib's JSON."""
+def _ocam(node: Node) -> Values:
+    """Numbers of OCamCalib's "export data" (depth below zero) or py-OCamCalib's JSON."""
     if "taylor_coefficient" in node:
         depth = [-a for a in _floats(node["taylor_coefficient"], "taylor_coefficient")]
-        cx, cy = _floats(_any(node, "distortion_center"), "distortion_center", (2,))
-        fx, skew, shear, fy = _floats(_any(node, "stretch_matrix"), "stretch_matrix", (4,))
+        stretch = _values(node, ["distortion_center: cx cy", "stretch_matrix: fx skew shear fy"])
     else:
         lines = node["ocam_lines"]
         if len(lines) < 5:
@@ -507,35 +425,12 @@ def _ocam(node: Node) -> Camera:
                 " polynomial, centre, affine part c d e, height and width (cut short?)"
             )
         count, *depth = _floats(lines[0], "direct polynomial")
-        cy, cx = _floats(lines[2], "centre", (2,))
-        fy, shear, skew = _floats(lines[3], "affine part c d e", (3,))
-        fx = 1.0
+        cy, cx = _floats(lines[2], "centre", 2)
+        fy, shear, skew = _floats(lines[3], "affine part c d e", 3)
+        stretch = {"fx": 1.0, "skew": skew, "shear": shear, "fy": fy, "cx": cx, "cy": cy}
         if len(depth) != int(count):
             raise ValueError(f"direct polynomial of {len(depth)} coefficients; announced {count:g}")
-    stretch = {"fx": fx, "skew": skew, "shear": shear, "fy": fy, "cx": cx, "cy": cy}
-    return "ocam", {f"a{i}": a for i, a in enumerate(depth)} | stretch
-
-
-def _has(*names: str) -> Callable[[set[str]], bool]:
-    return lambda keys: all(keys & set(name.split()) for name in names)
-
-
-BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = {
-    "basalt": (_has("camera_type", "intrinsics"), _basalt),
-    "kalibr": (_has("camera_model distortion_model", "intrinsics"), _kalibr),
-    "camodocal": (_has("model_type cam_model", "image_width"), _camodocal),
-    "svo": (_has("type", "intrinsics"), _svo),
-    "okvis": (_has("focal_length", "principal_point"), _okvis),
-    "vikit": (_has("cam_model"), _vikit),
-    "ros or opencv": (
-        _has(f"{MATRICES} distortion_coefficients", f"{COEFFICIENTS} camera_matrix"),
-        _matrix,
-    ),
-    "orb-slam": (_has("Camera.fx Camera1.fx"), _orbslam),
-    "boofcv": (_has("pinhole", "model"), _boofcv),
-    "ocam": (_has("taylor_coefficient ocam_lines"), _ocam),
-}
-"""Tool -> whether a mapping with these keys is a camera of its, and what reads it."""
+    return {f"a{i}": a for i, a in enumerate(depth)} | stretch
 
 
 # From the numbers of a file to our lens
@@ -544,28 +439,15 @@ BOXES: dict[str, tuple[Callable[[set[str]], bool], Callable[[Node], Camera]]] = 
 def _size(node: Node) -> tuple[int, int] | None:
     """Width and height [px]; None where the file does not say."""
     if "ocam_lines" in node:
-        height, width = _floats(node["ocam_lines"][4], "height and width", (2,))
+        height, width = _floats(node["ocam_lines"][4], "height and width", 2)
         return int(width), int(height)
-    if "pinhole" in node:
-        node = node["pinhole"]
-    pair = (
-        "resolution",
-        "cameraResolution",
-        "image_size",
-        "imageSize",
-        "img_size",
-        "image_dimension",
-    )
-    value = next((node[name] for name in pair if node.get(name) is not None), None)
-    if value is not None:
-        width, height = _floats(value, "image size", (2,))
+    pair = "resolution cameraResolution image_size imageSize img_size image_dimension"
+    if (value := _find(node, pair)) is not None:
+        width, height = _floats(value, "image size", 2)
         return int(width), int(height)
-    ends = ("image_{}", "{}", "cam_{}", "Camera.{}")
-    sides = [
-        (*(end.format(side) for end in ends), f"image_{side.title()}", f"Camera.{lines}")
-        for side, lines in (("width", "cols"), ("height", "rows"))
-    ]
-    sizes = [next((node[n] for n in names if n in node), None) for names in sides]
+    places = "image_{0} image_{1} {0} cam_{0} Camera.{0} Camera.{2} pinhole.{0}"
+    sides = (("width", "Width", "cols"), ("height", "Height", "rows"))
+    sizes = [_find(node, places.format(*names)) for names in sides]
     if None in sizes:
         return None
     width, height = _floats(sizes, "image size")

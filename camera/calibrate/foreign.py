@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import NDArray
 
 from camera.params import FisheyeParams, monotonic_limit
@@ -145,7 +146,7 @@ def _kb4_radius(values: Values, theta: Array) -> Array:
 def _polyfisheye_radius(values: Values, theta: Array) -> Array:
     """Polynomial of camodocal's PolyFisheyeCamera: all powers of the angle from 1 to 7."""
     powers = np.array([0.0, 1.0] + [values.get(f"k{i}", 0.0) for i in range(2, 8)])
-    return np.polynomial.polynomial.polyval(theta, powers)
+    return polyval(theta, powers)
 
 
 def _ocam_radius(values: Values, theta: Array) -> Array:
@@ -154,14 +155,14 @@ def _ocam_radius(values: Values, theta: Array) -> Array:
     """
     powers = np.array([values[f"a{i}"] for i in range(sum(name[0] == "a" for name in values))])
     rho = np.linspace(0.0, values["farthest"], 4096)
-    angles = np.arctan2(rho, -np.polynomial.polynomial.polyval(rho, powers))
+    angles = np.arctan2(rho, -polyval(rho, powers))
     grows = int(np.argmin(np.append(np.diff(angles) > 0.0, False)))
     radius = np.interp(theta, angles[: grows + 1], rho[: grows + 1], right=np.nan)
-    slope = np.polynomial.polynomial.polyder(powers)
+    slope = polyder(powers)
     for _ in range(4):
-        depth = np.polynomial.polynomial.polyval(radius, powers)
+        depth = polyval(radius, powers)
         off = radius * np.cos(theta) + depth * np.sin(theta)
-        steepness = np.cos(theta) + np.sin(theta) * np.polynomial.polynomial.polyval(radius, slope)
+        steepness = np.cos(theta) + np.sin(theta) * polyval(radius, slope)
         radius = radius - off / steepness
     return np.asarray(radius)
 
@@ -249,14 +250,8 @@ def fit_fisheye(
             f"its {model} numbers fold back {math.degrees(folds):.1f} deg off the axis, inside the"
             " image: the field of view ends there"
         )
-    report = FitReport(
-        model,
-        float(np.sqrt(np.mean(error**2))),
-        float(error.max()),
-        len(theta),
-        holds,
-        tuple(remarks),
-    )
+    rms = float(np.sqrt(np.mean(error**2)))
+    report = FitReport(model, rms, float(error.max()), len(theta), holds, tuple(remarks))
     return FisheyeParams(width, height, **lens, fov_deg=fov), report
 
 
