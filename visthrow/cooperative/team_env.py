@@ -13,8 +13,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import history as hist
-from camera.keypoint_noise import StepDraw, apply_noise
-from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.common.free_fall import free_flight
@@ -25,7 +23,7 @@ from visthrow.onboard import observations as ob
 from visthrow.task import plant_of
 from visthrow.training import rewards, terminations
 from visthrow.training.compute_device import rounded_products
-from visthrow.training.env.options import redraw
+from visthrow.training.env.options import DetectorView, redraw
 
 RESULTS = {
     "released": "episodes",
@@ -86,31 +84,30 @@ class TeamEnv(VecEnv):
             wp.to_torch(array, requires_grad=False) for array in self.sim.load
         )
         self.layout = layout_of(experiment)
-        self.camera = KeypointCamera(experiment.camera, device)
-        make = {"device": device}
-        ropes = torch.tensor([r.segment_length for r in options["ropes"]], **make)
+        like = torch.zeros(self.rows, device=device)
+        self.view = DetectorView(experiment.camera, like)
+        ropes = like.new_tensor([r.segment_length for r in options["ropes"]])
         rows = torch.arange(self.rows, device=device)
         self._segment = ropes[rows % len(ropes)]
-        self._mount = torch.tensor(plant.rope.mount, **make)
+        self._mount = like.new_tensor(plant.rope.mount)
         hover = act.hover_action(GRAVITY * plant.total_mass, task.action.max_thrust)
-        self._start_action = torch.tensor(hover, **make)
-        self._max_rate = torch.tensor(task.action.max_rate, **make)
+        self._start_action = like.new_tensor(hover)
+        self._max_rate = like.new_tensor(task.action.max_rate)
         samples = experiment.release.clearance_samples
-        self._fractions = torch.linspace(0.0, 1.0, samples, **make)
-        self._rate_weights = torch.tensor(task.reward.rate_command, **make)
-        self._change_weights = torch.tensor(task.reward.command_change, **make)
-        self.episode_length_buf = torch.zeros(self.rows, device=device, dtype=torch.long)
-        self._memory = self._remembered()
-        self.earliest = torch.zeros((), device=device, dtype=torch.long)
+        self._fractions = torch.linspace(0.0, 1.0, samples, device=device)
+        self._rate_weights = like.new_tensor(task.reward.rate_command)
+        self._change_weights = like.new_tensor(task.reward.command_change)
+        self.episode_length_buf = like.new_zeros(self.rows, dtype=torch.long)
+        self._memory = self._remembered(like)
+        self.earliest = like.new_zeros((), dtype=torch.long)
         self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
 
-    def _remembered(self) -> dict[str, Tensor]:
+    def _remembered(self, like: Tensor) -> dict[str, Tensor]:
         """The buffers that an episode carries beside the simulator's state."""
         rows = self.rows
         worlds = self.worlds
-        make = {"device": self.device}
         steps = 2 + math.ceil(self.cfg.team.age[1] / self.cfg.sim.control_period)
         history = 1 + self.layout.history
         payload = self.layout.payload
@@ -120,7 +117,6 @@ class TeamEnv(VecEnv):
             "true_history": (rows, history, 3),
             "frame_bias": (rows, ob.VEHICLE + 5),
             "command_bias": (rows, act.COMMANDS),
-            "keypoint_bias": (rows, KEYPOINTS, 2),
             "pose_age": (rows,),
             "age": (worlds,),
             "poses": (rows, steps, ob.VEHICLE + 3),
@@ -128,8 +124,8 @@ class TeamEnv(VecEnv):
             "first": (worlds,),
             "tripped": (worlds,),
         }
-        memory = {name: torch.zeros(shape, **make) for name, shape in shapes.items()}
-        memory["totals"] = torch.zeros(1 + len(RESULTS), dtype=torch.float64, **make)
+        memory = {name: like.new_zeros(shape) for name, shape in shapes.items()}
+        memory["totals"] = like.new_zeros(1 + len(RESULTS), dtype=torch.float64)
         return memory
 
     def _rows(self, of_worlds: Tensor) -> Tensor:
@@ -328,12 +324,9 @@ class TeamEnv(VecEnv):
         memory["requests"].masked_fill_(fresh[:, None], 0.0)
         memory["first"].masked_fill_(fresh, 1e6)
         memory["tripped"].masked_fill_(fresh, 0.0)
-        spreads = {
-            "frame_bias": noise.observation_bias,
-            "command_bias": noise.command_bias,
-            "keypoint_bias": self.cfg.camera.noise.bias_std,
-        }
+        spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
         redraw(memory, spreads, rows)
+        self.view.begin(rows)
         age = memory["pose_age"]
         latency = between(task.observation.latency, torch.rand_like(age))
         torch.where(rows, latency, age, out=age)
@@ -398,7 +391,8 @@ class TeamEnv(VecEnv):
         frame = frame + torch.randn_like(frame) * noise.observation_step + memory["frame_bias"]
         valid = None
         if self.layout.name == "vision":
-            points, valid = self._see(pose, goal)
+            eye = (pose[:, :3], ob.rotation_in(pose))
+            points, valid = self.view.look(*eye, goal, pose[:, ob.VEHICLE :], fresh)
             frame = torch.cat([frame[:, : ob.VEHICLE], points.flatten(1)], -1)
         messages = self._messages(poses, frame[:, :3])
         attached = state["attached"].float()
@@ -430,15 +424,6 @@ class TeamEnv(VecEnv):
             place = neighbour[:, :3] + torch.randn_like(pos_w) * noise - pos_w
             parts += [place, neighbour[:, 9 : ob.VEHICLE]]
         return torch.cat([*parts, age[:, None], self._rows(self._memory["tripped"])[:, None]], -1)
-
-    def _see(self, pose: Tensor, goal: Tensor) -> tuple[Tensor, Tensor]:
-        """Keypoints of goal and load in each vehicle's camera, with noise."""
-        rot_wb = ob.rotation_in(pose)
-        load = pose[:, ob.VEHICLE :]
-        points, valid = keypoints(self.camera, pose[:, :3], rot_wb, goal, load)
-        draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
-        bias = self._memory["keypoint_bias"]
-        return apply_noise(self.cfg.camera.noise, points, valid, bias, draw)
 
     def _privileged(self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor) -> Tensor:
         """Critic's view."""

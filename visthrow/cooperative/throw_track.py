@@ -112,26 +112,23 @@ def write_recording(track: ThrowTrack, path: Path, radius: float) -> None:
 
     from visthrow.view.rerun_view import TIMELINE, colour_code, recording
 
-    def lines(name: str, strips: ndarray, width: float, colour: str) -> None:
-        strip = rr.LineStrips3D(strips, radii=width, colors=[colour_code(colour)])
-        stream.log(f"world/{name}", strip)
-
-    def ball(name: str, place_w: ndarray, size: float, colour: str) -> None:
-        point = rr.Points3D([place_w], radii=size, colors=[colour_code(colour)])
-        stream.log(f"world/{name}", point)
+    def send(name: str, shape: type, places: Any, size: float, colour: str, **how: bool) -> None:
+        thing = shape(places, radii=size, colors=[colour_code(colour)])
+        stream.log(f"world/{name}", thing, **how)
 
     with recording(path) as stream:
         stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        for k, time in enumerate(track.time):
+        send("goal", rr.Points3D, [track.goal_w], 0.03, style.GOAL, static=True)
+        flight = zip(track.flight_time, track.flight_w, strict=True)
+        for k, (time, load) in enumerate([*zip(track.time, track.load_w, strict=True), *flight]):
             stream.set_time(TIMELINE, duration=float(time))
-            ball("goal", track.goal_w, 0.03, style.GOAL)
-            lines("vehicles", track.frames_w[k].reshape(-1, 2, 3), 0.01, style.VEHICLE)
-            lines("cables", track.cables_w[k][track.attached[k]], 0.003, style.ROPE)
-            ball("load", track.load_w[k], radius, style.PAYLOAD)
-        for time, place in zip(track.flight_time, track.flight_w, strict=True):
-            stream.set_time(TIMELINE, duration=float(time))
-            lines("cables", track.cables_w[:0, 0], 0.003, style.ROPE)
-            ball("load", place, radius, style.PAYLOAD)
+            cables = track.cables_w[:0, 0]
+            if k < len(track.time):
+                vehicles = track.frames_w[k].reshape(-1, 2, 3)
+                send("vehicles", rr.LineStrips3D, vehicles, 0.01, style.VEHICLE)
+                cables = track.cables_w[k][track.attached[k]]
+            send("cables", rr.LineStrips3D, cables, 0.003, style.ROPE)
+            send("load", rr.Points3D, [load], radius, style.PAYLOAD)
 
 
 def write(track: ThrowTrack, folder: Path, radius: float) -> list[Path]:

@@ -3,8 +3,10 @@
 All in the style of :mod:`visthrow.common.style`.
 """
 
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,12 @@ from visthrow.common.statistics import Interval, pareto
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # width of a picture over the whole page [inch]
+
+LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
+"""Part of a picture -> matplotlib's keywords."""
+for _look_of_part in LOOKS.values():
+    if isinstance(_look_of_part.get("ls"), list):
+        _look_of_part["ls"] = (0, tuple(_look_of_part["ls"]))
 
 CIRCLES = (0.1, 0.2, 0.4)  # about the target, in scatter panels [m]
 
@@ -121,26 +129,16 @@ def marks(
         value = row.interval
         paper = row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
-        axis.plot(
-            [value.low, value.high],
-            [y, y],
-            "-",
-            color=colour,
-            lw=2.2,
-            solid_capstyle="butt",
-            alpha=0.55,
-        )
-        handles[row.series] = axis.plot(
-            value.value, y, marker, color=colour, ms=6.5, mec="white", mew=0.6, zorder=3
-        )[0]
+        axis.plot([value.low, value.high], [y, y], "-", color=colour, **LOOKS["interval"])
+        drawn = axis.plot(value.value, y, marker, color=colour, **LOOKS["value"])
+        handles[row.series] = drawn[0]
         if paper is not None:
             ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
-            axis.plot(ends, [y + 0.14] * 2, "-", color=style.QUIET, lw=1.0)
-            handles[len(series)] = axis.plot(
-                paper.value, y + 0.14, "x", color=style.INK, ms=7, mew=1.5, zorder=4
-            )[0]
+            axis.plot(ends, [y + 0.14] * 2, "-", **LOOKS["paper_interval"])
+            drawn = axis.plot(paper.value, y + 0.14, "x", **LOOKS["paper_value"])
+            handles[len(series)] = drawn[0]
     if zero is not None:
-        axis.axvline(zero, color=style.QUIET, lw=1.0, ls=(0, (4, 3)), zorder=1)
+        axis.axvline(zero, **LOOKS["zero"])
     if log:
         _log_axis(axis, "x")
     axis.set_yticks([-i for i in range(len(names))], names)
@@ -213,27 +211,11 @@ def _target(axis, half: float) -> None:
 
     for radius in CIRCLES:
         if radius < half:
-            axis.add_patch(
-                Circle(
-                    (0, 0), radius, fill=False, color=style.QUIET, lw=0.8, ls=(0, (4, 3)), zorder=1
-                )
-            )
+            axis.add_patch(Circle((0, 0), radius, **LOOKS["circle"]))
         if 0.3 * half < radius < half:
-            place = {
-                "xytext": (2, -2),
-                "textcoords": "offset points",
-                "ha": "left",
-                "va": "top",
-                "zorder": 2,
-            }
-            axis.annotate(
-                f"{radius:g} m",
-                (0.7071 * radius, -0.7071 * radius),
-                fontsize=7.5,
-                color=style.QUIET,
-                **place,
-            )
-    axis.plot(0, 0, "+", color=style.INK, ms=12, mew=1.4, zorder=5)
+            place = (0.7071 * radius, -0.7071 * radius)
+            axis.annotate(f"{radius:g} m", place, **LOOKS["circle_label"])
+    axis.plot(0, 0, "+", **LOOKS["target"])
     axis.grid(True)
     axis.set_axisbelow(True)
 
@@ -243,32 +225,15 @@ def _landings(axis, points: ndarray, half: float, series: int, label: str) -> No
     colour, marker = _look(series)
     clipped = np.clip(points, -half, half)
     visible = np.all(clipped == points, axis=1)
-    alpha = 0.8 if len(points) <= 40 else 0.35
-    axis.scatter(
-        -points[visible, 1],
-        points[visible, 0],
-        s=11,
-        color=colour,
-        marker=marker,
-        alpha=alpha,
-        lw=0,
-        label=label,
-        zorder=3,
-    )
+    look = {"color": colour, "marker": marker, **LOOKS["landing"]}
+    look["alpha"] = 0.8 if len(points) <= 40 else 0.35
+    axis.scatter(-points[visible, 1], points[visible, 0], label=label, **look)
     out = clipped[~visible]
-    axis.scatter(
-        -out[:, 1],
-        out[:, 0],
-        s=18,
-        facecolor="none",
-        edgecolor=colour,
-        marker=marker,
-        clip_on=False,
-        zorder=3,
-    )
+    look = {"edgecolor": colour, "marker": marker, **LOOKS["landing_outside"]}
+    axis.scatter(-out[:, 1], out[:, 0], **look)
     if len(points):
         center = points.mean(0)
-        axis.plot(-center[1], center[0], marker, color=colour, ms=7, mec="white", mew=1.2, zorder=6)
+        axis.plot(-center[1], center[0], marker, color=colour, **LOOKS["landing_mean"])
 
 
 def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
@@ -278,26 +243,11 @@ def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
     labels: dict[str, object] = {}
     for i, (label, duration, error) in enumerate(stars):
         colour = style.COLOURS[3 + i]
-        axis.plot(
-            [duration.value] * 2, [error.low, error.high], "-", color=colour, lw=2.0, alpha=0.6
-        )
-        axis.plot(
-            [duration.low, duration.high],
-            [error.value] * 2,
-            "-",
-            color=colour,
-            lw=2.0,
-            alpha=0.6,
-        )
-        star = {
-            "color": colour,
-            "ms": 14,
-            "mec": "white",
-            "mew": 0.7,
-            "ls": "none",
-            "zorder": 5,
-        }
-        labels[label] = axis.plot(duration.value, error.value, "*", **star)[0]
+        bar = {"color": colour, **LOOKS["bar"]}
+        axis.plot([duration.value] * 2, [error.low, error.high], "-", **bar)
+        axis.plot([duration.low, duration.high], [error.value] * 2, "-", **bar)
+        drawn = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])
+        labels[label] = drawn[0]
     return labels
 
 
@@ -311,31 +261,19 @@ def trades(panels: Sequence[Trade]) -> bytes:
         for series, label, points in panel.fronts:
             colour, marker = _look(series)
             best = points[pareto(points)] if len(points) else points
-            axis.plot(*points.T, marker, color=colour, ms=4.5, alpha=0.35, mew=0)
-            labels[label] = axis.plot(*best.T, marker + "-", color=colour, ms=5.5, lw=1.4)[0]
+            axis.plot(*points.T, marker, color=colour, **LOOKS["settings"])
+            drawn = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])
+            labels[label] = drawn[0]
         for label, points in panel.crosses:
-            starred = len(points) <= 2
-            if starred:
-                look = {"marker": "*", "ms": 11, "ls": "none", "mec": "white"}
-            else:
-                look = {"marker": "x", "ms": 6, "ls": "--"}
-            labels[label] = axis.plot(*points.T, color=style.QUIET, lw=1.1, **look)[0]
+            look = LOOKS["paper_stars" if len(points) <= 2 else "paper_front"]
+            labels[label] = axis.plot(*points.T, **look)[0]
         labels |= _stars(axis, panel.stars)
         empty = [label for _, label, points in panel.fronts if not len(points)]
         if empty or not panel.fronts:
+            caption = "not swept yet"
             if empty:
                 caption = "no setting landed all its throws:\n" + "\n".join(empty)
-            else:
-                caption = "not swept yet"
-            axis.text(
-                0.03,
-                0.02,
-                caption,
-                transform=axis.transAxes,
-                fontsize=7.5,
-                color=style.QUIET,
-                va="bottom",
-            )
+            axis.text(0.03, 0.02, caption, transform=axis.transAxes, **LOOKS["remark"])
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel("from start to landing [s]")
         _log_axis(axis, "y")
@@ -356,15 +294,8 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
         for line in panel.lines:
             labels.setdefault(line.label, _curve(axis, line))
         if not panel.lines:
-            axis.text(
-                0.5,
-                0.5,
-                panel.missing or "no results",
-                transform=axis.transAxes,
-                ha="center",
-                color=style.QUIET,
-                fontsize=9,
-            )
+            text = panel.missing or "no results"
+            axis.text(0.5, 0.5, text, transform=axis.transAxes, **LOOKS["missing"])
         axis.set_title(panel.title, fontsize=10.5)
         axis.set_xlabel(panel.xlabel)
         axis.grid(True)
@@ -387,27 +318,11 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
 def _curve(axis, line: Line):
     colour, marker = _look(line.series)
     x = np.asarray(line.x, dtype=float)
-    axis.fill_between(
-        x,
-        [i.low for i in line.intervals],
-        [i.high for i in line.intervals],
-        color=colour,
-        alpha=0.18,
-        lw=0,
-    )
-    (curve_line,) = axis.plot(
-        x, [i.value for i in line.intervals], marker + "-", color=colour, ms=4.5, lw=1.5
-    )
+    low, value, high = np.array([(i.low, i.value, i.high) for i in line.intervals]).T
+    axis.fill_between(x, low, high, color=colour, **LOOKS["band"])
+    (curve_line,) = axis.plot(x, value, marker + "-", color=colour, **LOOKS["curve"])
     if line.own is not None:
-        axis.plot(
-            x[line.own],
-            line.intervals[line.own].value,
-            "o",
-            ms=11,
-            mfc="none",
-            mec=style.INK,
-            mew=1.1,
-        )
+        axis.plot(x[line.own], value[line.own], "o", **LOOKS["own"])
     return curve_line
 
 

@@ -16,6 +16,7 @@ from visthrow.common.errors import LogError
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view.figures import LOOKS
 from visthrow.view.parts import png_of
 
 MARGIN = 0.35  # about what is seen [m]
@@ -144,25 +145,16 @@ def _side_view(
     axis.set(
         xlim=(origin_x, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5)
     )
-    axis.add_patch(
-        Rectangle((origin_x, -GROUND), right - origin_x, GROUND, color="#EFEDE8", lw=0, zorder=0)
-    )
-    axis.axhline(0.0, color=style.QUIET, lw=1.0, zorder=1)
-    axis.plot(
-        [goal[0] - 0.125, goal[0] + 0.125],
-        [0, 0],
-        color=style.GOAL,
-        lw=5,
-        solid_capstyle="butt",
-        zorder=2,
-    )
+    floor = Rectangle((origin_x, -GROUND), right - origin_x, GROUND, **LOOKS["floor"])
+    axis.add_patch(floor)
+    axis.axhline(0.0, **LOOKS["floor_line"])
+    axis.plot([goal[0] - 0.125, goal[0] + 0.125], [0, 0], **LOOKS["goal"])
     if column:
         axis.tick_params(labelleft=False)
     else:
         axis.set_ylabel("height [m]")
         axis.set_xlabel("distance ahead [m]")
-        above = {"xytext": (0, 6), "textcoords": "offset points", "ha": "center", "va": "bottom"}
-        axis.annotate("target", (goal[0], 0.0), color=style.GOAL, fontsize=9, **above)
+        axis.annotate("target", (goal[0], 0.0), **LOOKS["goal_label"])
     axis.tick_params(length=2.5)
     for past in np.arange(times["policy_start"], time - 0.03, GHOST_EVERY):
         _vehicle(axis, log, past, 0.16)
@@ -172,33 +164,29 @@ def _side_view(
     when = np.append(payload.time[visible], time)
     carried = when <= times["separation"] + 1e-6
     flown = when >= times["separation"] - 0.02
-    axis.plot(path[carried, 0], path[carried, 2], color=style.PAYLOAD, lw=1.3, alpha=0.45, zorder=3)
+    axis.plot(path[carried, 0], path[carried, 2], **LOOKS["carried"])
     if np.count_nonzero(flown) > 1:
-        axis.plot(
-            path[flown, 0], path[flown, 2], color=style.PAYLOAD, lw=1.8, ls=(0, (4, 1.6)), zorder=3
-        )
+        axis.plot(path[flown, 0], path[flown, 2], **LOOKS["flown"])
     if log["cable_points_w"].time[-1] > time - 0.05:  # poses tell nothing of a rope that has let go
         rope = log["cable_points_w"].at(time)
-        axis.plot(rope[:, 0], rope[:, 2], color=style.ROPE, lw=1.3, zorder=4)
+        axis.plot(rope[:, 0], rope[:, 2], **LOOKS["rope"])
     _vehicle(axis, log, time, 1.0)
     ball = log["payload_pos_w"].at(time)
-    axis.add_patch(Circle((ball[0], ball[2]), 0.033, color=style.PAYLOAD, lw=0, zorder=6))
+    axis.add_patch(Circle((ball[0], ball[2]), 0.033, **LOOKS["ball"]))
 
 
 def _vehicle(axis, log: FlightLog, time: float, alpha: float) -> None:
     """Arms and rotor discs as seen along y."""
     pos = log["pos_w"].at(time)
     rot = matrix_of_quat(log["quat_wb"].at(time)[None])[0]
-    reach = ARM / np.sqrt(2.0)
-    for sx in (1.0, -1.0):
-        hub = pos + rot @ np.array([sx * reach, 0.0, BLADE_HEIGHT])
-        foot = pos + rot @ np.array([sx * reach, 0.0, 0.0])
-        ends = [hub + rot @ np.array([s * ROTOR, 0.0, 0.0]) for s in (-1.0, 1.0)]
-        line = {"color": style.VEHICLE, "alpha": alpha, "zorder": 5, "solid_capstyle": "round"}
-        axis.plot([pos[0], foot[0]], [pos[2], foot[2]], lw=2.4, **line)
+    for foot in (ARM / np.sqrt(2.0), -ARM / np.sqrt(2.0)):
+        strokes = [((0.0, 0.0), (foot, 0.0), 2.4)]
         if alpha == 1.0:
-            axis.plot([foot[0], hub[0]], [foot[2], hub[2]], lw=1.2, **line)
-            axis.plot([ends[0][0], ends[1][0]], [ends[0][2], ends[1][2]], lw=1.8, **line)
+            strokes.append(((foot, 0.0), (foot, BLADE_HEIGHT), 1.2))
+            strokes.append(((foot - ROTOR, BLADE_HEIGHT), (foot + ROTOR, BLADE_HEIGHT), 1.8))
+        for first, last, width in strokes:
+            ends = pos + np.array([first, last]) @ rot[:, ::2].T
+            axis.plot(ends[:, 0], ends[:, 2], lw=width, alpha=alpha, **LOOKS["vehicle"])
 
 
 def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, first: bool) -> bool:
@@ -227,24 +215,8 @@ def _camera_view(axis, log: FlightLog, camera: KeypointCamera, time: float, firs
     for name, part in (("target", slice(0, GOAL_KEYPOINTS)), ("ball", slice(GOAL_KEYPOINTS, None))):
         right = pixels[part, 0].max()
         middle = pixels[part, 1].mean()
-        axis.annotate(
-            name,
-            (right, middle),
-            xytext=(7, 0),
-            textcoords="offset points",
-            color="white",
-            va="center",
-            fontsize=9,
-        )
+        axis.annotate(name, (right, middle), **LOOKS["keypoints_label"])
     quarter = float(lens.radius_from_angle(torch.tensor(np.pi / 2))) * lens.params.fy
-    axis.annotate(
-        "90° off the axis",
-        (lens.params.cx, lens.params.cy + quarter),
-        xytext=(0, 4),
-        textcoords="offset points",
-        color="#B5B5B5",
-        ha="center",
-        va="bottom",
-        fontsize=8,
-    )
+    place = (lens.params.cx, lens.params.cy + quarter)
+    axis.annotate("90° off the axis", place, **LOOKS["angle_label"])
     return visible
