@@ -122,7 +122,9 @@ class FakePx4(FakeMavlink):
             and self.plant.time - self._last > self.parameters["COM_OF_LOSS_T"]
         ):
             self.happened("left OFFBOARD: no set-points")
-            self.enter(LAND if self.parameters["COM_OBL_RC_ACT"] == px4.LAND_OR_HOLD[0] else HOLD)
+            self.enter(
+                LAND if self.parameters["COM_OBL_RC_ACT"] == px4.FACTS["loss_land"] else HOLD
+            )
             self.beat_soon()
         if self.mode == LAND:
             return self.descend()

@@ -14,7 +14,6 @@ Source: `hil.links.facts`, ardupilot.toml."""
 from dataclasses import dataclass
 from typing import Literal
 
-from hil.links.backends.audit import Rule, bits, equal, within
 from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND
 from hil.links.facts import values
@@ -27,8 +26,6 @@ GUIDED, GUIDED_NOGPS, LOITER, BRAKE, LAND_MODE = (
 )
 THRUST_AS_THRUST = FACTS["thrust_option"]  # bit of GUID_OPTIONS
 SERVO_GRIPPER = FACTS["gripper_function"]
-SERVO_DISABLED = FACTS["servo_disabled"]
-MOST_SILENCE = 0.5  # of GUID_TIMEOUT [s]: at a throw's rates a vehicle turns over in a second
 
 
 @dataclass(frozen=True)
@@ -80,43 +77,3 @@ class ArduPilot(MavlinkAutopilot):
         if p.release == "servo":
             return mav.MAV_CMD_DO_SET_SERVO, (p.servo_output, p.servo_open_us)
         return mav.MAV_CMD_DO_GRIPPER, (p.gripper, mav.GRIPPER_ACTION_RELEASE)
-
-    def _rules(self) -> list[Rule]:
-        p = self.params
-        rules = [
-            bits("GUID_OPTIONS", THRUST_AS_THRUST, "else thrust is read as a climb rate"),
-            equal("ATC_ANGLE_BOOST", 0.0, "else thrust grows with tilt"),
-            within(
-                "GUID_TIMEOUT",
-                0.0,
-                MOST_SILENCE,
-                MOST_SILENCE,
-                "so long the last rates are flown when the runner is gone [s]",
-            ),
-        ]
-        if p.poses:
-            why = "holding after the throw needs an external position (ExternalNav)"
-            rules.append(equal("EK3_SRC1_POSXY", FACTS["position_source"], why))
-        function = f"SERVO{p.servo_output}_FUNCTION"
-        if p.release == "servo":
-            rules.append(
-                equal(
-                    function,
-                    SERVO_DISABLED,
-                    "DO_SET_SERVO is accepted on a used output and moves nothing",
-                )
-            )
-        else:
-            rules += [
-                equal("GRIP_ENABLE", 1.0, "DO_GRIPPER is refused without it"),
-                equal(
-                    "GRIP_TYPE",
-                    FACTS["gripper_servo"],
-                    "a servo; it is read at the start alone: set it and start again",
-                    writable=False,
-                ),
-            ]
-            if p.servo_output:
-                why = "the gripper's output, which is read back"
-                rules += [equal(function, SERVO_GRIPPER, why), self._open_end("GRIP_RELEASE")]
-        return rules

@@ -2,8 +2,14 @@
 refuses to fly, and nothing is written unless the operator said so.
 """
 
+import math
+import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hil.links.facts import values
 
 ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
 # after a value was written, answers may still be on their way that were given before; then it is
@@ -12,55 +18,73 @@ SETTLE = 0.5
 GIVE_UP = 5.0  # a value that has not come within this time is missing [s]
 GIVE_UP_OPTIONAL = 1.0  # likewise one that not all firmware has [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
+ROUNDING = 1e-6  # tolerance of values
+RULES = tomllib.loads(Path(__file__).with_name("rules.toml").read_text(encoding="utf-8"))
 MOST_NAMED = 4  # parameters that a fault names; the table has all
 
 
 @dataclass(frozen=True)
 class Rule:
-    """The required value of one parameter."""
+    """The required value of one parameter; all that is stated must hold."""
 
     name: str
-    expected: str  # in words
     why: str
-    good: Callable[[float], bool]
-    # what is written where the operator asked for it; None: nothing can be
-    value: Callable[[float], float] | None = None
+    values: tuple[float, ...] = ()  # one of these
+    near: float = 0.0  # tolerance of them; 0: rounding
+    mask: int = 0  # bits that must be set
+    above: float = -math.inf
+    below: float = math.inf
+    least: float = -math.inf
+    most: float = math.inf
+    expected: str = ""  # in words; "": the value, or the bits
+    # write the bits, the first of the values, or the most, where the operator asked for it
+    write: bool = False
     optional: bool = False  # firmware without it is right as well
     warns: bool = False  # a mismatch is told, and flown with
     text: Callable[[float], str] = "{:g}".format  # a value in words
 
+    def good(self, found: float) -> bool:
+        """Return whether a value is as required."""
+        known = not self.values or any(
+            abs(found - x) <= (self.near or ROUNDING * max(1.0, abs(x))) for x in self.values
+        )
+        inside = self.above < found < self.below
+        inside &= self.least - ROUNDING <= found <= self.most + ROUNDING
+        return known and inside and (not self.mask or int(found) & self.mask == self.mask)
 
-def equal(name: str, value: float, why: str, writable: bool = True) -> Rule:
-    """Return the rule of a parameter that must have a value."""
-    return Rule(
-        name,
-        f"{value:g}",
-        why,
-        lambda v: abs(v - value) <= 1e-6 * max(1.0, abs(value)),
-        (lambda _: value) if writable else None,
-    )
+    def corrected(self, found: float) -> float:
+        """Return what is written in place of a value."""
+        return int(found) | self.mask if self.mask else (*self.values, self.most)[0]
 
-
-def bits(name: str, mask: int, why: str) -> Rule:
-    """Return the rule of a parameter some of whose bits must be set."""
-    return Rule(
-        name,
-        f"with the bits of {mask} set",
-        why,
-        lambda v: int(v) & mask == mask,
-        lambda v: int(v) | mask,
-    )
+    @property
+    def words(self) -> str:
+        """What is expected."""
+        exact = f"{self.values[0]:g}" if self.values else f"with the bits of {self.mask} set"
+        return self.expected or exact
 
 
-def within(name: str, low: float, high: float, value: float, why: str) -> Rule:
-    """Return the rule of a parameter above ``low`` and not above ``high``; ``value`` is written."""
-    return Rule(
-        name,
-        f"above {low:g}, at most {high:g}",
-        why,
-        lambda v: low < v <= high + 1e-6,
-        lambda _: value,
-    )
+def rules_of(firmware: str, params: Any, **further: Any) -> list[Rule]:
+    """Return the rules of ``rules.toml`` for a firmware by its facts, the vehicle's configuration
+    and further values.
+    """
+    known = values(firmware) | vars(params) | further
+    rules = []
+    for row in RULES[firmware]:
+        conditions = row.get("when", {})
+        if all(wanted in (known[k], bool(known[k])) for k, wanted in conditions.items()):
+            fields = {key: _filled(key, entry, known) for key, entry in row.items()}
+            fields.pop("when", None)
+            rules.append(Rule(**fields))
+    return rules
+
+
+def _filled(key: str, entry: Any, known: dict[str, Any]) -> Any:
+    """Return an entry of a row with the known values in it."""
+    if isinstance(entry, list):
+        return tuple(_filled(key, value, known) for value in entry)
+    if isinstance(entry, str):
+        return entry.format(**known) if key in ("name", "why", "expected") else known[entry]
+    return entry
 
 
 class Audit:
@@ -110,16 +134,12 @@ class Audit:
         if self.done or rule is None or self._settling(name):
             return
         self.found[name] = value
-        if (
-            not rule.good(value)
-            and self._write is not None
-            and rule.value is not None
-            and name not in self.written
-        ):
+        writes = self._write is not None and rule.write and name not in self.written
+        if writes and not rule.good(value):
             self.written.append(name)
             self._written_at[name] = self._now
             del self.found[name]  # it counts when it was read back
-            self._write(name, rule.value(value))
+            self._write(name, rule.corrected(value))
 
     def _settling(self, name: str) -> bool:
         return self._now - self._written_at.get(name, -1e9) < SETTLE
@@ -139,12 +159,10 @@ class Audit:
         ]
         if not missing or waited > GIVE_UP:
             self.done = True
-            values = {
-                name: f" is {self.rules[name].text(value)}" for name, value in self.found.items()
-            }
-            values |= {name: f": {why}" for name, why in self.refused.items() if name not in values}
+            told = {name: f": {why}" for name, why in self.refused.items()}
+            told |= {name: f" is {self.rules[name].text(x)}" for name, x in self.found.items()}
             self.problems = [
-                f"{r.name}{values.get(r.name, ' was not told')}; expected {r.expected}"
+                f"{r.name}{told.get(r.name, ' was not told')}; expected {r.words}"
                 for r in self._wrong()
                 if not r.warns
             ]
@@ -157,11 +175,11 @@ class Audit:
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:
-        values = self.found
+        found = self.found
         return [
             r
             for r in self.rules.values()
-            if not (r.good(values[r.name]) if r.name in values else r.optional)
+            if not (r.good(found[r.name]) if r.name in found else r.optional)
         ]
 
     def fault(self) -> str | None:
@@ -186,7 +204,7 @@ class Audit:
             )
             shown += " (written)" if name in self.written else ""
             judged = ("WARN" if rule.warns else "WRONG") if rule in wrong else "ok"
-            rows.append((judged, name, shown, rule.expected, rule.why))
+            rows.append((judged, name, shown, rule.words, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines = [
             "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from hil.links.backends.audit import Audit, Rule, equal
+from hil.links.backends.audit import Audit, Rule, rules_of
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Command, Release
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.mavlink_link import Link, attitude_target
@@ -116,10 +116,15 @@ class MavlinkAutopilot(Autopilot, ABC):
         link.roster.moved.append(self._came_back)
 
     def _begin_audit(self) -> None:
-        extra = [equal(*row, "by the config") for row in self.params.parameters.items()]
-        rules = [*self._rules(), *extra] if self.params.audit else ()
+        p = self.params
+        rules = rules_of(self.name, p, **self._rule_values())
+        for name, value in p.parameters.items():
+            rules.append(Rule(name, "by the config", (value,), write=True))
         self.audit = Audit(
-            rules, self._ask_parameter, self._write_parameter if self._write else None, self._tell
+            rules if p.audit else (),
+            self._ask_parameter,
+            self._write_parameter if self._write else None,
+            self._tell,
         )
 
     def _came_back(self, party: Party) -> None:
@@ -131,20 +136,9 @@ class MavlinkAutopilot(Autopilot, ABC):
             self._streamed = -1e9
             self._begin_audit()
 
-    @abstractmethod
-    def _rules(self) -> list[Rule]:
-        """Return what its parameters must be."""
-
-    def _open_end(self, name: str, optional: bool = False) -> Rule:
-        """Return the rule of the parameter that says where the mechanism's output is open."""
-        opens = self.params.servo_open_us
-        return Rule(
-            name,
-            f"{opens} (servo_open_us)",
-            "the output with the mechanism open, which is read back [us]",
-            lambda v: abs(v - opens) <= SERVO_NEAR,
-            optional=optional,
-        )
+    def _rule_values(self) -> dict[str, Any]:
+        """Return what rows of ``rules.toml`` name beside facts and configuration."""
+        return {}
 
     @abstractmethod
     def _role(self, mode: int) -> str | None:

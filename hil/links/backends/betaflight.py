@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from hil.links import msp
-from hil.links.backends.audit import Audit, Rule, equal
+from hil.links.backends.audit import Audit, Rule, rules_of
 from hil.links.backends.base import (
     ACCEPTED,
     FOLLOW,
@@ -57,7 +57,6 @@ EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
 """First version, as of :func:`version_text`, in which the sticks of MSP OVERRIDE expire."""
 
 FEWEST_AUX = 4  # channels of a frame beside the sticks
-LONGEST_DELAY = 1.5  # of the failsafe [s]
 IMU = struct.Struct(f"<{FACTS['imu_rates']}x3h")  # body rates of MSP_RAW_IMU
 NEAR = 50  # a channel or output this near to its target has arrived [us]
 # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
@@ -85,13 +84,6 @@ which the signs of its rates show [s]: for longer they would make frames queue u
 """
 
 AXES = ("roll", "pitch", "yaw")
-ZEROS = {
-    "throttle_limit_type": "else full throttle is not full",
-    "throttle_expo": "thrust is computed for a straight line",
-    "deadband": "small rates would be lost",
-    "yaw_deadband": "as above",
-}
-"""Settings that must be 0, and why."""
 
 
 @dataclass(frozen=True)
@@ -165,54 +157,14 @@ class Betaflight(OnPort):
 
     def _rules(self) -> list[Rule]:
         p = self.params
-        rules = [
-            Rule(
-                "api_version",
-                "1.43 or newer",
-                "older ones do not tell their rates type",
-                lambda v: v >= FACTS["api_oldest"],
-            ),
-            equal("rates_type", RATES_TYPES[p.rates.type], "the curve that sticks are computed by"),
-        ]
         curves = {"rc_rate": p.rates.rc_rates, "rate": p.rates.rates, "expo": p.rates.expo}
-        rules += [
-            equal(f"{axis}_{name}", values[i], "as above")
+        numbers = {
+            f"{axis}_{name}": curve[i]
+            for name, curve in curves.items()
             for i, axis in enumerate(AXES)
-            for name, values in curves.items()
-        ]
-        rules += [
-            *(equal(name, 0.0, why, False) for name, why in ZEROS.items()),
-            equal("min_check", p.minimum_us, "throttle that counts as 0 [us]", False),
-            equal("mid_rc", MIDDLE, "middle of the sticks [us]", False),
-            Rule(
-                "failsafe_delay",
-                "above 0, at most 1.5 s",
-                "motors stop so late when the runner is gone",
-                lambda v: 0.0 < v <= LONGEST_DELAY,
-            ),
-        ]
-        if p.servo_output:
-            rules.append(
-                Rule(
-                    "channel_forwarding",
-                    "0, or 1",
-                    "1: MSP_SERVO does not show the output, its channel is read back",
-                    lambda v: v in (0.0, 1.0),
-                )
-            )
-        if p.arm_channel:
-            rules.append(equal("arm_aux", p.arm_channel, "AUX of the ARM mode", False))
-        else:
-            rules.append(
-                Rule(
-                    "override_aux",
-                    "any AUX",
-                    "the pilot's switch of MSP OVERRIDE",
-                    lambda v: v > 0.0,
-                )
-            )
-            rules.append(expiry())
-        return rules
+        }
+        rules = rules_of(self.name, p, rates_type=RATES_TYPES[p.rates.type], **numbers)
+        return rules if p.arm_channel else [*rules, expiry()]
 
     def _hint(self) -> str:
         if not self._taken or self._raised:
@@ -492,10 +444,10 @@ def expiry() -> Rule:
     """
     return Rule(
         "fc_version",
-        f"{version_text(EXPIRES)} or newer",
         f"there the pilot's sticks count {FACTS['override_window']:g} s after the runner dies;"
         " before, its last sticks count until the pilot switches MSP OVERRIDE off",
-        lambda v: v >= EXPIRES - 1e-6,
+        least=EXPIRES,
+        expected=f"{version_text(EXPIRES)} or newer",
         warns=True,
         text=version_text,
     )

@@ -16,7 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from hil.links import crtp
-from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, equal
+from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Command, OnPort, Release
 from hil.links.backends.crazyflie_gyro import GyroStream
 from hil.links.backends.thrust_curve import HoverThrustParams
@@ -98,16 +98,14 @@ class Crazyflie(OnPort):
     def _rules(self) -> list[Rule]:
         why = {name: fact.means for name, fact in facts(self.name).items()}
         oldest = FACTS["protocol_state"]
+        old = (
+            "firmware of 2026.04: an older one stops its motors at a manual set-point, or"
+            " tells no state"
+        )
         return [
-            Rule(
-                "protocol",
-                f"{oldest} or newer",
-                "firmware of 2026.04: an older one stops its motors at a manual set-point, or"
-                " tells no state",
-                lambda v: v >= oldest,
-            ),
-            *(equal(name, FACTS[name], why[name], False) for name in MODES),
-            equal(self.params.release_parameter, 0.0, "the mechanism, closed", False),
+            Rule("protocol", old, least=oldest, expected=f"{oldest} or newer"),
+            *(Rule(name, why[name], (FACTS[name],)) for name in MODES),
+            Rule(self.params.release_parameter, "the mechanism, closed", (0.0,)),
         ]
 
     def _ask(self, name: str) -> None:

@@ -13,9 +13,8 @@ Source: `hil.links.facts`, px4.toml."""
 
 import struct
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from hil.links.backends.audit import Rule, bits, equal, within
 from hil.links.backends.autopilot import AutopilotParams, MavlinkAutopilot
 from hil.links.backends.base import FOLLOW, HOLD, LAND, Command
 from hil.links.facts import values
@@ -34,9 +33,6 @@ MARGIN = 0.2  # more than PX4 asks for [s]
 GAP = 0.6  # share of its longest pause
 STREAM_FIRST = FACTS["stream_first"] + MARGIN
 STREAM_GAP = GAP / FACTS["stream_hz"]
-LAND_OR_HOLD = (FACTS["loss_land"], FACTS["loss_hold"])  # values of COM_OBL_RC_ACT
-POSITION_BITS = FACTS["vision_horizontal"] | FACTS["vision_vertical"]  # of EKF2_EV_CTRL
-MOST_LOSS = 0.5  # of COM_OF_LOSS_T [s]: at a throw's rates a vehicle turns over in a second
 
 
 @dataclass(frozen=True)
@@ -111,61 +107,18 @@ class Px4(MavlinkAutopilot):
     def _field(self, value: float, kind: int) -> float:
         return integer_to_bytes(value) if kind == mav.MAV_PARAM_TYPE_INT32 else value
 
-    def _rules(self) -> list[Rule]:
+    def _rule_values(self) -> dict[str, Any]:
         p = self.params
-        rules = [
-            within(
-                "COM_OF_LOSS_T",
-                0.0,
-                MOST_LOSS,
-                MOST_LOSS,
-                "so long the last rates are flown when the runner is gone [s]",
-            ),
-            Rule(
-                "COM_OBL_RC_ACT",
-                "4 (Land) or 5 (Hold)",
-                "what follows when the runner is gone",
-                lambda v: v in LAND_OR_HOLD,
-                lambda _: LAND_OR_HOLD[0],
-            ),
-        ]
-        if p.poses:
-            why = "holding after the throw needs an external position"
-            rules.append(bits("EKF2_EV_CTRL", POSITION_BITS, why))
-        return [*rules, *self._mechanism_rules()]
-
-    def _mechanism_rules(self) -> list[Rule]:
-        p = self.params
-        rules = []
-        gripper = self.params.release == "gripper"
-        if gripper:
-            rules += [
-                Rule(
-                    FACTS["gripper_enable"],
-                    "1, or none since 1.17",
-                    "DO_GRIPPER is not answered without it",
-                    lambda v: v == 1.0,
-                    lambda _: 1.0,
-                    optional=True,
-                ),
-                Rule(
-                    "PD_GRIPPER_TO",
-                    f"below {p.release_timeout:g}",
-                    "ACCEPTED comes so late [s]",
-                    lambda v: v < p.release_timeout,
-                    optional=True,
-                ),
-            ]
-        if p.output_parameter:
-            actuator = FACTS["actuator_function"] + p.gripper - 1
-            function = FACTS["gripper_function"] if gripper else actuator
-            why = "what drives the output that the mechanism hangs on"
-            rules.append(equal(p.output_parameter, function, why))
+        gripper = p.release == "gripper"
+        actuator = FACTS["actuator_function"] + p.gripper - 1
         opens = FACTS["gripper_open"] if gripper else p.actuator_open
         end = {-1.0: "MIN", 1.0: "MAX"}.get(opens)
-        if p.servo_output and end is not None and "FUNC" in p.output_parameter:
-            rules.append(self._open_end(p.output_parameter.replace("FUNC", end), optional=True))
-        return rules
+        is_read = p.servo_output and end is not None and "FUNC" in p.output_parameter
+        return {
+            "position_bits": FACTS["vision_horizontal"] | FACTS["vision_vertical"],
+            "output_function": FACTS["gripper_function"] if gripper else actuator,
+            "open_end": p.output_parameter.replace("FUNC", end) if is_read else "",
+        }
 
 
 def modes_of(custom: int) -> tuple[int, int]:

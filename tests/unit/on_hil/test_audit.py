@@ -8,19 +8,18 @@ from hil.links.backends.audit import (
     GIVE_UP,
     Audit,
     Rule,
-    bits,
-    equal,
-    within,
 )
 from hil.links.backends.base import ACCEPTED, FAILED, IDLE, Release
 
 RULES = (
-    bits("GUID_OPTIONS", 8, "thrust"),
-    equal("ATC_ANGLE_BOOST", 0.0, "tilt"),
-    within("GUID_TIMEOUT", 0.0, 1.0, 0.5, "silence"),
-    Rule("FIXED", "7", "cannot be written", lambda v: v == 7),
+    Rule("GUID_OPTIONS", "thrust", mask=8, write=True),
+    Rule("ATC_ANGLE_BOOST", "tilt", (0.0,), write=True),
+    Rule(
+        "GUID_TIMEOUT", "silence", above=0.0, most=0.5, expected="above 0, at most 0.5", write=True
+    ),
+    Rule("FIXED", "cannot be written", (7.0,)),
 )
-GOOD = {"GUID_OPTIONS": 13.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 1.0, "FIXED": 7.0}
+GOOD = {"GUID_OPTIONS": 13.0, "ATC_ANGLE_BOOST": 0.0, "GUID_TIMEOUT": 0.5, "FIXED": 7.0}
 
 
 def audit(values, write=False):
@@ -52,8 +51,8 @@ def audit(values, write=False):
     [
         ("GUID_OPTIONS", 5.0, "GUID_OPTIONS is 5; expected with the bits of 8 set"),
         ("ATC_ANGLE_BOOST", 1.0, "ATC_ANGLE_BOOST is 1; expected 0"),
-        ("GUID_TIMEOUT", 3.0, "GUID_TIMEOUT is 3; expected above 0, at most 1"),
-        ("GUID_TIMEOUT", 0.0, "GUID_TIMEOUT is 0; expected above 0, at most 1"),
+        ("GUID_TIMEOUT", 3.0, "GUID_TIMEOUT is 3; expected above 0, at most 0.5"),
+        ("GUID_TIMEOUT", 0.0, "GUID_TIMEOUT is 0; expected above 0, at most 0.5"),
         ("FIXED", float("nan"), "FIXED is nan; expected 7"),
     ],
 )
