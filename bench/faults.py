@@ -256,9 +256,11 @@ class Deed:
             self._thread.start()
 
     def _wait(self, pid: int) -> None:
-        poses = self._folder / "poses.jsonl"
+        ticks = self._folder / "ticks.jsonl"
         end = time.monotonic() + ENDED
-        while not (poses.is_file() and poses.stat().st_size) and time.monotonic() < end:
+        while not (ticks.is_file() and b'"poses": [[' in ticks.read_bytes()) and (
+            time.monotonic() < end
+        ):
             time.sleep(0.01)
         time.sleep(START / self._speed)
         self.at = time.monotonic() * self._speed
@@ -395,7 +397,7 @@ def _one(
             "breaches": [],
         }
     ticks = json_lines(folder / "ticks.jsonl")
-    offset = _offset(folder)
+    offset = _offset(ticks)
     begin = _begin(case, summary, ticks, offset, deed)
     last = early + START + length - 0.1 + offset  # then the fake goes, which is none of these
     began_in = before = next(
@@ -421,10 +423,10 @@ def _one(
     }
 
 
-def _offset(folder: Path) -> float:
+def _offset(ticks: list[dict]) -> float:
     """From the vehicle's clock at a measurement to the run's at the arrival of its pose [s]."""
-    rows = [row for row in json_lines(folder / "poses.jsonl") if row[3] == "vehicle"]
-    return statistics.median(row[2] - row[1] for row in rows if row[1] < rows[0][1] + START)
+    rows = [row for tick in ticks for row in tick["poses"] if row[2] == "vehicle"]
+    return statistics.median(row[1] - row[0] for row in rows if row[0] < rows[0][0] + START)
 
 
 def _begin(case: Case, summary: dict, ticks: list[dict], offset: float, deed: Deed | None) -> float:

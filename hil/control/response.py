@@ -16,7 +16,7 @@ import numpy as np
 
 from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
-from visthrow.common.rotations import rotate_one
+from visthrow.common.rotations import conjugate, multiply, rotate_one, rotation_vector
 from visthrow.onboard.hover import GRAVITY
 
 AXES = ("roll", "pitch", "yaw")
@@ -178,9 +178,9 @@ class Response:
         """Judge by poses, whenever all of a doublet was answered: by the angle turned since the
         first tick. A doublet turns to one side and back, whatever its delay.
         """
-        self._angle = self._angle + turn_between(self._last.quat, vehicle.quat)
-        turn = self._period * self._responses[..., 1:]
-        self._commanded_angles = self._commanded_angles + turn
+        turn = multiply(conjugate(self._last.quat), vehicle.quat)
+        self._angle = self._angle + rotation_vector(turn)
+        self._commanded_angles = self._commanded_angles + self._period * self._responses[..., 1:]
         commanded = self._commanded_angles
         angle = self._angle + 0.0 * commanded
         self._angle_sums += [angle * commanded, commanded**2, angle**2]
@@ -239,17 +239,3 @@ def _misfit(sums: np.ndarray, gains: np.ndarray) -> np.ndarray:
 
 def _names(which: np.ndarray) -> str:
     return ", ".join(axis for axis, one in zip(AXES, which) if one)
-
-
-def turn_between(first: tuple[float, ...], second: tuple[float, ...]) -> np.ndarray:
-    """Return the small turn from one attitude to another [rad], body axes, shape (3,)."""
-    x0, y0, z0, w0 = first
-    x, y, z, w = second
-    turn = np.array(
-        [
-            w0 * x - x0 * w - y0 * z + z0 * y,
-            w0 * y + x0 * z - y0 * w - z0 * x,
-            w0 * z - x0 * y + y0 * x - z0 * w,
-        ]
-    )
-    return 2.0 * turn * math.copysign(1.0, w0 * w + x0 * x + y0 * y + z0 * z)

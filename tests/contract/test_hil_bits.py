@@ -14,7 +14,7 @@ from numpy.testing import assert_array_equal
 from pytest import mark, param, skip
 
 from hil.control.recording.playback import replay
-from hil.control.recording.record import RunRecorder, lines, read_poses
+from hil.control.recording.record import RunRecorder, lines, load_run
 from hil.control.runner import OperatorInput, Runner
 from hil.links.backends.base import Status
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
@@ -83,7 +83,7 @@ def recorded(flown: dict[str, np.ndarray], folder) -> dict[int, list[Pose]]:
         payload = Pose(at, at, PAYLOAD, tuple(flat["payload"][n]))
         recorder.tick(n, [vehicle, payload], Status(True), OperatorInput(), True, idle, {})
     recorder.close({})
-    return read_poses(folder)
+    return {line["n"]: line["poses"] for line in load_run(folder)[2]}
 
 
 def seen_by_the_runner(flown, poses, policy: str) -> tuple[np.ndarray, np.ndarray]:

@@ -49,9 +49,9 @@ RANGE = (28, 48)  # steps of a switch's range, of 25 us from 900 us: 1600 to 210
 
 SIZES = {
     msp.RC_TUNING: 24,
-    msp.RC_DEADBAND: 5,
-    msp.RX_CONFIG: 7,
-    msp.FAILSAFE_CONFIG: 8,
+    msp.FACTS["MSP_RC_DEADBAND"]: 5,
+    msp.FACTS["MSP_RX_CONFIG"]: 7,
+    msp.FACTS["MSP_FAILSAFE_CONFIG"]: 8,
 }  # bytes of the answers that tell settings
 
 
@@ -114,9 +114,9 @@ class FakeBetaflight(PortFake):
 
     def _hear(self, frame: msp.Frame) -> None:
         answers: dict[int, Callable[[], bytes]] = {
-            msp.API_VERSION: lambda: bytes([0, 1, 47]),
-            msp.FC_VARIANT: lambda: b"BTFL",
-            msp.FC_VERSION: self._version,
+            msp.FACTS["MSP_API_VERSION"]: lambda: bytes([0, 1, 47]),
+            msp.FACTS["MSP_FC_VARIANT"]: lambda: b"BTFL",
+            msp.FACTS["MSP_FC_VERSION"]: self._version,
             msp.STATUS: self._status,
             msp.RAW_IMU: self._imu,
             msp.RX_MAP: lambda: bytes([*ORDER, 4, 5, 6, 7]),
@@ -126,7 +126,7 @@ class FakeBetaflight(PortFake):
             msp.ANALOG: lambda: struct.pack("<BHHhH", 111, 0, 0, 0, 1110),
             msp.MODE_RANGES: self._ranges,
             msp.EEPROM_WRITE: lambda: b"",
-            msp.FEATURE_CONFIG: lambda: struct.pack(
+            msp.FACTS["MSP_FEATURE_CONFIG"]: lambda: struct.pack(
                 "<I", FORWARDING if self.parameters["channel_forwarding"] else 0
             ),
         }

@@ -83,14 +83,14 @@ def measured(sample: Sample, params: HilParams) -> float:
 def read(folder: str | Path) -> PlayedRun:
     """Play a run back; raises `RunError` for what is no folder of a run, or a damaged one."""
     folder = Path(folder)
-    params, policy, lines, poses = load_run(folder)
+    params, policy, lines = load_run(folder)
     if not lines:
         raise RunError(f"{folder}: the run ended before its first tick; there is nothing to show")
     playback = Playback(params, policy)
     provenance = _read_json(folder / PROVENANCE)
     links = _read_json(folder / SUMMARY).get("links")
     provenance["simulated"] = any(link.get("simulated") for link in links or [])
-    ticks = [playback.feed(line, poses.get(line["n"], [])) for line in lines]
+    ticks = [playback.feed(line) for line in lines]
     return PlayedRun(playback, ticks, provenance)
 
 

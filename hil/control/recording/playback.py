@@ -57,8 +57,8 @@ class Playback:
         )
         self._samples: list[Sample] = []
 
-    def feed(self, line: dict[str, Any], poses: list[Pose]) -> Tick:
-        """Run one recorded tick."""
+    def feed(self, line: dict[str, Any]) -> Tick:
+        """Run one recorded tick, as of `hil.control.recording.record.with_poses`."""
         self._samples = []
         runner = self.runner
         time = line["time"]
@@ -71,7 +71,11 @@ class Playback:
         runner.commander.calibration = calibration
         runner.parts.agreed = line.get("agreed")
         decision = runner.tick(
-            time, poses, Status(*line["status"]), OperatorInput(*line["words"]), line["recording"]
+            time,
+            line["poses"],
+            Status(*line["status"]),
+            OperatorInput(*line["words"]),
+            line["recording"],
         )
         ages = {name: track.gate.age(time) for name, track in runner.tracks.items()}
         return Tick(
@@ -95,14 +99,14 @@ def replay(folder: str | Path) -> dict[str, Any]:
     Returns the number of ticks and actions compared, the bodies, the differences (tick, name,
     recorded value, value now), and what is missing of the recording, or None; ``story``: where it
     went wrong, in a sentence."""
-    params, policy, ticks, poses = load_run(folder)
+    params, policy, ticks = load_run(folder)
     playback = Playback(params, policy)
     turn = None
     last = None
     differences: list[tuple[int, str, Any, Any]] = []
     actions = 0
     for line in ticks:
-        decision = playback.feed(line, poses.get(line["n"], [])).decision
+        decision = playback.feed(line).decision
         actions += decision.action is not None
         same_state = last is not None and decision.state == last["state"]
         moment = {
@@ -123,15 +127,14 @@ def replay(folder: str | Path) -> dict[str, Any]:
             if was != value:
                 differences.append((line["n"], name, was, value))
     cut = _cut(folder, len(ticks))
+    bodies = {pose.body for line in ticks for pose in line["poses"]}
     return {
         "ticks": len(ticks),
         "actions": actions,
         "differences": differences,
         "cut": cut,
         "story": sentence(turn, last, cut),
-        "bodies": sorted(
-            {pose.body for group in poses.values() for pose in group} & set(playback.runner.tracks)
-        ),
+        "bodies": sorted(bodies & playback.runner.tracks.keys()),
     }
 
 

@@ -1,9 +1,9 @@
-"""One folder a run: config, policy, every raw pose, every tick, the link's .tlog; and what is made
-of it afterwards.
+"""One folder a run: config, policy, every tick with its raw poses, the link's .tlog; and what is
+made of it afterwards.
 
-``poses.jsonl`` and ``ticks.jsonl`` hold a JSON value a line and survive a kill but for a tenth of a
-second; floats are written so that they read back to the same bits. Lines are written by a thread of
-their own, so that a slow disk delays no tick."""
+``ticks.jsonl`` holds a tick a line and survives a kill but for a tenth of a second; floats are
+written so that they read back to the same bits. Lines are written by a thread of their own, so that
+a slow disk delays no tick."""
 
 import hashlib
 import json
@@ -32,13 +32,13 @@ from visthrow.onboard.policy import Policy, find_policy
 
 POLICY = "policy.npz"
 CONFIG = "config.toml"
-POSES = "poses.jsonl"
 TICKS = "ticks.jsonl"
+FORMER_POSES = "poses.jsonl"  # of runs that were recorded with the poses apart
 SUMMARY = "summary.json"
 PROVENANCE = "provenance.json"
 
 
-EXPECTED = f"expected {CONFIG}, {POLICY}, {POSES} and {TICKS} in it"
+EXPECTED = f"expected {CONFIG}, {POLICY} and {TICKS} in it"
 
 
 def check_free(folder: Path) -> None:
@@ -82,12 +82,12 @@ class RunRecorder:
             policy_sha256=hashlib.sha256(data).hexdigest(),
         )
         atomic_write(self.folder / POLICY, data)
-        self._writers = {name: Writer(self.folder / name) for name in (POSES, TICKS)}
+        self._writer = Writer(self.folder / TICKS)
 
     @property
     def failed(self) -> str | None:
         """Return the reason why something could not be written, or None."""
-        return next((writer.why for writer in self._writers.values() if writer.why), None)
+        return self._writer.why
 
     def tick(
         self,
@@ -105,30 +105,22 @@ class RunRecorder:
         """
         if self.failed is not None:
             return
-        for pose in poses:
-            self._put(POSES, (index, *vars(pose).values()))
-        self._put(
-            TICKS,
-            {
-                "n": index,
-                "status": list(vars(status).values()),
-                "words": list(vars(words).values()),
-                "recording": recording,
-                **vars(decision),
-                "times": times,
-                "poses": len(poses),
-            },
-        )
-
-    def _put(self, name: str, values: Any) -> None:
-        self._writers[name].put(json.dumps(values).encode() + b"\n")
+        line = {
+            "n": index,
+            "status": list(vars(status).values()),
+            "words": list(vars(words).values()),
+            "recording": recording,
+            **vars(decision),
+            "times": times,
+            "poses": [list(vars(pose).values()) for pose in poses],
+        }
+        self._writer.put(json.dumps(line).encode() + b"\n")
 
     def close(self, summary: dict[str, Any]) -> None:
         """Write what is left and the summary; raises `StorageError` where the disk is full, when
         the run itself is over.
         """
-        for writer in self._writers.values():
-            writer.close()
+        self._writer.close()
         write_json(self.folder / SUMMARY, {**summary, "recording_failed": self.failed})
 
 
@@ -151,23 +143,13 @@ def lines(path: Path) -> Iterator[Any]:
                 raise RunError(f"{path}: line {number} is damaged: {error}") from error
 
 
-def pose_of(row: list) -> tuple[int, Pose]:
-    """Return the number of the tick and the raw pose of a line of :data:`POSES`."""
-    index, stamp, arrival, body, *values = row
-    pos, quat, vel, rate = (None if v is None else tuple(v) for v in values[:4])
-    return index, Pose(stamp, arrival, body, pos, quat, vel, rate, *values[4:])
-
-
-def read_poses(folder: Path) -> dict[int, list[Pose]]:
-    """Return raw poses of a run by tick; raises `RunError` where the file is missing or damaged."""
-    poses: dict[int, list[Pose]] = {}
-    try:
-        for row in lines(folder / POSES):
-            index, pose = pose_of(row)
-            poses.setdefault(index, []).append(pose)
-    except (TypeError, ValueError) as error:
-        raise RunError(f"{folder / POSES}: not a list of poses: {error}") from error
-    return poses
+def with_poses(line: dict[str, Any]) -> dict[str, Any]:
+    """Return a line of a tick with its raw poses as such."""
+    poses = []
+    for stamp, arrival, body, *values in line["poses"]:
+        pos, quat, vel, rate = (None if v is None else tuple(v) for v in values[:4])
+        poses.append(Pose(stamp, arrival, body, pos, quat, vel, rate, *values[4:]))
+    return line | {"poses": poses}
 
 
 def require_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> None:
@@ -200,26 +182,32 @@ def _replayable(path: Path) -> str:
     return dumps(tree)
 
 
-def load_run(
-    folder: str | Path,
-) -> tuple[HilParams, Policy, list[dict[str, Any]], dict[int, list[Pose]]]:
-    """Return config, policy, ticks and raw poses by tick of a run; raises `RunError` for no folder
-    of a run, or a damaged one.
+def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:
+    """Return config, policy and ticks of a run; raises `RunError` for no folder of a run, or a
+    damaged one.
     """
     folder = Path(folder)
     require_run(folder)
-    params = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG))
-    policy = Policy.load(folder / POLICY)
     ticks = list(lines(folder / TICKS))
-    poses = read_poses(folder)
-    # killed: the two files may end at different ticks, with half of its poses
-    if not (folder / SUMMARY).is_file():
-        ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
-    return params, policy, ticks, poses
+    try:
+        if (folder / FORMER_POSES).is_file():
+            poses: dict[int, list] = {}
+            for number, *row in lines(folder / FORMER_POSES):
+                poses.setdefault(number, []).append(row)
+            ticks = [line | {"poses": poses.get(line["n"], [])} for line in ticks]
+        return *load_setup(folder), [with_poses(line) for line in ticks]
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{folder / TICKS}: not a list of ticks with poses: {error!r}") from error
+
+
+def load_setup(folder: Path) -> tuple[HilParams, Policy]:
+    """Return config and policy of a run, also of one that goes on."""
+    params = config.loads(HilParams, _replayable(folder / CONFIG), name=str(folder / CONFIG))
+    return params, Policy.load(folder / POLICY)
 
 
 # files of a bundle, beside the links' own records
-PARTS = (CONFIG, POLICY, POSES, TICKS, SUMMARY, PROVENANCE)
+PARTS = (CONFIG, POLICY, TICKS, FORMER_POSES, SUMMARY, PROVENANCE)
 
 RECORDS = ("*.tlog", "*.msp")
 

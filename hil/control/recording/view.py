@@ -23,18 +23,15 @@ from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import (
     CONFIG,
     POLICY,
-    POSES,
     PROVENANCE,
     SUMMARY,
     TICKS,
-    pose_of,
+    load_setup,
     require_run,
+    with_poses,
 )
 from hil.errors import RunError
-from hil.params import HilParams
-from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from visthrow import config
-from visthrow.onboard.policy import Policy
+from hil.poses.pose import PAYLOAD, VEHICLE
 
 ENDINGS = (".rrd", ".mcap")  # of recordings: for rerun, for Foxglove
 POLL_INTERVAL = 0.1  # between two looks at the folder [s]
@@ -104,65 +101,31 @@ def tail(path: Path) -> Generator[list[Any], None, None]:
             yield [json.loads(row) for row in whole]
 
 
-class Follower:
-    """Plays back a run while it is written."""
-
-    def __init__(self, folder: Path) -> None:
-        """Read config, policy and provenance, which a run writes before it waits for poses; raises
-        `RunError` for no folder of a run.
-        """
-        require_run(folder, (CONFIG, POLICY, PROVENANCE))
-        self.folder = folder
-        self.params = config.load(HilParams, folder / CONFIG)
-        self.playback = Playback(self.params, Policy.load(folder / POLICY))
-        self.provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
-        self._tails = {name: tail(folder / name) for name in (TICKS, POSES)}
-        self._lines: deque[dict[str, Any]] = deque()
-        self._poses: dict[int, list[Pose]] = {}
-
-    def ticks(self) -> list[Tick]:
-        """Return ticks that were written since the last call, with all their poses."""
-        for row in next(self._tails[POSES]):
-            index, pose = pose_of(row)
-            self._poses.setdefault(index, []).append(pose)
-        self._lines.extend(next(self._tails[TICKS]))
-        lines = []
-        while (
-            self._lines and len(self._poses.get(self._lines[0]["n"], ())) >= self._lines[0]["poses"]
-        ):
-            line = self._lines.popleft()
-            lines.append(self.playback.feed(line, self._poses.pop(line["n"], [])))
-        return lines
-
-    def close(self) -> None:
-        """Close its files."""
-        for lines in self._tails.values():
-            lines.close()
-
-
 def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: True) -> int:
     """Send a run to a stream of rerun while it is written, until it is over; returns the number of
     ticks that were left out.
     """
-    follower = Follower(Path(folder))
+    folder = Path(folder)
+    require_run(folder, (CONFIG, POLICY, PROVENANCE))
+    playback = Playback(*load_setup(folder))
+    provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
+    lines = tail(folder / TICKS)
     show = None
     dropped = 0
     try:
         while going():
-            finished = (follower.folder / SUMMARY).is_file()
-            ticks = follower.ticks()
+            finished = (folder / SUMMARY).is_file()
+            ticks = [playback.feed(with_poses(line)) for line in next(lines)]
             dropped += max(0, len(ticks) - MOST_SHOWN)
             if ticks:
                 if show is None:
-                    show = Show(
-                        stream, follower.playback, follower.provenance, ticks[0].line["time"]
-                    )
+                    show = Show(stream, playback, provenance, ticks[0].line["time"])
                 show.take(ticks[-MOST_SHOWN:])
             elif finished:
                 break
             time.sleep(POLL_INTERVAL)
     finally:
-        follower.close()
+        lines.close()
     return dropped
 
 
@@ -204,7 +167,8 @@ def run(args: argparse.Namespace) -> int:
         from visthrow.view import rerun_view
         from visthrow.view.live import web_viewer
 
-        layout = rerun_view.blueprint(np.array(Follower(folder).params.goal_w), {"state"})
+        require_run(folder, (CONFIG, POLICY))
+        layout = rerun_view.blueprint(np.array(load_setup(folder)[0].goal_w), {"state"})
         with web_viewer(layout, args.web_port, args.data_port) as stream:
             dropped = follow(folder, stream)
             print(

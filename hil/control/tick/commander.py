@@ -16,6 +16,7 @@ from hil.links.backends.base import HOLD as HOLDING
 from hil.links.team_link import NOTHING, RELEASE, THROW
 from hil.poses.body_track import BodyState
 from hil.poses.gate import ABORT, HOLD
+from visthrow.common.rotations import tilt_and_heading
 from visthrow.onboard.calibration import Calibration
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.pilot import PilotOutput
@@ -36,8 +37,7 @@ WARM_CALLS = 3
 
 def is_level(vehicle: BodyState) -> bool:
     """Return whether a vehicle is level enough for the autopilot's own hold."""
-    x, y, _, _ = vehicle.quat or (0.0, 0.0, 0.0, 1.0)
-    return 1.0 - 2.0 * (x * x + y * y) > math.cos(HAND_OVER_TILT)
+    return vehicle.quat is None or tilt_and_heading(vehicle.quat)[0] < HAND_OVER_TILT
 
 
 def can_hand_over(vehicle: BodyState) -> bool:

@@ -102,16 +102,31 @@ class MocapSource(Source):
 
     def __init__(
         self,
+        params: MocapParams,
+        bodies: tuple[RigidBody, ...],
         clock: Callable[[], float],
         link: Link | None = None,
+        module: Any = None,
         tell: Callable[[str], None] | None = None,
     ) -> None:
+        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``tell`` is handed what is
+        dropped, ``module`` stands for the package, in this process. Raises `SourceError` where that
+        is missing, no body is named or by no name of the system, or the system does not answer.
+        """
         super().__init__(() if link is None else (link,), clock)
         self._waiting: deque[Pose] = deque(maxlen=MOST_WAITING)
         self._tell = tell or (lambda text: print(text, file=sys.stderr, flush=True))
         self.failure: str | None = None
         self.roster = Roster(tell=tell)
         self.rosters.append(self.roster)
+        self._params = params
+        self._module = module
+        self._names = body_names(bodies)
+        self._connect()
+
+    def _connect(self) -> None:
+        """Connect to the system."""
+        raise NotImplementedError
 
     def hand_over(self, pose: Pose) -> None:
         """Take a pose; from any thread."""
@@ -131,24 +146,9 @@ class MotionCaptureSource(MocapSource):
 
     stamped = False
 
-    def __init__(
-        self,
-        params: MocapParams,
-        bodies: tuple[RigidBody, ...],
-        clock: Callable[[], float],
-        link: Link | None = None,
-        module: Any = None,
-        tell: Callable[[str], None] | None = None,
-    ) -> None:
-        """Connect; ``clock`` gives the arrivals, ``link`` is served, ``tell`` is handed what is
-        dropped, ``module`` stands for the package, in this process. Raises `SourceError` where that
-        is missing, no body is named, or the system does not answer.
-        """
-        super().__init__(clock, link, tell)
-        self._params = params
-        self._names = body_names(bodies)
-        self._module = module
-        if module is None and importlib.util.find_spec("motioncapture") is None:
+    def _connect(self) -> None:
+        params = self._params
+        if self._module is None and importlib.util.find_spec("motioncapture") is None:
             load_extra("motioncapture", "motioncapture", "this source", SourceError)
         self._stop = threading.Event()
         self._ready = threading.Event()
@@ -270,25 +270,15 @@ class NatNetSource(MocapSource):
     each is looked at before them: only frames of the host's that parse get through.
     """
 
-    def __init__(
-        self,
-        params: MocapParams,
-        bodies: tuple[RigidBody, ...],
-        clock: Callable[[], float],
-        link: Link | None = None,
-        module: Any = None,
-        tell: Callable[[str], None] | None = None,
-    ) -> None:
-        """Connect; arguments and errors as `MotionCaptureSource`, and a name that is no number."""
-        super().__init__(clock, link, tell)
-        wrong = [body.name for body in bodies if not body.name.isdecimal()]
+    def _connect(self) -> None:
+        params = self._params
+        wrong = [name for name in self._names if not name.isdecimal()]
         if wrong:
             raise SourceError(
                 f"natnet bodies {', '.join(wrong)}; expected streaming ids, which are numbers"
             )
-        self._params = params
-        self._names = {int(name): body for name, body in body_names(bodies).items()}
-        self._module = module or load_extra("natnet", "natnet", "this source", SourceError)
+        self._ids = {int(name): body for name, body in self._names.items()}
+        self._module = self._module or load_extra("natnet", "natnet", "this source", SourceError)
         self._client = self._module.NatNetClient(
             server_ip_address=params.host,
             local_ip_address=params.local,
@@ -351,7 +341,7 @@ class NatNetSource(MocapSource):
     def _frame(self, frame: Any) -> None:
         arrival = self._clock()
         for rigid_body in frame.rigid_bodies:
-            body = self._names.get(rigid_body.id_num)
+            body = self._ids.get(rigid_body.id_num)
             if body is not None:
                 stamp = float(frame.suffix.timestamp)
                 pos = tuple(rigid_body.pos)

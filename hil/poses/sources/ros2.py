@@ -14,13 +14,12 @@ Source: REP 103, REP 105; ROS 2 design, Topic and Service name mapping to DDS (`
 topic, ``::msg::dds_::NAME_``)."""
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 from hil.errors import SourceError
-from hil.links.mavlink_link import Link
 from hil.poses.pose import Pose
-from hil.poses.sources.motion_capture import MocapParams, MocapSource, RigidBody, body_names
+from hil.poses.sources.motion_capture import MocapParams, MocapSource
 from visthrow.common.extras import load_extra
 
 KINDS = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry", "tf2_msgs/TFMessage")
@@ -152,22 +151,11 @@ class Ros2Source(MocapSource):
 
     _domain: Any
 
-    def __init__(
-        self,
-        params: MocapParams,
-        bodies: tuple[RigidBody, ...],
-        clock: Callable[[], float],
-        link: Link | None = None,
-        tell: Callable[[str], None] | None = None,
-    ) -> None:
-        """Subscribe; arguments and errors as
-        `hil.poses.sources.motion_capture.MotionCaptureSource`, and a name that is no
-        ``TYPE:TOPIC``.
-        """
-        super().__init__(clock, link, tell)
-        topics = [(*_topic(name), body) for name, body in body_names(bodies).items()]
+    def _connect(self) -> None:
+        """Subscribe. Raises `SourceError` for a name that is no ``TYPE:TOPIC``."""
+        topics = [(*_topic(name), body) for name, body in self._names.items()]
         types = message_types()
-        self._domain = domain(params)
+        self._domain = domain(self._params)
         core, sub, topic = (
             load_extra(f"cyclonedds.{name}", "ros2", "ROS 2 topics", SourceError)
             for name in ("core", "sub", "topic")

@@ -49,7 +49,7 @@ def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
     write = zipfile.ZipFile.write
 
     def full(bundle, file, name):
-        if name == "poses.jsonl":
+        if name == "ticks.jsonl":
             raise OSError(errno.ENOSPC, "No space left on device")
         write(bundle, file, name)
 

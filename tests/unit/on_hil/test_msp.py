@@ -18,7 +18,7 @@ PARAMS = load_run("fake_betaflight").betaflight
 
 
 def test_published_bytes():
-    assert msp.pack(msp.Frame(msp.API_VERSION)) == bytes.fromhex("244d3c000101")
+    assert msp.pack(msp.Frame(msp.FACTS["MSP_API_VERSION"])) == bytes.fromhex("244d3c000101")
 
 
 @mark.parametrize("payload", [b"", b"\x00", b"$M<$X>", bytes(range(200))])

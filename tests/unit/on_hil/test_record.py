@@ -68,9 +68,8 @@ def test_one_bit_that_differs_is_found(run_folder, tmp_path, capsys):
 def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
     for path in run_folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
-    for name in ("ticks.jsonl", "poses.jsonl"):
-        data = (tmp_path / name).read_bytes()
-        (tmp_path / name).write_bytes(data[: len(data) // 2])
+    data = (tmp_path / "ticks.jsonl").read_bytes()
+    (tmp_path / "ticks.jsonl").write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
     assert run_command(f"hil replay {tmp_path}") == 1, (
         "what there is is the same, and not all is there"
@@ -92,6 +91,21 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     (tmp_path / "ticks.jsonl").write_text('{"n": 0\n{"n": 1}\n')
     with raises(RunError, match="line 1 is damaged"):
         load_run(tmp_path)
+    (tmp_path / "ticks.jsonl").write_text('{"n": 0}\n')
+    with raises(RunError, match="not a list of ticks with poses: KeyError"):
+        load_run(tmp_path)
+
+
+def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_path, capsys):
+    shutil.copytree(run_folder, tmp_path / "before")
+    ticks = list(lines(run_folder / "ticks.jsonl"))
+    poses = [[line["n"], *row] for line in ticks for row in line["poses"]]
+    former = [line | {"poses": len(line["poses"])} for line in ticks]
+    for name, rows in (("ticks", former), ("poses", poses)):
+        text = "".join(json.dumps(row) + "\n" for row in rows)
+        (tmp_path / "before" / f"{name}.jsonl").write_text(text)
+    assert run_command(f"hil replay {tmp_path}/before") == 0
+    assert "all bit for bit the same" in capsys.readouterr().out
 
 
 @mark.parametrize(
@@ -146,13 +160,13 @@ def test_a_view_is_a_recording(run_folder, tmp_path, capsys):
 
 
 def test_the_folder_holds_config_policy_and_hash(run_folder):
-    wanted, policy, ticks, poses = load_run(run_folder)
+    wanted, policy, ticks = load_run(run_folder)
     assert wanted == params("policy=vision", "observe=true")
     assert policy.obs_dim == Policy.load(find_policy("vision")).obs_dim
     record = json.loads((run_folder / "provenance.json").read_text())
     assert record["policy"] == "vision"
     assert len(record["policy_sha256"]) == 64
-    assert {pose.body for group in poses.values() for pose in group} == {"vehicle", "payload"}
+    assert {pose.body for line in ticks for pose in line["poses"]} == {"vehicle", "payload"}
     assert len(ticks) > 200
     with raises(StorageError, match="holds a run already"):
         RunRecorder(run_folder, wanted)
@@ -205,7 +219,7 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     text = capsys.readouterr()
     assert "vehicle: 300 poses taken; refused: none" in text.out
     assert "throws 0, released 0" in text.out
-    _, _, ticks, _ = load_run("run")
+    _, _, ticks = load_run("run")
     asked = [line for line in ticks if line["action"] is not None]
     assert len(asked) > 140
     assert len(asked[0]["keypoints"]) == 8
