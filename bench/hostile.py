@@ -132,16 +132,18 @@ class MotionCapture:
     kind = "motioncapture"
 
     def __init__(self, clock: Callable[[], float]) -> None:
-        ended = SimpleNamespace(connect=lambda *args: (_ for _ in ()).throw(RuntimeError))
-        self.source = MotionCaptureSource.__new__(MotionCaptureSource)
-        MocapSource.__init__(self.source, clock, tell=lambda text: None)
-        self.source._params = MocapParams("mock", HOST[0])
-        self.source._names = {name: body for body, name in NUMBERS.items()}
-        self.source._ready = SimpleNamespace(is_set=lambda: False, set=lambda: None)
-        self.source._module = ended
+        class Unconnected(MotionCaptureSource):
+            """The source without its process."""
+
+            def _connect(self) -> None:
+                self._ready = SimpleNamespace(is_set=lambda: False, set=lambda: None)
+                self._process = None
+                self._heard = math.inf
+
+        bodies = tuple(RigidBody(body, name) for body, name in NUMBERS.items())
+        params = MocapParams("mock", HOST[0])
+        self.source = Unconnected(params, bodies, clock, tell=lambda text: None)
         self._system = Silent()
-        self.source._process = None
-        self.source._heard = math.inf
 
     def _flush(self) -> None:
         listen(
@@ -194,8 +196,14 @@ class Ros2:
     kind = "ros2"
 
     def __init__(self, clock: Callable[[], float]) -> None:
-        self.source = Ros2Source.__new__(Ros2Source)
-        MocapSource.__init__(self.source, clock, tell=lambda text: None)
+        class Unconnected(Ros2Source):
+            """The source without its subscriptions."""
+
+            def _connect(self) -> None:
+                pass
+
+        params = MocapParams("ros2", HOST[0])
+        self.source = Unconnected(params, _bodies(), clock, tell=lambda text: None)
 
     def _take(self, body: str, stamp: Any, pos: Any, quat: Any, publisher: int) -> None:
         point = SimpleNamespace(**dict(zip("xyz", pos)))
