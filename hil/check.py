@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from hil.control.recording.record import CONFIG, POLICY, TICKS, lines, require_run
+from hil.control.recording.record import TICKS, lines, load_setup, require_run
 from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State
 from hil.errors import RunError
@@ -26,7 +26,6 @@ from hil.poses import handcarry
 from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
 from hil.poses.sources.open_source import open_source, unit_problems
-from visthrow import config
 from visthrow.onboard.hover import GRAVITY
 from visthrow.onboard.policy import Policy, find_policy
 
@@ -50,21 +49,14 @@ def check(args: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock, bool]]:
-    """Source, the autopilot's link, clock, and whether the poses are recorded ones."""
+def _opened(params: HilParams, args: argparse.Namespace) -> Iterator[tuple[Any, Any, Clock]]:
+    """Source, the autopilot's link, and the clock."""
     with tempfile.TemporaryDirectory() as folder:
-        source, link, recorded = open_source(
-            params, Path(folder), MonotonicClock(args.speed), key_of(args)
-        )
+        opened = open_source(params, Path(folder), MonotonicClock(args.speed), key_of(args))
         try:
-            yield (
-                source,
-                link,
-                ManualClock(source.start) if recorded else MonotonicClock(args.speed),
-                recorded,
-            )
+            yield opened
         finally:
-            source.close()
+            opened[0].close()
 
 
 def _hand_carry(args: argparse.Namespace) -> int:
@@ -72,7 +64,8 @@ def _hand_carry(args: argparse.Namespace) -> int:
     params = dataclasses.replace(
         params, source=dataclasses.replace(params.source, check_units=False)
     )
-    with _opened(params, args) as (source, _, clock, recorded):
+    with _opened(params, args) as (source, _, clock):
+        recorded = isinstance(clock, ManualClock)
         steps = handcarry.collect(
             source, clock, args.seconds or CARRY, lambda text: print(text, flush=True), recorded
         )
@@ -88,7 +81,7 @@ def _listen(args: argparse.Namespace) -> int:
     """
     params = params_of(args)
     waiting = dataclasses.replace(params.states, idle=FOR_EVER, check=FOR_EVER, check_hold=FOR_EVER)
-    with _opened(params, args) as (source, link, clock, _):
+    with _opened(params, args) as (source, link, clock):
         runner = Runner(
             dataclasses.replace(params, states=waiting),
             Policy.load(find_policy(params.policy)),
@@ -232,13 +225,13 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
     """
     folder = Path(folder)
     require_run(folder)
-    params = config.load(HilParams, folder / CONFIG)
+    params, policy = load_setup(folder)
     if params.backend == "dry-run":
         raise RunError(
             f"{folder} is a dry run: nothing followed its commands; expected a run with an"
             " autopilot"
         )
-    mass = Policy.load(folder / POLICY).total_mass
+    weight = policy.total_mass * GRAVITY
     thrusts = []
     hovering = 0
     for line in lines(folder / TICKS):
@@ -255,7 +248,6 @@ def hover_of_run(folder: str | Path) -> tuple[bool, str]:
         )
     thrust = getattr(params, params.backend).thrust
     commanded = sum(thrusts) / len(thrusts)
-    weight = mass * GRAVITY
     ratio = commanded / weight
     text = (
         f"hover took {ratio:.3f} times the weight by the config's calibration: the hover share is"

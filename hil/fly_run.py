@@ -18,7 +18,7 @@ from hil.control.recording.view import start_viewer
 from hil.control.runner import Runner
 from hil.errors import ConfigError, RunError
 from hil.links.backends import make_backend, mechanism_lag, require_reach
-from hil.links.clock import Clock, ManualClock, MonotonicClock
+from hil.links.clock import Clock, MonotonicClock
 from hil.links.crtp import CFLIB
 from hil.links.device import check_device
 from hil.links.mavlink_link import Link
@@ -128,10 +128,9 @@ def _prepare(
     """Return the loop of a run, and the autopilot's link where there is one."""
     flies = args.action == "run"
     policy = Policy.load(find_policy(params.policy))
-    clock: Clock = MonotonicClock(args.speed)
-    source, link, recorded = open_source(params, folder, clock, key_of(args), console.say)
-    if recorded:
-        clock = ManualClock(source.start)
+    source, link, clock = open_source(
+        params, folder, MonotonicClock(args.speed), key_of(args), console.say
+    )
     require_reach(params, policy.contract)
     write = flies and args.write_parameters
     backend = make_backend(params, link, write, console.say, folder)

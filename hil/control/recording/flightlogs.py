@@ -105,10 +105,12 @@ def _read_json(path: Path) -> dict[str, Any]:
 class TickLogger:
     """Adds ticks to a flight log."""
 
-    def __init__(self, playback: Playback, meta: dict) -> None:
-        """Start an empty log with its metadata."""
+    def __init__(self, playback: Playback, provenance: dict[str, Any], start: float) -> None:
+        """Start an empty log with what is known from a run's beginning on; ``start`` [s] is the
+        zero of its pictures.
+        """
         self.params = playback.params
-        self.recorder = FlightRecorder(meta)
+        self.recorder = FlightRecorder(_meta_of(playback, provenance, start))
         self._declare()
         self._times: dict[str, float] = {}  # of each body's last sample [s]
         self._vehicle: Pose | None = None  # last pose: where the rope hangs
@@ -191,15 +193,8 @@ class TickLogger:
                 estimated.append(name)
 
 
-def logger_of(played: PlayedRun, start: float) -> TickLogger:
-    """Return what adds ticks to a log of the run that begins at a time [s]."""
-    return TickLogger(played.playback, meta_of(played.playback, played.provenance, start))
-
-
-def meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
-    """Return the metadata that are known from a run's beginning on; ``start`` [s] is the zero of
-    its pictures.
-    """
+def _meta_of(playback: Playback, provenance: dict[str, Any], start: float) -> dict[str, Any]:
+    """Return the metadata that are known from a run's beginning on."""
     params = playback.params
     policy = playback.runner.pilot.policy
     goal_w = playback.runner.estimator.goal_w or params.goal_w
@@ -240,7 +235,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     runner = played.playback.runner
     begin = first if throw is None else played.throws[throw][0]
     start = played.ticks[begin].line["time"]
-    logger = logger_of(played, start)
+    logger = TickLogger(played.playback, played.provenance, start)
     thrown = [tick for tick in ticks if tick.line["time"] >= start]
     landing: Landing | None = None
     if throw is not None:

@@ -5,6 +5,7 @@ and nothing else."""
 
 import argparse
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -96,30 +97,16 @@ def replay(folder: str | Path) -> dict[str, Any]:
     """Run the recorded poses, statuses and words of a run through the runner again; raises
     `RunError` for a folder that is none.
 
-    Returns the number of ticks and actions compared, the bodies, the differences (tick, name,
-    recorded value, value now), and what is missing of the recording, or None; ``story``: where it
-    went wrong, in a sentence."""
+    Returns the number of ticks and actions compared, the differences (tick, name, recorded value,
+    value now), and what is missing of the recording, or None; ``story``: where it went wrong, in a
+    sentence."""
     params, policy, ticks = load_run(folder)
     playback = Playback(params, policy)
-    turn = None
-    last = None
+    flown: list[tuple[TickRecord, BodyState | None]] = []
     differences: list[tuple[int, str, Any, Any]] = []
-    actions = 0
     for line in ticks:
         decision = playback.feed(line).decision
-        actions += decision.action is not None
-        same_state = last is not None and decision.state == last["state"]
-        moment = {
-            "time": decision.time,
-            "state": decision.state,
-            "reason": decision.reason,
-            "since": last["since"] if same_state else decision.time,
-            "vehicle": playback.runner.tracks[VEHICLE].state(decision.time),
-        }
-        if turn is None and decision.state == State.ABORT:
-            before = last or moment
-            turn = {**moment, "state": before["state"], "since": before["since"]}
-        last = moment
+        flown.append((decision, playback.runner.tracks[VEHICLE].state(decision.time)))
         for name in COMPARED:
             was = line[name]
             value = getattr(decision, name)
@@ -127,14 +114,12 @@ def replay(folder: str | Path) -> dict[str, Any]:
             if was != value:
                 differences.append((line["n"], name, was, value))
     cut = _cut(folder, len(ticks))
-    bodies = {pose.body for line in ticks for pose in line["poses"]}
     return {
         "ticks": len(ticks),
-        "actions": actions,
+        "actions": sum(decision.action is not None for decision, _ in flown),
         "differences": differences,
         "cut": cut,
-        "story": sentence(turn, last, cut),
-        "bodies": sorted(bodies & playback.runner.tracks.keys()),
+        "story": sentence(flown, cut),
     }
 
 
@@ -152,26 +137,31 @@ def _cut(folder: str | Path, ticks: int) -> str | None:
     return None if ticks == flown else f"{flown - ticks} of {flown} ticks are missing"
 
 
-def sentence(turn: dict[str, Any] | None, last: dict[str, Any] | None, cut: str | None) -> str:
-    """Return where a run went wrong, by the first tick in abort (``time`` [s], ``state`` before it,
-    ``since`` when [s], ``reason``, ``vehicle`` as it was seen), the last tick in the same form, and
-    what is missing of the recording.
+def sentence(flown: list[tuple[TickRecord, BodyState | None]], cut: str | None) -> str:
+    """Return where a run went wrong, by its decisions, the vehicle as it was seen at each, and what
+    is missing of the recording.
     """
-    turn_number = turn or (last if cut else None)
-    if last is None:
+    if not flown:
         return "Whether it went wrong is not known: no tick is recorded."
-    if turn_number is None:
-        return f"It did not go wrong: it ended in {last['state']} ({last['reason']})."
-    why = turn["reason"] if turn else "the recording ends"
-    vehicle: BodyState | None = turn_number["vehicle"]
+    states = [decision.state for decision, _ in flown]
+    aborted = State.ABORT in states
+    turn = states.index(State.ABORT) if aborted else len(states) - 1
+    decision, vehicle = flown[turn]
+    if not aborted and not cut:
+        return f"It did not go wrong: it ended in {decision.state} ({decision.reason})."
+    why = decision.reason if aborted else "the recording ends"
+    before = states[max(turn - aborted, 0)]
+    begin = turn
+    while begin and states[begin - 1] == before:
+        begin -= 1
     where = "had not been seen"
     if vehicle is not None:
         place = ", ".join(f"{x:.2f}" for x in vehicle.pos)
-        speed = sum(v * v for v in vehicle.vel) ** 0.5
+        speed = math.hypot(*vehicle.vel)
         where = f"was at ({place}) m with {speed:.1f} m/s, its pose {1e3 * vehicle.age:.0f} ms old"
     return (
-        f"It went wrong {turn_number['time'] - turn_number['since']:.2f} s into"
-        f" '{turn_number['state']}': {why}; the vehicle {where}."
+        f"It went wrong {decision.time - flown[begin][0].time:.2f} s into '{before}': {why}; the"
+        f" vehicle {where}."
     )
 
 
@@ -181,17 +171,14 @@ def compare_run(args: argparse.Namespace) -> int:
     """
     with opened(args.folder) as folder:
         comparison = replay(folder)
-    for n, name, was, time in comparison["differences"][:10]:
-        print(f"tick {n}: {name} was {was}, is {time}")
-    same = (
-        "all bit for bit the same"
-        if not comparison["differences"]
-        else f"{len(comparison['differences'])} DIFFERENCES"
-    )
+    differences = comparison["differences"]
+    for n, name, was, value in differences[:10]:
+        print(f"tick {n}: {name} was {was}, is {value}")
+    same = f"{len(differences)} DIFFERENCES" if differences else "all bit for bit the same"
     print(f"{comparison['ticks']} ticks, {comparison['actions']} actions of the policy: {same}")
     if comparison["cut"]:
         print(f"CUT: {comparison['cut']}")
         if Path(args.folder).is_dir():
             print(f"{pack(args.folder)}  what there is of the run, in one file")
     print(comparison["story"])
-    return 1 if comparison["differences"] or comparison["cut"] else 0
+    return 1 if differences or comparison["cut"] else 0

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from hil.control.recording.flightlogs import TickLogger, events, logger_of, meta_of, read
+from hil.control.recording.flightlogs import TickLogger, events, read
 from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import (
     CONFIG,
@@ -52,11 +52,13 @@ class Show:
 
         self._stream = stream
         self._view = rerun_view
-        self._meta = meta_of(playback, provenance, start)
-        self._samples = TickLogger(playback, self._meta)
+        self._start = start
+        self._samples = TickLogger(playback, provenance, start)
         self._trails: dict[str, deque] = {name: deque(maxlen=TRAIL) for name in BODY_CHANNELS}
         self._said: list | None = None
-        rerun_view.still(stream, self._meta["goal_w"], sizes(playback.runner.pilot))
+        rerun_view.still(
+            stream, self._samples.recorder.meta["goal_w"], sizes(playback.runner.pilot)
+        )
 
     def take(self, ticks: list[Tick]) -> None:
         """Send some ticks, in order."""
@@ -72,7 +74,7 @@ class Show:
         self._said = phases[-1] if phases else self._said
         log.meta["events"] = phases
         self._view.send(self._stream, log)
-        time = ticks[-1].line["time"] - self._meta["times"]["policy_start"]
+        time = ticks[-1].line["time"] - self._start
         for body, points in self._trails.items():
             if len(points) > 1:
                 self._view.trail(self._stream, BODY_CHANNELS[body], time, np.array(points))
@@ -136,8 +138,9 @@ def write(folder: str | Path, path: str | Path) -> None:
     from visthrow.view import mcap_view, rerun_view
 
     played = read(folder)
+    run = played.playback, played.provenance, played.ticks[0].line["time"]
     if Path(path).suffix == ".mcap":
-        samples = logger_of(played, played.ticks[0].line["time"])
+        samples = TickLogger(*run)
         for tick in played.ticks:
             samples.add(tick)
         log = samples.flush()
@@ -146,7 +149,7 @@ def write(folder: str | Path, path: str | Path) -> None:
         return
     layout = rerun_view.blueprint(np.array(played.playback.params.goal_w), {"state"})
     with rerun_view.recording(path, layout) as stream:
-        show = Show(stream, played.playback, played.provenance, played.ticks[0].line["time"])
+        show = Show(stream, *run)
         for first in range(0, len(played.ticks), MOST_SHOWN // 10):
             show.take(played.ticks[first : first + MOST_SHOWN // 10])
 

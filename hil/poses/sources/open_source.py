@@ -9,7 +9,7 @@ import numpy as np
 
 from hil.errors import SourceError
 from hil.links.backends import AUTOPILOTS
-from hil.links.clock import Clock
+from hil.links.clock import Clock, ManualClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, LinkSync
 from hil.links.roster import Party, Roster
@@ -72,9 +72,9 @@ def open_source(
     clock: Clock,
     key: bytes | None = None,
     tell: Callable[[str], None] | None = None,
-) -> tuple[Any, Link | None, bool]:
-    """Open a source: it, the autopilot's link where there is one, and whether its poses are
-    recorded; raises `SourceError`, `LinkError`.
+) -> tuple[Any, Link | None, Clock]:
+    """Open a source: it, the autopilot's link where there is one, and the run's clock, which is put
+    from pose to pose where they are recorded; raises `SourceError`, `LinkError`.
 
     ``key`` signs the links' messages, ``tell`` is handed who is refused and never waits.
     """
@@ -87,7 +87,8 @@ def open_source(
             raise SourceError(
                 f"{source.file}: {'; '.join(problems)} (source.check_units=false lets it pass)"
             )
-        return RecordedSource(poses, roster), None, True
+        recording = RecordedSource(poses, roster)
+        return recording, None, ManualClock(recording.start)
     has_port = source.kind == "mavlink" and source.device is not None
 
     def opened(named: str, device: str, tlog: str, who: list[Party]) -> Link:
@@ -104,23 +105,18 @@ def open_source(
         return link
 
     link = None
-    if (source.kind == "mavlink" and not has_port) or params.backend in AUTOPILOTS:
-        link = opened(
-            "link.device",
-            params.link.device,
-            TLOG,
-            parties(params, source.kind == "mavlink" and not has_port, True),
-        )
+    shared = source.kind == "mavlink" and not has_port
+    if shared or params.backend in AUTOPILOTS:
+        who = parties(params, shared, True)
+        link = opened("link.device", params.link.device, TLOG, who)
     if source.kind == "mocap":
-        return (
-            open_mocap(source.mocap, source.bodies, clock.now, params.link.remote, link, tell),
-            link,
-            False,
-        )
-    if not has_port:
-        return MavlinkSource(link, source.senders, clock.now), link, False
+        remote = params.link.remote
+        capture = open_mocap(source.mocap, source.bodies, clock.now, remote, link, tell)
+        return capture, link, clock
+    if shared:
+        return MavlinkSource(link, source.senders, clock.now), link, clock
     poses = opened("source.device", source.device, POSES_TLOG, parties(params, True, False))
-    return MavlinkSource(poses, source.senders, clock.now, link), link, False
+    return MavlinkSource(poses, source.senders, clock.now, link), link, clock
 
 
 def open_mocap(

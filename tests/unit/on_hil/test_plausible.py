@@ -9,7 +9,7 @@ import numpy as np
 from pytest import mark, raises
 
 from hil.errors import SourceError
-from hil.links.clock import MonotonicClock
+from hil.links.clock import ManualClock, MonotonicClock
 from hil.params import HilParams
 from hil.poses.pose import Pose
 from hil.poses.sources.open_source import open_source, read_poses, unit_problems
@@ -141,7 +141,7 @@ def test_a_recording_in_wrong_units_is_refused_unless_told(tmp_path, capsys):
     ):
         open_source(params, tmp_path, MonotonicClock())
     lax = replace(params, source=replace(params.source, check_units=False))
-    assert open_source(lax, tmp_path, MonotonicClock())[2]
+    assert isinstance(open_source(lax, tmp_path, MonotonicClock())[2], ManualClock)
     wrong = 'source.columns=[{name="pos_w", columns=["t_s", "t_s", "acc"], unit="mm"}]'
     file = f"source.file={DATA / FLIGHTS['crazyflie_log']}"
     assert run_command(f"hil check --config crazyflie_log --set {file} --set", wrong) == 2
