@@ -7,7 +7,9 @@
 import argparse
 import os
 import sys
+import tomllib
 from collections.abc import Sequence
+from pathlib import Path
 
 from visthrow import __version__
 from visthrow.common.arguments import (
@@ -19,62 +21,12 @@ from visthrow.common.arguments import (
 )
 from visthrow.common.errors import VisthrowError
 
-COMMANDS = {
-    "demo": (
-        "throw once with the shipped vision policy and compare it with the state policy",
-        "visthrow.cli.demo",
-    ),
-    "train": ("train a throwing policy from scratch", "visthrow.cli.train"),
-    "fly": ("fly one throw and write a 3D recording and a picture of it", "visthrow.cli.fly"),
-    "compare": (
-        "throw many times with each policy and print landing errors and durations",
-        "visthrow.cli.compare",
-    ),
-    "detector": (
-        "train the keypoint detector on rendered frames, and throw with it",
-        "visthrow.detector_training.detector_command",
-    ),
-    "hil": ("fly a policy on motion-capture poses, live or recorded", "hil.cli"),
-    "baseline": (
-        "throw with trajectory optimisation and MPC, and compare it with the policies",
-        "visthrow.paper.commands.baseline_command",
-    ),
-    "diagnose": (
-        "find what the simulation gets wrong about measured flights",
-        "visthrow.diagnose.cli",
-    ),
-    "sweep": (
-        "run a list of trainings and throws, on several GPUs or a cluster",
-        "visthrow.paper.commands.sweep_command",
-    ),
-    "report": (
-        "write one page with the paper's tables and figures beside ours",
-        "visthrow.paper.commands.report_command",
-    ),
-    "camera": (
-        "make a camera configuration from a calibration, check it, and draw its view",
-        "visthrow.cli.camera",
-    ),
-    "policy": ("export a policy's network as ONNX or C", "visthrow.cli.policy_command"),
-    "bench": (
-        "print what was measured, with command, commit and machine",
-        "visthrow.paper.commands.bench_command",
-    ),
-    "cooperative": (
-        "throw one load with several vehicles",
-        "visthrow.cooperative.team_command",
-    ),
-    "config": ("print a configuration with all its values filled in", "visthrow.cli.config"),
-}
-TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
+_TABLES = tomllib.loads(Path(__file__).with_name("commands.toml").read_text(encoding="utf-8"))
 
-_EXTRAS = {
-    **dict.fromkeys(("warp", "rsl_rl", "tensordict", "kornia"), "train"),
-    **dict.fromkeys(("rerun", "pyarrow"), "view"),
-    **dict.fromkeys(("cv2", "matplotlib", "scipy"), "pictures"),
-    **{"submitit": "slurm", "mujoco": "reference", "piqp": "paper"},
-}
-"""Optional packages by import name, and the extra of visthrow that installs them."""
+COMMANDS: dict[str, tuple[str, str]] = _TABLES["commands"]
+"""Name -> help and module."""
+
+TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
 _DESCRIPTION = """\
 Train, compare and fly policies that throw a ball hanging on a rope below a quadrotor onto a target.
@@ -137,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 " 'visthrow[reference]' in an environment of its own"
             )
         package = (error.name or "").split(".")[0]
-        extra = _EXTRAS.get(package)
+        extra = _TABLES["extras"].get(package)
         if extra is None:
             raise
         return _refuse(

@@ -4,21 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.common.errors import PolicyError
 from visthrow.common.storage import atomic_write
 from visthrow.onboard.estimator import Estimator
-from visthrow.onboard.policy import Policy
-
-ACTIVATIONS = {
-    "elu": "x > 0.0f ? x : expm1f(x)",
-    "relu": "x > 0.0f ? x : 0.0f",
-    "lrelu": "x > 0.0f ? x : 0.01f * x",
-    "tanh": "tanhf(x)",
-    "sigmoid": "1.0f / (1.0f + expf(-x))",
-    "softplus": "log1pf(expf(-fabsf(x))) + (x > 0.0f ? x : 0.0f)",
-    "swish": "x / (1.0f + expf(-x))",
-}
-"""Activations by the policy's name -> expression in C."""
+from visthrow.onboard.policy import Policy, named_activation
 
 HEAD = """\
 /* Network of a visthrow policy. Generated; do not edit.
@@ -77,11 +65,7 @@ def write_c(policy: Policy, path: str | Path) -> None:
     """Write the policy's network as a C file, whole or not at all.
 
     Raises PolicyError if the activation has no expression here."""
-    if policy.activation not in ACTIVATIONS:
-        raise PolicyError(
-            f"activation '{policy.activation}' has no C expression; expected one of"
-            f" {sorted(ACTIVATIONS)}"
-        )
+    activation = named_activation(policy, "c", "C expression")
     estimator = policy.estimator
     memory = 0 if estimator is None else estimator.memory
     parts = [
@@ -89,7 +73,7 @@ def write_c(policy: Policy, path: str | Path) -> None:
             obs=policy.obs_dim,
             memory=memory,
             actions=policy.action_dim,
-            activation=ACTIVATIONS[policy.activation],
+            activation=activation,
         )
     ]
     if estimator is not None:

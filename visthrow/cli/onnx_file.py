@@ -5,23 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy import ndarray
 
-from visthrow.common.errors import PolicyError
 from visthrow.common.storage import atomic_write
 from visthrow.onboard.estimator import Estimator
-from visthrow.onboard.policy import Policy
+from visthrow.onboard.policy import Policy, named_activation
 
 OPSET = 17
-ACTIVATIONS = {
-    "elu": "Elu",
-    "selu": "Selu",
-    "relu": "Relu",
-    "lrelu": "LeakyRelu",
-    "tanh": "Tanh",
-    "sigmoid": "Sigmoid",
-    "softplus": "Softplus",
-    "mish": "Mish",
-}
-"""Activations by the policy's name -> ONNX operator. LeakyRelu's default slope is torch's."""
 
 
 def write_onnx(policy: Policy, path: str | Path) -> None:
@@ -90,12 +78,7 @@ class _Graph:
 
 def _add_network(graph: _Graph, policy: Policy, features: str) -> None:
     """Add the perceptron with its normaliser."""
-    operator = ACTIVATIONS.get(policy.activation)
-    if operator is None:
-        raise PolicyError(
-            f"activation '{policy.activation}' has no ONNX operator in opset {OPSET}; expected one"
-            f" of {sorted(ACTIVATIONS)}"
-        )
+    operator = named_activation(policy, "onnx", f"ONNX operator in opset {OPSET}")
     x = features
     if policy.mean is not None and policy.std is not None:
         mean = graph.constant(policy.mean.cpu().numpy())

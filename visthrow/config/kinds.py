@@ -1,29 +1,14 @@
 """Which schema each folder of configs, and each file that differs from its folder, is read with."""
 
 import importlib
+import tomllib
+from pathlib import Path
 
 from visthrow.common.errors import ConfigError, suggest
 
-SCHEMAS = {
-    "vehicle": "sim.params:VehicleParams",
-    "rope": "sim.params:RopeParams",
-    "camera": "camera.params:CameraParams",
-    "detector": "visthrow.detector_training.fit_detector:FitParams",
-    "release": "sim.params:ReleaseParams",
-    "sim": "sim.params:SimParams",
-    "effects": "sim.effects.effect:EffectTables",
-    "model_effects": "visthrow.diagnose.models.catalogue:ModelEffects",
-    "task": "visthrow.task:TaskParams",
-    "start": "sim.params:RandomizationParams",
-    "train": "visthrow.task:Experiment",
-    "cooperative": "visthrow.cooperative.team:TeamExperiment",
-    "fleet": "sim.vehicle_class:FleetParams",
-    "ppo": "visthrow.task:PPOParams",
-    "sweep": "visthrow.paper.sweep:SweepList",
-    "hil": "hil.params:HilParams",
-    "diagnose": "visthrow.diagnose.inputs.setup:Setup",
-    "vehicle/reference_realistic": "sim.reference.reference_extras:ReferenceExtras",
-}
+SCHEMAS: dict[str, str] = tomllib.loads(
+    Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
+)
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
 
 

@@ -115,17 +115,8 @@ def _compare(args: argparse.Namespace) -> int:
             row = throw(experiment, policy.act, count=args.throws, **options)
             rows.append({"policy": name, "solver": args.solver, **row})
             cells.append(_cells(rows[-1]))
-    heads = (
-        "policy",
-        "fault",
-        "throws",
-        "error [m]",
-        "95 % [m]",
-        "duration [s]",
-        "landed",
-        "contact",
-    )
-    print(aligned(heads, cells, heads=2))
+    heads = "policy | fault | throws | error [m] | 95 % [m] | duration [s] | landed | contact"
+    print(aligned(heads.split(" | "), cells, heads=2))
     if args.json:
         write_json(args.json, rows)
     return 0

@@ -101,13 +101,12 @@ class RenderedEyes:
         self._draw = (count, seed)
         self._nuisances = nuisances or Nuisances()
         lens = Fisheye(params.fisheye)
+        sizes = (params.payload_radius, params.goal_side)
         if method == "learnt":
-            networks = Networks.load(weights) if weights else Networks.load()
-            self.detector: Detector = LearntDetector(
-                lens, params.payload_radius, params.goal_side, networks=networks
-            )
+            networks = Networks.load(weights) if weights else None
+            self.detector: Detector = LearntDetector(lens, *sizes, networks=networks)
         else:
-            self.detector = Detector(lens, params.payload_radius, params.goal_side)
+            self.detector = Detector(lens, *sizes)
         self.camera = KeypointCamera(params)
         self._looks = 0
         self._hall: Scenes | None = None
@@ -129,11 +128,8 @@ class RenderedEyes:
             measured: likewise, as poses report it; attitude and height help the detector.
             goal_w: [m], shape (E, 3). carried: which payloads hang, shape (E,).
         """
-        pictures = (
-            self.renderer.render(self._scenes(snapshot, goal_w, np.asarray(carried)), self._looks)
-            .cpu()
-            .numpy()
-        )
+        scenes = self._scenes(snapshot, goal_w, np.asarray(carried))
+        pictures = self.renderer.render(scenes, self._looks).cpu().numpy()
         self._looks += 1
         points = np.zeros((self.count, KEYPOINTS, 2), np.float32)
         valid = np.zeros((self.count, KEYPOINTS), bool)
@@ -186,16 +182,14 @@ class RenderedEyes:
         """
         rot_wc = rot_wb @ self.camera.rot_cb.double().numpy().T
         eye_w = pos_w + rot_wb @ np.array(self.params.mount.position_b)
-        detections = self.detector.detect(
-            picture,
-            self._followed[e].prior(
-                rot_wc, rot_wb[:, 2], eye_w, HANGING if carried else None, stamp
-            ),
-        )
+        distance = HANGING if carried else None
+        prior = self._followed[e].prior(rot_wc, rot_wb[:, 2], eye_w, distance, stamp)
+        detections = self.detector.detect(picture, prior)
         self.found["frames"] += 1
         for name in THINGS:
-            self._hits[name][e] += getattr(detections, name) is not None
-            self.found[name] += getattr(detections, name) is not None
+            hit = getattr(detections, name) is not None
+            self._hits[name][e] += hit
+            self.found[name] += hit
         return self._followed[e].take(detections, rot_wc, stamp)
 
     def sheet(self, path: Path) -> Path:
@@ -233,19 +227,11 @@ class RenderedEyes:
         turned = rate @ self.camera.rot_cb.T
         lens = torch.linalg.cross(rate, self.camera.position_b.expand(self.count, 3))
         vel = tensor(snapshot.vel_w) + torch.einsum("eij,ej->ei", rot, lens)
-        rope = torch.cat(
-            [
-                plain.rope[:, :3],
-                hall.rope[:, 3:4] * torch.from_numpy(carried)[:, None],
-                hall.rope[:, 4:],
-            ],
-            -1,
-        )
-        ball = torch.cat([plain.ball[:, :4], tensor(snapshot.payload_vel_w), hall.ball[:, 7:]], -1)
-        return replace(
-            hall,
-            pose=torch.cat([plain.pose[:, :7], vel, turned], -1),
-            ball=ball,
-            rope=rope,
-            goal=torch.cat([plain.goal[:, :2], hall.goal[:, 2:]], -1),
-        )
+        radius = hall.rope[:, 3:4] * torch.from_numpy(carried)[:, None]
+        columns = {
+            "pose": (plain.pose[:, :7], vel, turned),
+            "ball": (plain.ball[:, :4], tensor(snapshot.payload_vel_w), hall.ball[:, 7:]),
+            "rope": (plain.rope[:, :3], radius, hall.rope[:, 4:]),
+            "goal": (plain.goal[:, :2], hall.goal[:, 2:]),
+        }
+        return replace(hall, **{name: torch.cat(parts, -1) for name, parts in columns.items()})

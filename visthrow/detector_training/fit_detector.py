@@ -209,18 +209,13 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
 
 
 def looks(
-    kind: str,
-    labels: Labels,
-    lens: Fisheye,
-    count: int,
-    peaks: tuple[Tensor, Tensor] | None,
-    generator,
+    kind: str, labels: Labels, count: int, peaks: tuple[Tensor, Tensor], generator
 ) -> tuple[Tensor, ...]:
     """Places to look at: frame, ray, size; half of them about the thing, the others at other
     things, anywhere, or where the search erred.
 
     Args:
-        kind: of the thing. labels, lens: of the frames. count: of places.
+        kind: of the thing. labels: of the frames. count: of places.
         peaks: of the search, rays (F, 3) and sizes (F,). generator: on the labels' device.
     """
     device = labels.corners.device
@@ -233,58 +228,11 @@ def looks(
     other_kind = "goal" if kind == "ball" else "ball"
     anywhere = F.normalize(draw(count, 3), dim=-1)
     anywhere[:, 2] = anywhere[:, 2].abs()
-    for number, rays in (
-        (4, labels.distractor[index]),
-        (5, anywhere),
-        (6, labels.rays[other_kind][index]),
-    ):
+    peak, peak_size = (value[index] for value in peaks)
+    others = (labels.distractor[index], anywhere, labels.rays[other_kind][index], peak)
+    for number, rays in enumerate(others, 4):
         ray = torch.where((source == number)[:, None], rays, ray)
-    if peaks is not None:
-        ray = torch.where((source == 7)[:, None], peaks[0][index], ray)
-        size = torch.where(source == 7, peaks[1][index].clamp(5e-3, 0.5), size)
-    return index, ray, size
-
-
-def look_loss(
-    networks: Networks,
-    kind: str,
-    frames: Tensor,
-    labels: Labels,
-    lens: Fisheye,
-    places,
-    augment,
-    generator,
-) -> Tensor:
-    """Loss of one kind's close looks: whether the thing is there, where and how large, and how far
-    off that is.
-    """
-    index, ray, size = places
-    north = labels.north[index] + 0.15 * torch.randn(
-        len(index), 3, generator=generator, device=ray.device
-    )
-    views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
-    patches = patches_of(frames, index, views, lens, PATCH[kind])
-    outputs = getattr(networks, kind)(augment(patches))
-    true = labels.rays[kind][index]
-    point = views.points(true[:, None])[:, 0]
-    radius = point.norm(dim=-1)
-    in_front = (views.axes[:, 2] * true).sum(-1) > 0.2
-    ratio = (labels.sizes[kind][index] / size).log().abs()
-    present = labels.seen[kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
-    absent = ~in_front | (radius > 1.2)
-    judged = present | absent
-    loss = F.binary_cross_entropy_with_logits(outputs[:, 0], present.float(), reduction="none")
-    loss = (loss * judged).sum() / judged.sum().clamp(min=1)
-    off = offsets(kind, views, outputs, labels, index)
-    where = off.abs().mean(1)
-    if kind == "ball":
-        error = off[:, :2].norm(dim=-1)
-    else:
-        error = off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
-    spread = outputs[:, 1].clamp(-8.0, 3.0)
-    accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread  # of a Laplace distribution
-    present = present.float()
-    return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
+    return index, ray, torch.where(source == 7, peak_size.clamp(5e-3, 0.5), size)
 
 
 def offsets(kind: str, views: Views, detections: Tensor, labels: Labels, index: Tensor) -> Tensor:
@@ -373,12 +321,9 @@ class Fit:
         grids = self.networks.search(self.augment(halved(frames)))
         losses = {"search": search_loss(grids, labels, lens)}
         for k, kind in enumerate(KINDS):
-            places = looks(
-                kind, labels, lens, p.patches, _peaks(grids[:, k].detach(), lens), generator
-            )
-            losses[kind] = look_loss(
-                self.networks, kind, frames, labels, lens, places, self.augment, generator
-            )
+            peaks = _peaks(grids[:, k].detach(), lens)
+            places = looks(kind, labels, p.patches, peaks, generator)
+            losses[kind] = self.look_loss(kind, frames, labels, lens, places, generator)
         self.optimizer.zero_grad()
         sum(losses.values()).backward()
         torch.nn.utils.clip_grad_norm_(self.networks.parameters(), 1.0)
@@ -386,6 +331,42 @@ class Fit:
         self.rates.step()
         self.step += 1
         return {name: float(value.detach()) for name, value in losses.items()}
+
+    def look_loss(
+        self, kind: str, frames: Tensor, labels: Labels, lens: Fisheye, places, generator
+    ) -> Tensor:
+        """Loss of one kind's close looks: whether the thing is there, where and how large, and how far
+        off that is.
+        """
+        index, ray, size = places
+        north = labels.north[index] + 0.15 * torch.randn(
+            len(index), 3, generator=generator, device=ray.device
+        )
+        views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
+        patches = patches_of(frames, index, views, lens, PATCH[kind])
+        outputs = getattr(self.networks, kind)(self.augment(patches))
+        true = labels.rays[kind][index]
+        point = views.points(true[:, None])[:, 0]
+        radius = point.norm(dim=-1)
+        in_front = (views.axes[:, 2] * true).sum(-1) > 0.2
+        ratio = (labels.sizes[kind][index] / size).log().abs()
+        present = labels.seen[kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
+        absent = ~in_front | (radius > 1.2)
+        judged = present | absent
+        loss = F.binary_cross_entropy_with_logits(outputs[:, 0], present.float(), reduction="none")
+        loss = (loss * judged).sum() / judged.sum().clamp(min=1)
+        off = offsets(kind, views, outputs, labels, index)
+        where = off.abs().mean(1)
+        if kind == "ball":
+            error = off[:, :2].norm(dim=-1)
+        else:
+            error = off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
+        spread = outputs[:, 1].clamp(-8.0, 3.0)
+        accuracy = (error.detach() / spread.exp()).clamp(
+            max=50.0
+        ) + spread  # of a Laplace distribution
+        present = present.float()
+        return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
 
     def run(
         self,
@@ -441,16 +422,15 @@ class Fit:
         """
         self.networks.eval()
         samples = {kind: [] for kind in KINDS}
-        done = 0
-        while done < self.params.calibration:
-            count = min(16, self.params.calibration - done)
-            frames, labels, lens = rendered(self.camera, self.renderer, count, 900_000_001 + done)
+        total = self.params.calibration
+        for first in range(0, total, 16):
+            count = min(16, total - first)
+            frames, labels, lens = rendered(self.camera, self.renderer, count, 900_000_001 + first)
             for e in range(count):
-                for kind, rows in findings(
-                    self.networks, frames[e : e + 1], _chosen(labels, torch.tensor([e])), lens
-                ).items():
+                one = _chosen(labels, torch.tensor([e]))
+                scores = findings(self.networks, frames[e : e + 1], one, lens)
+                for kind, rows in scores.items():
                     samples[kind].append(rows)
-            done += count
         figures = {}
         for kind in KINDS:
             rows = torch.cat(samples[kind]).cpu().double()

@@ -16,6 +16,7 @@ fit the network. ``made_by`` tells config, commit, command, seed and figures; no
 import json
 import math
 import re
+import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,7 +27,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from visthrow.common.errors import MismatchError, PolicyError, suggest
+from visthrow.common.errors import MismatchError, PolicyError, expect_known, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.shipped import find_policy as find_policy
@@ -44,20 +45,10 @@ RSL_RL_EPS = 1e-2
 state.
 """
 
-_ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
-    "elu": F.elu,
-    "selu": F.selu,
-    "relu": F.relu,
-    "lrelu": F.leaky_relu,
-    "tanh": torch.tanh,
-    "sigmoid": torch.sigmoid,
-    "softplus": F.softplus,
-    "gelu": F.gelu,
-    "swish": F.silu,
-    "mish": F.mish,
-}
-"""By rsl_rl's names; its "crelu" is missing, as it stands for another function than the name says.
-"""
+ACTIVATIONS: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_name("activations.toml").read_text(encoding="utf-8")
+)
+"""Activations by rsl_rl's names, and what torch, ONNX and C call them."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +71,7 @@ class Policy:
     estimator: Estimator | None = None
 
     def __post_init__(self) -> None:
-        if self.activation not in _ACTIVATIONS:
-            raise PolicyError(
-                f"activation '{self.activation}'; {suggest(self.activation, _ACTIVATIONS)}"
-            )
+        expect_known([self.activation], ACTIVATIONS, "activation '{}'", PolicyError)
         _check_shapes(self)
         for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
             section = self.contract.get(part)
@@ -175,7 +163,7 @@ class Policy:
         """
         if self.mean is not None and self.std is not None:
             x = (x - self.mean) / (self.std + self.eps)
-        activation = _ACTIVATIONS[self.activation]
+        activation = getattr(F, ACTIVATIONS[self.activation]["torch"])
         for weight, bias in zip(self.weights[:-1], self.biases[:-1]):
             x = activation(F.linear(x, weight, bias))
         return F.linear(x, self.weights[-1], self.biases[-1])
@@ -350,6 +338,16 @@ class Policy:
             take("obs_normalizer._std").reshape(-1) if normalized else None,
             RSL_RL_EPS if normalized else 0.0,
         )
+
+
+def named_activation(policy: Policy, language: str, kind: str) -> str:
+    """Return what another language calls a policy's activation; PolicyError where it has none."""
+    names = {name: table[language] for name, table in ACTIVATIONS.items() if language in table}
+    if policy.activation not in names:
+        raise PolicyError(
+            f"activation '{policy.activation}' has no {kind}; expected one of {sorted(names)}"
+        )
+    return names[policy.activation]
 
 
 _ABSENT = object()

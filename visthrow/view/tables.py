@@ -31,16 +31,9 @@ PAPER_NOTE = (
     " two columns do not measure the same thing."
 )
 
-COLUMNS = (
-    "policy",
-    "target [m]",
-    "throws",
-    "landing error [m]",
-    "duration [s]",
-    "landed",
-    "bias x / y [m]",
-    "smoothness",
-    "the paper's: error [m], duration [s]",
+HEADER = (
+    "policy | target [m] | throws | landing error [m] | duration [s] | landed | bias x / y [m]"
+    " | smoothness | the paper's: error [m], duration [s]"
 )
 
 
@@ -54,7 +47,7 @@ def markdown(rows: Sequence[dict], title: str) -> str:
     """Table of summaries, :meth:`visthrow.task.measurement.Throws.summary` with ``policy`` and
     ``layout`` added.
     """
-    return f"{title}\n\n{aligned(COLUMNS, [_cells(row) for row in rows], heads=1)}\n"
+    return f"{title}\n\n{aligned(HEADER.split(' | '), [_cells(row) for row in rows], heads=1)}\n"
 
 
 def _cells(row: dict) -> tuple[str, ...]:
@@ -83,38 +76,16 @@ def csv_text(throws: Sequence[tuple[str, str, object]]) -> str:
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        [
-            "policy",
-            "plant",
-            "target [m]",
-            "throw",
-            "success",
-            "landing x [m]",
-            "landing y [m]",
-            "landing error [m]",
-            "duration [s]",
-            "clearance [m]",
-            "smoothness",
-        ]
+    names = (
+        "policy, plant, target [m], throw, success, landing x [m], landing y [m],"
+        " landing error [m], duration [s], clearance [m], smoothness"
     )
+    writer.writerow(names.split(", "))
     for policy, plant, results in throws:
-        for i in range(len(results.success)):
-            numbers = (
-                *results.landing_w[i],
-                results.error[i],
-                results.duration[i],
-                results.clearance[i],
-                results.smoothness[i],
-            )
-            writer.writerow(
-                [
-                    policy,
-                    plant,
-                    results.target,
-                    i,
-                    int(results.success[i]),
-                    *("" if np.isnan(x) else f"{x:.6g}" for x in numbers),
-                ]
-            )
+        measured = (results.error, results.duration, results.clearance, results.smoothness)
+        numbers = np.column_stack([results.landing_w, *measured])
+        for i, row in enumerate(numbers):
+            cells = ("" if np.isnan(x) else f"{x:.6g}" for x in row)
+            head = (policy, plant, results.target, i, int(results.success[i]))
+            writer.writerow([*head, *cells])
     return text.getvalue()

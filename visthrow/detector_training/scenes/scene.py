@@ -20,6 +20,9 @@ from camera.params import CameraParams, FisheyeParams
 
 THINGS = 10  # most things on the ground and about the hall
 
+ALIKE = ((0.75, 0.80, 0.25), (0.20, 0.50, 0.28), (0.85, 0.75, 0.20), (0.9, 0.9, 0.88))
+"""Colours of things like the ball's or the square's."""
+
 
 def _table(name: str) -> dict[str, Any]:
     return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
@@ -191,8 +194,9 @@ def posed_scenes(
 
 
 def _flat(*columns: Tensor) -> Tensor:
-    """Join columns, shape (F,) or (F, n)."""
-    return torch.cat([c if c.dim() == 2 else c[:, None] for c in columns], -1)
+    """Join columns, shape (F, ...) or (F, ..., n)."""
+    rank = max(2, *(c.dim() for c in columns))
+    return torch.cat([c if c.dim() == rank else c[..., None] for c in columns], -1)
 
 
 def _exposed(count: int, d: Draw, n: Nuisances) -> tuple[Tensor, Tensor]:
@@ -280,44 +284,29 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     """Things of any colour, half of them of one like the ball's or the square's; none on the square
     or before the ball.
     """
-    kind = torch.where(
-        d.chance(0.6 * n.clutter, THINGS), 1.0 + d.one_of(3, THINGS), torch.zeros(())
-    )
+    kind = d.chance(0.6 * n.clutter, THINGS) * (1.0 + d.one_of(3, THINGS))
     angle = d.uniform(0.0, 6.28, THINGS)
-    place = scenes.pose[:, None, :2] + d.uniform(0.2, 3.5, THINGS)[..., None] * torch.stack(
-        [angle.cos(), angle.sin()], -1
-    )
-    size = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), d.uniform(0.02, 0.14, THINGS))
-    random_size = torch.where(kind == 2, d.uniform(0.03, 0.3, THINGS), size)
-    alike = torch.tensor(
-        [[0.75, 0.80, 0.25], [0.20, 0.50, 0.28], [0.85, 0.75, 0.20], [0.9, 0.9, 0.88]]
-    )[d.one_of(4, THINGS).long()]
-    colour = torch.where(
-        d.chance(0.5, THINGS)[..., None],
-        alike + d.uniform(-0.08, 0.08, THINGS, 3),
-        d.uniform(0.03, 0.97, THINGS, 3),
-    )
-    height = torch.where(kind == 3, size + d.uniform(0.0, 0.4, THINGS), torch.zeros(()))
+    way = torch.stack([angle.cos(), angle.sin()], -1)
+    place = scenes.pose[:, None, :2] + d.uniform(0.2, 3.5, THINGS, 1) * way
+    rectangle = kind == 2
+    size = torch.where(rectangle, d.uniform(0.03, 0.3, THINGS), d.uniform(0.02, 0.14, THINGS))
+    breadth = torch.where(rectangle, d.uniform(0.03, 0.3, THINGS), size)
+    alike = torch.tensor(ALIKE)[d.one_of(4, THINGS).long()]
+    of_one = d.chance(0.5, THINGS, 1)
+    alike = alike + d.uniform(-0.08, 0.08, THINGS, 3)
+    colour = torch.where(of_one, alike, d.uniform(0.03, 0.97, THINGS, 3)).clamp(0.0, 1.0)
+    raised = size + d.uniform(0.0, 0.4, THINGS)
+    height = torch.where(kind == 3, raised, 0.0)
     off = (place - scenes.goal[:, None, :2]).norm(dim=-1)
     distance = (place - scenes.ball[:, None, :2]).norm(dim=-1)
-    stays = (off > 0.22 + torch.maximum(size, random_size)) & (
-        (kind != 3) | (distance > 0.25 + size)
-    )
-    rim = torch.where(d.chance(0.3, THINGS), d.uniform(0.6, 0.9, THINGS), torch.full((), 9.0))
-    return torch.cat(
-        [
-            (kind * stays)[..., None],
-            place,
-            height[..., None],
-            size[..., None],
-            random_size[..., None],
-            d.uniform(0.0, 3.14, THINGS, 1),
-            colour.clamp(0.0, 1.0),
-            rim[..., None],
-            d.uniform(0.0, 1.0, THINGS, 1),
-        ],
-        -1,
-    )
+    beside = off > 0.22 + torch.maximum(size, breadth)
+    clear = (kind != 3) | (distance > 0.25 + size)
+    rimmed = d.chance(0.3, THINGS)
+    rim_from = torch.where(rimmed, d.uniform(0.6, 0.9, THINGS), 9.0)
+    turn = d.uniform(0.0, 3.14, THINGS, 1)
+    rim = d.uniform(0.0, 1.0, THINGS, 1)
+    stays = kind * (beside & clear)
+    return _flat(stays, place, height, size, breadth, turn, colour, rim_from, rim)
 
 
 def _quat(rot: Tensor) -> Tensor:
@@ -366,9 +355,8 @@ def truth_of(scenes: Scenes, lens: Fisheye) -> Truth:
         row = (pixels[..., 1:2] + 0.5) / lens.params.height - 0.5
         time = row * scenes.shutter[:, None, 1:2].double()
     visible = visible & lens.on_sensor(pixels)
-    _, sides = lens.project_normalized(
-        ball_extremes_c(lens, static_c[:, 4], float(scenes.ball[0, 3])), clip=False
-    )
-    return Truth(
-        static_c[:, 4], static_c[:, :4], rot, sides.all(1) & visible[:, 4], visible[:, :4].all(1)
-    )
+    ball_c = static_c[:, 4]
+    extremes_c = ball_extremes_c(lens, ball_c, float(scenes.ball[0, 3]))
+    _, sides = lens.project_normalized(extremes_c)
+    ball_seen = sides.all(1) & visible[:, 4]
+    return Truth(ball_c, static_c[:, :4], rot, ball_seen, visible[:, :4].all(1))
