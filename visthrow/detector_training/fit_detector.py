@@ -335,8 +335,8 @@ class Fit:
     def look_loss(
         self, kind: str, frames: Tensor, labels: Labels, lens: Fisheye, places, generator
     ) -> Tensor:
-        """Loss of one kind's close looks: whether the thing is there, where and how large, and how far
-        off that is.
+        """Loss of one kind's close looks: whether the thing is there, where and how large, and how
+        far off that is.
         """
         index, ray, size = places
         north = labels.north[index] + 0.15 * torch.randn(
