@@ -1,10 +1,20 @@
 """One thread a product for all tests: see :mod:`visthrow.diagnose.likelihood.threads`."""
 
-from pytest import fixture
+import gc
+
+from pytest import fixture, hookimpl
 
 from visthrow.diagnose.likelihood.threads import limit_to_one_thread
 
 limit_to_one_thread()
+gc.disable()  # nothing of what is collected and imported becomes garbage
+
+
+@hookimpl(tryfirst=True)
+def pytest_runtestloop():
+    """Collect garbage from here on, without a look at what was imported."""
+    gc.freeze()
+    gc.enable()
 
 
 @fixture

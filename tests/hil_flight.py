@@ -15,6 +15,7 @@ from hil.params import HilParams
 from hil.poses.pose import Pose
 from tests.configs import load_run
 from visthrow.common.rotations import multiply, rotate_one
+from visthrow.onboard.actions import hover_action
 from visthrow.onboard.policy import Policy, find_policy
 
 TICK, SUBSTEPS = 0.02, 2  # poses at 100 Hz
@@ -40,11 +41,16 @@ def params(*overrides: str) -> HilParams:
 
 
 def simple_policy(action=(0.0, 0.0, 0.0, 0.0, 1.0), layout="state") -> Policy:
-    """A network that always says the same; hover needs a first number of about -0.13."""
+    """A network that always says the same; hover needs `HOVER` first."""
     shipped = Policy.load(find_policy(layout))
     return Policy(
         (torch.zeros(5, shipped.obs_dim),), (torch.tensor(action),), "relu", shipped.contract
     )
+
+
+HOVER = hover_action(9.81 * 0.272, 14.0)[0]  # first number of an action that hovers
+NEVER, AT_ONCE = (simple_policy((HOVER, 0.0, 0.0, 0.0, asked)) for asked in (-1.0, 1.0))
+"""Policies that hover and ask for the release."""
 
 
 class Vehicle:

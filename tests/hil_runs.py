@@ -6,11 +6,9 @@ from pathlib import Path
 
 from hil.control.recording.record import RunRecorder
 from hil.control.runner import Runner, TickRecord
-from tests.hil_flight import Spy, fly, params, simple_policy
-from visthrow.onboard.actions import hover_action
+from tests.hil_flight import HOVER, Spy, fly, params, simple_policy
 from visthrow.onboard.policy import Policy, find_policy
 
-HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
 """Of a policy that hovers and releases at once: the payload falls straight down."""
 

@@ -12,12 +12,11 @@ from hil.rehearsal.fake_ardupilot import FakeArduPilot
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import load_plant
 from tests.configs import load_run
-from tests.hil_flight import simple_policy
+from tests.hil_flight import AT_ONCE
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe, throw
 
 PARAMS = load_run("fake", ["ardupilot.audit=false"]).ardupilot
-AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 
 
 def pair(answer="accepted", **options):

@@ -13,22 +13,10 @@ from pytest import approx, mark
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput
 from tests.fakes.fake_px4 import HOLD
-from tests.hil_flight import simple_policy
+from tests.hil_flight import AT_ONCE, NEVER, simple_policy
 from tests.level import LevelPlant
-from tests.loopback.wire import cut, peers
-from visthrow.onboard.actions import hover_action
+from tests.loopback.wire import AUTOPILOTS, QUICK, cut, peers
 
-KINDS = ("ardupilot", "px4", "betaflight")
-QUICK = (
-    "states.check_hold=0.2",
-    "states.armed_least=0.1",
-    "states.quiet=0.1",
-    "states.abort=0.5",
-    "states.land=0.5",
-)
-HOVER = hover_action(9.81 * 0.272, 14.0)[0]
-NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))
-AT_ONCE = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
 START = 2.2
 """When the fault begins [s]: in a throw that the policy never releases."""
 
@@ -90,7 +78,7 @@ def reason(told, state: str) -> str:
 GONE = "the autopilot is silent, disarmed or in another mode"
 
 
-@mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", AUTOPILOTS)
 def test_silent(kind):
     """Abort after the heartbeat's time-out, counted from the last sign of life."""
     limit = 0.5 if kind == "betaflight" else 1.5
@@ -100,7 +88,7 @@ def test_silent(kind):
     assert START + limit - BEAT[kind] - TICK <= when(told, "abort") <= START + limit + 2 * TICK
 
 
-@mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", AUTOPILOTS)
 def test_the_pilot_takes_over(kind):
     """Abort at the next sign of life; from then on not one command is sent, no mode is
     asked for.
@@ -139,7 +127,7 @@ def test_a_pilots_hold_at_the_end_of_a_throw_stands(before):
     assert modes == ["mode 4.3"]
 
 
-@mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", AUTOPILOTS)
 def test_disarmed_and_not_ours_to_arm(kind):
     fake, _, told = run(kind, 4.0, armed=False, overrides=("states.idle=1.5",))
     assert reason(told, "abort") == "autopilot not ready (disarmed), for 1.5 s"

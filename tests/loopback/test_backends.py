@@ -15,19 +15,10 @@ from hil.links.backends.betaflight import OPEN_TIME, STICKS
 from hil.links.pymav import mav
 from tests.fakes.fake_px4 import LAND as PX4_LAND
 from tests.fakes.fake_px4 import OFFBOARD, POSCTL, custom
-from tests.hil_flight import AutoOperator, simple_policy
+from tests.hil_flight import AT_ONCE, AutoOperator
 from tests.level import LevelPlant
-from tests.loopback.wire import peers, throw
+from tests.loopback.wire import AUTOPILOTS, QUICK, peers, throw
 
-KINDS = ("ardupilot", "px4", "betaflight")
-QUICK = (
-    "states.check_hold=0.2",
-    "states.armed_least=0.1",
-    "states.quiet=0.1",
-    "states.abort=0.5",
-    "states.land=0.5",
-)
-AT_ONCE = simple_policy((-0.1269, 0.0, 0.0, 0.0, 1.0))
 HOVER = (2.668, 0.0, 0.0, 0.0)
 
 SEPARATION = 5e-4
@@ -74,7 +65,7 @@ class Desk:
         raise AssertionError(self.status)
 
 
-@mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", AUTOPILOTS)
 def test_units_and_axes_of_commands(kind):
     """A quarter of a turn a second about each axis alone, and a thrust, arrive as they
     were meant.
@@ -118,7 +109,7 @@ def test_a_vehicle_that_the_runner_is_to_arm_is_not_taken_before_its_checks_pass
         assert desk.status.connected == connected, desk.status.note
 
 
-@mark.parametrize("kind", KINDS)
+@mark.parametrize("kind", AUTOPILOTS)
 def test_hands(kind):
     """Pilot, runner, the autopilot's own hold and landing; then the pilot again, who is
     not fought.
@@ -309,7 +300,7 @@ TRAPS = {
 }
 
 
-@mark.parametrize(("kind", "name"), [(kind, name) for kind in KINDS for name in TRAPS[kind]])
+@mark.parametrize(("kind", "name"), [(kind, name) for kind in AUTOPILOTS for name in TRAPS[kind]])
 def test_a_wrong_parameter_is_found_over_the_wire(kind, name):
     tables = []
     desk = Desk(kind, parameters={name: TRAPS[kind][name]}, tell=tables.append)
@@ -463,7 +454,7 @@ def test_px4_says_in_progress_first_and_that_is_pending():
 
 
 def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
-    for kind in KINDS:
+    for kind in AUTOPILOTS:
         desk = Desk(kind).follow()
         desk.backend.release(desk.now + 0.1)
         desk.turn(0.04, HOVER)
@@ -474,7 +465,7 @@ def test_a_release_before_its_hour_is_not_sent_when_it_was_stopped():
 
 @mark.parametrize(
     ("kind", "mechanism"),
-    [*((kind, 0.06) for kind in KINDS), ("ardupilot", 0.002), ("betaflight", 0.11)],
+    [*((kind, 0.06) for kind in AUTOPILOTS), ("ardupilot", 0.002), ("betaflight", 0.11)],
 )
 def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     """Measured by the fake, which knows the true separation; a faster mechanism waits for the
@@ -490,7 +481,7 @@ def test_latch_to_separation_is_the_trained_lag(kind, mechanism):
     assert (summary["latches"], fake.witness.breaches) == (1, [])
 
 
-@mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in KINDS), ("px4", False)])
+@mark.parametrize(("kind", "prompt"), [*((kind, True) for kind in AUTOPILOTS), ("px4", False)])
 def test_a_complete_throw(kind, prompt):
     """Also where a change of mode is seen in a heartbeat up to a second later."""
     plant = LevelPlant()
@@ -547,7 +538,7 @@ def test_two_throws_with_the_autopilots_own_hold_between_them():
 
 
 @mark.parametrize(
-    ("kind", "factor", "good"), [*((kind, 1.0, True) for kind in KINDS), ("px4", 1.15, False)]
+    ("kind", "factor", "good"), [*((kind, 1.0, True) for kind in AUTOPILOTS), ("px4", 1.15, False)]
 )
 def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     """The vehicle hovers in other hands; its share of thrust is held against the config's."""

@@ -10,14 +10,11 @@ from pytest import mark
 
 from hil.control.loop import Loop
 from hil.operator_terminal import ENDING, Terminal
-from tests.hil_flight import simple_policy
+from tests.hil_flight import NEVER
 from tests.level import LevelPlant
-from tests.loopback.wire import peers
-from visthrow.onboard.actions import hover_action
+from tests.loopback.wire import AUTOPILOTS, peers
 
-KINDS = ("ardupilot", "px4", "betaflight")
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.6")
-NEVER = simple_policy((hover_action(9.81 * 0.272, 14.0)[0], 0.0, 0.0, 0.0, -1.0))
 STATES = {"armed": ("states.armed_least=9.0",), "throw": ()}
 """In hover, and in a throw that the policy never ends."""
 
@@ -99,8 +96,8 @@ REASONS = {
 }
 
 
-RUNS = [("SIGINT", state, kind) for state in STATES for kind in KINDS]
-RUNS += [(way, "throw", KINDS[i % 3]) for i, way in enumerate(REASONS) if way != "SIGINT"]
+RUNS = [("SIGINT", state, kind) for state in STATES for kind in AUTOPILOTS]
+RUNS += [(way, "throw", AUTOPILOTS[i % 3]) for i, way in enumerate(REASONS) if way != "SIGINT"]
 """Each autopilot in each state, and each way once: what ends a run knows no autopilot."""
 
 

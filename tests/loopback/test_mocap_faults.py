@@ -6,18 +6,14 @@ In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the sa
 from pytest import approx, mark
 
 from hil.control.state_machine import OperatorInput
-from tests.hil_flight import simple_policy
+from tests.hil_flight import AT_ONCE, NEVER
 from tests.level import LevelPlant
-from tests.loopback.wire import cut, peers
+from tests.loopback.wire import QUICK, cut, peers
 from tests.mocap_faults import FAULTS
-from visthrow.onboard.actions import hover_action
 
-HOVER = hover_action(9.81 * 0.272, 14.0)[0]
-NEVER = simple_policy((HOVER, 0.0, 0.0, 0.0, -1.0))
 START = 1.2
 """When the fault begins [s]: in a throw that the policy never releases."""
 
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.5")
 ODOMETRY = (
     (
         'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
@@ -102,10 +98,9 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     """It asks from the first tick of the throw on; the fault is there from the start of the check:
     nothing is released unless the poses passed all checks, and then once.
     """
-    at_once = simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0))
     plant = LevelPlant()
     runner, source, clock, fake = peers(
-        plant, overrides=(*QUICK, "states.check=1.0"), loaded=at_once, mocap_fault=(name, 0.0)
+        plant, overrides=(*QUICK, "states.check=1.0"), loaded=AT_ONCE, mocap_fault=(name, 0.0)
     )
     cut(runner, source, clock, OneWord(), None, 3.0, lambda decision: None)
     assert fake.witness.breaches == []

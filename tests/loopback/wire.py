@@ -23,6 +23,16 @@ from tests.hil_flight import AutoOperator
 from tests.mocap_faults import MocapFault
 from visthrow.onboard.policy import Policy, find_policy
 
+AUTOPILOTS = ("ardupilot", "px4", "betaflight")
+QUICK = (
+    "states.check_hold=0.2",
+    "states.armed_least=0.1",
+    "states.quiet=0.1",
+    "states.abort=0.5",
+    "states.land=0.5",
+)
+"""A run whose states last no longer than they must."""
+
 HERE = ("127.0.0.1", 1)
 """Address of the other end."""
 

@@ -3,6 +3,7 @@ free of it.
 """
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,15 @@ from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 
 REAL = Path(__file__).resolve().parents[2] / "data" / "real"
-FLIGHTS = {
-    n: setup.read_logs([REAL / "payload_cf_single" / f"log{n}.csv.gz"], "cf_payload")[0]
-    for n in (204, 205, 206)
-}
+FLIGHTS = (204, 205, 206)
 """Flights along x, along y, and in place."""
+
+
+@cache
+def recorded(number: int) -> FlightLog:
+    return setup.read_logs([REAL / "payload_cf_single" / f"log{number}.csv.gz"], "cf_payload")[0]
+
+
 CRAZYFLIE = setup.known("cf_payload")
 PATHS = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "est_pos_w")
 LATE = 0.1
@@ -50,12 +55,12 @@ def bad(log: FlightLog, known: KnownVehicle = CRAZYFLIE) -> str:
 
 @mark.parametrize("number", FLIGHTS)
 def test_flights_as_they_are(number):
-    assert bad(FLIGHTS[number]) == ""
+    assert bad(recorded(number)) == ""
 
 
 @mark.parametrize("number", [204, 205])
 def test_exchanged_axes_are_named_with_their_evidence(number):
-    found = bad(changed(FLIGHTS[number], PATHS, lambda v: v[:, [1, 0, 2]]))
+    found = bad(changed(recorded(number), PATHS, lambda v: v[:, [1, 0, 2]]))
     assert "fit with (y,x,z) of positions and velocities" in found
     assert float(found.split(" nats better")[0].split()[-1]) > 15.0
     assert "a mirror image" in found
@@ -63,7 +68,7 @@ def test_exchanged_axes_are_named_with_their_evidence(number):
 
 def test_an_exchanged_accelerometer_is_named():
     assert "acc_b fits as (y,x,z)" in bad(
-        changed(FLIGHTS[204], ["acc_b"], lambda v: v[:, [1, 0, 2]])
+        changed(recorded(204), ["acc_b"], lambda v: v[:, [1, 0, 2]])
     )
 
 
@@ -76,7 +81,7 @@ def test_an_exchanged_accelerometer_is_named():
     ],
 )
 def test_late_streams_are_named_with_their_offset(streams, row):
-    (checked,) = check([shifted(FLIGHTS[204], *streams)], CRAZYFLIE)
+    (checked,) = check([shifted(recorded(204), *streams)], CRAZYFLIE)
     (found,) = [r for r in checked.rows if (r.topic, r.channel, r.verdict) == ("delay", row, "bad")]
     assert found.figures["delay_s"] == approx(LATE, abs=0.02)
     assert contradictions([checked])
@@ -84,7 +89,7 @@ def test_late_streams_are_named_with_their_offset(streams, row):
 
 def test_thrust_of_another_flight_is_refused():
     found = bad(
-        FlightLog({**FLIGHTS[205].channels, "thrust_command": FLIGHTS[204]["thrust_command"]})
+        FlightLog({**recorded(205).channels, "thrust_command": recorded(204)["thrust_command"]})
     )
     assert "the force does not follow the thrust" in found
     assert "thrust of another flight" in found
@@ -92,7 +97,7 @@ def test_thrust_of_another_flight_is_refused():
 
 def test_early_thrust_is_named():
     assert "the stream of the thrust is about" in bad(
-        shifted(FLIGHTS[206], "thrust_command", by=-LATE)
+        shifted(recorded(206), "thrust_command", by=-LATE)
     )
 
 
@@ -110,7 +115,7 @@ def test_early_thrust_is_named():
     ],
 )
 def test_units_are_named_by_their_ratio(names, factor, words):
-    found = bad(changed(FLIGHTS[204], names, lambda v: v * factor))
+    found = bad(changed(recorded(204), names, lambda v: v * factor))
     assert all(part in found for part in words.split(".*")), found
 
 
@@ -119,19 +124,19 @@ def test_units_are_named_by_their_ratio(names, factor, words):
     [(41.9, "the model's mass is in g"), (5.0, "no battery's charge does that"), (0.05, "")],
 )
 def test_a_mass_that_no_battery_explains_is_another_unit(mass, words):
-    found = bad(FLIGHTS[204], replace(CRAZYFLIE, mass=mass))
+    found = bad(recorded(204), replace(CRAZYFLIE, mass=mass))
     assert words in found
     assert bool(found) == bool(words)
 
 
 def test_the_cable_is_held_against_the_models():
     assert "apart by +70.8 % of the model's cable of 0.3 m: another cable" in bad(
-        FLIGHTS[204], KnownVehicle(cable_length=0.3)
+        recorded(204), KnownVehicle(cable_length=0.3)
     )
 
 
 def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
-    logs = [*FLIGHTS.values(), changed(FLIGHTS[205], ["thrust_command"], lambda v: 1.3 * v)]
+    logs = [*map(recorded, FLIGHTS), changed(recorded(205), ["thrust_command"], lambda v: 1.3 * v)]
     texts = [row.text for row in check(logs, CRAZYFLIE)[3].rows if row.verdict == "warn"]
     assert any("the thrust's scale differs from flight to flight" in text for text in texts)
 

@@ -11,12 +11,10 @@ from scipy.integrate import solve_ivp
 from hil.control.aim import AimParams, ReleaseCheck
 from hil.control.runner import Runner
 from hil.poses.body_track import BodyState
-from tests.hil_flight import Spy, fly, params, simple_policy
-from visthrow.onboard.actions import hover_action
+from tests.hil_flight import AT_ONCE, Spy, fly, params
 
 ROPE = {"payload_mass": 0.058}
 AHEAD, HEIGHT = 0.12, 0.04
-HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 
 
 def at(pos, vel) -> BodyState:
@@ -82,7 +80,7 @@ def test_a_policy_that_asks_in_hover_never_releases():
     """
     runner = Runner(
         params("aim.bound=0.8", "aim.patience=0.3"),
-        simple_policy((HOVER, 0.0, 0.0, 0.0, 1.0)),
+        AT_ONCE,
         Spy(),
     )
     decisions = fly(runner, 5.0)

@@ -14,12 +14,11 @@ from hil.fly_run import autopilot_record
 from hil.poses.pose import VEHICLE
 from tests.commands import run_command
 from tests.configs import load_run
-from tests.hil_flight import simple_policy
+from tests.hil_flight import NEVER
 from tests.level import LevelPlant
 from tests.loopback.wire import peers
 
 QUICK = ("states.check_hold=0.2",)
-NEVER = simple_policy((-0.1269, 0.0, 0.0, 0.0, -1.0))
 
 
 class Nobody:

@@ -17,11 +17,9 @@ from hil.links.backends.base import HOLD, Status
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
 from tests.configs import load_run
-from tests.hil_flight import TICK, Spy, changes, fly, params, simple_policy
+from tests.hil_flight import HOVER, TICK, Spy, changes, fly, params, simple_policy
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.actions import hover_action
 
-HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 NEVER = (HOVER, 0.0, 0.0, 0.0, -1.0)
 AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
 LAG = 0.11
