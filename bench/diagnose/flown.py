@@ -37,6 +37,7 @@ def fly(
     fade=0.0,
     swirl=0.0,
     beat=0.0,
+    downwash=0.0,
 ) -> FlightLog:
     """A vehicle with an attitude of closed form and motors that hold it up; equations and
     integrator of the test's own.
@@ -59,6 +60,9 @@ def fly(
     volts = 4.1 - 0.05 * half
     level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
 
+    # another vehicle, which passes above
+    above = np.column_stack([3.0 * np.sin(0.9 * half + phases[0]), np.cos(half), 6.0 + 0.0 * half])
+
     def slope(i, state):
         p = state[:3]
         v = state[3:6]
@@ -69,6 +73,8 @@ def fly(
             0,
             mass * G,
         ]
+        apart = p - above[i]
+        force = force + downwash * apart[2] / np.sum(apart**2) * np.array([0.0, 0.0, 1.0])
         force = force + [swirl * v[1], beat * np.sin(4.5 * half[i]) - swirl * v[0], 0.0]
         lag = [(told[i] - thrust) / 0.03]
         if cable is None:
@@ -107,6 +113,8 @@ def fly(
         "motor_command": Channel(time, np.tile(command[:, None], 4), "1"),
         "battery_voltage": Channel(time, 4.1 - 0.05 * time, "V"),
     }
+    if downwash:
+        channels["neighbour_pos_w"] = Channel(time, above[::4][: len(time)], "m", "world")
     return FlightLog(channels | ({"payload_pos_w": seen(path[:, 7:10])} if cable else {}))
 
 

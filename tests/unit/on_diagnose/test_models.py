@@ -25,6 +25,7 @@ from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel
 from visthrow.diagnose.models.flyer_params import FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
+from visthrow.diagnose.models.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
@@ -259,6 +260,18 @@ class TestFlyer:
         assert not diagnosis.theta
         assert diagnosis.laws[0].vector == "axis_cross_vel"
 
+    def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
+        logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
+        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        assert diagnosis.overall == "UNKNOWN"
+        assert diagnosis.laws[0].formula == "F = c 1/d d_z/d z"
+        law = diagnosis.laws[0]
+        assert law.coefficient == approx(0.03, rel=0.02)
+        for log in logs:
+            del log.channels["neighbour_pos_w"]
+        unaware = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        assert all("/d" not in law.formula for law in unaware.laws)
+
     def test_what_neither_name_nor_law_explains_is_told(self):
         logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
         diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)), laws=False)
@@ -350,6 +363,83 @@ TRIM = TrimParams(
     0.01,
     5e-4,
 )
+
+
+class TestImu:
+    """Motors' commands, accelerometer and gyro, and nothing else."""
+
+    PARAMS = ImuParams(
+        "motor_command",
+        0.03,
+        G,
+        (0.0, 0.06, 0.1),
+        0.03,
+        0.0,
+        3.8,
+        0.0,
+        1.0,
+        0.01,
+        1,
+        40,
+        TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0)),
+    )
+
+    def log(self, tau: float, curve: float, inertia: tuple[float, float], seed: int) -> FlightLog:
+        """A vehicle that turns to and fro about all axes while its thrust swings; Euler steps of
+        0.5 ms of the test's own, an accelerometer off by 0.2 m/s^2.
+        """
+        p, rng, step = self.PARAMS, default_rng(seed), 5e-4
+        time = np.arange(0.0, 8.0, step)
+        arm = p.torque.arm_x
+        mixer = np.array(
+            [[arm, -arm, arm, -arm], [-arm, -arm, arm, arm], [0.006, -0.006, -0.006, 0.006]]
+        )
+        moment = np.array(p.torque.inertia) * (1.0 + np.array([inertia[0], inertia[0], inertia[1]]))
+        hover = p.mass * G / 4.0
+        tones = rng.uniform(8.0, 25.0, 3), rng.uniform(0.0, 6.0, 4)
+        thrust, rate, sent = np.full(4, hover), np.zeros(3), np.zeros(4)
+        rows = []
+        for i, t in enumerate(time):
+            if i % 10 == 0:  # commands at 200 Hz
+                wanted = [3.0, 3.0, 1.0] * np.sin(tones[0] * t + tones[1][:3])
+                torque = np.array(p.torque.inertia) * [30.0, 30.0, 10.0] * (wanted - rate)
+                level = hover * (1.0 + 0.3 * np.sin(9.0 * t + tones[1][3]))
+                sent = np.clip(level + np.linalg.pinv(mixer) @ torque, 0.2 * hover, 3.0 * hover)
+                acc = (thrust * (1.0 + curve * (thrust / hover - 1.0))).sum() / p.mass
+                command = (-0.06 + np.sqrt(0.06**2 + 0.4 * sent)) / 0.2
+                rows.append([t, acc, *rate, *command])
+            real = thrust * (1.0 + curve * (thrust / hover - 1.0))
+            rate = rate + step / moment * (mixer @ real - np.cross(rate, moment * rate))
+            thrust = sent + (thrust - sent) * np.exp(-step / tau)
+        t, acc, *columns = np.array(rows).T
+        rates, command = np.array(columns[:3]).T, np.array(columns[3:]).T
+        force = np.column_stack([0.0 * acc, 0.0 * acc, acc + 0.2])
+        return FlightLog(
+            {
+                "motor_command": Channel(t, command, "1"),
+                "acc_b": Channel(t, force + rng.normal(0, 0.3, force.shape), "m/s^2", "body"),
+                "rate_b": Channel(t, rates + rng.normal(0, 0.02, rates.shape), "rad/s", "body"),
+            }
+        )
+
+    def test_lag_curve_and_inertia_without_a_position(self):
+        truth = {"motor_tau": 0.02, "thrust_curve": 0.2, "inertia_xy": 0.3, "inertia_z": -0.2}
+        logs = [self.log(0.05, 0.2, (0.3, -0.2), seed) for seed in range(2)]
+        model = ImuModel(logs, self.PARAMS)
+        fitted = fitting.fit(model, [*fitting.DEFAULT_FREE["imu"]])
+        found = dict(zip(fitted.names, fitted.theta))
+        sd = dict(zip(fitted.names, np.sqrt(np.diag(fitted.covariance))))
+        for name, size in truth.items():
+            assert abs(found[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
+            assert sd[name] < 0.15 * abs(size), name
+
+    def test_a_lag_is_named_with_its_interval(self):
+        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(3)]
+        diagnosis = search.explain(ImuModel(logs, self.PARAMS))
+        assert diagnosis.named == ("motor_tau",)
+        finding = diagnosis["motor_tau"]
+        assert finding.estimate == approx(0.02, abs=5e-4)
+        assert 0.0 < finding.high - finding.low < 2e-3
 
 
 def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:

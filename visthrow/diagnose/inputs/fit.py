@@ -32,6 +32,7 @@ DEFAULT_FREE = {
         "frame_tilt_x",
         "frame_tilt_y",
     ),
+    "imu": ("thrust_gain", "thrust_curve", "motor_tau", "cmd_delay", "inertia_xy", "inertia_z"),
     "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
     "trim": ("motor_fl", "motor_fr", "motor_rl", "motor_rr"),
 }

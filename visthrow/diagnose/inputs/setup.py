@@ -12,6 +12,7 @@ from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
+from visthrow.diagnose.models.imu import UNREAD, ImuModel, ImuParams
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
@@ -29,6 +30,7 @@ MODELS = {
     "stand": StandModel,
     "gimbal": GimbalModel,
     "flyer": FlyerModel,
+    "imu": ImuModel,
     "trim": TrimModel,
 }
 """Table of a setup -> the model that it parametrises."""
@@ -50,6 +52,7 @@ class Setup:
     stand: StandParams | None = None
     gimbal: GimbalParams | None = None
     flyer: FlyerParams | None = None
+    imu: ImuParams | None = None
     trim: TrimParams | None = None
     effects: dict[str, float] = field(
         default_factory=dict
@@ -99,7 +102,11 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
     setup has no flying model.
     Raises ConfigError: as :func:`load`.
     """
-    flyer = load(name).flyer if name is not None else None
+    setup = load(name) if name is not None else None
+    if setup is not None and (imu := setup.imu) is not None:
+        unread = VELOCITIES | UNREAD
+        return KnownVehicle(0.0, imu.mass, imu.input, imu.thrust_map, unread)
+    flyer = setup.flyer if setup is not None else None
     if flyer is not None:
         length = flyer.cable.length if flyer.cable is not None else 0.0
         return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map, VELOCITIES)

@@ -15,7 +15,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
-from visthrow.diagnose.models.flyer_windows import FINE, KNOTS, expect_thrust, spare, windows_of
+from visthrow.diagnose.models.flyer_windows import (
+    FINE,
+    KNOTS,
+    NEIGHBOUR,
+    expect_thrust,
+    spare,
+    windows_of,
+)
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -49,7 +56,7 @@ class FlyerModel(NumericModel):
         optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
         simulated = [name for name, part in optional.items() if part is not None]
         self.channels = (params.position, *simulated)
-        drivers = ("battery_voltage", "acc_b", "rate_b")
+        drivers = ("battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         present = [name for name in drivers if all(name in log for log in logs)]
         self.inputs = (params.attitude, params.input, *present)
         self.needed = (params.position, params.attitude, params.input, *simulated)
@@ -61,6 +68,8 @@ class FlyerModel(NumericModel):
             np.array([s.data[name] for s in self.stretches])
             for name in ("rot", "input", "volts", "since", "lean", "direction")
         )
+        if NEIGHBOUR in present:
+            self._neighbour = np.array([s.data["neighbour"] for s in self.stretches])
         self._commanded = params.thrust(inputs)  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
         hangs = params.cable is not None
@@ -180,6 +189,9 @@ class FlyerModel(NumericModel):
             ),
             "thrust": values[:, -self._commanded.shape[2] :].sum(1),
         }
+        if NEIGHBOUR in self.inputs:
+            stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
+            out[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
         if p.cable is not None:
             gap = path[:, 6:9]
             vel = path[:, 3:6] + path[:, 9:12]
@@ -375,6 +387,8 @@ class FlyerModel(NumericModel):
                 "slope": rise[half],
                 **{f"axis_{a}": rot[half, :, :, i] for i, a in enumerate("xyz")},
             }
+            if NEIGHBOUR in self.inputs:
+                values[NEIGHBOUR] = self._neighbour[lanes.owner, at]
             if hung is not None:
                 values |= {
                     "payload_pos_w": state[:, :3] + state[:, 6:9],

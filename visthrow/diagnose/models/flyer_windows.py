@@ -3,6 +3,7 @@ state.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -18,6 +19,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 # entries of the commands' table in a step of the integration: between them, commands switch at
 # their own times
 FINE = 16
+NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
 KNOTS = 8  # of the latent forces over a window
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
@@ -48,23 +50,25 @@ def windows_of(
     sigma = {
         name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels
     }  # no less is believed
-    driven = [log[name] for name in (params.position, params.attitude, params.input)]
+    driving = (params.position, params.attitude, params.input, *[NEIGHBOUR] * (NEIGHBOUR in log))
+    driven = [log[name] for name in driving]
     first = max(c.time[0] for c in driven)
     last = min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
     starts = starts[
         :: max(1, len(starts) // (4 * params.most_windows))
     ]  # hours are thinned before they are cut
-    covered = (
+    begins = (
         float(start)
         for start in starts
-        if all(_covered(c, start, start + params.window) for c in driven)
+        if all(covered(c, start, start + params.window) for c in driven)
     )
-    windows = (_window(log, number, params, channels, sigma, start) for start in covered)
+    windows = (_window(log, number, params, channels, sigma, start) for start in begins)
     return [stretch for stretch in windows if stretch is not None]
 
 
-def _covered(channel: Channel, start: float, end: float) -> bool:
+def covered(channel: Channel, start: float, end: float) -> bool:
+    """Whether a channel has no large gap between two times."""
     stamps = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
     return (
         len(stamps) > 5
@@ -82,9 +86,8 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         rows.append((channel.time[samples], channel.values[samples].astype(float)))
     if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
         return None
-    inputs = _inputs(log[params.input], params, start)
-    thrust = params.thrust(inputs).sum(axis=1)
-    if np.min(thrust[len(thrust) // 2 :]) < _IDLE * params.mass * params.gravity:
+    inputs = held_inputs(log[params.input], params, start)
+    if not flies(inputs, params):
         return None
     margin = spare(params.step)
     halves = start + 0.5 * params.step * np.arange(
@@ -112,6 +115,7 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
             "volts": float(volts),
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, halves),
+            "neighbour": (on_grid(*log[NEIGHBOUR].samples(), halves) if NEIGHBOUR in log else None),
             "since": start - float(log[params.input].time[0]),
         },
         latent_layout(start, end, KNOTS, blocks),
@@ -120,12 +124,18 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     )
 
 
+def flies(inputs: np.ndarray, params: Any) -> bool:
+    """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
+    thrust = params.thrust(inputs).sum(axis=1)
+    return np.min(thrust[len(thrust) // 2 :]) >= _IDLE * params.mass * params.gravity
+
+
 def spare(step: float) -> int:
     """Half steps of attitudes before a window and behind it, for what may be late."""
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
-def _inputs(channel: Channel, params: FlyerParams, start: float) -> np.ndarray:
+def held_inputs(channel: Channel, params: Any, start: float) -> np.ndarray:
     """Means of the held commands over fine steps, from one window before the start to its end,
     shape (fine steps, motors).
     """

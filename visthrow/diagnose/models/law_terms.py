@@ -234,6 +234,10 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "rate_w": lambda k: rotate(k["quat_wb"], k["rate_b"]),
     "swing_b": lambda k: rotate_back(k["quat_wb"], k["swing"]),
     "inverse_height": lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST),
+    "apart": lambda k: k["pos_w"] - k["neighbour_pos_w"],
+    "inverse_distance": lambda k: 1.0 / np.maximum(k["|apart|"], LOWEST),
+    "neighbour": lambda k: k["apart"] * k["inverse_distance"][:, None],
+    "distance_upright": lambda k: k["neighbour"][:, 2],
     "sideways": lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"],
 }
 """What :class:`KnotValues` computes of the quantities at the knots."""
@@ -248,12 +252,17 @@ def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
     return factors
 
 
-SCALARS = _factors(LAW_FACTORS["scalars"])
+MEASURED = LAW_FACTORS["measured"]  # factors of what a log alone holds: no simulator flies them
+
+SCALARS = _factors(LAW_FACTORS["scalars"] | MEASURED["scalars"])
 """Scalars of a term."""
 
 ONLY_JOINT = ("joint_rate",)  # scalars of terms in the rope's joint alone
 
-VECTORS = {block: _factors(rows) for block, rows in LAW_FACTORS["vectors"].items()}
+VECTORS = {
+    block: _factors(rows | MEASURED["vectors"].get(block, {}))
+    for block, rows in LAW_FACTORS["vectors"].items()
+}
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
 JOINT_NEEDS = VECTORS[JOINT]["joint_rate"].needs

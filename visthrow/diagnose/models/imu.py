@@ -1,0 +1,143 @@
+"""A quadrotor whose position nobody measures: driven by its motors' logged commands, seen by its
+accelerometer and gyro.
+
+Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
+of torque to inertia. An accelerometer's offset hides the map's scale."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from visthrow.config.bounds import Bounded, NotNegative, Positive
+from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.models.flyer_params import TorqueParams
+from visthrow.diagnose.models.flyer_windows import KNOTS, covered, flies, held_inputs
+from visthrow.diagnose.models.numeric import (
+    Lanes,
+    NumericModel,
+    Stretch,
+    integrate,
+    latent_force,
+    latent_layout,
+    sigma_of,
+)
+from visthrow.logs.check.relations import on_grid
+from visthrow.logs.flightlog import FlightLog
+
+CHANNELS = ("acc_b", "rate_b")
+UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
+OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
+QUIETEST = (1e-2, 2e-3)  # noise of accelerometer and gyro below which none is believed
+
+
+@dataclass(frozen=True)
+class ImuParams(Bounded):
+    """The vehicle that is assumed first."""
+
+    input: Literal["motor_command", "motor_speed"]  # channel of the commands
+    mass: Positive  # of all that flies [kg]
+    gravity: Positive  # [m/s^2]
+    thrust_map: tuple[float, float, float]  # of a motor by powers 0, 1, 2 of its input [N]
+    motor_time_constant: NotNegative  # [s]
+    command_delay: float  # below 0 where the log stamps its inputs late [s]
+    reference_voltage: Positive  # at which the map holds [V]
+    voltage_coefficient: float  # thrust changes by this share a volt [1/V]
+    window: Positive  # [s]
+    step: Positive  # of the integration [s]
+    every: int  # the samples taken: each so-manieth
+    most_windows: int  # spread evenly over all logs
+    torque: TorqueParams
+
+    @property
+    def total_mass(self) -> float:
+        """Return the mass of all that flies [kg]."""
+        return self.mass
+
+    def thrust(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the thrust that the map gives for inputs [N]."""
+        return np.polynomial.polynomial.polyval(inputs, self.thrust_map)
+
+
+class ImuModel(FlyerModel):
+    """Windows of flights of one vehicle; motors and torques are those of the base class."""
+
+    table = "imu"
+    channels = CHANNELS
+    lawless = "nothing tells the attitude and the velocity that a law is made of"
+
+    def __init__(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
+        """See the base class."""
+        self.needed = (params.input, *CHANNELS)
+        self.has_voltage = all("battery_voltage" in log for log in logs)
+        self.inputs = (params.input, *["battery_voltage"] * self.has_voltage)
+        NumericModel.__init__(self, logs, params)
+        self.steps = round(params.window / params.step)
+        inputs, self._volts, self._since = (
+            np.array([s.data[name] for s in self.stretches]) for name in ("input", "volts", "since")
+        )
+        self._commanded = params.thrust(inputs)
+
+    def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
+        """See the base class."""
+        p = self.params
+        driven = [log[name] for name in self.needed]
+        first = max(c.time[0] for c in driven)
+        last = min(c.time[-1] for c in driven)
+        sigma = [sigma_of(log[name], least) for name, least in zip(CHANNELS, QUIETEST)]
+        stretches = []
+        for start in np.arange(first + p.window, last - p.window, p.window):
+            end = start + p.window
+            inputs = held_inputs(log[p.input], p, start)
+            if not (all(covered(c, start, end) for c in driven) and flies(inputs, p)):
+                continue
+            acc, rate = (
+                log[name].only((log[name].time >= start) & (log[name].time < end)).samples()
+                for name in CHANNELS
+            )
+            samples = [
+                (time[:: p.every], values[:: p.every, part].astype(float), noise[part])
+                for (time, values), noise, part in zip((acc, rate), sigma, (slice(2, 3), slice(3)))
+            ]
+            volts = log["battery_voltage"].hold(np.array([end]))[0] if self.has_voltage else 0.0
+            data = {"start": start, "input": inputs, "volts": float(volts)}
+            data["since"] = start - float(log[p.input].time[0])
+            layout = latent_layout(start, end, KNOTS, (0, 1))
+            guess = [*samples[1][1][0], 0.0]
+            spread = [1.0, 1.0, 1.0, OFFSET]
+            stretches.append(Stretch.of(number, "flight", samples, data, layout, guess, spread))
+        return stretches
+
+    def simulate(self, lanes: Lanes) -> np.ndarray:
+        """See the base class; the state: body rates, and behind them the force along the rotors'
+        axis over the mass [m/s^2], with the accelerometer's offset.
+        """
+        p = self.params
+        thrust = self._thrusts(lanes)
+        latent = latent_force(lanes.latent, self.steps, 2)
+        turning: Callable = self._turning(lanes, thrust)
+
+        def slope(half: int, rate: np.ndarray) -> np.ndarray:
+            return turning(half, rate, latent[half, 1])
+
+        step = np.full((len(lanes.owner), 1), p.step)
+        rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
+        push = (thrust.sum(2) + latent[:, 0, :, 2])[::2].T / p.mass + lanes.nuisance[:, 3:]
+        return np.concatenate([rates, push[..., None]], 2)
+
+    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+        """See the base class."""
+        grid = stretch.data["start"] + self.params.step * np.arange(path.shape[1])
+        out = np.empty((len(path), len(stretch.time)))
+        for channel, part in enumerate((slice(3, 4), slice(3))):
+            rows = stretch.channel == channel
+            width = part.stop - (part.start or 0)
+            time = stretch.time[rows][::width]
+            seen = [on_grid(grid, states[:, part], time) for states in path]
+            out[:, rows] = np.reshape(seen, (len(path), -1))
+        return out
+
+    def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
+        """See the base class."""
+        return {}
