@@ -332,12 +332,25 @@ def test_write_parameters_mends_them(kind, names):
     assert set(desk.backend.audit.written) == names
 
 
-@mark.parametrize(("kind", "name"), [("ardupilot", "EK3_SRC1_POSXY"), ("px4", "EKF2_EV_CTRL")])
-def test_an_autopilot_without_external_poses_needs_no_source_of_them(kind, name):
-    """Software knows its place by its own simulated GPS."""
-    desk = Desk(kind, f"{kind}.poses=false", parameters={name: 0.0})
-    desk.turn(0.5)
-    assert desk.status.fault is None
+AUDITED = [
+    # software knows its place by its own simulated GPS
+    ("ardupilot", "poses=false", {"EK3_SRC1_POSXY": 0.0}, []),
+    ("px4", "poses=false", {"EKF2_EV_CTRL": 0.0}, []),
+    # a second of the last rates is too long
+    ("ardupilot", "", {"GUID_TIMEOUT": 1.0}, ["GUID_TIMEOUT is 1; expected above 0, at most 0.5"]),
+    ("px4", "", {"COM_OF_LOSS_T": 1.0}, ["COM_OF_LOSS_T is 1; expected above 0, at most 0.5"]),
+    # older firmware answers no DO_GRIPPER without it
+    ("px4", "", {"PD_GRIPPER_EN": 0.0}, ["PD_GRIPPER_EN is 0; expected 1, or none since 1.17"]),
+    # the closed end taken for the open one
+    ("px4", "servo_open_us=2000", {}, ["PWM_AUX_MIN1 is 1000; expected 2000 (servo_open_us)"]),
+]
+
+
+@mark.parametrize(("kind", "override", "parameters", "problems"), AUDITED)
+def test_what_the_audit_says(kind, override, parameters, problems):
+    desk = Desk(kind, *([f"{kind}.{override}"] if override else []), parameters=parameters)
+    desk.turn(1.5)
+    assert (desk.backend.audit.done, desk.backend.audit.problems) == (True, problems)
 
 
 def test_px4_in_software_has_no_minimum_of_an_output():
@@ -359,13 +372,6 @@ def test_parameters_of_the_config_are_audited_and_written():
     desk.turn(3.0)
     assert desk.status.fault is None
     assert desk.fake.parameters["SIH_MASS"] == approx(0.272)
-
-
-@mark.parametrize(("kind", "name"), [("ardupilot", "GUID_TIMEOUT"), ("px4", "COM_OF_LOSS_T")])
-def test_a_second_of_the_last_rates_is_too_long(kind, name):
-    desk = Desk(kind, parameters={name: 1.0})
-    desk.turn(0.5)
-    assert desk.backend.audit.problems == [f"{name} is 1; expected above 0, at most 0.5"]
 
 
 def test_betaflight_is_not_written_while_it_is_armed():
@@ -597,24 +603,12 @@ def test_what_speaks_against_arming_is_said_in_words():
     assert desk.status.note == "arming disabled: tilted more than small_angle (flags 0x100)"
 
 
-def test_px4_without_the_gripper_switch_flies_and_with_it_off_does_not():
-    """PD_GRIPPER_EN is gone since 1.17; older firmware has it, and answers no DO_GRIPPER without
-    it.
-    """
+def test_px4_without_the_gripper_switch_flies():
+    """PD_GRIPPER_EN is gone since 1.17."""
     desk = Desk("px4")
     desk.turn(1.5)
     assert (desk.backend.audit.done, desk.status.fault) == (True, None)
     assert desk.backend.audit.refused == {"PD_GRIPPER_EN": "no such parameter"}
-    old = Desk("px4", parameters={"PD_GRIPPER_EN": 0.0})
-    old.turn(1.5)
-    assert old.backend.audit.problems == ["PD_GRIPPER_EN is 0; expected 1, or none since 1.17"]
-
-
-def test_px4s_gripper_opens_at_the_minimum_of_its_output():
-    """A config that takes the closed end for the open one is found at connect."""
-    wrong = Desk("px4", "px4.servo_open_us=2000")
-    wrong.turn(1.5)
-    assert wrong.backend.audit.problems == ["PWM_AUX_MIN1 is 1000; expected 2000 (servo_open_us)"]
 
 
 @mark.parametrize(("kind", "closed"), [("ardupilot", 1900), ("px4", 2000)])

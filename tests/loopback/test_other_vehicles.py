@@ -16,7 +16,7 @@ from tests.configs import load_run
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.loopback.test_endings import NEVER
 from tests.loopback.wire import CONFIGS, peers
-from tests.point import PointPlant
+from tests.point import LAG, PointPlant
 
 KINDS = tuple(CONFIGS)
 QUICK = ("states.idle=3.0", "states.check=3.0", "states.abort=0.5")
@@ -29,13 +29,13 @@ AT_ONCE = 0.10  # time in which a sign is judged by the rates that an autopilot 
 BY_POSES = 0.5  # and by poses alone [s]
 
 
-def fly(kind, times=1.0, spoil=lambda fake: None, plant=None):
+def fly(kind, times=1.0, spoil=lambda fake: None, yaw_lag=LAG):
     """Fly until a run is refused, given back or thrown.
 
     Returns the runner, what it said, and how far the vehicle had sunk while it was ours [m].
     """
     taken = () if kind in ("betaflight", "crazyflie") else (f"{kind}.take=true",)
-    plant, waits = plant or PointPlant(times), []
+    plant, waits = PointPlant(times, yaw_lag), []
     runner, source, clock, fake = peers(
         plant, kind=kind, loaded=NEVER, seed=3, overrides=(*QUICK, *taken)
     )
@@ -94,16 +94,9 @@ def require_refused(runner, said, sunk):
 
 @mark.parametrize("kind", KINDS)
 def test_the_policys_vehicle_throws_even_with_a_slow_yaw(kind):
-    runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=SLOW))
+    runner, said, sunk = fly(kind, yaw_lag=SLOW)
     assert runner.machine.state is State.THROW, said
     assert sunk < SUNK
-
-
-@mark.parametrize("kind", KINDS)
-def test_a_yaw_that_does_not_turn_is_handed_back(kind):
-    runner, said, sunk = fly(kind, plant=PointPlant(yaw_lag=1e6))
-    require_refused(runner, said, sunk)
-    assert "handed back: yaw: the vehicle does not turn as commanded" in said
 
 
 @mark.parametrize("kind", KINDS)
@@ -116,20 +109,23 @@ def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, tim
         require_reach(params, simple_policy().contract)
 
 
-@mark.parametrize("kind", KINDS)
-@mark.parametrize("times", [0.5, 2.0])
-def test_another_weight_than_the_configuration_says(kind, times):
-    runner, said, sunk = fly(kind, times)
-    require_refused(runner, said, sunk)
-    assert "times the weight" in said or "thrust: the vehicle" in said
+THRUST = ("times the weight", "thrust: the vehicle")
+OTHERS = {
+    "half the weight": ({"times": 0.5}, THRUST),
+    "twice the weight": ({"times": 2.0}, THRUST),
+    "less thrust": ({"spoil": bend(0.8)}, THRUST),
+    "more thrust": ({"spoil": bend(1.2)}, THRUST),
+    "no yaw": ({"yaw_lag": 1e6}, ("handed back: yaw: the vehicle does not turn as commanded",)),
+}
 
 
 @mark.parametrize("kind", KINDS)
-@mark.parametrize("share", [0.8, 1.2])
-def test_another_thrust_line(kind, share):
-    runner, said, sunk = fly(kind, spoil=bend(share))
+@mark.parametrize("name", OTHERS)
+def test_another_vehicle_than_the_configuration_says(kind, name):
+    flown, reasons = OTHERS[name]
+    runner, said, sunk = fly(kind, **flown)
     require_refused(runner, said, sunk)
-    assert "times the weight" in said or "thrust: the vehicle" in said
+    assert any(reason in said for reason in reasons)
 
 
 @mark.parametrize("kind", KINDS)

@@ -383,50 +383,31 @@ def wait_for(process, words):
     pytest.fail("".join(said[-30:]))
 
 
+def bridged(folder, report, *more):
+    """Start the firmware with the bridge to it."""
+    words = f"hil fake --kind betaflight-sitl --speed {SPEED}".split()
+    places = "--firmware", str(program()), "--folder", str(folder), "--out", str(report)
+    return visthrow(*words, *places, *more, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+
+
+def running(folder, *overrides):
+    """Start the runner."""
+    words = f"hil run --config betaflight_sitl --auto-arm --bare --speed {SPEED}".split()
+    sets = (word for text in overrides for word in ("--set", text))
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return visthrow(*words, "--out", str(folder), *sets, **pipes)
+
+
 def test_a_whole_throw(tmp_path):
     """Take-over, throw, release, recovery and landing with the page's two commands; the error is
     printed.
     """
     report, folder = tmp_path / "report.json", tmp_path / "firmware"
-    bridge = visthrow(
-        "hil",
-        "fake",
-        "--kind",
-        "betaflight-sitl",
-        "--firmware",
-        str(program()),
-        "--folder",
-        str(folder),
-        "--policy",
-        "vision",
-        "--speed",
-        str(SPEED),
-        "--after",
-        "9",
-        "--out",
-        str(report),
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-    )
+    bridge = bridged(folder, report, "--policy", "vision", "--after", "9")
     runner = None
     try:
         wait_for(bridge, "it flies")
-        runner = visthrow(
-            "hil",
-            "run",
-            "--config",
-            "betaflight_sitl",
-            "--auto-arm",
-            "--bare",
-            "--speed",
-            str(SPEED),
-            "--out",
-            str(tmp_path / "run"),
-            "--set",
-            "realtime.priority=10",
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
+        runner = running(tmp_path / "run", "realtime.priority=10")
         told, states = runner.communicate(timeout=LONG)
         bridge.communicate(timeout=LONG)
     finally:
@@ -455,40 +436,11 @@ def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
     endings.NEVER.save(tmp_path / "never.npz")
     overrides = (f'policy="{tmp_path / "never.npz"}"', *endings.QUICK)
     report, run = tmp_path / "report.json", tmp_path / "run"
-    bridge = visthrow(
-        "hil",
-        "fake",
-        "--kind",
-        "betaflight-sitl",
-        "--firmware",
-        str(program()),
-        "--folder",
-        str(tmp_path / "firmware"),
-        "--speed",
-        str(SPEED),
-        "--out",
-        str(report),
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-    )
+    bridge = bridged(tmp_path / "firmware", report)
     runner = None
     try:
         wait_for(bridge, "it flies")
-        runner = visthrow(
-            "hil",
-            "run",
-            "--config",
-            "betaflight_sitl",
-            "--auto-arm",
-            "--bare",
-            "--speed",
-            str(SPEED),
-            "--out",
-            str(run),
-            *(word for text in overrides for word in ("--set", text)),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-        )
+        runner = running(run, *overrides)
         wait_for(runner, " s  throw ")
         time.sleep(0.3 / SPEED)
         runner.kill()

@@ -244,10 +244,25 @@ class TestTables:
             1,
         )
 
-    def test_held_values_are_one_measurement(self, tmp_path):
-        rows = ["t,v", *(f"{10 * i},{i // 4}" for i in range(12))]
-        (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m", held=True)))
-        assert log["x"].time == approx([0, 0.04, 0.08])
+    @mark.parametrize(
+        ("rows", "entry", "values"),
+        [
+            ("t;v\n0;1,5\n10;2,5\n20;3,5", {}, [1.5, 2.5, 3.5]),
+            ("t\tv\n0\t1.5\n10\t2.5\n20\t3.5", {}, [1.5, 2.5, 3.5]),
+            ("t v\n0 1.5\n10   2.5\n20 3.5", {}, [1.5, 2.5, 3.5]),
+            ("t;v\n0;1.5\n10;2.5\n20;3.5", {}, [1.5, 2.5, 3.5]),
+            ("t,v\n0,1\n10,1\n20,2\n30,2\n40,3", {"held": True}, [1, 2, 3]),
+            ("t,v\n0,1\n10,2\n20,-4", dict(unit="cm", scale=2, offset=3), [0.05, 0.07, -0.05]),
+            ("t,v,v\n0,1,5\n10,2,6\n20,3,7", {"columns": ("v (2)",)}, [5, 6, 7]),
+            ("t,v\n0,1\n10,2\n20,3\n30", {}, [1, 2, 3]),  # cut while it was written
+        ],
+    )
+    def test_one_column(self, tmp_path, rows, entry, values):
+        entry = {"name": "x", "columns": ("v",), "unit": "m"} | entry
+        (log,) = read(written(tmp_path, [rows]), mapping(ChannelMap(**entry)))
+        period = 0.02 if entry.get("held") else 0.01
+        assert log["x"].time == approx([0, period, 2 * period])
+        assert log["x"].values.ravel() == approx(values)
 
     def test_blanks_are_no_samples_and_break_no_hold(self, tmp_path):
         """Two streams in one table: rows of the one are blank in the other; a part of a vector that
@@ -265,20 +280,6 @@ class TestTables:
         assert np.all(log["x"].valid)
         assert len(log["y"].time) == 13
         assert log["y"].valid.tolist() == [i % 3 > 0 for i in range(13)]
-
-    @mark.parametrize(
-        "text",
-        [
-            "t;v\n0;1,5\n10;2,5\n20;3,5\n",
-            "t\tv\n0\t1.5\n10\t2.5\n20\t3.5\n",
-            "t v\n0 1.5\n10   2.5\n20 3.5\n",
-            "t;v\n0;1.5\n10;2.5\n20;3.5\n",
-        ],
-    )
-    def test_separators_and_decimal_commas(self, tmp_path, text):
-        (tmp_path / "a.csv").write_text(text)
-        (log,) = read(tmp_path / "a.csv", mapping(ChannelMap("x", ("v",), "m")))
-        assert log["x"].values == approx([1.5, 2.5, 3.5])
 
     def test_no_header_and_lists_in_cells(self, tmp_path):
         (tmp_path / "a.csv").write_text(
@@ -313,11 +314,6 @@ class TestTables:
             read(f"{path}:c", whole)
         assert logs[1]["x"].time[0] == 100.0
         assert logs[1]["y"].time[0] == approx(0.5)
-
-    def test_scale_and_offset_are_in_the_files_unit(self, tmp_path):
-        entry = ChannelMap("x", ("v",), "cm", scale=2.0, offset=3.0)
-        (log,) = read(written(tmp_path, ["t,v", "0,1", "10,2", "20,-4"]), mapping(entry))
-        assert log["x"].values == approx([0.05, 0.07, -0.05])
 
     @mark.parametrize(
         ("clock", "times"),
@@ -376,17 +372,6 @@ class TestTables:
     def test_bad_tables(self, tmp_path, rows, message):
         with raises(LogError, match=message):
             read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
-
-    def test_a_name_that_stands_twice_is_numbered(self, tmp_path):
-        path = written(tmp_path, ["t,v,v", "0,1,5", "1,2,6"])
-        (log,) = read(path, mapping(ChannelMap("x", ("v (2)",), "m")))
-        assert log["x"].values.ravel().tolist() == [5.0, 6.0]
-
-    def test_a_table_cut_while_written_loses_its_last_row(self, tmp_path):
-        (log,) = read(
-            written(tmp_path, ["t,v", "0,1", "1,2", "2"]), mapping(ChannelMap("x", ("v",), "m"))
-        )
-        assert len(log["x"].time) == 2
 
     def test_damaged_files(self, tmp_path):
         path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
