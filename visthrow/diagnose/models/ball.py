@@ -44,7 +44,7 @@ class BallParams(Bounded):
     drag: NotNegative  # k / m of the quadratic drag k |v| v [1/m]
     edge: NotNegative  # cut off at either end of a free flight [s]
     shortest: Positive  # free flights [s]
-    every: int = 1  # the samples taken: each so-manieth
+    every: int = 1  # the samples taken: every n-th
 
 
 class BallModel(NumericModel):

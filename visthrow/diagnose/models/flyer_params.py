@@ -59,7 +59,7 @@ class FlyerParams(Bounded):
     lowest: float  # windows keep above this height [m]
     window: Positive  # [s]
     step: Positive  # of the integration [s]
-    every: int  # the position samples taken: each so-manieth
+    every: int  # the position samples taken: every n-th
     most_windows: int  # spread evenly over all logs
     estimator_rate: Positive = (
         1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]

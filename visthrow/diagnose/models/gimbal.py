@@ -38,7 +38,7 @@ class GimbalParams(Bounded):
     # whether the gimbal's angles are against the horizon (then only the vehicle's yaw turns it)
     stabilised: bool
     window: Positive  # [s]
-    every: int  # the samples taken: each so-manieth
+    every: int  # the samples taken: every n-th
     largest: Positive  # detections further than this from the prediction are of something else [m]
 
 

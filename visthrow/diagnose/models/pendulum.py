@@ -48,7 +48,7 @@ class PendulumParams(Bounded):
     quadratic: NotNegative  # air drag per inertia [1/rad]
     window: Positive  # [s]
     step: Positive  # of the integration [s]
-    every: int  # the samples taken: each so-manieth
+    every: int  # the samples taken: every n-th
 
     @property
     def stiffness(self) -> float:
