@@ -11,7 +11,7 @@ from visthrow.common.arguments import add_commands, run_command
 ACTIONS = {
     "run": (
         "fly, or compute commands without sending them (a dry run)",
-        "hil.commands.run_command",
+        "hil.commands.flight_command",
     ),
     "view": (
         "show a run in 3D while it flies, or write a recording, pictures and flight logs of it",
@@ -27,11 +27,11 @@ ACTIONS = {
     ),
     "calibrate": (
         "hover, sway, estimate the camera's tilt and latency and the thrust in hover, and land",
-        "hil.commands.calibrate_command",
+        "hil.commands.flight_command",
     ),
     "record": (
         "record incoming poses and the policy's commands for them; never arms",
-        "hil.commands.record_command",
+        "hil.commands.flight_command",
     ),
     "fake": (
         "run a fake autopilot that flies the simulated vehicle over UDP",

@@ -42,20 +42,3 @@ def add_source_options(parser: argparse.ArgumentParser) -> None:
     add("--speed", type=ABOVE_ZERO, default=1.0, help=speed)
     signing = "sign MAVLink messages, and reject any that is not signed"
     add("--sign", metavar="KEYFILE", help=signing)
-
-
-def add_flight_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of a run that writes a folder."""
-    add_source_options(parser)
-    add = parser.add_argument
-    add("--out", metavar="FOLDER", help="of the run (default: a new one in runs/hil)")
-    add("--view", action="store_true", help="serve a live view to this machine's browser")
-    bare = "leave out flight logs and pictures; `hil view` makes them later"
-    add("--bare", action="store_true", help=bare)
-
-
-def fly(args: argparse.Namespace) -> int:
-    """Fly, or run dry, and return the exit status."""
-    from hil import fly_run
-
-    return fly_run.fly(args)

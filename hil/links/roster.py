@@ -17,6 +17,9 @@ from visthrow.config.bounds import Bound
 
 MavlinkId = Annotated[int, Bound(1, 255)]
 
+# takes lines for the operator, and never waits; None where nobody reads them
+Announce = Callable[[str], None] | None
+
 # address of a datagram's sender; None on a stream, which has one peer
 Address = tuple[str, int] | None
 
@@ -125,7 +128,7 @@ class Roster:
         self,
         parties: Iterable[Party] = (),
         allow: Iterable[str] = (),
-        tell: Callable[[str], None] | None = None,
+        tell: Announce = None,
     ) -> None:
         """Wait for all parties; without one, the first valid message of anybody says who is heard
         and answered. ``allow``: addresses that may send at all; none: any.

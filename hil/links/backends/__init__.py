@@ -4,7 +4,6 @@
 the poses may share, ``betaflight`` speaks MSP and ``crazyflie`` CRTP on a port of its own.
 """
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from hil.links.backends.px4 import Px4
 from hil.links.backends.rates import Sticks
 from hil.links.crtp import open_crtp
 from hil.links.device import check_device, open_port
+from hil.links.roster import Announce
 from hil.links.writer import MSP_LOG, LoggedPort
 from visthrow.onboard.hover import GRAVITY
 
@@ -39,7 +39,7 @@ def make_backend(
     params: Any,
     link: Any = None,
     write: bool = False,
-    tell: Callable[[str], None] | None = None,
+    tell: Announce = None,
     folder: Path | None = None,
 ) -> Backend | Held:
     """Return the back-end of a run; raises `LinkError` or `RunError` where there is no link or port

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hil.links.facts import values
+from hil.links.roster import Announce
 
 ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
 # after a value was written, answers may still be on their way that were given before; then it is
@@ -101,7 +102,7 @@ class Audit:
         rules: Iterable[Rule] = (),
         ask: Callable[[str], None] = lambda name: None,
         write: Callable[[str, float], None] | None = None,
-        tell: Callable[[str], None] | None = None,
+        tell: Announce = None,
     ) -> None:
         """Begin with nothing asked; without rules the audit is done.
 

@@ -6,7 +6,6 @@ taken over: the runner stops commanding and asks for nothing any more, an abort 
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -15,7 +14,7 @@ from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Command
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
-from hil.links.roster import MavlinkId, Party
+from hil.links.roster import Announce, MavlinkId, Party
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
 ASK_AGAIN = 0.1  # between two requests for a mode or for arming [s]
@@ -83,7 +82,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         link: Link,
         params: AutopilotParams,
         write: bool = False,
-        tell: Callable[[str], None] | None = None,
+        tell: Announce = None,
     ) -> None:
         """Listen on a link, which the pose source may share; ``tell`` is handed the audit's table.
         Wrong parameters are written or not.

@@ -1,14 +1,13 @@
 """What the runner needs of a back-end, the one that sends nothing, and one whose commands wait."""
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 from hil.links.backends.audit import Audit
 from hil.links.device import Port
-from hil.links.roster import Address, Roster, shown
+from hil.links.roster import Address, Announce, Roster, shown
 
 # how far a release has come
 IDLE = "idle"
@@ -296,9 +295,7 @@ class OnPort(Autopilot):
 
     protocol = ""
 
-    def __init__(
-        self, port: Port, silence: float, tell: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, port: Port, silence: float, tell: Announce = None) -> None:
         """Take an open port; after a silence [s] the controller counts as lost. ``tell`` is handed
         who is refused.
         """

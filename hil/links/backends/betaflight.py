@@ -16,7 +16,6 @@ Computer Over MSP."""
 
 import math
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -36,6 +35,7 @@ from hil.links.backends.rates import MIDDLE, RATES_TYPES, RatesParams, Sticks
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import values
+from hil.links.roster import Announce
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
@@ -124,7 +124,7 @@ class Betaflight(OnPort):
         port: Port,
         params: BetaflightParams,
         write: bool = False,
-        tell: Callable[[str], None] | None = None,
+        tell: Announce = None,
     ) -> None:
         """Speak MSP on an open port; ``tell`` is handed the table of settings, and wrong rates are
         written or not.

@@ -12,7 +12,6 @@ set-points of a place.
 Source: `hil.links.facts`, crazyflie."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 from hil.links import crtp
@@ -22,6 +21,7 @@ from hil.links.backends.crazyflie_gyro import GyroStream
 from hil.links.backends.thrust_curve import HoverThrustParams
 from hil.links.device import Port, chunks
 from hil.links.facts import facts, values
+from hil.links.roster import Announce
 from hil.poses.body_track import Track
 from hil.poses.pose import VEHICLE
 from visthrow.common.errors import ConfigError
@@ -78,9 +78,7 @@ class Crazyflie(OnPort):
     name = "crazyflie"
     protocol = "CRTP"
 
-    def __init__(
-        self, port: Port, params: CrazyflieParams, tell: Callable[[str], None] | None = None
-    ) -> None:
+    def __init__(self, port: Port, params: CrazyflieParams, tell: Announce = None) -> None:
         """Speak CRTP on an open port; ``tell`` is handed the settings and who is refused."""
         super().__init__(port, params.silence, tell)
         self.params = params

@@ -25,7 +25,7 @@ from typing import Any, Literal
 
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link
-from hil.links.roster import Roster
+from hil.links.roster import Announce, Roster
 from hil.poses.pose import BODIES, Body, Pose
 from hil.poses.sources import capture
 from hil.poses.sources.capture import PAUSE, listen
@@ -107,7 +107,7 @@ class MocapSource(Source):
         clock: Callable[[], float],
         link: Link | None = None,
         module: Any = None,
-        tell: Callable[[str], None] | None = None,
+        tell: Announce = None,
     ) -> None:
         """Connect; ``clock`` gives the arrivals, ``link`` is served, ``tell`` is handed what is
         dropped, ``module`` stands for the package, in this process. Raises `SourceError` where that

@@ -12,7 +12,7 @@ from hil.links.backends import AUTOPILOTS
 from hil.links.clock import Clock, ManualClock
 from hil.links.device import check_device, open_port
 from hil.links.mavlink_link import Link, LinkSync
-from hil.links.roster import Party, Roster
+from hil.links.roster import Announce, Party, Roster
 from hil.links.writer import POSES_TLOG, TLOG, TlogWriter
 from hil.params import LIVE, HilParams
 from hil.poses.frames import FrameParams, Frames
@@ -71,7 +71,7 @@ def open_source(
     folder: Path,
     clock: Clock,
     key: bytes | None = None,
-    tell: Callable[[str], None] | None = None,
+    tell: Announce = None,
 ) -> tuple[Any, Link | None, Clock]:
     """Open a source: it, the autopilot's link where there is one, and the run's clock, which is put
     from pose to pose where they are recorded; raises `SourceError`, `LinkError`.
@@ -125,7 +125,7 @@ def open_mocap(
     clock: Callable[[], float],
     remote: bool,
     link: Link | None = None,
-    tell: Callable[[str], None] | None = None,
+    tell: Announce = None,
 ) -> MocapSource:
     """Connect to a system; raises `LinkError` for a host that is no numeric address, or leaves this
     machine without the config's leave.
