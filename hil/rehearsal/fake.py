@@ -485,8 +485,30 @@ class Bridge(Fake):
     process by.
     """
 
+    params: Any  # of the back-end: which output or channel opens the mechanism
     # entries of a report
     unknown = ("followed", "ignored", "commands", "worst", "breaches", "last_command")
+
+    def __init__(
+        self,
+        plant: WirePlant,
+        link: Link,
+        mocap: FakeMocapParams | None,
+        seed: int,
+        options: FakeOptions,
+        params: Any,
+        autopilot: Any = None,
+    ) -> None:
+        """Connect to an autopilot; ``params`` of its back-end, ``autopilot``: what it is reached by
+        where that is made before.
+        """
+        super().__init__(plant, link, mocap, seed, options)
+        self.params = params
+        self.connect(autopilot)
+
+    @abstractmethod
+    def connect(self, autopilot: Any) -> None:
+        """Connect to the autopilot."""
 
     def take(self) -> None:
         """Do nothing: the pilot is the autopilot's."""

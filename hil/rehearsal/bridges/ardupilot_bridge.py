@@ -25,10 +25,8 @@ from hil.errors import LinkError
 from hil.links.backends.ardupilot import ArduPilotParams
 from hil.links.device import LARGEST_DATAGRAM
 from hil.links.facts import values
-from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_bridge import MotorPlant
-from hil.rehearsal.fake import Bridge, FakeOptions
-from hil.rehearsal.fake_mocap import FakeMocapParams
+from hil.rehearsal.fake import Bridge
 
 FACTS = values("ardupilot")
 SERVOS = FACTS["json_port"]  # UDP port on which ArduPilot finds the simulation
@@ -84,21 +82,11 @@ class ArduPilotSitl(Bridge):
     """
 
     unknown = (*Bridge.unknown, "armed")
+    plant: MotorPlant
+    params: ArduPilotParams
 
-    def __init__(
-        self,
-        plant: MotorPlant,
-        link: Link,
-        mocap: FakeMocapParams | None,
-        seed: int,
-        options: FakeOptions,
-        params: ArduPilotParams,
-    ) -> None:
-        """Listen for ArduPilot; ``params`` of the back-end say which output opens the mechanism.
-        Raises `LinkError`: the port is taken.
-        """
-        super().__init__(plant, link, mocap, seed, options)
-        self.params = params
+    def connect(self, autopilot: None) -> None:
+        """Listen for ArduPilot. Raises `LinkError`: the port is taken."""
         self._number = -1
         self.motors = np.zeros(4)
         self.frames = 0

@@ -15,11 +15,10 @@ import numpy as np
 from hil.links import msp
 from hil.links.backends.betaflight import BOX_ARM, FACTS, HIGH, NEAR, STICKS, BetaflightParams
 from hil.links.device import Device, TcpPort, chunks
-from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_firmware import PORTS
 from hil.rehearsal.bridges.packets import Sensors
-from hil.rehearsal.fake import Bridge, FakeOptions, WirePlant
-from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
+from hil.rehearsal.fake import Bridge, WirePlant
+from hil.rehearsal.fake_mocap import SLACK
 
 ASK = {msp.RC: 0.002, msp.STATUS: 0.1}  # what the firmware is asked for, and how often [s]
 
@@ -49,21 +48,11 @@ class BetaflightSitl(Bridge):
     (4,), in our order; ``answered``: periods in which the firmware put out motors.
     """
 
-    def __init__(
-        self,
-        plant: MotorPlant,
-        link: Link,
-        mocap: FakeMocapParams | None,
-        seed: int,
-        options: FakeOptions,
-        params: BetaflightParams,
-        stands: int,
-    ) -> None:
-        """Connect to a firmware that runs; ``params`` of the back-end say which channel opens the
-        mechanism, ``stands``: see `Sensors`.
-        """
-        super().__init__(plant, link, mocap, seed, options)
-        self.params = params
+    plant: MotorPlant
+    params: BetaflightParams
+
+    def connect(self, stands: int) -> None:
+        """Connect to a firmware that runs; ``stands``: see `Sensors`."""
         self.armed = False
         self.port = TcpPort(Device("tcp", "127.0.0.1", PORTS[1]))
         self.sensors = Sensors(stands)
@@ -74,8 +63,8 @@ class BetaflightSitl(Bridge):
         self.answered = 0
         self.cycles: list[int] = []
         self._outputs: list[np.ndarray] = []
-        self._samples = round(plant.period / SAMPLE)
-        self._rate_b = plant.rate_b  # at the beginning of the last period
+        self._samples = round(self.plant.period / SAMPLE)
+        self._rate_b = self.plant.rate_b  # at the beginning of the last period
         self._sent = 0  # samples in this one
 
     def run_on(self, when: float) -> None:

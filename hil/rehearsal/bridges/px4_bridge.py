@@ -22,8 +22,8 @@ from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.facts import values
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
-from hil.rehearsal.fake import Bridge, FakeOptions
-from hil.rehearsal.fake_mocap import SLACK, FakeMocapParams
+from hil.rehearsal.fake import Bridge
+from hil.rehearsal.fake_mocap import SLACK
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.onboard.hover import GRAVITY
 
@@ -244,22 +244,10 @@ class Px4Sih(Bridge):
     """
 
     plant: HangingBall
+    params: Px4Params
 
-    def __init__(
-        self,
-        plant: HangingBall,
-        link: Link,
-        mocap: FakeMocapParams | None,
-        seed: int,
-        options: FakeOptions,
-        params: Px4Params,
-        autopilot: Link,
-    ) -> None:
-        """Listen to PX4 by a link of the bridge's own; ``params`` of the back-end say which output
-        opens the mechanism.
-        """
-        super().__init__(plant, link, mocap, seed, options)
-        self.params = params
+    def connect(self, autopilot: Link) -> None:
+        """Listen to PX4 by a link of the bridge's own."""
         self.autopilot = autopilot
         self.port = autopilot.port
         self._asked: dict[int | str, float] = {}
