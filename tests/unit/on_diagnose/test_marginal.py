@@ -70,6 +70,17 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
         )
 
 
+def test_windows_say_the_same_in_one_batch_and_alone(fitted):
+    _, _, _, levels, grams = fitted
+    together = Stack(grams).integrals(levels, latents=True).shares(grams, levels)
+    for w, (gram, share) in enumerate(zip(grams, together)):
+        by_itself = alone(gram, levels, w, latents=True)
+        for name in ("information", "score", "square"):
+            expected = getattr(by_itself, name)
+            scale = np.abs(expected).max()
+            assert_allclose(getattr(share, name), expected, rtol=0.0, atol=1e-9 * scale)
+
+
 def test_likelihood_is_that_of_the_dense_covariance(fitted):
     """At any noise levels and any weights of the samples, so that models compare whose outliers are
     not the same.

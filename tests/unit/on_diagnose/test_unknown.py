@@ -43,7 +43,7 @@ KNOTS = (
 
 
 def table(terms_: list, knots: dict) -> np.ndarray:
-    return laws.TermLayout.of(terms_).table(knots)
+    return laws.TermLayout.of(terms_).table(laws.KnotValues(knots))
 
 
 def turned(knots: dict, angle: float) -> dict:
@@ -105,7 +105,7 @@ def test_a_torque_in_the_joint_acts_on_both_sides():
     knots = random_knots()
     terms = laws.terms_of(laws.JOINT, KNOTS)[:5]
     torque_b = table(terms, knots)
-    found = laws.loads(laws.JOINT, knots, torque_b)
+    found = laws.loads(laws.JOINT, laws.KnotValues(knots), torque_b)
     assert tuple(sorted(found)) == tuple(sorted(LATENT_BLOCKS))
     assert_allclose(found["vehicle force"], -found["payload force"])
     away = knots["payload_pos_w"] - knots["pos_w"]

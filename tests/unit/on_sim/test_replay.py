@@ -165,6 +165,20 @@ def test_commands_switch_where_they_should(flight):
     assert np.abs(large - small).max() < 0.05 * np.abs(large).max()
 
 
+def test_a_command_that_does_not_come_leaves_the_one_before(flight):
+    """A lane that skips a command flies as though the log held the one before in its place."""
+    start, times, commands, truth = flight
+    skipped = np.array([5, 12])
+    seen, _ = replay(flight, [plant()], count=2, skip=skipped)
+    for lane, number in enumerate(skipped):
+        held = commands.copy()
+        held[number] = held[number - 1]
+        assert norm(held - commands) > 0.01
+        expected, _ = replay((start, times, held, truth), [plant()])
+        for name, values in expected.items():
+            assert_array_equal(seen[name][:, lane], values[:, 0])
+
+
 def test_release_falls_between_steps(flight):
     """The payload's path bends at latch plus lag, to a fraction of a substep."""
     stamps = np.arange(0.45, 0.56, 0.0005)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect
-from visthrow.diagnose.models.law_terms import JOINT, KnotValues, Term, TermLayout, carries, loads
+from visthrow.diagnose.models.law_terms import JOINT, KnotValues, Term, carries, loads
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 
 FINE = 8  # points between two knots at which a curve is looked at
@@ -86,6 +86,6 @@ def forces(window: Window, effects: Sequence[TermEffect]) -> np.ndarray:
     quantities = KnotValues(window.knots)
     for i, effect in enumerate(effects):
         if carries(window.latent_block, effect.term.block):
-            values = TermLayout.of([effect.term]).table(quantities).ravel()
+            values = effect.term.read(quantities).ravel()
             out[:, i] = through_latents(window, quantities, effect.term.block) @ values
     return out

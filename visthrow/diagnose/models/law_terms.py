@@ -14,6 +14,7 @@ what a pair of forces does,
 so that the latent forces of three blocks together carry it (:func:`loads`) and momentum is
 conserved."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations_with_replacement
@@ -91,6 +92,11 @@ class Term:
         """Scalars, then the vector."""
         return [*(SCALARS[name] for name in self.factors), VECTORS[self.block][self.vector]]
 
+    def read(self, values: KnotValues) -> np.ndarray:
+        """Return what it exerts at the knots with a coefficient of 1, shape (k, 3)."""
+        *scalars, vector = (factor.read(values) for factor in self.parts)
+        return math.prod(scalars, start=np.ones(len(vector)))[:, None] * vector
+
     def law(self, coefficient: float) -> LawParams:
         """The law that it is with a coefficient."""
         return LawParams(self.block, self.factors, self.vector, coefficient)
@@ -141,9 +147,7 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
     values = KnotValues(values)
     total = {}
     for law in laws:
-        value = law.coefficient * VECTORS[law.block][law.vector].read(values)
-        for factor in law.factors:
-            value *= SCALARS[factor].read(values)[:, None]
+        value = law.coefficient * Term(law.block, law.factors, law.vector).read(values)
         for block, load in loads(law.block, values, value[:, :, None]).items():
             total[block] = total.get(block, 0.0) + load[:, :, 0]
     return total
@@ -327,18 +331,16 @@ class TermLayout:
             [VECTORS[self.block][v].read(values) for v in self.vectors], axis=-1
         )
 
-    def table(self, knots: Knots) -> np.ndarray:
+    def table(self, knots: KnotValues) -> np.ndarray:
         """Values of the terms, shape (k, 3, T)."""
-        scalars, vectors = self.factors(
-            knots if isinstance(knots, KnotValues) else KnotValues(knots)
-        )
+        scalars, vectors = self.factors(knots)
         values = vectors[:, :, self.vector]
         for which in self.scalar:
             values *= scalars[:, None, which]
         return values
 
 
-def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]:
+def loads(block: str, knots: KnotValues, values: np.ndarray) -> dict[str, np.ndarray]:
     """Return the loads of terms in each latent block: a torque in the joint acts on the vehicle, on
     the rope and, by it, on the payload.
 
@@ -347,12 +349,11 @@ def loads(block: str, knots: Knots, values: np.ndarray) -> dict[str, np.ndarray]
     """
     if block != JOINT:
         return {block: values}
-    quantities = knots if isinstance(knots, KnotValues) else KnotValues(knots)
     torque_b = np.swapaxes(values, 1, 2)
-    reach = quantities["reach_w"][:, None, :]
-    turn = np.stack([quantities[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
+    reach = knots["reach_w"][:, None, :]
+    turn = np.stack([knots[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
     torque_w = np.einsum("kij,ktj->kti", turn, torque_b)
     pair = -cross(torque_w, reach) / (reach**2).sum(-1, keepdims=True)
-    at_mount = cross(quantities["mount_b"][:, None, :], -np.einsum("kij,kti->ktj", turn, pair))
+    at_mount = cross(knots["mount_b"][:, None, :], -np.einsum("kij,kti->ktj", turn, pair))
     out = {"vehicle force": -pair, "vehicle torque": torque_b + at_mount, "payload force": pair}
     return {name: np.swapaxes(value, 1, 2) for name, value in out.items()}
