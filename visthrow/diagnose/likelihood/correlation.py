@@ -64,7 +64,7 @@ class Correlation:
     order: int  # of the filter: 1 or 2
     scale: float = 1.0  # of the deviation that is stated
 
-    def at(self, lag: np.ndarray) -> np.ndarray:
+    def at_lag(self, lag: np.ndarray) -> np.ndarray:
         """Correlation of samples ``lag`` [s] apart."""
         x = np.abs(lag) / self.time
         return self.share * np.exp(-x) * (1.0 + x if self.order == 2 else 1.0) + (
@@ -103,7 +103,7 @@ def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]
         rows = components(window, channel)
         if rows is not None:
             time = window.time[rows[:, 0]]
-            factors.append((rows, np.linalg.cholesky(correlation.at(time[:, None] - time))))
+            factors.append((rows, np.linalg.cholesky(correlation.at_lag(time[:, None] - time))))
             sigma[rows] *= correlation.scale
     return replace(window, sigma=sigma, correlated=tuple(factors))
 

@@ -63,7 +63,7 @@ class Gram:
     latent_block: np.ndarray  # shape (L,)
     # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
     factor: np.ndarray
-    shown: Mapping[
+    visibility: Mapping[
         int, float
     ]  # latent block -> median inner product of its columns with themselves
     log_sigma: float = 0.0  # sum over all samples: grams whose outliers have other weights compare
@@ -266,9 +266,9 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ factor).reshape(channels, size, -1)
     cross = gram.cross.copy()
     cross[:, part] = (cross[:, part].reshape(-1, knots) @ factor).reshape(channels, -1)
-    shown = _information_by_block(inner, gram.nuisances, gram.latent_block)
+    visibility = _information_by_block(inner, gram.nuisances, gram.latent_block)
     whole = np.kron(np.eye(groups), factor)
-    return replace(gram, inner=inner, cross=cross, factor=whole, shown=shown)
+    return replace(gram, inner=inner, cross=cross, factor=whole, visibility=visibility)
 
 
 def knot_factor(window: Window, time: float) -> np.ndarray:

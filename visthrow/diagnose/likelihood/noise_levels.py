@@ -140,7 +140,7 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
     scale = np.ones(len(grams[0].count))
     visible: dict[tuple[int, str], list[float]] = {}
     for gram in grams:
-        for block, information in gram.shown.items():
+        for block, information in gram.visibility.items():
             if information > 0.0:  # else these forces show nowhere in the window
                 visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(information))
     return Noise(
@@ -160,13 +160,13 @@ class _Layout:
     keys: tuple[tuple[int, str], ...]  # (block, phase)
     pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
     phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
-    seen: np.ndarray  # channels with samples
+    measured: np.ndarray  # channels with samples
     # 1 where a parameter moves a window's own level of a block, or scale of a channel; shape
     # (P, W (B + C))
     moves: csr_array
 
     @staticmethod
-    def of(grams: Sequence[Gram], noise: Noise) -> "_Layout":
+    def numbered(grams: Sequence[Gram], noise: Noise) -> "_Layout":
         """Number the parameters."""
         keys = tuple(sorted(noise.latent_sd))
         index = {key: i for i, key in enumerate(keys)}
@@ -199,7 +199,7 @@ class _Layout:
         """Logarithms of all levels, shape (P,)."""
         shared = [noise.latent_sd[key] for key in self.keys]
         return np.log(
-            np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.seen]))
+            np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.measured]))
         )
 
     def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
@@ -209,7 +209,7 @@ class _Layout:
         share = noise.share.copy()
         scale = noise.scale.copy()
         share[tuple(self.pairs.T)] = np.exp(x[first:last])
-        scale[self.seen] = np.exp(x[last:])
+        scale[self.measured] = np.exp(x[last:])
         return replace(
             noise,
             scale=scale,
@@ -221,7 +221,7 @@ class _Layout:
         """Lowest and highest values of the parameters."""
         guess = _first_guess(grams).latent_sd
         visible = np.log([guess[key] for key in self.keys])
-        sizes = len(self.pairs), len(self.seen)
+        sizes = len(self.pairs), len(self.measured)
         bounds = (
             (
                 np.log(low) + visible,
@@ -242,7 +242,7 @@ def maximised(
     By Fisher scoring: the expected curvature costs nothing beside the gradient, and a few looks at
     all windows suffice. ``noise``: where the search starts; ``tolerance``: nats; a step that
     promises less is the last."""
-    layout = _Layout.of(grams, noise)
+    layout = _Layout.numbered(grams, noise)
     stack = Stack(grams, device)
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
@@ -369,7 +369,7 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
     for row, gram in zip(share, bare):
         for (block, _), level in _first_guess([gram]).latent_sd.items():
             row[block] = WIDE * level
-    levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.shown}
+    levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
     fits = Stack(shaped, device).fitted(Noise(np.ones(len(bare[0].count)), levels, time, share))
     for fit, gram in zip(fits, shaped):
         fit[gram.nuisances :] = gram.factor @ fit[gram.nuisances :]

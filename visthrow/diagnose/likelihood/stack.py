@@ -154,8 +154,8 @@ class Stack:
         """
 
         def fit(batch: _Batch) -> tuple[torch.Tensor]:
-            at = _shape(batch, noise)
-            return (at.level * _solved(at, batch)[0],)
+            shape = _shape(batch, noise)
+            return (shape.level * _solved(shape, batch)[0],)
 
         rows = _by_window(self._order, [rows for (rows,) in self._of_batches(fit)])
         return [row[:size] for row, size in zip(rows, self._sizes)]
@@ -299,8 +299,8 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
 class _Integrated:
     """The remainder of the last J columns of a batch."""
 
-    left: list[np.ndarray]  # which of the J columns are a window's own
-    at: _Shape
+    own_columns: list[np.ndarray]  # which of the J columns are a window's own
+    shape: _Shape
     # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     half: torch.Tensor
     information: list[np.ndarray]  # of each window
@@ -311,16 +311,16 @@ class _Integrated:
         count, n, columns = self.half.shape
         hidden = np.zeros((count, n))
         effects = np.zeros((count, columns))
-        for w, (gram, kept_columns) in enumerate(zip(grams, self.left)):
+        for w, (gram, kept_columns) in enumerate(zip(grams, self.own_columns)):
             cross = weight @ gram.cross
             size = gram.nuisances + gram.latents
             hidden[w, :size] = cross[:size]
             effects[w, kept_columns] = cross[len(cross) - len(kept_columns) :]
-        right = self.at.level * torch.from_numpy(hidden).to(self.half.device)
-        projected = torch.linalg.solve_triangular(self.at.factor, right[:, :, None], upper=False)
+        right = self.shape.level * torch.from_numpy(hidden).to(self.half.device)
+        projected = torch.linalg.solve_triangular(self.shape.factor, right[:, :, None], upper=False)
         results = (
             (self.half.transpose(1, 2) @ projected)[..., 0],
-            self.at.log_det - projected.square().sum((1, 2)),
+            self.shape.log_det - projected.square().sum((1, 2)),
         )
         explained, taken = all_to_host(results)
         return [
@@ -328,7 +328,7 @@ class _Integrated:
                 information, score[kept_columns], float(weight @ gram.square + square_of)
             )
             for gram, kept_columns, information, score, square_of in zip(
-                grams, self.left, self.information, effects - explained, taken
+                grams, self.own_columns, self.information, effects - explained, taken
             )
         ]
 
@@ -350,7 +350,7 @@ class Integrals:
     @property
     def log_dets(self) -> list[float]:
         """Return the log determinant of each window's V."""
-        return _by_window(self._order, [part.at.log_det.tolist() for part in self._parts])
+        return _by_window(self._order, [part.shape.log_det.tolist() for part in self._parts])
 
     def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives;
@@ -389,5 +389,5 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
         columns = [
             np.r_[gram.nuisances : size, n : n + width] for gram, size in zip(batch.grams, sizes)
         ]
-    information = [values[np.ix_(kept, kept)] for values, kept in zip(whole, columns)]
+    information = [values[np.ix_(rows, rows)] for values, rows in zip(whole, columns)]
     return _Integrated(columns, shape, half, information)

@@ -68,12 +68,12 @@ class BallModel(NumericModel):
             fit = np.polynomial.polynomial.polyfit(time - time[0], pos, 3)
             horizontal = fit[1] * np.array([1.0, 1.0, 0.0])
             horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
-            across = np.array([-horizontal[1], horizontal[0], 0.0])
-            data = {"time": time, "across": across, "span": np.ptp(time)}
+            sideways = np.array([-horizontal[1], horizontal[0], 0.0])
+            data = {"time": time, "across": sideways, "span": np.ptp(time)}
             layout = latent_layout(time[0], time[-1], KNOTS, (2,))
             begin = [*fit[0], *fit[1]], [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
             table = time, pos, sigma
-            flights.append(Stretch.of(number, "ballistic", [table], data, layout, *begin))
+            flights.append(Stretch.laid_out(number, "ballistic", [table], data, layout, *begin))
         return flights
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
@@ -83,8 +83,8 @@ class BallModel(NumericModel):
         """
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
-        across, spans = self.tables(lanes, "across", "span")
-        spin = top[:, None] * across + side[:, None] * np.array([0.0, 0.0, 1.0])
+        sideways, spans = self.tables(lanes, "across", "span")
+        spin = top[:, None] * sideways + side[:, None] * np.array([0.0, 0.0, 1.0])
         push = latent_force(lanes.latent, STEPS, 1)[:, 0]
         gravity = np.array([0.0, 0.0, -self.params.gravity])
         quadratic = (self.params.drag + drag)[:, None]

@@ -25,7 +25,7 @@ class ModelEffect(Effect):
     )
     needs: str = ""  # parameter that a setup may lack, and the effect with it
 
-    def of(self, params: Any) -> "ModelEffect":
+    def for_params(self, params: Any) -> "ModelEffect":
         """Return the effect in the parameters' numbers."""
 
         def scaled(name: str, value: float) -> float:
@@ -58,7 +58,7 @@ def _tables(model: str) -> ModelEffects:
 def effects_of(model: str, params: Any) -> list[ModelEffect]:
     """Return the effects of a setup's model in the order of its file."""
     return [
-        e.of(params)
+        e.for_params(params)
         for e in _tables(model).effects.values()
         if not e.needs or getattr(params, e.needs) is not None
     ]

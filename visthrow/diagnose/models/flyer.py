@@ -92,12 +92,12 @@ class FlyerModel(NumericModel):
         Raises LogError: commands are of another size than carries the vehicle.
         """
         stretches = super().cut(logs)
-        most = self.params.most_windows
+        limit = self.params.most_windows
         if stretches:
             expect_thrust(stretches, self.params)
-        if len(stretches) <= most:
+        if len(stretches) <= limit:
             return stretches
-        chosen = np.linspace(0, len(stretches) - 1, most).round().astype(int)
+        chosen = np.linspace(0, len(stretches) - 1, limit).round().astype(int)
         return [stretches[i] for i in chosen]
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
@@ -112,8 +112,8 @@ class FlyerModel(NumericModel):
         step's own mean: commands switch there."""
         p = self.params
         fine = self.params.step / FINE
-        delay = p.command_delay + self.of(lanes, "cmd_delay")
-        tau = p.motor_time_constant + self.of(lanes, "motor_tau")
+        delay = p.command_delay + self.size_of(lanes, "cmd_delay")
+        tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
         tau = np.maximum(tau, SHORTEST)
         position = (
             p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
@@ -141,10 +141,10 @@ class FlyerModel(NumericModel):
         thrust, whole = out
         mean = np.diff(whole[::2], axis=0) * (fine / p.step)
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
-        curve = self.of(lanes, "thrust_curve")[:, None]
+        curve = self.size_of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
         since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
-        faded = 1.0 + self.of(lanes, "thrust_fade") * since
+        faded = 1.0 + self.size_of(lanes, "thrust_fade") * since
         curved = 1.0 + curve * (thrust / hover - 1.0)
         return thrust * self._scale(lanes) * curved * faded[..., None]
 
@@ -179,35 +179,22 @@ class FlyerModel(NumericModel):
         rot = Rotation.from_matrix(stretch.data["rot"][halves])
         turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
         rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
-        out = {
-            "time": time,
-            "pos_w": values[:, :3],
-            "vel_w": values[:, 3:6],
-            "quat_wb": turned(time).as_quat(),
-            "rate_b": (
-                triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
-            ),
-            "thrust": values[:, -self._commanded.shape[2] :].sum(1),
-        }
+        rate = triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
+        thrust = values[:, -self._commanded.shape[2] :].sum(1)
+        hung = None
+        known = {"time": time, "quat_wb": turned(time).as_quat()}
         if NEIGHBOUR in self.inputs:
             stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
-            out[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
+            known[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
         if p.cable is not None:
             gap = path[:, 6:9]
             vel = path[:, 3:6] + path[:, 9:12]
             direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
-            at_knots = triangles(time, grid) @ np.column_stack(
-                [direction, np.maximum(-np.sum(direction * force, 1), 0.0)]
-            )
-            out |= {
-                "payload_pos_w": values[:, :3] + values[:, 6:9],
-                "payload_vel_w": values[:, 3:6] + values[:, 9:12],
-                "cable_dir_w": at_knots[:, :3],
-                "tension": at_knots[:, 3],
-                "mount_b": np.zeros((len(time), 3)),
-            }
-        return out
+            tension = np.maximum(-np.sum(direction * force, 1, keepdims=True), 0.0)
+            hung = triangles(time, grid) @ direction, triangles(time, grid) @ tension
+        quantities = _quantities(values, rate, thrust, hung)
+        return known | quantities
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
@@ -217,8 +204,8 @@ class FlyerModel(NumericModel):
             if self.has_voltage
             else np.zeros(len(lanes.owner))
         )
-        sag = p.voltage_coefficient + self.of(lanes, "battery_sag")
-        scale = (1.0 + self.of(lanes, "thrust_gain")) * (1.0 + sag * volts)
+        sag = p.voltage_coefficient + self.size_of(lanes, "battery_sag")
+        scale = (1.0 + self.size_of(lanes, "thrust_gain")) * (1.0 + sag * volts)
         motors = self._commanded.shape[2]
         if motors == 1 or p.torque is None:
             return np.repeat(scale[:, None], motors, 1)
@@ -240,7 +227,9 @@ class FlyerModel(NumericModel):
                 rates = [on_grid(grid, x[:, self._rates], time) for x in path]
                 out[:, rows] = np.reshape(rates, (len(path), -1))
                 continue
-            late = time[None] - self.of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
+            late = (
+                time[None] - self.size_of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
+            )
             value = path[..., 0:3]
             rate = path[..., 3:6]
             if name == "payload_pos_w":
@@ -263,7 +252,7 @@ class FlyerModel(NumericModel):
         unknown = lanes.nuisance
         if self.params.cable is None:
             return unknown
-        length = (self.params.cable.length + self.of(lanes, "rope_length"))[:, None]
+        length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
         down = self._direction[lanes.owner]
         level = ((0, 0), (0, 1))  # a third component of 0
         side = np.pad(unknown[:, 6:8], level)
@@ -277,7 +266,7 @@ class FlyerModel(NumericModel):
     def _slope(self, lanes: Lanes, thrust: np.ndarray) -> Slope:
         """Return the derivative of the states under thrusts [N], shape (half steps, B, motors)."""
         p = self.params
-        mass = (p.mass + self.of(lanes, "mass_quad"))[:, None]
+        mass = (p.mass + self.size_of(lanes, "mass_quad"))[:, None]
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
         gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
         wind = self.stack(lanes, "wind_x", "wind_y", "")
@@ -308,7 +297,7 @@ class FlyerModel(NumericModel):
 
     def _rotations(self, lanes: Lanes) -> np.ndarray:
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
-        late = self._spare + self.of(lanes, "attitude_delay") / (0.5 * self.params.step)
+        late = self._spare + self.size_of(lanes, "attitude_delay") / (0.5 * self.params.step)
         position = np.arange(2 * self.steps + 1)[:, None] + late
         index = np.clip(position.astype(int), 0, self._rot.shape[1] - 2)
         before = self._rot[lanes.owner, index]
@@ -321,10 +310,10 @@ class FlyerModel(NumericModel):
         total = thrust.sum(2, keepdims=True)
         added = self.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
         drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
-        parasitic = self.of(lanes, "parasitic")[:, None]
-        lift = self.of(lanes, "translational_lift")[:, None]
+        parasitic = self.size_of(lanes, "parasitic")[:, None]
+        lift = self.size_of(lanes, "translational_lift")[:, None]
         turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")
-        lean = self.of(lanes, "estimator_lean")[:, None]
+        lean = self.size_of(lanes, "estimator_lean")[:, None]
         turns = np.any(turn) or np.any(lean)
 
         def force(half: int, air: np.ndarray) -> np.ndarray:
@@ -344,8 +333,8 @@ class FlyerModel(NumericModel):
         """Return what gives accelerations of vehicle and payload, the cable's direction, and what
         it pulls with [N], by states, velocity in the air and loads; it never pushes.
         """
-        payload = (self.params.cable.mass + self.of(lanes, "mass_payload"))[:, None]
-        payload_drag = self.of(lanes, "payload_drag")[:, None]
+        payload = (self.params.cable.mass + self.size_of(lanes, "mass_payload"))[:, None]
+        payload_drag = self.size_of(lanes, "payload_drag")[:, None]
         reduced = 1.0 / (1.0 / payload + 1.0 / mass)
 
         def pulled(state: np.ndarray, air: np.ndarray, loads: Mapping) -> tuple[np.ndarray, ...]:
@@ -357,8 +346,8 @@ class FlyerModel(NumericModel):
             free_payload = (drag + loads["payload force"]) / payload + gravity
             length = np.sqrt(_products(gap, gap))
             direction = gap / length
-            apart = _products(direction, free_payload - free)
-            relative = apart + _products(gap_rate, gap_rate) / length
+            separation = _products(direction, free_payload - free)
+            relative = separation + _products(gap_rate, gap_rate) / length
             pull = np.maximum(relative * reduced, 0.0)
             pull_w = pull * direction
             return free + pull_w / mass, free_payload - pull_w / payload, direction, pull
@@ -373,30 +362,19 @@ class FlyerModel(NumericModel):
         total = thrust.sum(2)
 
         def loads(half: int, state: np.ndarray, hung: tuple | None) -> dict[str, np.ndarray]:
-            none = np.zeros((len(state), 3))
-            at = half + self._spare
-            before, after = (self._rot[lanes.owner, at + side] for side in (-1, 1))
+            row = half + self._spare
+            before, after = (self._rot[lanes.owner, row + side] for side in (-1, 1))
             turn = np.einsum("bji,bjk->bik", before, after)
             skew = turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]]
+            rate = skew / (2.0 * self.params.step)
             values = {
-                "time": none[:, 0],
-                "pos_w": state[:, :3],
-                "vel_w": state[:, 3:6],
-                "rate_b": skew / (2.0 * self.params.step),
-                "thrust": total[half],
+                "time": np.zeros(len(state)),
                 "slope": rise[half],
                 **{f"axis_{a}": rot[half, :, :, i] for i, a in enumerate("xyz")},
+                **_quantities(state, rate, total[half], hung and hung[2:]),
             }
             if NEIGHBOUR in self.inputs:
-                values[NEIGHBOUR] = self._neighbour[lanes.owner, at]
-            if hung is not None:
-                values |= {
-                    "payload_pos_w": state[:, :3] + state[:, 6:9],
-                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
-                    "cable_dir_w": hung[2],
-                    "tension": hung[3][:, 0],
-                    "mount_b": none,
-                }
+                values[NEIGHBOUR] = self._neighbour[lanes.owner, row]
             return exerted(self.laws, values)
 
         return loads
@@ -426,6 +404,22 @@ class FlyerModel(NumericModel):
             return (torque - cross(rate, inertia * rate) + push) / inertia
 
         return turning
+
+
+def _quantities(
+    state: np.ndarray, rate: np.ndarray, thrust: np.ndarray, hung: tuple | None
+) -> dict[str, np.ndarray]:
+    """Return quantities of laws at states; ``hung``: the cable's direction, and its pull [N]."""
+    values = {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "rate_b": rate, "thrust": thrust}
+    if hung is None:
+        return values
+    return values | {
+        "payload_pos_w": state[:, :3] + state[:, 6:9],
+        "payload_vel_w": state[:, 3:6] + state[:, 9:12],
+        "cable_dir_w": hung[0],
+        "tension": hung[1][:, 0],
+        "mount_b": np.zeros((len(state), 3)),
+    }
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

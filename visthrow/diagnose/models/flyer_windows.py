@@ -104,7 +104,7 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         *([2] if params.cable is not None else []),
         *([1] if params.torque is not None else []),
     ]
-    return Stretch.of(
+    return Stretch.laid_out(
         number,
         "flight",
         [(time, values, sigma[name]) for name, (time, values) in zip(channels, rows)],

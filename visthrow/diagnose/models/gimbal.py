@@ -70,19 +70,19 @@ class GimbalModel(NumericModel):
             in_table = (table_time > start - MARGIN) & (table_time < end + MARGIN)
             if len(rows) < 10 or np.sum(in_table) < 20:
                 continue
-            near = {name: values[in_table] for name, values in tables.items()}
+            poses = {name: values[in_table] for name, values in tables.items()}
             point = marker.values[rows].astype(float)
-            distance = np.median(np.linalg.norm(near["gap"], axis=1))
+            distance = np.median(np.linalg.norm(poses["gap"], axis=1))
             fits = np.abs(np.linalg.norm(point, axis=1) - distance) < params.largest
             rejected += int(np.sum(~fits))
             frames += len(fits)
             if np.sum(fits) < 10:
                 continue
             sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
-            seen = marker.time[rows][fits], point[fits], sigma
-            data = {"table_time": table_time[in_table], "table": near}
+            measured = marker.time[rows][fits], point[fits], sigma
+            data = {"table_time": table_time[in_table], "table": poses}
             layout = latent_layout(start, end, KNOTS, (2,))
-            stretches.append(Stretch.of(number, "view", [seen], data, layout))
+            stretches.append(Stretch.laid_out(number, "view", [measured], data, layout))
         if rejected > MOST_APART * frames:
             raise LogError(
                 f"the marker's distance is more than {params.largest:g} m from the payload's in"
@@ -98,7 +98,7 @@ class GimbalModel(NumericModel):
         )
         time = stretch.time.reshape(-1, 3)[:, 0]
         table = stretch.data["table"]
-        late = time[None] - self.of(lanes, "camera_delay")[:, None]
+        late = time[None] - self.size_of(lanes, "camera_delay")[:, None]
         gap, axes, level = (
             on_grid(stretch.data["table_time"], table[name], late)
             for name in ("gap", "rot", "gimbal")

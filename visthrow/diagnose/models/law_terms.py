@@ -112,8 +112,8 @@ class Term:
         in the joint, a torque [N m].
         """
         target = (1, 2, -2) if self.block in ("vehicle torque", JOINT) else (1, 1, -2)
-        left = np.array(target) - sum(factor.exponents for factor in self.parts)
-        powers = [u if n == 1 else f"{u}^{n}" for u, n in zip(BASE_UNITS, left) if n]
+        remaining = np.array(target) - sum(factor.exponents for factor in self.parts)
+        powers = [u if n == 1 else f"{u}^{n}" for u, n in zip(BASE_UNITS, remaining) if n]
         return " ".join(powers) or "1"
 
     @property

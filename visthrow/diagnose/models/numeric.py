@@ -52,7 +52,7 @@ class Stretch(Window):
         return self.residual
 
     @staticmethod
-    def of(
+    def laid_out(
         flight: int,
         phase: str,
         channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
@@ -139,10 +139,10 @@ class NumericModel(Model, ABC):
 
         Raises LogError: all lack one.
         """
-        held = [[name for name in self.needed if _holds(log, name)] for log in logs]
-        usable = [i for i, names in enumerate(held) if len(names) == len(self.needed)]
+        present = [[name for name in self.needed if _holds(log, name)] for log in logs]
+        usable = [i for i, names in enumerate(present) if len(names) == len(self.needed)]
         if not usable:
-            lacking = sorted(set(self.needed).difference(*held))
+            lacking = sorted(set(self.needed).difference(*present))
             raise LogError(
                 f"no log has all of {', '.join(self.needed)}; missing everywhere:"
                 f" {', '.join(lacking) or 'none'}"
@@ -237,7 +237,7 @@ class NumericModel(Model, ABC):
         """Return entries of the windows' data, of one shape in all windows, a row for each lane."""
         return [np.array([s.data[name] for s in self.stretches])[lanes.owner] for name in names]
 
-    def of(self, lanes: Lanes, name: str) -> np.ndarray:
+    def size_of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
         return (
             lanes.theta[:, self.numbers[name]]
@@ -247,7 +247,7 @@ class NumericModel(Model, ABC):
 
     def stack(self, lanes: Lanes, *names: str) -> np.ndarray:
         """Sizes of several effects, shape (B, N); zeros for an empty name."""
-        return np.stack([self.of(lanes, name) for name in names], axis=1)
+        return np.stack([self.size_of(lanes, name) for name in names], axis=1)
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""

@@ -81,11 +81,11 @@ class PendulumModel(NumericModel):
         angle = angle[:, 0]
         if len(time) < FEWEST:
             return []
-        away = np.median(np.abs(angle - params.hanging))
-        if away > FARTHEST:
+        distance = np.median(np.abs(angle - params.hanging))
+        if distance > FARTHEST:
             raise LogError(
-                f"the pendulum is {away:.3g} rad from where it hangs ({params.hanging:.3g} rad);"
-                " expected radians within a turn: degrees, or another zero?"
+                f"the pendulum is {distance:.3g} rad from where it hangs ({params.hanging:.3g}"
+                " rad); expected radians within a turn: degrees, or another zero?"
             )
         sigma = sigma_of(log[CHANNEL], 1e-5)
         stretches = []
@@ -100,7 +100,9 @@ class PendulumModel(NumericModel):
             layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
             table = t, y[:, None], sigma
             begin = fit[:2], [0.2, 1.0]
-            stretches.append(Stretch.of(number, "swing", [table], {"start": start}, layout, *begin))
+            stretches.append(
+                Stretch.laid_out(number, "swing", [table], {"start": start}, layout, *begin)
+            )
         return stretches
 
     def simulate(self, lanes: Lanes) -> np.ndarray:

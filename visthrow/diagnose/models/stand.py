@@ -68,7 +68,7 @@ class StandModel(NumericModel):
         ]
         data = {"speed": speed, "volts": volts}
         layout = latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1))
-        return [Stretch.of(number, "steps", channels, data, layout)]
+        return [Stretch.laid_out(number, "steps", channels, data, layout)]
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: thrusts [N], then currents [A]."""

@@ -86,7 +86,7 @@ class TrimModel(NumericModel):
             }
             table = np.array([start]), np.mean(sent_here, axis=0)[None], np.array(params.spread)
             layout = _latent(start, start + window)
-            stretches.append(Stretch.of(number, "hover", [table], data, layout))
+            stretches.append(Stretch.laid_out(number, "hover", [table], data, layout))
         return stretches
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:

@@ -133,8 +133,8 @@ def _(model: FlyerModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
         extra = ("battery_voltage",) * model.has_voltage
         return build([flight.setup_log(model.params, noise, extra)])
 
-    known = plant_of(config.load(Experiment, config.find("train", "state")))
-    plant = vehicle_of(model.params, known)
+    vehicle = plant_of(config.load(Experiment, config.find("train", "state")))
+    plant = vehicle_of(model.params, vehicle)
     return plant, model_of, partial(carried, params=model.params)
 
 

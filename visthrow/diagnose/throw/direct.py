@@ -265,11 +265,11 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     }
     view = {}
     for name, (track, delay) in tracks.items():
-        shown = replace(track, time=track.time - delay)  # at the times that they show
-        near = [smoothed(shown, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
-        if any(fit is None for fit in near):
+        stamped = replace(track, time=track.time - delay)  # at the times that they show
+        fits = [smoothed(stamped, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
+        if any(fit is None for fit in fits):
             return None
-        values = np.array([value for value, _ in near])
+        values = np.array([value for value, _ in fits])
         if name == "attitude":
             view[name] = RotationSpline(grid, Rotation.from_quat(values))
         else:

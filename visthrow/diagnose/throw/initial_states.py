@@ -192,9 +192,9 @@ def smoothed(
     """Value and derivative at a time from a local cubic through the samples about it; None without
     enough of them.
     """
-    if (time, before, after) not in samples.near:
-        samples.near[time, before, after] = _smoothed(samples, time, before, after)
-    return samples.near[time, before, after]
+    if (time, before, after) not in samples.estimates:
+        samples.estimates[time, before, after] = _smoothed(samples, time, before, after)
+    return samples.estimates[time, before, after]
 
 
 def _smoothed(

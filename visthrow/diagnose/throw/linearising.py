@@ -85,7 +85,7 @@ class Plan:
 
     window: int
     first: int  # lane
-    kept: int  # first row of the knots
+    first_knot: int  # first row of the knots
     fine: int  # lanes of nominal steps
     order: np.ndarray  # of effects, states and latent forces, the lane behind the first one
     nuisances: list[int]  # directions of the initial state
@@ -93,7 +93,7 @@ class Plan:
 
 
 class Linearisation:
-    """What all windows of a linearisation share."""
+    """The part of a linearisation that all windows share."""
 
     def __init__(
         self,
@@ -114,7 +114,7 @@ class Linearisation:
         """
         self._flights = flights
         self._simulation = simulation
-        self._setting, *others = simulation.settings
+        self._setting, *perturbed = simulation.settings
         self._steps = steps
         self._directions = directions
         self._states = states
@@ -122,7 +122,7 @@ class Linearisation:
         self._blocks = [e.block for e in effects]
         kinds = {flights.kind(w) for w in range(len(flights.cuts))}
         self._alike = {
-            kind: np.array([flown_alike(kind, self._setting, x) for x in others], dtype=bool)
+            kind: np.array([flown_alike(kind, self._setting, x) for x in perturbed], dtype=bool)
             for kind in kinds
         }
 
@@ -130,12 +130,12 @@ class Linearisation:
         """Linearise windows whose lanes fit a run; ``channels``: of the samples of each."""
         plans: list[Plan] = []
         lanes: list[Lane] = []
-        kept = 0
+        first_knot = 0
         for w in batch:
-            plan, flown_by = self._plan(w, len(lanes), kept)
+            plan, flown_by = self._plan(w, len(lanes), first_knot)
             plans.append(plan)
             lanes += flown_by
-            kept += 2 * int(self._flights.knots[w])
+            first_knot += 2 * int(self._flights.knots[w])
         flown = self._flights.fly(self._simulation, self._states, lanes)
         in_order = map if flown.seen.is_cuda else parallel_map
         slopes = list(in_order(partial(self._slopes, flown.seen), plans))
@@ -149,10 +149,10 @@ class Linearisation:
 
         return parallel_map(window, range(len(plans)))
 
-    def _plan(self, w: int, first: int, kept: int) -> tuple[Plan, list[Lane]]:
+    def _plan(self, w: int, first: int, first_knot: int) -> tuple[Plan, list[Lane]]:
         """Return the lanes of one window.
 
-        ``first``: number of the first; ``kept``: first row of the knots; twice as many as the
+        ``first``: number of the first; ``first_knot``: first row of the knots; twice as many as the
         window's are taken."""
         c = self._flights.cuts[w]
         knots = int(self._flights.knots[w])
@@ -168,20 +168,20 @@ class Linearisation:
         lanes = [Lane(w, 1 + k, w, rough=not fine[k]) for k in range(len(fine))]
         lanes += [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
         for axis, knot in latents:
-            resume = kept + knots + max(knot - 1, 0)
+            resume = first_knot + knots + max(knot - 1, 0)
             force = axis, knot, LATENT_SIZES[axis]
             lanes.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
         # lanes that ride along follow the nominal one
         order = [*np.argsort(~alike, kind="stable"), *range(len(alike), len(lanes))]
-        nominal = Lane(w, 0, w, keep=kept, shared=int(alike.sum()))
-        rough = Lane(w, 0, w, keep=kept + knots, rough=True)
+        nominal = Lane(w, 0, w, keep=first_knot, shared=int(alike.sum()))
+        rough = Lane(w, 0, w, keep=first_knot + knots, rough=True)
         numbers = [-1, *(i for i in order if not lanes[i].rough)]
         split = len(numbers)
         numbers += [-1, *(i for i in order if lanes[i].rough)]
         flown = [nominal, *(lanes[i] for i in numbers[1:split])]
         flown += [rough, *(lanes[i] for i in numbers[split + 1 :])]
         places = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
-        return Plan(w, first, kept, split, places, nuisances, latents), flown
+        return Plan(w, first, first_knot, split, places, nuisances, latents), flown
 
     def _slopes(self, measured: torch.Tensor, plan: Plan) -> list[torch.Tensor]:
         """Derivatives of a window's samples by effects, states and latent forces, shape (3 rows,
@@ -221,7 +221,7 @@ class Linearisation:
         c = f.cuts[w]
         effects, states, latents = slopes
         axes, places = np.array(plan.latents).T
-        rows = slice(plan.kept, plan.kept + f.knots[w])
+        rows = slice(plan.first_knot, plan.first_knot + f.knots[w])
         values = {name: value[rows] for name, value in knots.items()}
         window = Window(
             c.flight,

@@ -35,7 +35,7 @@ class ChannelSamples:
     time: np.ndarray  # [s], shape (T,)
     values: np.ndarray  # shape (T, 3) or (T, 4)
     sigma: float  # of one component; of an attitude the angle's [rad]
-    near: dict = field(
+    estimates: dict = field(
         default_factory=dict, repr=False, compare=False
     )  # what they say about times that were asked for before
 

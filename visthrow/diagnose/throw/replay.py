@@ -53,13 +53,13 @@ def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[lis
     ``lanes``: of each window.
     """
     groups: list[list[int]] = []
-    left = 0
+    spare = 0
     for w, count in zip(windows, lanes):
-        if not groups or left < count:
+        if not groups or spare < count:
             groups.append([])
-            left = room
+            spare = room
         groups[-1].append(w)
-        left -= count
+        spare -= count
     return groups
 
 
