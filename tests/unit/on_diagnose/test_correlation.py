@@ -63,7 +63,7 @@ def test_inner_products_are_those_of_the_dense_covariance(order):
     dense = np.diag(window.sigma**2)
     for part in components(window, 1).T:
         lag = window.time[part][:, None] - window.time[part]
-        dense[np.ix_(part, part)] = (1.7 * window.sigma[part[0]]) ** 2 * known.at(lag)
+        dense[np.ix_(part, part)] = (1.7 * window.sigma[part[0]]) ** 2 * known.at_lag(lag)
     floors = np.ones(SOME)
     z, gram = marginal.columns(window, floors), marginal.gram_of(told, floors, 2)
     inverse = np.linalg.inv(dense)
