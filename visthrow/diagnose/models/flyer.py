@@ -182,10 +182,10 @@ class FlyerModel(NumericModel):
         rate = triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
         thrust = values[:, -self._commanded.shape[2] :].sum(1)
         hung = None
-        known = {"time": time, "quat_wb": turned(time).as_quat()}
+        pose = {"time": time, "quat_wb": turned(time).as_quat()}
         if NEIGHBOUR in self.inputs:
             stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
-            known[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
+            pose[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
         if p.cable is not None:
             gap = path[:, 6:9]
             vel = path[:, 3:6] + path[:, 9:12]
@@ -194,7 +194,7 @@ class FlyerModel(NumericModel):
             tension = np.maximum(-np.sum(direction * force, 1, keepdims=True), 0.0)
             hung = triangles(time, grid) @ direction, triangles(time, grid) @ tension
         quantities = _quantities(values, rate, thrust, hung)
-        return known | quantities
+        return pose | quantities
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""

@@ -85,7 +85,7 @@ class ImuModel(FlyerModel):
         driven = [log[name] for name in self.needed]
         first = max(c.time[0] for c in driven)
         last = min(c.time[-1] for c in driven)
-        sigma = [sigma_of(log[name], least) for name, least in zip(CHANNELS, QUIETEST)]
+        sigma = [sigma_of(log[name], floor) for name, floor in zip(CHANNELS, QUIETEST)]
         stretches = []
         for start in np.arange(first + p.window, last - p.window, p.window):
             end = start + p.window
@@ -106,7 +106,9 @@ class ImuModel(FlyerModel):
             layout = latent_layout(start, end, KNOTS, (0, 1))
             guess = [*samples[1][1][0], 0.0]
             spread = [1.0, 1.0, 1.0, OFFSET]
-            stretches.append(Stretch.of(number, "flight", samples, data, layout, guess, spread))
+            stretches.append(
+                Stretch.laid_out(number, "flight", samples, data, layout, guess, spread)
+            )
         return stretches
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
@@ -134,8 +136,8 @@ class ImuModel(FlyerModel):
             rows = stretch.channel == channel
             width = part.stop - (part.start or 0)
             time = stretch.time[rows][::width]
-            seen = [on_grid(grid, states[:, part], time) for states in path]
-            out[:, rows] = np.reshape(seen, (len(path), -1))
+            values = [on_grid(grid, states[:, part], time) for states in path]
+            out[:, rows] = np.reshape(values, (len(path), -1))
         return out
 
     def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
