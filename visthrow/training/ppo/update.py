@@ -2,6 +2,7 @@
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
@@ -14,9 +15,7 @@ FASTEST = 1e-2
 
 
 class CapturedPPO(PPO):
-    """rsl_rl's PPO of networks without memory, whose learning rate lives on the device and whose
-    samples are gathered in the order of the minibatches once for all epochs.
-    """
+    """rsl_rl's PPO of networks without memory, whose learning rate lives on the device."""
 
     def __init__(self, actor: Network, critic: Network, storage, **settings):
         super().__init__(actor, critic, storage, **settings)
@@ -30,9 +29,6 @@ class CapturedPPO(PPO):
         self.optimizer = torch.optim.Adam(
             self._parameters, lr=self.rate, fused=True, capturable=self._cuda
         )
-        samples = storage.num_envs * storage.num_transitions_per_env
-        self._minibatch = samples // self.num_mini_batches
-        self._order = torch.zeros(samples, device=self.device, dtype=torch.long)
         self._totals = torch.zeros(3, **make)
         self._updates = 0
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -49,7 +45,6 @@ class CapturedPPO(PPO):
         From the second on a GPU replays a captured graph.
         """
         self.target_kl.fill_(self.desired_kl)
-        self._order.copy_(torch.randperm(len(self._order), device=self.device))
         if not self._cuda or self._updates == 0:
             self._epochs()
         else:
@@ -70,52 +65,29 @@ class CapturedPPO(PPO):
         return {name: total / count for name, total in losses} | {"spread": spread}
 
     def _epochs(self) -> None:
-        """Gather the samples in the order of the minibatches and descend on each, once an epoch."""
-        storage = self.storage
-        obs = storage.observations.flatten(0, 1)
-        stored = (
-            storage.actions,
-            storage.actions_log_prob,
-            storage.advantages,
-            storage.returns,
-            storage.values,
-            *storage.distribution_params,
-        )
-        with torch.no_grad():
-            gathered = [model.get_latent(obs)[self._order] for model in (self.actor, self.critic)]
-            gathered += [t.flatten(0, 1)[self._order] for t in stored]
-        batches = list(zip(*(part.split(self._minibatch) for part in gathered)))
+        """Descend on each minibatch of the samples, once an epoch."""
         self._totals.zero_()
-        for _ in range(self.num_learning_epochs):
-            for batch in batches:
-                self._descend(*batch)
+        for batch in self.storage.mini_batch_generator(
+            self.num_mini_batches, self.num_learning_epochs
+        ):
+            self._descend(batch)
 
-    def _descend(
-        self,
-        actor_input: Tensor,
-        critic_input: Tensor,
-        actions: Tensor,
-        old_log_probability: Tensor,
-        advantage: Tensor,
-        returns: Tensor,
-        old_value: Tensor,
-        *old_distribution: Tensor,
-    ) -> None:
-        """Take one gradient step on a minibatch of the networks' inputs and the samples."""
+    def _descend(self, batch: RolloutStorage.Batch) -> None:
+        """Take one gradient step on a minibatch."""
         distribution = self.actor.distribution
-        distribution.update(self.actor.output(actor_input))
-        value = self.critic.output(critic_input)
-        ratio = (distribution.log_prob(actions)[:, None] - old_log_probability).exp()
+        distribution.update(self.actor.output(self.actor.get_latent(batch.observations)))
+        value = self.critic.output(self.critic.get_latent(batch.observations))
+        ratio = (distribution.log_prob(batch.actions)[:, None] - batch.old_actions_log_prob).exp()
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-advantage * ratio, -advantage * clipped).mean()
-        step = (value - old_value).clamp(-self.clip_param, self.clip_param)
-        error = (value - returns).square()
-        largest = torch.max(error, (old_value + step - returns).square())
+        surrogate = torch.max(-batch.advantages * ratio, -batch.advantages * clipped).mean()
+        step = (value - batch.values).clamp(-self.clip_param, self.clip_param)
+        error = (value - batch.returns).square()
+        largest = torch.max(error, (batch.values + step - batch.returns).square())
         error = torch.where(self.actor_learns > 0.0, largest, error).mean()
         entropy = distribution.entropy.mean()
         gain = surrogate - self.entropy_coef * entropy
         total = self.actor_learns[0] * gain + self.value_loss_coef * error
-        self._adapt_rate(old_distribution)
+        self._adapt_rate(batch.old_distribution_params)
         self._totals += torch.stack([error, surrogate, entropy]).detach()
         gradients = torch.autograd.grad(total, self._parameters)
         for parameter, gradient in zip(self._parameters, gradients):
