@@ -74,27 +74,26 @@ def captured(work: Callable[[], Any], **options: Any) -> "torch.cuda.CUDAGraph":
 class ReplayedGraph:
     """Work on fixed tensors of a GPU: done eagerly at first, then captured in a CUDA graph and
     replayed, on a stream of its own.
-
-    For work without autograd: capturing that failed on an H200 (cudaErrorStreamCaptureUnsupported).
     """
-
-    EAGER = 3
 
     def __init__(self, work: Callable[[], None]):
         self._work = work
-        self._done = 0
+        self._warm = False
         self._graph = None
         self._stream = torch.cuda.Stream()
 
     def __call__(self) -> None:
         """Do the work."""
         self._stream.wait_stream(torch.cuda.current_stream())
-        if self._graph is None and self._done == self.EAGER:
-            self._graph = captured(self._work, stream=self._stream)
+        if self._graph is None and self._warm:
+            # autograd and NCCL's watchdog use the device from other threads meanwhile
+            self._graph = captured(
+                self._work, stream=self._stream, capture_error_mode="thread_local"
+            )
         with torch.cuda.stream(self._stream):
             if self._graph is None:
                 self._work()
-                self._done += 1
+                self._warm = True
             else:
                 self._graph.replay()
         torch.cuda.current_stream().wait_stream(self._stream)

@@ -183,7 +183,7 @@ def backward(fo, by):
     for name, tensor in fo.flights.adjoint.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
     fo.layers.by_action.zero_()
-    fo.layers.prepare(fo.flights.last)
+    fo.layers.by_seen.zero_()
     fo.backward()
     return fo.layers.by_action.clone()
 
@@ -211,7 +211,7 @@ def test_weights_get_what_autograd_gives_them():
     fo.rollout()
     assert fo.derivatives()["cost"].isfinite()
     shares = torch.rand(24, generator=torch.Generator().manual_seed(0))
-    fo.layers.gradients(fo.flights.obs, fo.flights.flown(), shares)
+    fo.layers.gradients(fo.flights.flown(), shares)
     by_action = fo.layers.by_action * shares[:, None]
     parameters = list(fo.network.mlp.parameters())
     expected = torch.autograd.grad(decided(fo, fo.flights.obs), parameters, by_action)

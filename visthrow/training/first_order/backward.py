@@ -2,14 +2,15 @@
 two of them through the network.
 
 Warp differentiates the surrogate's step. What a derivative by a state is worth is known once all
-later steps are done: so the network's own are products with one vector a step, those by its weights
-are products over all steps at the end."""
+later steps are done: so the network is differentiated by its observations step by step, and by its
+weights over all steps at the end."""
 
 import torch
 import warp as wp
-from torch import Tensor, nn
+from torch import Tensor
 
 from sim.params import GRAVITY
+from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
 from visthrow.training.first_order.surrogate import TAUT, Course
 from visthrow.training.ppo.network import Network
@@ -175,78 +176,52 @@ def step(
 
 
 class Layers:
-    """The activations of a network's layers over the steps of flights, shape (T, E, N), and
-    derivatives by it; by what one step saw, shape (E, D).
+    """A network's actions over the steps of flights, shape (T, E, 5), with derivatives by them and
+    by what one step saw, shape (E, D).
     """
 
     def __init__(self, network: Network, obs: Tensor):
+        """Allocate; ``obs``: where flights write what they see, shape (T, E, D)."""
         self._network = network
-        self._linear = [layer for layer in network.mlp if isinstance(layer, nn.Linear)]
-        rooms = [
-            [obs.new_zeros(*obs.shape[:2], layer.out_features) for layer in self._linear]
-            for _ in range(3)
-        ]
-        self._inner, self._by_inner, (*self._slope, _) = rooms
-        self._first = torch.zeros_like(self._linear[0].weight)  # with the normaliser's spread
-        self.action = self._inner[-1]
-        self.by_action = self._by_inner[-1]
+        self._obs = obs
+        self.action, self.by_action = obs.new_zeros(2, *obs.shape[:2], actions.ACTIONS)
         self.by_seen = torch.zeros_like(obs[0])
+
+    def _decide(self, obs: Tensor) -> Tensor:
+        return self._network.mlp(self._network.obs_normalizer(obs))
 
     def forward(self, k: int, obs: Tensor, flying: Tensor) -> Tensor:
         """Actions of step k, shape (E, 5), for observations, shape (E, D), of the flights that are
         flying, shape (E,).
         """
         rows = _picked(flying)
-        x = self._network.obs_normalizer(obs[rows])
-        for layer, inner in zip(self._linear, self._inner):
-            out = torch.addmm(layer.bias, x, layer.weight.T)
-            inner[k, rows] = out
-            x = self._network.mlp[1](out)
+        self.action[k, rows] = self._decide(obs[rows])
         return self.action[k]
-
-    def prepare(self, steps: int) -> None:
-        """Begin a way back from this step."""
-        for inner, slope in zip(self._inner, self._slope):
-            for x, out in zip(
-                inner[:steps].split(4), slope[:steps].split(4)
-            ):  # pieces that caches hold
-                with torch.enable_grad():
-                    out.copy_(
-                        torch.autograd.grad(
-                            self._network.mlp[1](leaf := x.detach().requires_grad_()).sum(), leaf
-                        )[0]
-                    )
-        if self._network.obs_normalization:
-            spread = self._network.obs_normalizer.std + self._network.obs_normalizer.eps
-        else:
-            spread = 1.0
-        self._first.copy_(self._linear[0].weight.detach() / spread)
-        self.by_seen.zero_()
 
     def backpropagate(self, k: int, flown: Tensor) -> None:
         """Turn derivatives by the actions of step k into those by its observations, of the flights
         that flew it, shape (E,).
         """
         rows = _picked(flown)
-        gradient = self.by_action[k, rows]
-        for layer, slope, by_inner in reversed(
-            list(zip(self._linear[1:], self._slope, self._by_inner))
-        ):
-            gradient = by_inner[k, rows] = (gradient @ layer.weight).mul_(slope[k, rows])
-        self.by_seen[rows] = gradient @ self._first
+        with torch.enable_grad():
+            seen = self._obs[k, rows].detach().requires_grad_()
+            action = self._decide(seen)
+        (self.by_seen[rows],) = torch.autograd.grad(action, seen, self.by_action[k, rows])
 
-    def gradients(self, obs: Tensor, flown: Tensor, shares: Tensor) -> None:
-        """Give the weights their derivatives: seen, shape (T, E, D), at steps that were flown, (T,
-        E); flights count by shares, (E,).
+    def gradients(self, flown: Tensor, shares: Tensor) -> None:
+        """Give the weights their derivatives from the steps that were flown, bool, shape (T, E);
+        flights count by shares, shape (E,).
         """
         rows = _picked(flown.flatten())
-        x = self._network.obs_normalizer(obs.flatten(0, 1)[rows])
-        shares = shares.expand(flown.shape).flatten()[rows, None]
-        for layer, inner, by_inner in zip(self._linear, self._inner, self._by_inner):
-            gradient = by_inner.flatten(0, 1)[rows] * shares
-            layer.weight.grad = gradient.mT @ x
-            layer.bias.grad = gradient.sum(0)
-            x = self._network.mlp[1](inner.flatten(0, 1)[rows])
+        obs, by_action = (
+            tensor[: len(flown)].flatten(0, 1)[rows]
+            for tensor in (self._obs, self.by_action * shares[:, None])
+        )
+        weights = list(self._network.mlp.parameters())
+        with torch.enable_grad():
+            action = self._decide(obs)
+        for weight, gradient in zip(weights, torch.autograd.grad(action, weights, by_action)):
+            weight.grad = gradient
 
 
 def _picked(mask: Tensor) -> Tensor | slice:

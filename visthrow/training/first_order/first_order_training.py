@@ -262,7 +262,7 @@ class FirstOrder:
         for name, gradient in zip(STATES, by_states):
             flights.adjoint[name][: T + 1] = gradient
         self.layers.by_action[:T] = by_action
-        self.layers.prepare(T)
+        self.layers.by_seen.zero_()
         self.backward()
         return {name: figure.detach() for name, figure in (figures | {"cost": cost}).items()}
 
@@ -337,9 +337,7 @@ class FirstOrder:
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
         # a few wild flights must not outweigh the rest
         limit = OUTLIER * size.kthvalue(len(size) // 2 + 1).values
-        self.layers.gradients(
-            self.flights.obs[:T], self.flights.flown()[:T], (limit / size).clamp(max=1.0)
-        )
+        self.layers.gradients(self.flights.flown()[:T], (limit / size).clamp(max=1.0))
         self._ranks.average(parameters)
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from rsl_rl.algorithms import PPO
 
-from sim.torch_bridge import captured
+from sim.torch_bridge import ReplayedGraph
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams
@@ -82,10 +82,12 @@ class PPOTraining:
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
         self._obs = self.env.get_observations()
-        self._graph: torch.cuda.CUDAGraph | None = None
-        self._rollouts = 0
+        # a solver whose work cannot be captured is launched
+        capturable = device.startswith("cuda") and self.env.sim.capturable
+        self.rollout = ReplayedGraph(self._rollout) if capturable else self._rollout
 
     def _rollout(self) -> None:
+        """Collect one batch."""
         obs = self._obs
         with torch.inference_mode():
             for _ in range(self.experiment.ppo.steps):
@@ -95,20 +97,6 @@ class PPOTraining:
             self.alg.compute_returns(obs)
             for key, value in obs.items():
                 self._obs[key].copy_(value)
-
-    def rollout(self) -> None:
-        """Collect one batch: eagerly the first time (everything is allocated then), from a captured
-        graph afterwards where the simulator's work can be captured.
-        """
-        capturable = self.device.startswith("cuda") and self.env.sim.capturable
-        if not capturable or self._rollouts == 0:
-            self._rollout()
-        else:
-            if self._graph is None:
-                self.alg.storage.clear()
-                self._graph = captured(self._rollout)
-            self._graph.replay()
-        self._rollouts += 1
 
     def collect(self, done: float) -> None:
         self.env.clear_totals()

@@ -6,7 +6,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
 
-from sim.torch_bridge import captured
+from sim.torch_bridge import ReplayedGraph
 from visthrow.training.ppo.network import Network
 
 # range of the adaptive learning rate
@@ -30,8 +30,11 @@ class CapturedPPO(PPO):
             self._parameters, lr=self.rate, fused=True, capturable=self._cuda
         )
         self._totals = torch.zeros(3, **make)
-        self._updates = 0
-        self._graph: torch.cuda.CUDAGraph | None = None
+        self._capture()
+
+    def _capture(self) -> None:
+        """Launch the next update, and replay those after it from a graph, on a GPU."""
+        self.descend = ReplayedGraph(self._epochs) if self._cuda else self._epochs
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Compute returns and advantages in place: graphs go on reading the same memory."""
@@ -40,19 +43,9 @@ class CapturedPPO(PPO):
         self.storage.advantages = advantages.copy_(self.storage.advantages)
 
     def update(self) -> dict[str, float]:
-        """All epochs over the stored samples; returns mean losses.
-
-        From the second on a GPU replays a captured graph.
-        """
+        """All epochs over the stored samples; returns mean losses."""
         self.target_kl.fill_(self.desired_kl)
-        if not self._cuda or self._updates == 0:
-            self._epochs()
-        else:
-            if self._graph is None:
-                # NCCL's watchdog queries the device from another thread meanwhile
-                self._graph = captured(self._epochs, capture_error_mode="thread_local")
-            self._graph.replay()
-        self._updates += 1
+        self.descend()
         for model in (self.actor, self.critic):
             model.update_normalization(self.storage.observations.flatten(0, 1))
         self.storage.clear()
@@ -122,8 +115,7 @@ class CapturedPPO(PPO):
         """
         result = super().load(loaded_dict, load_cfg, strict)
         self.set_rate(float(self.learning_rate))
-        self._graph = None
-        self._updates = 0
+        self._capture()
         return result
 
     def set_rate(self, rate: float) -> None:
