@@ -2,8 +2,8 @@
 
 import csv
 import io
-import math
 import time
+from datetime import timedelta
 from pathlib import Path
 from types import TracebackType
 
@@ -92,8 +92,8 @@ class TrainLog:
         text = (
             f"iteration {figures['iteration']}/{self.last}  {speed:.2f} M steps/s  released"
             f" {100 * figures['released']:.0f} %  landing error {figures['landing_error']:.3f} m "
-            f" {clock(figures['wall_s'])},"
-            f" {clock(self._remaining(figures['iteration'], elapsed))} left"
+            f" {timedelta(seconds=round(figures['wall_s']))},"
+            f" {timedelta(seconds=round(self._remaining(figures['iteration'], elapsed)))} left"
         )
         if throws is not None:
             print(f"{text}  at 2.0 m: {figures_text(figures)}", flush=True)
@@ -104,15 +104,6 @@ class TrainLog:
         """Time to the last iteration or the end of the minutes at the speed so far [s]."""
         remaining = (self.last - iteration) * elapsed / max(iteration - self.done, 1)
         return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed)
-
-
-def clock(seconds: float) -> str:
-    """Return a duration as minutes and seconds, hours where there are any."""
-    if not math.isfinite(seconds):
-        return "-"
-    minutes, seconds_left = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{seconds_left:02d}" if hours else f"{minutes}:{seconds_left:02d}"
 
 
 def evaluated(throws: Throws) -> dict[str, float]:

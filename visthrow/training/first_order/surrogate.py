@@ -78,13 +78,13 @@ class FlightBatch:
         self.x = {"command": torch.zeros(steps + 1, E, actions.COMMANDS, **make)}
         for name in STATES:
             dtype = Course.vars[name].type.dtype
-            x, adjoint = torch.zeros(2, steps + 1, E, dtype._length_, **make)
-            self.x[name] = x
-            self.adjoint[name] = adjoint
-            grad = wp.from_torch(adjoint, dtype=dtype)
-            setattr(self.course, name, wp.from_torch(x, dtype=dtype, grad=grad))
-            unused = wp.from_torch(torch.zeros_like(x), dtype=dtype, grad=grad)
+            states, unused = (wp.zeros((steps + 1, E), dtype, env.device) for _ in range(2))
+            states.requires_grad = True
+            unused.grad = states.grad
+            setattr(self.course, name, states)
             setattr(self.made, name, unused)
+            self.x[name] = wp.to_torch(states, requires_grad=False)
+            self.adjoint[name] = wp.to_torch(states.grad)
         self.obs = torch.zeros(steps, E, env.layout.dimension, **make)
         self.landing = torch.zeros(steps + 1, E, 2, **make)
         self.time = torch.zeros(steps + 1, E, **make)
