@@ -37,7 +37,8 @@ def train(
     Returns:
         ``curve``: (wall time without evaluations [s], environment steps, error [m]) of each
         evaluation; ``reached``: error as text -> the evaluation that made it "for good", None where
-        there is none; ``final``: errors at all targets [m] of a training that came to its end.
+        there is none; ``final`` and ``final_under_faults``: errors at all targets [m] of a training
+        that came to its end, as flown and under its training's faults where these differ.
     """
     from visthrow.training.session import EVALUATION_SHARE, Regularly
     from visthrow.training.trainer import Trainer
@@ -71,14 +72,16 @@ def train(
             in_a_row[bar] = in_a_row[bar] + 1 if throws.within(float(bar)) else 0
             if in_a_row[bar] == IN_A_ROW and reached[bar] is None:
                 reached[bar] = curve[-1]
-    final = []
+    final: dict[str, list] = {}
     if trainer.iteration == last:
-        final = [one.summary().get("error_mean") for one in trainer.final_throws()["flown"]]
+        for name, throws in trainer.final_throws().items():
+            final[name] = [one.summary().get("error_mean") for one in throws]
     times = ", ".join(
         f"{bar} m {_seconds(hit[0] if hit else math.inf)}" for bar, hit in reached.items()
     )
     print(f"seed {seed}: {times}; {spent:.1f} s in all; {final}", file=sys.stderr, flush=True)
-    return {"seed": seed, "curve": curve, "reached": reached, "seconds": spent, "final": final}
+    figures = {"seed": seed, "curve": curve, "reached": reached, "seconds": spent}
+    return figures | {"final": final.get("flown", []), "final_under_faults": final.get("trained", [])}
 
 
 def measure(
