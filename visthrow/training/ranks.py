@@ -3,7 +3,6 @@ they share.
 """
 
 import gc
-import io
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -67,19 +66,12 @@ class Ranks:
         distributed.all_reduce(tensor, op=distributed.ReduceOp.MAX)
         return int(tensor)
 
-    def gather(self, state: dict) -> list[Tensor]:
-        """Every process' state as torch saves it, in the order of ranks; of use to the
-        lead alone.
-        """
-        buffer = io.BytesIO()
-        torch.save(state, buffer)
-        payload = buffer.getvalue()
-        saved: list[bytes] = [payload] * self.world
+    def gather(self, state: dict) -> list[dict]:
+        """Every process' state, in the order of ranks; of use to the lead alone."""
+        states = [state] * self.world
         if self.world > 1:
-            distributed.gather_object(payload, saved if self.lead else None)
-        if self.lead:
-            return [torch.frombuffer(bytearray(content), dtype=torch.uint8) for content in saved]
-        return []
+            distributed.gather_object(state, states if self.lead else None)
+        return states
 
     def leave(self) -> None:
         """Part from the others.

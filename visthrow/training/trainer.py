@@ -270,7 +270,7 @@ class Trainer:
         Raises CheckpointError: a broken file, or one of another configuration or seed.
         """
         try:
-            saved = torch.load(path, map_location="cpu", weights_only=True)
+            saved = torch.load(path, map_location=self.device, weights_only=True)
         except FileNotFoundError:
             raise CheckpointError(
                 f"{path}: no checkpoint there; expected a file that `visthrow train` wrote"
@@ -286,8 +286,7 @@ class Trainer:
         rank = self.ranks.rank
         parts = saved["ranks"]
         has_state = rank < len(parts)
-        part = io.BytesIO(parts[rank if has_state else 0].numpy().tobytes())
-        state = torch.load(part, map_location=self.device, weights_only=True)
+        state = parts[rank if has_state else 0]
         self.algorithm.load_state_dict(state["algorithm"], own_throws=has_state)
         if not has_state:  # with another's episodes it would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
