@@ -76,28 +76,28 @@ def _fly(
     observations = begin(env)
     previous = env.previous_action.clone()
     open_ = torch.ones(count, dtype=torch.bool, device=env.device)
-    tensors: dict[str, torch.Tensor] = {}
+    results: dict[str, torch.Tensor] = {}
     change, steps = torch.zeros(2, count, device=env.device)
     for _ in range(env.max_episode_length + 1):
         observations, _, done, _ = env.step(policy(observations["actor"]))
-        action = env.last["action"][:, :4]
-        change += open_ * (action - previous[:, :4]).square().mean(-1)
+        change += open_ * (env.last["action"] - previous)[:, :4].square().mean(-1)
         steps += open_
         previous = env.last["action"]
         ended = open_ & (done > 0)
         for name, value in env.last.items():
             mask = ended.view(-1, *(1,) * (value.dim() - 1))
-            tensors[name] = torch.where(mask, value, tensors.get(name, torch.zeros_like(value)))
+            results[name] = torch.where(mask, value, results.get(name, value))
         open_ &= ~ended
         if not bool(open_.any()):  # most throws take a fifth of the time limit
             break
-    success = (tensors["released"] & ~open_).cpu().numpy()
-    blank = np.where(success, 1.0, np.nan)
-    array = {k: v.cpu().numpy().astype(np.float64) for k, v in tensors.items()}
-    smoothness = (change / steps.clamp(min=1)).sqrt().cpu().numpy().astype(np.float64)
-    landing_w, goal_w = (
-        array[name][:, :2] * blank[:, None] if name in array else None
-        for name in ("landing_w", "goal_w")
-    )
-    measured = (array[name] * blank for name in ("landing_error", "duration", "clearance"))
-    return Throws(target, success, landing_w, *measured, smoothness * blank, goal_w)
+    results["smoothness"] = (change / steps.clamp(min=1)).sqrt()
+    success = (results["released"] & ~open_).cpu().numpy()
+
+    def measured(name: str) -> np.ndarray:
+        values = results[name].double().cpu().numpy()
+        values[~success] = np.nan
+        return values
+
+    numbers = map(measured, ("landing_error", "duration", "clearance", "smoothness"))
+    goal_w = measured("goal_w")[:, :2] if "goal_w" in results else None
+    return Throws(target, success, measured("landing_w")[:, :2], *numbers, goal_w)
