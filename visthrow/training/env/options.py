@@ -62,22 +62,19 @@ class PoseDelay:
         """
         self._params = params
         self._period = period
-        self._unit = unit
-        oldest = params.oldest if unit is None else params.oldest / float(unit.min())
+        self._unit = torch.ones_like(like[:1]) if unit is None else unit
+        oldest = params.oldest / float(self._unit.min())
         steps = 1 + max(math.ceil(oldest / period - 1e-6), 1)
         self.age = like.new_zeros(len(like))  # of what is measured in these episodes [s]
         self.poses = like.new_zeros(len(like), steps, POSE)
         self.buffers = {"pose_age": self.age, "poses": self.poses}
-
-    def _scaled(self, time: Tensor) -> Tensor:
-        return time if self._unit is None else time / self._unit
 
     def begin(self, fresh: Tensor) -> None:
         """Draw the latency of the episodes that begin."""
         low, high = self._params.latency
         if high > 0.0:
             sample = low + (high - low) * torch.rand_like(self.age)
-            torch.where(fresh, self._scaled(sample), self.age, out=self.age)
+            torch.where(fresh, sample / self._unit, self.age, out=self.age)
 
     def push(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Take the current pose sample; return the delayed one, linear between control steps."""
@@ -87,7 +84,7 @@ class PoseDelay:
         age = self.age
         jitter = self._params.latency_jitter
         if jitter > 0.0:
-            age = age + self._scaled(jitter * (2.0 * torch.rand_like(age) - 1.0))
+            age = age + jitter * (2.0 * torch.rand_like(age) - 1.0) / self._unit
         age = age / self._period
         whole = age.floor().clamp(max=self.poses.shape[1] - 2.0)
         row = whole.long()[:, None, None].expand(-1, 1, POSE)

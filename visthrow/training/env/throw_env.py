@@ -169,8 +169,7 @@ class ThrowEnv(VecEnv):
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
         self.episode_length_buf.zero_()
         self.buffers["previous"].copy_(self.start_action.expand_as(self.buffers["previous"]))
-        self._observations = self._observe(fresh)
-        return self._observations
+        return self._look(fresh)
 
     def fix_goal(self, goal_w: Tensor | None) -> None:
         """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones
@@ -206,6 +205,10 @@ class ThrowEnv(VecEnv):
         fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
         self._start(fresh)
         self._begin(fresh)
+        return self._look(fresh)
+
+    def _look(self, fresh: Tensor) -> TensorDict:
+        """Observe, and keep what is observed."""
         self._observations = self._observe(fresh)
         return self._observations
 
@@ -220,8 +223,7 @@ class ThrowEnv(VecEnv):
         ``mask``: plants that move on, shape (E,), int32; default all.
         """
         self.buffers["previous"].copy_(self._apply(actions, True, mask))
-        self._observations = self._observe(self.buffers["continued"])
-        return self._observations
+        return self._look(self.buffers["continued"])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start
@@ -244,8 +246,7 @@ class ThrowEnv(VecEnv):
         self._start(done)
         self.buffers["previous"].copy_(action)
         self._begin(done)
-        self._observations = self._observe(done)
-        return self._observations, reward, done.to(torch.float32), {}
+        return self._look(done), reward, done.to(torch.float32), {}
 
     def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
         """Fly one control period; returns the clipped actions."""
