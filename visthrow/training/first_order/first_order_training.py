@@ -21,7 +21,7 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, step
 from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit
-from visthrow.training.ppo.network import Network, cosine_rate
+from visthrow.training.ppo.network import MuonAdam, Network, cosine_rate
 from visthrow.training.ranks import Ranks
 
 # Reach of the barriers
@@ -99,8 +99,9 @@ class FirstOrder:
         self._adapting = False
         self._schedule(0.0)
         rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
-        self.optimizer = torch.optim.Adam(
-            self.network.mlp.parameters(), lr=rate, betas=(0.9, 0.95), capturable=on_gpu
+        weights = self.network.mlp.parameters()
+        self.optimizer = MuonAdam(
+            weights, self.network.matrices, lr=rate, betas=(0.9, 0.95), capturable=on_gpu
         )
         self.rollout, self.backward = (
             ReplayedGraph(work) if on_gpu else work for work in (self._fly, self._run_backward)
