@@ -81,7 +81,10 @@ def train(
     )
     print(f"seed {seed}: {times}; {spent:.1f} s in all; {final}", file=sys.stderr, flush=True)
     figures = {"seed": seed, "curve": curve, "reached": reached, "seconds": spent}
-    return figures | {"final": final.get("flown", []), "final_under_faults": final.get("trained", [])}
+    return figures | {
+        "final": final.get("flown", []),
+        "final_under_faults": final.get("trained", []),
+    }
 
 
 def measure(

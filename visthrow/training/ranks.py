@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 from rsl_rl.utils import reduce_gradients_in_buckets
-from torch import Tensor, distributed, nn
+from torch import distributed, nn
 
 BUCKET_MB = 64.0  # gradients that are averaged at once [MB]
 
