@@ -307,6 +307,17 @@ def test_commands_that_come_after_the_rates_are_caught_however_late():
     assert "the commands' clock is late" in faults(log_of(columns, command=late))
 
 
+@mark.parametrize(("late", "told"), [(-0.03, False), (0.02, False), (0.3, True)])
+def test_a_payload_that_leaves_before_its_command_is_told(late, told):
+    columns = carrying()
+    time = columns["time"]
+    gone = np.maximum(time - 6.0, 0.0)
+    columns["payload_pos_w"] = columns["payload_pos_w"] - np.outer(4.0 * gone, [0.6, 0.0, 0.8])
+    pressed = Channel(time, (time > 6.0 + late).astype(float), "1")
+    said = faults(log_of(columns, release_command=pressed))
+    assert ("before its release is commanded" in said) == told
+
+
 def test_a_drifting_clock_is_told():
     columns = flight(40.0)
     stretched = columns["time"] * 1.001

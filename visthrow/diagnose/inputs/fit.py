@@ -4,7 +4,6 @@ at once, with covariance.
 Where a diagnosis asks which cause is there, a fit takes for granted that all chosen ones are: their
 slabs are the only prior."""
 
-import dataclasses
 import hashlib
 import json
 from collections import defaultdict
@@ -15,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sim.params import VehicleParams
+from sim.params import VehicleParams, changed
 from visthrow import config
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
@@ -135,59 +134,44 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
 
 def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> VehicleParams:
     gain = 1.0 + size["thrust_gain"]
-    curve = size["thrust_curve"]
     mass = p.mass + size["mass_quad"]
-    motor = dataclasses.replace(
-        base.motor,
-        kind="first_order",
-        time_constant=max(p.motor_time_constant + size["motor_tau"], 1e-3),
-    )
-    aero = dataclasses.replace(
-        base.aero,
-        kind="rotor_drag",
-        drag_x=p.drag_xy + size["rotor_drag_xy"],
-        drag_y=p.drag_xy + size["rotor_drag_xy"],
-        drag_z=p.drag_z + size["rotor_drag_z"],
-        parasitic=max(size["parasitic"], 0.0),
-        translational_lift=size["translational_lift"],
-    )
-    battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
-    thrust = dataclasses.replace(
-        base.thrust, voltage_coefficient=p.voltage_coefficient + size["battery_sag"]
-    )
-    controller = base.controller
-    hover = mass * p.gravity / 4.0
+    drag_xy = p.drag_xy + size["rotor_drag_xy"]
+    values = {
+        "body.mass": mass,
+        "motor.kind": "first_order",
+        "motor.time_constant": max(p.motor_time_constant + size["motor_tau"], 1e-3),
+        "aero.kind": "rotor_drag",
+        "aero.drag_x": drag_xy,
+        "aero.drag_y": drag_xy,
+        "aero.drag_z": p.drag_z + size["rotor_drag_z"],
+        "aero.parasitic": max(size["parasitic"], 0.0),
+        "aero.translational_lift": size["translational_lift"],
+        "battery.reference_voltage": p.reference_voltage,
+        "thrust.voltage_coefficient": p.voltage_coefficient + size["battery_sag"],
+        "queue.delay": max(p.command_delay + size["cmd_delay"], 0.0),
+    }
     if p.input == "motor_speed":
         # the curve's departure in thrust is taken at hover, where it is measured
-        thrust = dataclasses.replace(thrust, k_f=p.thrust_map[2] * gain, k_1=p.thrust_map[1] * gain)
+        values |= {"thrust.k_f": p.thrust_map[2] * gain, "thrust.k_1": p.thrust_map[1] * gain}
     elif p.input == "motor_command":
         full = sum(p.thrust_map) * gain
-        full *= 1.0 + curve * (full / hover - 1.0)
-        controller = dataclasses.replace(controller, max_thrust=full)
+        hover = mass * p.gravity / 4.0
+        values["controller.max_thrust"] = full * (1.0 + size["thrust_curve"] * (full / hover - 1.0))
     else:
-        thrust = dataclasses.replace(thrust, gain=tuple(gain * scale for scale in thrust.gain))
-    return dataclasses.replace(
-        base,
-        body=dataclasses.replace(base.body, mass=mass),
-        motor=motor,
-        aero=aero,
-        battery=battery,
-        thrust=thrust,
-        controller=controller,
-        queue=dataclasses.replace(base.queue, delay=max(p.command_delay + size["cmd_delay"], 0.0)),
-    )
+        values["thrust.gain"] = tuple(gain * scale for scale in base.thrust.gain)
+    return changed(base, values)
 
 
 def _of_stand(
     p: Any, size: Mapping[str, float], middle: float, base: VehicleParams
 ) -> VehicleParams:
-    k_f = p.k_f * (1.0 + size["thrust_gain"])
-    k_1 = p.k_f * size["thrust_linear"] * middle
-    thrust = dataclasses.replace(
-        base.thrust, k_f=k_f, k_1=k_1, voltage_coefficient=size["thrust_voltage"]
-    )
-    battery = dataclasses.replace(base.battery, reference_voltage=p.reference_voltage)
-    return dataclasses.replace(base, thrust=thrust, battery=battery)
+    values = {
+        "thrust.k_f": p.k_f * (1.0 + size["thrust_gain"]),
+        "thrust.k_1": p.k_f * size["thrust_linear"] * middle,
+        "thrust.voltage_coefficient": size["thrust_voltage"],
+        "battery.reference_voltage": p.reference_voltage,
+    }
+    return changed(base, values)
 
 
 def write(

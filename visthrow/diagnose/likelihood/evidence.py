@@ -234,9 +234,9 @@ def estimate(
         normal = information[np.ix_(columns, columns)] + np.diag(priors.slab[columns] ** -2.0)
         factor = np.linalg.cholesky(normal)
         right = np.linalg.solve(factor, score[columns])
-        theta[columns] = lsq_linear(
-            factor.T, right, (priors.low[columns], priors.high[columns]), method="bvls"
-        ).x
+        bounds = priors.low[columns], priors.high[columns]
+        solution = lsq_linear(factor.T, right, bounds, method="bvls").x
+        theta[columns] = np.clip(solution, *bounds)  # which the solver leaves by rounding
     return theta
 
 

@@ -9,7 +9,7 @@ from functools import partial, singledispatch
 import numpy as np
 
 from sim.effects.effect import apply
-from sim.params import PlantParams
+from sim.params import PlantParams, changed
 from sim.units import Units, in_units
 from visthrow import config
 from visthrow.common import mocap
@@ -154,20 +154,17 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     alike = Units(ratio ** (1 / 3), ratio)
     v = in_units(plant.vehicle, alike)
     rope = in_units(plant.rope, alike)
-    no_drag = {f.name: 0.0 for f in fields(v.aero) if f.name != "kind"}
-    aero = replace(
-        v.aero,
-        **{**no_drag, "drag_x": params.drag_xy, "drag_y": params.drag_xy, "drag_z": params.drag_z},
-    )
-    v = replace(
-        v,
-        body=replace(v.body, mass=params.mass),
-        queue=replace(v.queue, delay=params.command_delay),
-        aero=aero,
-        motor=replace(v.motor, time_constant=params.motor_time_constant),
-        thrust=replace(v.thrust, voltage_coefficient=0.0),
-        controller=replace(v.controller, voltage_compensation=1.0),
-    )
+    no_drag = {f"aero.{f.name}": 0.0 for f in fields(v.aero) if f.name != "kind"}
+    values = no_drag | {
+        "aero.drag_x": params.drag_xy,
+        "aero.drag_y": params.drag_xy,
+        "aero.drag_z": params.drag_z,
+        "body.mass": params.mass,
+        "queue.delay": params.command_delay,
+        "motor.time_constant": params.motor_time_constant,
+        "thrust.voltage_coefficient": 0.0,
+        "controller.voltage_compensation": 1.0,
+    }
     if params.cable is not None:
         rope = replace(
             rope,
@@ -176,7 +173,7 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
             mount=(0.0, 0.0, 0.0),
             rope_mass=THREAD * params.cable.mass,
         )
-    return replace(plant, vehicle=v, rope=rope)
+    return replace(plant, vehicle=changed(v, values), rope=rope)
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:

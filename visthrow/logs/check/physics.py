@@ -47,6 +47,7 @@ _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
 _TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
+_COMPARED = 10_000  # samples that a payload's share of the mass is taken from
 _HEAVIEST = 0.9  # share of the mass that a payload may have
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
@@ -379,9 +380,12 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     """Return the acceleration of vehicle and payload together [m/s^2]: with the payload's share of
     the mass that makes it follow the thrust best, in whatever axes.
     """
-    up = matrix_of_quat(turn)[:, :, 2]
+    if not np.any(relative):
+        return acc
+    rows = slice(None, None, max(1, len(acc) // _COMPARED))
+    up = matrix_of_quat(turn[rows])[:, :, 2]
     lean = (up / np.maximum(up[:, 2:], 0.2))[:, :2]
-    moved, added = (np.einsum("kij,nj->kni", MATRICES, a) for a in (acc, relative))
+    moved, added = (np.einsum("kij,nj->kni", MATRICES, a[rows]) for a in (acc, relative))
     off = moved[..., :2] - lean * (moved[..., 2:] + GRAVITY)
     slope = added[..., :2] - lean * added[..., 2:]
     power = np.maximum(np.sum(slope**2, axis=(1, 2)), 1e-12)
@@ -700,7 +704,26 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
         ]
     rows = [Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)]
     rows += _length(middle, vehicle.cable_length, channels) if vehicle.cable_length else []
+    rows += _left_early(log, time_p, length)
     return rows + _payload_late(time_q, q, time_p, p, channels)
+
+
+def _left_early(log: FlightLog, time: np.ndarray, length: np.ndarray) -> list[Row]:
+    """Report a payload that leaves its cable before its release is commanded."""
+    if "release_command" not in log:
+        return []
+    pressed = log["release_command"]
+    commanded = pressed.time[pressed.values.ravel() > 0.0]
+    near = np.flatnonzero(length < (1.0 + _TAUT) * np.percentile(length, 25))
+    if not len(commanded) or near[-1] == len(time) - 1:
+        return []
+    early = float(commanded[0] - time[near[-1] + 1])
+    if early < _DELAY_BAD:
+        return []
+    text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "
+    text += "the commands' clock is late, or it fell off"
+    channels = "release_command, payload_pos_w"
+    return [Row("delay", channels, "bad", text, {"delay_s": -early})]
 
 
 def _length(middle: float, expected: float, channels: str) -> list[Row]:
