@@ -34,7 +34,7 @@ NEAR = {"contours": 0.01, "learnt": 0.015}
 
 def train(folder, *words: str) -> int:
     sets = [word for name in SMALL for word in ("--set", name)]
-    return cli.main(["detector", "train", "--out", str(folder), "--device", "cpu", *sets, *words])
+    return cli.main([*f"detector train --out {folder} --device cpu".split(), *sets, *words])
 
 
 def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):

@@ -46,14 +46,7 @@ def words(folder, *extra):
         "task.bounds.time_limit=0.4",
     )
     return [
-        "train",
-        "vision_ideal",
-        "--device",
-        "cpu",
-        "--out",
-        str(folder),
-        "--checkpoint-every",
-        "1",
+        *f"train vision_ideal --device cpu --out {folder} --checkpoint-every 1".split(),
         *sets,
         *extra,
     ]

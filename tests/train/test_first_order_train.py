@@ -29,14 +29,7 @@ SMALL = [
 def words(folder, *extra):
     sets = [part for item in SMALL for part in ("--set", item)]
     return [
-        "train",
-        "state",
-        "--device",
-        "cpu",
-        "--out",
-        str(folder),
-        "--checkpoint-every",
-        "1",
+        *f"train state --device cpu --out {folder} --checkpoint-every 1".split(),
         *sets,
         *extra,
     ]

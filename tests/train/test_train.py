@@ -45,7 +45,7 @@ SMALL = [
 
 def train(folder, *extra):
     """Run the command on the CPU; return its exit status."""
-    words = ["train", "laptop", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1"]
+    words = f"train laptop --device cpu --out {folder} --checkpoint-every 1".split()
     for item in SMALL:
         words += ["--set", item]
     return cli.main(words + list(extra))
@@ -169,18 +169,7 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
     a metre at once.
     """
     folder = tmp_path / "run"
-    words = [
-        "train",
-        "laptop",
-        "--from",
-        "state",
-        "--until",
-        "1.0",
-        "--evaluate-every",
-        "1",
-        "--out",
-        str(folder),
-    ]
+    words = f"train laptop --from state --until 1.0 --evaluate-every 1 --out {folder}".split()
     words += [
         "--device",
         "cpu",
@@ -350,7 +339,7 @@ def test_the_end_compares_the_seed_with_recorded_ones(capsys):
 
 def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
     folder = tmp_path / "run"
-    words = ["train", "laptop", "--device", "cpu", "--out", str(folder), "--checkpoint-every", "1"]
+    words = f"train laptop --device cpu --out {folder} --checkpoint-every 1".split()
     changes = [
         word for item in [*SMALL[:3], "ppo.iterations=4", SMALL[4]] for word in ("--set", item)
     ]

@@ -354,7 +354,7 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
         (text + "".join(f"H {name}:{value}\n" for name, value in header.items())).encode()
         + b"I\x00\x05"
     )
-    command = ["diagnose", "apply", str(log), "--plant", "vision", "--out", str(out)]
+    command = f"diagnose apply {log} --plant vision --out {out}".split()
     assert cli.main(command) == 2
     assert "--hover" in capsys.readouterr().err
     assert cli.main([*command, *["--hover", "0.3645", "--delay", "0.003"]]) == 0

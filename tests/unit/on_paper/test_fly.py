@@ -165,18 +165,9 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     packed = tmp_path / "all.json"
-    words = [
-        "baseline",
-        "--quick",
-        "--targets",
-        "1.5",
-        "--policies",
-        "state",
-        "--out",
-        str(tmp_path),
-        "--json",
-        str(packed),
-    ]
+    words = (
+        f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}".split()
+    )
     assert cli.main(words) == 0
     text = (tmp_path / "report.md").read_text()
     assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside the own model"

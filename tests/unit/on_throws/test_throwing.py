@@ -301,19 +301,9 @@ def test_compare_flies_the_state_and_the_vision_policy_unless_others_are_named(m
 
 def test_compare_prints_and_writes(dropper, tmp_path, capsys):
     out = tmp_path / "out"
-    words = [
-        "compare",
-        str(dropper),
-        "--targets",
-        "0.5",
-        "1.0",
-        "--throws",
-        "5",
-        "--out",
-        str(out),
-        "--json",
-        str(out / "c.json"),
-    ]
+    words = (
+        f"compare {dropper} --targets 0.5 1.0 --throws 5 --out {out} --json {out}/c.json".split()
+    )
     assert cli.main([*words, *["--device", "cpu", "--seed", "3"]]) == 0
     told = capsys.readouterr().out
     assert "`hybrid`, seed 3" in told

@@ -83,17 +83,7 @@ def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, caps
 
 
 def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
-    words = [
-        "fly",
-        "--policy",
-        "state",
-        "--device",
-        "cpu",
-        "--out",
-        str(tmp_path),
-        "--set",
-        "rope.length=0.4",
-    ]
+    words = f"fly --policy state --device cpu --out {tmp_path} --set rope.length=0.4".split()
     assert main(words) == 2
     assert "--allow rope.length" in capsys.readouterr().err
     assert main([*words, "--allow", "rope.length"]) == 0
@@ -114,14 +104,6 @@ def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, cap
 
 
 def test_fly_takes_another_camera_by_the_allowance_that_it_advises(tmp_path):
-    words = [
-        "fly",
-        "--device",
-        "cpu",
-        "--out",
-        str(tmp_path),
-        "--set",
-        "camera.fisheye.fov_deg=190",
-    ]
+    words = f"fly --device cpu --out {tmp_path} --set camera.fisheye.fov_deg=190".split()
     assert main([*words, "--allow", "camera"]) in (0, 1)
     assert (tmp_path / "flight.npz").exists()
