@@ -18,6 +18,7 @@ from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.held_out import PARTS, TELLING
 from visthrow.diagnose.select.result import Diagnosis
 
 DECISIVE = 11.0
@@ -107,16 +108,17 @@ class PlanningGoal:
                 ],
                 len(self.pairs),
             )
-        able = np.array([self.priors.slab[j] for j in self.vague]) * NAMEABLE
+        able = self.priors.slab[self.vague] * NAMEABLE
         unknown = able < self._deviations(0.0 * new)
-        return _fewest_flights(
-            lambda count: [
-                (j,)
-                for j, shows in zip(self.vague, unknown & (self._deviations(count * new) < able))
-                if shows
-            ],
-            len(self.vague),
-        )
+        # a name is confirmed by so many flights that tell of it
+        at_hand = self.base.statistics.information[:, self.vague, self.vague]
+        telling = np.sum(at_hand > TELLING * new[self.vague, self.vague], axis=0)
+
+        def shown(count: int) -> list[tuple[int, ...]]:
+            shows = unknown & (self._deviations(count * new) < able) & (telling + count >= PARTS)
+            return [(j,) for j in np.compress(shows, self.vague).tolist()]
+
+        return _fewest_flights(shown, len(self.vague))
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
         """Expected nats between two members after the new flight, with either as the truth; the
