@@ -28,6 +28,7 @@ NAN_QUATERNION = (math.nan,) * 4
 IGNORE_ATTITUDE = mav.ATTITUDE_TARGET_TYPEMASK_ATTITUDE_IGNORE
 OUR_SYSTEM = 245
 OUR_COMPONENT = mav.MAV_COMP_ID_ONBOARD_COMPUTER
+COMMAND_VALUES = 7  # of COMMAND_LONG
 # where system and component stand in a message's bytes
 IDS = {mav.PROTOCOL_MARKER_V1: slice(3, 5), mav.PROTOCOL_MARKER_V2: slice(5, 7)}
 MOST_PENDING = 50  # questions for a time whose answer may still come
@@ -216,6 +217,17 @@ def attitude_target(time_s: float, target: tuple[int, int], thrust: float, rate_
     return mav.MAVLink_set_attitude_target_message(
         stamp, *target, IGNORE_ATTITUDE, [1.0, 0.0, 0.0, 0.0], *rate_frd, thrust
     )
+
+
+def command_long(target: tuple[int, int], number: int, *values: float, repetition: int = 0) -> Any:
+    """Return COMMAND_LONG; parameters that are left out are 0."""
+    seven = [*map(float, values), *([0.0] * (COMMAND_VALUES - len(values)))]
+    return mav.MAVLink_command_long_message(*target, number, min(repetition, 255), *seven)
+
+
+def parameter_request(target: tuple[int, int], name: str) -> Any:
+    """Return PARAM_REQUEST_READ of a parameter."""
+    return mav.MAVLink_param_request_read_message(*target, name.encode(), -1)
 
 
 ASK_EVERY = (0.05, 0.15)

@@ -17,7 +17,14 @@ from hil.links.clock import Clock
 from hil.poses.frames import FrameParams, Frames
 from hil.poses.pose import VEHICLE, Pose
 from hil.poses.sources.pose_source import Source
-from visthrow.common.rotations import conjugate, multiply, rotation_vector, tilt_and_heading
+from visthrow.common.rotations import (
+    conjugate,
+    continuous,
+    multiply,
+    rotation_vector,
+    tilt_and_heading,
+    vectors_between,
+)
 from visthrow.logs.axes import OURS, TURNS, turn_of
 
 # below both the vehicle rests: noise of a millimetre and of 0.3 deg stays below
@@ -120,8 +127,8 @@ def _rests(poses: Sequence[Pose]) -> list[slice]:
     late = np.minimum(np.searchsorted(times, times + SPAN), len(times) - 1)
     early = np.maximum(np.searchsorted(times, times - SPAN, side="right") - 1, 0)
     span = np.maximum(times[late] - times[early], 1e-9)
-    cosine = np.abs(np.sum(quat[late] * quat[early], axis=1)) / np.linalg.norm(quat[late], axis=1)
-    rate = 2 * np.arccos(np.clip(cosine / np.linalg.norm(quat[early], axis=1), 0.0, 1.0)) / span
+    # the angle of a turn is the same whatever the order of the quaternions
+    rate = np.linalg.norm(vectors_between(quat[early], quat[late]), axis=1) / span
     resting = (np.linalg.norm(pos[late] - pos[early], axis=1) / span < SPEED) & (rate < RATE)
     turns = np.diff(resting, prepend=False, append=False)
     edges = np.flatnonzero(turns).reshape(-1, 2)  # of each rest: its first pose, and one past it
@@ -135,9 +142,7 @@ def _mean(poses: Sequence[Pose], span: slice) -> Pose:
     close = [
         p for p in poses[: span.stop - span.start] if abs(p.arrival - poses[0].arrival) <= REST_TIME
     ]
-    quats = np.array([p.quat for p in close])
-    quats[np.sum(quats * quats[0], axis=1) < 0.0] *= -1.0
-    quat = quats.mean(axis=0)
+    quat = continuous(np.array([p.quat for p in close])).mean(axis=0)
     place = tuple(np.mean([p.pos for p in close], axis=0).tolist())
     return replace(close[0], pos=place, quat=tuple((quat / np.linalg.norm(quat)).tolist()))
 
@@ -155,27 +160,19 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
     pairs = [(move, step) for move, step in zip(MOVES, steps) if move.axis is not None]
     ways = [(move.axis, step.way) for move, step in pairs if not move.turn]
     turns = [(move.axis, step) for move, step in pairs if move.turn]
-    world = max(TURNS, key=lambda axes: _agreement([(i, turn_of(axes) @ way) for i, way in ways]))
+    world = max(TURNS, key=lambda axes: _agreement(turn_of(axes), ways))
+    in_world, in_body = {}, {}
+    for order in ("xyzw", "wxyz"):
+        tried = replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)
+        vectors = [(i, *step.turns(Frames(tried))) for i, step in turns]
+        in_world[order] = _agreement(np.eye(3), [(i, vector) for i, vector, _ in vectors])
+        in_body[order] = [(i, vector) for i, _, vector in vectors]
 
-    choices = {
-        order: Frames(
-            replace(frames, axes=world, body_axes=OURS, quaternion=order, yaw_offset_deg=0.0)
-        )
-        for order in ("xyzw", "wxyz")
-    }
-    vectors = {
-        order: [(i, step.turns(ours)) for i, step in turns] for order, ours in choices.items()
-    }
+    def fit(case: tuple[str, str]) -> float:
+        order, body = case
+        return round(in_world[order] + _agreement(turn_of(body), in_body[order]), 9)
 
-    def fits(order: str, body: str) -> float:
-        pair = [
-            (i, v)
-            for i, (in_world, in_body) in vectors[order]
-            for v in (in_world, turn_of(body) @ in_body)
-        ]
-        return round(_agreement(pair), 9)
-
-    order, body = max(product(vectors, TURNS), key=lambda case: fits(*case))
+    order, body = max(product(in_world, TURNS), key=fit)
     fitting = replace(
         frames,
         axes=world,
@@ -190,9 +187,9 @@ def judge(steps: Sequence[MeasuredMove], frames: FrameParams) -> CarryResult:
     return CarryResult(tuple(lines), fitting, mirrored, all(passed for _, passed in lines))
 
 
-def _agreement(vectors: list[tuple[int, np.ndarray]]) -> float:
-    """Return the sum of the cosines between vectors and the axes that they belong to."""
-    return sum(float(v[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
+def _agreement(turn: np.ndarray, vectors: list[tuple[int, np.ndarray]]) -> float:
+    """Return the sum of the cosines between turned vectors and the axes that they belong to."""
+    return sum(float((turn @ v)[axis] / max(np.linalg.norm(v), 1e-12)) for axis, v in vectors)
 
 
 def _yaw(ways: list[tuple[int, np.ndarray]], world: np.ndarray) -> float:

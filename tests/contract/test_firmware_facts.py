@@ -25,8 +25,7 @@ PLAIN |= {255, 256, 65535, 65536, 0xFFFFFFFF}
 CHOICES = {
     "hil/links/backends/__init__.py": "THRUST_SHORT",
     "hil/links/backends/audit.py": "ASK_AGAIN GIVE_UP GIVE_UP_OPTIONAL",
-    "hil/links/backends/autopilot.py": "ASK_AGAIN CONFIRMATION_TIME STREAM COMMAND_VALUES"
-    " SERVO_NEAR",
+    "hil/links/backends/autopilot.py": "ASK_AGAIN CONFIRMATION_TIME STREAM SERVO_NEAR",
     "hil/links/backends/base.py": "REPEAT",
     "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX NEAR KEEP_ALIVE OPEN_TIME"
     " ARM_LOW POLLS READ_BACK RATES_PERIOD RATES_TIME",
@@ -36,7 +35,8 @@ CHOICES = {
     "hil/links/backends/px4.py": "MARGIN GAP",
     "hil/links/backends/thrust_curve.py": "LEAST_SHARES VOLTAGE_RANGE",
     "hil/links/device.py": "MOST_CHUNKS MOST_SHUT_OUT",
-    "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT IDS MOST_PENDING ASK_EVERY EARLY LATE",
+    "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT COMMAND_VALUES IDS MOST_PENDING"
+    " ASK_EVERY EARLY LATE",
     "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH BEHIND LEAST_WORD",
     "hil/links/roster.py": "SILENT MOST_SAID",
     "hil/links/team_link.py": "WINDOW",

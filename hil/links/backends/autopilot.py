@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from hil.links.backends.audit import Audit, Rule, rules_of
 from hil.links.backends.base import FOLLOW, HOLD, LAND, WAIT, Autopilot, Command, Release
 from hil.links.backends.thrust_curve import HoverThrustParams
-from hil.links.mavlink_link import Link, attitude_target
+from hil.links.mavlink_link import Link, attitude_target, command_long, parameter_request
 from hil.links.pymav import mav
 from hil.links.roster import Announce, MavlinkId, Party
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
@@ -35,7 +35,6 @@ in hover, the mode, which a heartbeat of 1 Hz tells up to a second late, body ra
 may be armed.
 """
 
-COMMAND_VALUES = 7  # of COMMAND_LONG
 SERVO_NEAR = 50  # an output this near to where the mechanism is open counts as open [us]
 
 HEARTBEAT = mav.MAVLink_heartbeat_message(  # ours
@@ -89,6 +88,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         """
         super().__init__()
         self.params = params
+        self._target = params.system, params.component
         self._link = link
         self._write = write
         self._tell = tell
@@ -160,11 +160,9 @@ class MavlinkAutopilot(Autopilot, ABC):
         return value
 
     def _hear(self, message: Any, arrival: float) -> None:
-        p = self.params
         handle = _HANDLERS.get(message.get_type())
-        if message.get_srcSystem() != p.system or message.get_srcComponent() != p.component:
-            return
-        if handle is not None:
+        sender = message.get_srcSystem(), message.get_srcComponent()
+        if sender == self._target and handle is not None:
             handle(self, message, arrival)
 
     def _hear_heartbeat(self, message: Any, arrival: float) -> None:
@@ -291,12 +289,9 @@ class MavlinkAutopilot(Autopilot, ABC):
         """Return modes that a throw may begin in, in words."""
 
     def send(self, command: Command, host_time: float) -> bool:
-        p = self.params
         thrust, x, y, z = command
-        share = p.thrust.share(thrust, self.voltage)
-        return self._link.send(
-            attitude_target(host_time, (p.system, p.component), share, (x, -y, -z))
-        )
+        share = self.params.thrust.share(thrust, self.voltage)
+        return self._link.send(attitude_target(host_time, self._target, share, (x, -y, -z)))
 
     def ask(self, mode: str, host_time: float) -> None:
         """Ask until the heartbeat shows the mode."""
@@ -317,11 +312,11 @@ class MavlinkAutopilot(Autopilot, ABC):
         beat = self._heartbeat
         if beat is None or self._role(beat.custom_mode) != mode:
             self._asked_at = host_time
-            self._command(mav.MAV_CMD_DO_SET_MODE, 0, CUSTOM, *self._mode_numbers(mode))
+            self._command(mav.MAV_CMD_DO_SET_MODE, CUSTOM, *self._mode_numbers(mode))
             self._request_heartbeat()
         elif mode == FOLLOW and self.params.arm and not beat.base_mode & ARMED:
             self._asked_at = host_time
-            self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 0, 1.0)
+            self._command(mav.MAV_CMD_COMPONENT_ARM_DISARM, 1.0)
 
     def _confirms(self, mode: str, host_time: float) -> bool:
         """Return whether another mode may be requested: once a heartbeat has come since the first
@@ -337,7 +332,7 @@ class MavlinkAutopilot(Autopilot, ABC):
         return late or self._heard > self._wished_at
 
     def _request_heartbeat(self) -> None:
-        self._command(mav.MAV_CMD_REQUEST_MESSAGE, 0, mav.MAVLINK_MSG_ID_HEARTBEAT)
+        self._command(mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_HEARTBEAT)
 
     def service(self, host_time: float) -> None:
         if host_time - self._beat_at >= 1.0:
@@ -348,37 +343,24 @@ class MavlinkAutopilot(Autopilot, ABC):
             if host_time - self._streamed > 10.0 and self._wanted is None:
                 self._streamed = host_time
                 for number, period in STREAM:
-                    self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, period)
+                    self._command(mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, period)
         if self.release_record.due(host_time):
             number, values = self._release_command()
-            self._command(number, self.release_record.sends - 1, *values)
+            self._command(number, *values, repetition=self.release_record.sends - 1)
 
     def abort(self, host_time: float) -> None:
         self.ask(LAND, host_time)
 
-    def _command(self, number: int, confirmation: int, *values: float) -> None:
-        p = self.params
-        seven = [*map(float, values), *([0.0] * (COMMAND_VALUES - len(values)))]
-        self._link.send(
-            mav.MAVLink_command_long_message(
-                p.system, p.component, number, min(confirmation, 255), *seven
-            )
-        )
+    def _command(self, number: int, *values: float, repetition: int = 0) -> None:
+        self._link.send(command_long(self._target, number, *values, repetition=repetition))
 
     def _ask_parameter(self, name: str) -> None:
-        p = self.params
-        self._link.send(
-            mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1)
-        )
+        self._link.send(parameter_request(self._target, name))
 
     def _write_parameter(self, name: str, value: float) -> None:
-        p = self.params
         kind = self._kinds.get(name, mav.MAV_PARAM_TYPE_REAL32)
-        self._link.send(
-            mav.MAVLink_param_set_message(
-                p.system, p.component, name.encode(), self._field(value, kind), kind
-            )
-        )
+        field = self._field(value, kind)
+        self._link.send(mav.MAVLink_param_set_message(*self._target, name.encode(), field, kind))
 
 
 _HANDLERS = {

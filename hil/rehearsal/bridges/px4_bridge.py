@@ -20,7 +20,7 @@ import numpy as np
 
 from hil.links.backends.px4 import Px4Params, parameter_value
 from hil.links.facts import values
-from hil.links.mavlink_link import Link
+from hil.links.mavlink_link import Link, command_long, parameter_request
 from hil.links.pymav import mav
 from hil.rehearsal.fake import Bridge
 from hil.rehearsal.fake_mocap import SLACK
@@ -327,20 +327,14 @@ class Px4Sih(Bridge):
 
     def speak(self) -> None:
         """Ask for what is not coming."""
-        p = self.params
+        target = self.params.system, self.params.component
         for number, period in STREAMS.items():
             if self._due(number):
-                seven = (number, 1e6 * period, 0, 0, 0, 0, 0)
-                self.autopilot.send(
-                    mav.MAVLink_command_long_message(
-                        p.system, p.component, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *seven
-                    )
-                )
+                interval = mav.MAV_CMD_SET_MESSAGE_INTERVAL
+                self.autopilot.send(command_long(target, interval, number, 1e6 * period))
         for name in ORIGIN:
             if name not in self._origin and self._due(name):
-                self.autopilot.send(
-                    mav.MAVLink_param_request_read_message(p.system, p.component, name.encode(), -1)
-                )
+                self.autopilot.send(parameter_request(target, name))
 
     def _due(self, what: int | str) -> bool:
         due = self.plant.time - self._asked.get(what, -math.inf) >= ASK_AGAIN
