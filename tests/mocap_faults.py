@@ -112,14 +112,17 @@ class MocapFault:
 def main() -> int:
     """Run a command with the fault in the fakes that it makes."""
     name, start, *words = sys.argv[1:]
-    make = process.make_fake
+    load = process.load_fake
 
-    def spoiled(*args: Any) -> Any:
-        fake, seed = make(*args), args[4]
-        fake.spoil = MocapFault(name, float(start), seed).spoil
-        return fake
+    def spoiled(kind: str) -> Any:
+        class Spoiled(load(kind)):
+            def __init__(self, *args: Any) -> None:
+                super().__init__(*args)
+                self.spoil = MocapFault(name, float(start), args[3]).spoil
 
-    process.make_fake = spoiled
+        return Spoiled
+
+    process.load_fake = spoiled
     return cli.main(words)
 
 

@@ -22,7 +22,7 @@ from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.bridges.px4_bridge import HangingBall, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, make_fake, serve
+from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, serve
 from visthrow import config
 from visthrow.common.arguments import ABOVE_ZERO, PORT, SOLVER, WHOLE
 from visthrow.common.errors import suggest
@@ -108,11 +108,12 @@ def run(args: argparse.Namespace) -> int:
         key=key_of(args),
     )
     with ExitStack() as ends:
+        vehicle = plant, link, mocap, args.seed, options
         if args.kind in SITL:
-            flown = _bridge(args, (plant, link, mocap, args.seed, options), ends)
+            flown = _bridge(args, vehicle, ends)
         else:
-            port = load_fake(args.kind).open_port(args.msp_port)
-            flown = make_fake(args.kind, plant, link, mocap, args.seed, options, port)
+            kind = load_fake(args.kind)
+            flown = kind(*vehicle, kind.open_port(args.msp_port))
             print(f"the fake {args.kind} flies", file=sys.stderr, flush=True)
         ends.callback(flown.close)
         report = serve(flown, MonotonicClock(args.speed), args.seconds, out, args.after)

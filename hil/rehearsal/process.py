@@ -13,9 +13,7 @@ from typing import Any
 from hil.control.realtime import collected
 from hil.errors import RunError
 from hil.links.clock import Clock
-from hil.links.mavlink_link import Link
-from hil.rehearsal.fake import Fake, FakeOptions, WirePlant
-from hil.rehearsal.fake_mocap import FakeMocapParams
+from hil.rehearsal.fake import Fake, WirePlant
 from visthrow.common.arguments import StopRequest
 from visthrow.common.errors import suggest
 
@@ -58,22 +56,6 @@ def load_fake(kind: str) -> type[Fake]:
 def _named(target: str) -> Any:
     module, _, name = target.partition(":")
     return getattr(importlib.import_module(module), name)
-
-
-def make_fake(
-    kind: str,
-    plant: WirePlant,
-    link: Link,
-    mocap: FakeMocapParams | None = None,
-    seed: int = 0,
-    options: FakeOptions | None = None,
-    port: Any = None,
-) -> Fake:
-    """Return a fake of a kind; ``port``: where its commands come by another port than the link's.
-
-    Raises `RunError`: unknown kind.
-    """
-    return load_fake(kind)(plant, link, mocap, seed, options, port)
 
 
 def serve(

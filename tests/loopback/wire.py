@@ -16,7 +16,7 @@ from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.open_source import parties
 from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from hil.rehearsal.process import make_fake
+from hil.rehearsal.process import load_fake
 from tests.configs import load_run
 from tests.fakes import KINDS
 from tests.hil_flight import AutoOperator
@@ -139,7 +139,7 @@ def peers(
     mine.whole = its.whole = kind == "crazyflie"
     more = FakeOptions(answer=answer, **options)
     far = Link(there, *VEHICLE_ID, key=key)
-    fake = make_fake(KINDS[kind], plant, far, mocap or FakeMocapParams(), seed, more, its)
+    fake = load_fake(KINDS[kind])(plant, far, mocap or FakeMocapParams(), seed, more, its)
     fake.spoil = MocapFault(*mocap_fault, seed).spoil
     roster = Roster(parties(params, True, True))
     clock, link = (

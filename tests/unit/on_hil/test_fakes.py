@@ -9,7 +9,7 @@ from hil.errors import RunError
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from hil.rehearsal.fake import FakeOptions, Witness
-from hil.rehearsal.process import make_fake
+from hil.rehearsal.process import load_fake
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow import config
@@ -69,7 +69,7 @@ def test_the_witness_catches_releases(armed, payload_w, answered, text):
 def test_a_fake_reports_what_its_witness_saw():
     """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
     here, there = pipe()
-    fake = make_fake("ardupilot", LevelPlant(), Link(there, 1, 1))
+    fake = load_fake("ardupilot")(LevelPlant(), Link(there, 1, 1))
     link = Link(here)
     link.send(attitude_target(0.0, (1, 1), math.nan, (0.0, 0.0, 0.0)))
     gripper = (mav.MAV_CMD_DO_GRIPPER, 0, 1.0, mav.GRIPPER_ACTION_RELEASE, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -98,4 +98,4 @@ def test_options_of_a_fake():
     with raises(ConfigError, match=r"servo_delay is -0.1; expected 0 or more"):
         read_options(["servo_delay=-0.1"])
     with raises(RunError, match="did you mean 'ardupilot'"):
-        make_fake("ardupilo", LevelPlant(), None)
+        load_fake("ardupilo")
