@@ -271,20 +271,19 @@ class Machine:
             self._go(time, State.READY, f"disarmed: {reason}")
 
     def _throw(self, time: float, inputs: Inputs) -> None:
-        if inputs.separated:
-            self._go(time, State.RECOVER, "separated")
-        elif inputs.released:
-            return  # a latched release cannot be taken back: fly on until the separation
-        elif inputs.poses_are_stale():
-            self._go(time, State.RECOVER, "stale poses")
-        elif inputs.lost:
-            self._go(time, State.RECOVER, "the payload has come off by itself")
-        elif inputs.astray:
-            self._go(time, State.RECOVER, "the policy released where it would miss")
-        elif inputs.alone:
-            self._go(time, State.RECOVER, "the team does not throw")
-        elif self._late(time):
-            self._go(time, State.RECOVER, "the policy did not release in time")
+        reasons = {
+            "separated": inputs.separated,
+            # a latched release cannot be taken back: fly on until the separation
+            "": inputs.released,
+            "stale poses": inputs.poses_are_stale(),
+            "the payload has come off by itself": inputs.lost,
+            "the policy released where it would miss": inputs.astray,
+            "the team does not throw": inputs.alone,
+            "the policy did not release in time": self._late(time),
+        }
+        reason = next((text for text, holds in reasons.items() if holds), "")
+        if reason:
+            self._go(time, State.RECOVER, reason)
 
     def _recover(self, time: float, inputs: Inputs) -> None:
         if inputs.fence is not None:  # the payload is off and the vehicle brakes: no more throws

@@ -3,8 +3,8 @@
 Convention: Betaflight's body axes are ours (x forward, y left, z up; a level vehicle at rest feels
 +1 g along z). Its motors are rear right, front right, rear left, front left."""
 
-import math
 import re
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,8 +15,8 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.readers.table import Table, make_channel
-from visthrow.logs.unit_names import G
 
+TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 MOTOR_ORDER = (3, 1, 2, 0)
 """Betaflight's motor of each of ours: front left, front right, rear left, rear right."""
 
@@ -60,40 +60,13 @@ def log_of_decoded(table: Table, path: str | Path) -> FlightLog:
 
 def _decoded_factor(name: str, unit: str, path: str | Path) -> float:
     """Factor from the bracketed unit to what the raw log holds."""
-    factors = {
-        "": 1.0,
-        "us": 1.0,
-        "ms": 1e3,
-        "s": 1e6,
-        "deg/s": 1.0,
-        "rad/s": 180 / math.pi,
-        "V": 100.0,
-        "A": 100.0,
-        "g": _ACC_1G,
-        "m/s/s": _ACC_1G / G,
-        "flags": 1.0,
-        "cm": 1.0,
-        "m": 1.0,
-        "mAh": 1.0,
-        "raw": 1.0,
-        "%": 1.0,
-    }
+    factors = TABLES["units"]
     if unit not in factors:
         raise LogError(f"{path}: column '{name}' is in '{unit}'; known: {', '.join(factors)}")
     return factors[unit]
 
 
 def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
-    keep = (
-        "Firmware revision",
-        "looptime",
-        "I interval",
-        "P interval",
-        "motorOutput",
-        "acc_1G",
-        "vbatref",
-        "motor_poles",
-    )
     return {
         "source": str(path),
         "kind": "blackbox",
@@ -103,7 +76,7 @@ def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
         "dropped": log.dropped,
         "complete": log.complete,
         "events": [[name, *values] for name, values in log.events],
-        "header": {key: log.header[key] for key in keep if key in log.header},
+        "header": {key: log.header[key] for key in TABLES["kept"] if key in log.header},
     }
 
 
@@ -131,16 +104,10 @@ def _numbered(name: str, numbers: Iterable[int]) -> tuple[str, ...]:
 
 def _sensed(header: dict[str, str]) -> list[ChannelMap]:
     """Return the channels of sensors and set-points."""
-    xyz = range(3)
     acc_1g = float(header.get("acc_1G", _ACC_1G)) or _ACC_1G
-    return [
-        ChannelMap("rate_b", _numbered("gyroADC", xyz), "deg/s", scale=_gyro_scale(header)),
-        ChannelMap("acc_b", _numbered("accSmooth", xyz), "g", scale=1.0 / acc_1g, frame="body"),
-        ChannelMap("rate_setpoint_b", _numbered("setpoint", xyz), "deg/s", frame="body"),
-        ChannelMap("throttle", ("setpoint[3]",), "1/1000"),
-        ChannelMap("battery_voltage", ("vbatLatest",), "cV"),
-        ChannelMap("current", ("amperageLatest",), "cA"),
-    ]
+    scales = {"gyro": _gyro_scale(header), "acc": 1.0 / acc_1g}
+    rows = [row | {"scale": scales.get(row.get("scale"), 1.0)} for row in TABLES["sensed"]]
+    return [ChannelMap(**row | {"columns": tuple(row["columns"])}) for row in rows]
 
 
 def _driven(table: Table, header: dict[str, str]) -> list[ChannelMap]:
