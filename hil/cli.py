@@ -4,40 +4,13 @@ Each action is imported when chosen.
 """
 
 import argparse
+import tomllib
+from pathlib import Path
 
 from hil.commands import examples
 from visthrow.common.arguments import add_commands, run_command
 
-ACTIONS = {
-    "run": (
-        "fly, or compute commands without sending them (a dry run)",
-        "hil.commands.flight_command",
-    ),
-    "view": (
-        "show a run in 3D while it flies, or write a recording, pictures and flight logs of it",
-        "hil.commands.view_command",
-    ),
-    "replay": (
-        "run a recorded run again and compare every action, bit for bit",
-        "hil.commands.replay_command",
-    ),
-    "check": (
-        "check the incoming poses, and print what prevents a throw",
-        "hil.commands.check_command",
-    ),
-    "calibrate": (
-        "hover, sway, estimate the camera's tilt and latency and the thrust in hover, and land",
-        "hil.commands.flight_command",
-    ),
-    "record": (
-        "record incoming poses and the policy's commands for them; never arms",
-        "hil.commands.flight_command",
-    ),
-    "fake": (
-        "run a fake autopilot that flies the simulated vehicle over UDP",
-        "hil.rehearsal.fake_command",
-    ),
-}
+ACTIONS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
