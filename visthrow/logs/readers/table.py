@@ -28,7 +28,7 @@ from visthrow.common.rotations import (
 from visthrow.common.storage import require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
-from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
+from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
 from visthrow.logs.readers.layout import TextTable, is_number, layout_of
 from visthrow.logs.unit_names import to_si
 
@@ -230,46 +230,36 @@ def _stamps(table: Table, clock: TimeColumn, source: str) -> np.ndarray:
 
 def _parts(
     table: Table, mapping: TableMap, count: int, source: str
-) -> list[tuple[np.ndarray | slice, str]]:
-    split = mapping.split
-    if split is None:
-        return [(slice(None), "")]
-    everything = np.arange(count)
+) -> list[tuple[np.ndarray, str]]:
+    """Rows and label of each log."""
+    split = mapping.split or Split()
+    parts = [(np.arange(count), "")]
     if split.column:
         if split.column not in table:
             raise LogError(f"{source}: no column '{split.column}'; {suggest(split.column, table)}")
         values = table[split.column]
-        order = list(dict.fromkeys(values.tolist()))
         parts = [
-            (everything[values == value], f"{value:g}" if isinstance(value, float) else value)
-            for value in order
+            (np.flatnonzero(values == value), f"{value:g}" if isinstance(value, float) else value)
+            for value in dict.fromkeys(values.tolist())
         ]
-    else:
-        parts = [(everything, "")]
+    if split.gap == split.shortest == 0.0:
+        return parts
+    time = _stamps(table, mapping.time, source)
     if split.gap > 0.0:
-        time = _stamps(table, mapping.time, source)
-        parts = [
-            (piece, f"{label}#{i}" if label else f"#{i}")
-            for rows, label in parts
-            for i, piece in enumerate(
-                np.split(rows, np.flatnonzero(np.diff(time[rows]) > split.gap) + 1)
-            )
-        ]
-    if split.shortest > 0.0:
-        time = _stamps(table, mapping.time, source)
-        parts = [
-            (rows, label)
-            for rows, label in parts
-            if len(rows) and np.ptp(time[rows]) >= split.shortest
-        ]
-    return parts
+        pieces = []
+        for rows, label in parts:
+            ends = np.flatnonzero(np.diff(time[rows]) > split.gap) + 1
+            pieces += [(piece, f"{label}#{i}") for i, piece in enumerate(np.split(rows, ends))]
+        parts = pieces
+    return [
+        (rows, label)
+        for rows, label in parts
+        if split.shortest == 0.0 or (len(rows) and np.ptp(time[rows]) >= split.shortest)
+    ]
 
 
-def _log(
-    table: Table, mapping: TableMap, rows: np.ndarray | slice, label: str, source: str
-) -> FlightLog:
-    count = len(next(iter(table.values()))[rows])
-    meta: dict[str, Any] = {"source": source, "part": label, "rows": count, "ingest": {}}
+def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: str) -> FlightLog:
+    meta: dict[str, Any] = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
     meta["left_out"] = list(getattr(table, "left_out", ()))
     channels = {}
     for entry in mapping.channels:
