@@ -432,18 +432,9 @@ class TeamEnv(VecEnv):
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
         history = hist.push(memory["true_history"], offset[:, 2:], fresh)
         memory["true_history"].copy_(history)
-        view = torch.cat(
-            [
-                vehicle,
-                memory["previous"],
-                state["cable_dir_w"][0],
-                state["release_timer"][:, None],
-                state["mass_scale"][:, None],
-                state["voltage"][:, None],
-                attached[:, None],
-            ],
-            -1,
-        )
+        numbers = [state[name] for name in ("release_timer", "mass_scale", "voltage")]
+        numbers = torch.stack([*numbers, attached], -1)
+        view = torch.cat([vehicle, memory["previous"], state["cable_dir_w"][0], numbers], -1)
         parts = [view] + [self._neighbour(view, k) for k in range(1, self.team)]
         time = self.episode_length_buf[:, None] * self.cfg.sim.control_period
         parts += [offset[:, :2], history.flatten(1), self._rows(self.load_vel_w), time]

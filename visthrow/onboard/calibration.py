@@ -252,36 +252,24 @@ class CalibrationProblem:
         """Set the deviations of constants, pushes and attitudes from the spreads."""
         s = self.spreads
         make = {"dtype": torch.float64}
-        spread = {
-            "camera": s.tilt,
-            "scale": s.scale,
-            "latency": s.latency,
-            "thrust": s.thrust,
-            "length": s.length,
-            "drag": s.drag,
-            "attitude": s.pose_bias,
-            "gyro": s.pose_bias,
-            "wind": s.wind,
-            "ball": 0.5 * s.keypoint_bias,
-            "corners": 0.5 * s.keypoint_bias,
-            "lens": s.lens,
-            "goal": s.goal,
-        }
-        self.prior = torch.cat(
-            [torch.full((n,), max(spread[name], 1e-9), **make) for name, n in CONSTANTS.items()]
-        )
+        named = {"camera": "tilt", "attitude": "pose_bias", "gyro": "pose_bias"}
+        named |= dict.fromkeys(("ball", "corners"), "keypoint_bias")
+        spreads = [max(getattr(s, named.get(name, name)), 1e-9) for name in CONSTANTS]
+        widths = torch.tensor(list(CONSTANTS.values()))
+        self.prior = torch.tensor(spreads, **make).repeat_interleave(widths)
         self.push = torch.tensor([s.push, s.push, s.lift], **make)
         self.attitude = torch.tensor([s.attitude, s.attitude, s.heading * s.attitude])
-        self.split(self.prior[None])["attitude"][0, 2] *= s.heading
+        parts = self.split(self.prior[None])
+        parts["attitude"][0, 2] *= s.heading
+        for name in ("ball", "corners"):
+            parts[name] *= 0.5
 
     def start(self) -> tuple[Tensor, Tensor]:
         """Unknowns to begin from: what was measured and a rope at rest, shape (N, 13); constants,
         shape (C,).
         """
-        zeros = torch.zeros(len(self.time), 7, dtype=torch.float64)
-        return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros(
-            len(self.prior), dtype=torch.float64
-        )
+        zeros = self.pos.new_zeros(len(self.time), 7)
+        return torch.cat([self.pos, self.vel, zeros], -1), torch.zeros_like(self.prior)
 
     def split(self, constants: Tensor) -> dict[str, Tensor]:
         """Constants by name, each (B, n)."""
@@ -321,13 +309,10 @@ class CalibrationProblem:
         perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
         # Magnus: of a rate that is linear in a step
         coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
-        turned = (
-            _vector(rot[:, :-1].transpose(-1, -2) @ rot[:, 1:])
-            - (self.mean_rate - c["gyro"][:, None]) * dt
-            - coning
-        )
+        back = rot[:, :-1].mT
+        turned = _vector(back @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
         off = (
-            _turned(rot[:, :-1].transpose(-1, -2), momentum) / self.push,
+            _turned(back, momentum) / self.push,
             perpendicular[..., :2] / s.pendulum,
             (jump(pos) - mean(vel) * dt) / 1e-4,
             (jump(swing) - mean(swing_rate) * dt) / 2e-4,
@@ -358,11 +343,8 @@ class CalibrationProblem:
         pos, vel, turn, swing, swing_rate = x.split(list(STATE.values()), -1)
         rate = self.rate - c["gyro"][:, None]
         rot = self.base @ rotation_from_vector(turn)
-        chord = _vector(rot[:, j].transpose(-1, -2) @ rot[:, j + 1])
-        bend = (
-            u * (1 - u) * ((1 - u) * (rate[:, j] * dt - chord) - u * (rate[:, j + 1] * dt - chord))
-        )
-        attitude = rot[:, j] @ rotation_from_vector(u * chord + bend)
+        chord = _vector(rot[:, j].mT @ rot[:, j + 1])
+        attitude = rot[:, j] @ rotation_from_vector(_hermite(chord, rate, j, u, dt))
         body_w = _cubic(pos, vel, j, u, dt)
         leaning = _cubic(swing, swing_rate, j, u, dt)
         rope, _ = _rope(leaning, torch.zeros_like(leaning))
@@ -373,32 +355,21 @@ class CalibrationProblem:
             -1, body_w.shape[1], -1, -1
         )
         offsets = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
-        lens = self.camera.position_b + c["lens"]
-        in_body = torch.einsum("bnji,bnkj->bnki", attitude, offsets) - lens[:, None, None]
+        place = self.camera.position_b + c["lens"]
+        in_body = torch.einsum("bnji,bnkj->bnki", attitude, offsets) - place[:, None, None]
         rot_bc = rotation_from_vector(c["camera"]) @ self.camera.rot_cb.T
         in_camera = torch.einsum("bji,bnkj->bnki", rot_bc, in_body)
-        rays = ball_extremes_c(
-            self.camera.fisheye, in_camera[:, :, 4].flatten(0, 1), self.camera.params.payload_radius
-        )
-        points, _ = self.camera.fisheye.project_normalized(
-            torch.cat([in_camera[:, :, :4].flatten(0, 1), rays], -2), clip=True
-        )
+        flat = in_camera.flatten(0, 1)
+        lens = self.camera.fisheye
+        rays = ball_extremes_c(lens, flat[:, 4], self.camera.params.payload_radius)
+        points, _ = lens.project_normalized(torch.cat([flat[:, :4], rays], -2), clip=True)
         size = 1.0 + c["scale"][:, None]
-        corners = (
-            size * points[:, :4].mean(1).unflatten(0, body_w.shape[:2]) + c["corners"][:, None]
-        )
-        ball = (
-            size * _box(box_midpoints(points[:, 4:])).unflatten(0, body_w.shape[:2])
-            + c["ball"][:, None]
-        )
-        off = torch.cat(
-            [
-                (ball - self.ball) * self.ball_seen[:, None],
-                (corners - self.corners) * self.corners_seen[:, None],
-            ],
-            -1,
-        )
-        return off / (0.5 * s.keypoint + 1e-4)
+        middle = points[:, :4].mean(1).unflatten(0, body_w.shape[:2])
+        box = _box(box_midpoints(points[:, 4:])).unflatten(0, body_w.shape[:2])
+        ball = size * box + c["ball"][:, None] - self.ball
+        corners = size * middle + c["corners"][:, None] - self.corners
+        seen = (ball * self.ball_seen[:, None], corners * self.corners_seen[:, None])
+        return torch.cat(seen, -1) / (0.5 * s.keypoint + 1e-4)
 
 
 def _box(points: Tensor) -> Tensor:
@@ -431,21 +402,14 @@ def _turned(rot: Tensor, vector: Tensor) -> Tensor:
 def _rope(swing: Tensor, rate: Tensor) -> tuple[Tensor, Tensor]:
     """Direction of a hanging rope and its rate, from their horizontal parts."""
     down = (1.0 - (swing * swing).sum(-1, keepdim=True)).clamp(min=1e-2).sqrt()
-    return torch.cat([swing, -down], -1), torch.cat(
-        [rate, (swing * rate).sum(-1, keepdim=True) / down], -1
-    )
+    fall = (swing * rate).sum(-1, keepdim=True) / down
+    return torch.cat([swing, -down], -1), torch.cat([rate, fall], -1)
 
 
 def _vector(rot: Tensor) -> Tensor:
     """Rotation vectors of small rotations."""
-    skew = 0.5 * torch.stack(
-        [
-            rot[..., 2, 1] - rot[..., 1, 2],
-            rot[..., 0, 2] - rot[..., 2, 0],
-            rot[..., 1, 0] - rot[..., 0, 1],
-        ],
-        -1,
-    )
+    twice = rot - rot.mT
+    skew = 0.5 * torch.stack([twice[..., 2, 1], twice[..., 0, 2], twice[..., 1, 0]], -1)
     sine2 = (skew * skew).sum(-1, keepdim=True)
     return skew * (1.0 + sine2 / 6.0 + 3.0 * sine2 * sine2 / 40.0)  # arcsin(s) / s
 
@@ -453,8 +417,13 @@ def _vector(rot: Tensor) -> Tensor:
 def _cubic(value: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Tensor:
     """Cubic through values and slopes of steps j and j + 1 at a share u of the way."""
     chord = value[:, j + 1] - value[:, j]
+    return value[:, j] + _hermite(chord, slope, j, u, dt)
+
+
+def _hermite(chord: Tensor, slope: Tensor, j: Tensor, u: Tensor, dt: Tensor) -> Tensor:
+    """Rise of a cubic from step j to a share u of its chord to j + 1, by the slopes of both."""
     bend = (1 - u) * (slope[:, j] * dt - chord) - u * (slope[:, j + 1] * dt - chord)
-    return value[:, j] + u * chord + u * (1 - u) * bend
+    return u * chord + u * (1 - u) * bend
 
 
 def calibrate(
@@ -538,9 +507,10 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tens
         for parity in (0, 1):
             xs[1 + 2 * i + parity, parity::2, i] += h
     cs[1 + 2 * width :] += h * torch.eye(len(c), dtype=c.dtype)
-    prior = torch.cat([torch.zeros(count * width, dtype=c.dtype), 1.0 / problem.prior**2])
+    flat = torch.zeros_like(x).flatten()
+    prior = torch.cat([flat, 1.0 / problem.prior**2])
     normal = torch.diag(prior + 1e-9)
-    gradient = prior * torch.cat([torch.zeros(count * width, dtype=c.dtype), c])
+    gradient = prior * torch.cat([flat, c])
     for values, step in (
         (problem.steps(xs, cs), torch.arange(count - 1)),
         (problem.sightings(xs, cs, j), j),
@@ -549,11 +519,9 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tens
         off = (values[1:] - values[:1]) / h
         if step is j:
             misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
-            parts_of = base.split((3, 2), -1)  # ball and goal
-            sizes = torch.cat(
-                [one.norm(dim=-1, keepdim=True).expand_as(one) for one in parts_of], -1
-            ).clamp(min=1e-9)
-            weight = (OUTLIER / sizes).clamp(max=1.0).sqrt()
+            ball, goal = (part.norm(dim=-1, keepdim=True) for part in base.split((3, 2), -1))
+            sizes = torch.cat([ball.expand(-1, 3), goal.expand(-1, 2)], -1)
+            weight = (OUTLIER / sizes.clamp(min=1e-9)).clamp(max=1.0).sqrt()
             base = base * weight
             off = off * weight
         even = off[: 2 * width : 2]

@@ -262,27 +262,22 @@ class Policy:
 
         header = _header(take("header").cpu().numpy(), path)
         count = sum(name.startswith("layer") and name.endswith("_weight") for name in arrays)
-        normalized = "normalizer_mean" in arrays
+        further: dict[str, Any] = {}
         try:
-            estimator = None
+            if "normalizer_mean" in arrays:
+                further = {name: take(f"normalizer_{name}") for name in ("mean", "std", "eps")}
+                further["eps"] = float(further["eps"])
             if header["format_version"] == FORMAT_VERSIONS[1]:
-                estimator = Estimator.of_parts(
-                    {
-                        name.removeprefix("estimator_"): take(name)
-                        for name in arrays
-                        if name.startswith("estimator_")
-                    }
-                )
+                names = [name for name in arrays if name.startswith("estimator_")]
+                parts = {name.removeprefix("estimator_"): take(name) for name in names}
+                further["estimator"] = Estimator.of_parts(parts)
             return Policy(
                 tuple(take(f"layer{i}_weight") for i in range(count)),
                 tuple(take(f"layer{i}_bias") for i in range(count)),
                 header["activation"],
                 header["contract"],
                 header["made_by"],
-                take("normalizer_mean") if normalized else None,
-                take("normalizer_std") if normalized else None,
-                float(take("normalizer_eps")) if normalized else 0.0,
-                estimator,
+                **further,
             )
         except PolicyError as error:
             raise (
@@ -327,16 +322,17 @@ class Policy:
         def take(key: str) -> Tensor:
             return state[key].detach().to("cpu", torch.float32).clone()
 
-        normalized = "obs_normalizer._mean" in state
+        normalizer: dict[str, Any] = {}
+        if "obs_normalizer._mean" in state:
+            normalizer = {n: take(f"obs_normalizer._{n}").reshape(-1) for n in ("mean", "std")}
+            normalizer["eps"] = RSL_RL_EPS
         return Policy(
             tuple(take(f"mlp.{i}.weight") for i in index),
             tuple(take(f"mlp.{i}.bias") for i in index),
             activation.lower(),
             json.loads(json.dumps(contract)),
             json.loads(json.dumps(made_by or {})),
-            take("obs_normalizer._mean").reshape(-1) if normalized else None,
-            take("obs_normalizer._std").reshape(-1) if normalized else None,
-            RSL_RL_EPS if normalized else 0.0,
+            **normalizer,
         )
 
 

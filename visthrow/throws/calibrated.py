@@ -80,22 +80,16 @@ def _hovered(env: "ThrowEnv") -> list[Hovered]:
         if 0.0 <= since < SWAY:
             command[:, 1:3] += sway(since)
         if k < steps:
-            rows.append(
-                (np.full(env.num_envs, k * period), *measured[:4], command[:, 0], *measured[4:])
-            )
+            time = np.full(env.num_envs, k * period)
+            rows.append((time, *measured[:4], command[:, 0], *measured[4:]))
         action = act.action_from_command(
             torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate
         )
         env.episode_length_buf.zero_()  # a hover has no time limit
         env.carry(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device))
-    time, pos, quat, vel, rates, thrust, points, valid = (
-        np.stack(column, 1) for column in zip(*rows)
-    )
-    goal = env.views.goal_w.cpu().numpy()
-    return [
-        Hovered(time[i], pos[i], quat[i], vel[i], rates[i], thrust[i], points[i], valid[i], goal[i])
-        for i in range(env.num_envs)
-    ]
+    columns = [np.stack(column, 1) for column in zip(*rows)]
+    columns.append(env.views.goal_w.cpu().numpy())
+    return [Hovered(*(column[i] for column in columns)) for i in range(env.num_envs)]
 
 
 def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:

@@ -156,14 +156,8 @@ class Policies(Pilots):
                 looked = self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
             keypoints = None if looked is None else (looked[0][part], looked[1][part])
-            outs.append(
-                pilot.act(
-                    *(getattr(snapshot, name)[part] for name in VIEWS),
-                    goal_w[part],
-                    snapshot.attached[part],
-                    keypoints,
-                )
-            )
+            views = [getattr(snapshot, name)[part] for name in VIEWS]
+            outs.append(pilot.act(*views, goal_w[part], snapshot.attached[part], keypoints))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
         return Decision(*(np.concatenate([getattr(out, name) for out in outs]) for name in names))
 

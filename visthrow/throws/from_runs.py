@@ -73,14 +73,12 @@ def entries(logs: list[FlightLog]) -> list[Entry]:
         groups.setdefault(key, {}).setdefault(distance, []).append(log)
     targets = sorted({distance for by_distance in groups.values() for distance in by_distance})
     names = [name for name, _, _ in groups]
-    return [
-        Entry(
-            name if names.count(name) == 1 else f"{name} {sha[:8]}",
-            layout,
-            [_throws(target, by_distance.get(target, [])) for target in targets],
-        )
-        for (name, sha, layout), by_distance in sorted(groups.items())
-    ]
+    entries = []
+    for (name, sha, layout), by_distance in sorted(groups.items()):
+        title = name if names.count(name) == 1 else f"{name} {sha[:8]}"
+        throws = [_throws(target, by_distance.get(target, [])) for target in targets]
+        entries.append(Entry(title, layout, throws))
+    return entries
 
 
 def _offset(log: FlightLog) -> np.ndarray:
@@ -94,15 +92,9 @@ def _throws(target: float, logs: list[FlightLog]) -> Throws:
     """
     columns = np.array([_row(log) for log in logs], dtype=float).reshape(-1, 5)
     error, duration, smooth = columns.T[2:]
-    return Throws(
-        target,
-        np.isfinite(error),
-        columns[:, :2],
-        error,
-        duration,
-        np.full(len(logs), np.nan),
-        smooth,
-    )
+    clearance = np.full(len(logs), np.nan)
+    success = np.isfinite(error)
+    return Throws(target, success, columns[:, :2], error, duration, clearance, smooth)
 
 
 def _row(log: FlightLog) -> tuple[float, ...]:

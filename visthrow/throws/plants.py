@@ -294,15 +294,10 @@ class HybridPlant:
     def _erring(self, snapshot: Snapshot) -> Snapshot:
         if self.noise is None:
             return snapshot
-        error = self._error
-        return replace(
-            snapshot,
-            pos_w=snapshot.pos_w + error[0],
-            vel_w=snapshot.vel_w + error[1],
-            rate_b=snapshot.rate_b + error[2],
-            payload_pos_w=snapshot.payload_pos_w + error[3],
-            quat_wb=turned(snapshot.quat_wb, error[4]),
-        )
+        *errors, turn = self._error
+        names = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
+        values = {name: getattr(snapshot, name) + error for name, error in zip(names, errors)}
+        return replace(snapshot, **values, quat_wb=turned(snapshot.quat_wb, turn))
 
     @property
     def landing(self) -> PayloadLandings:

@@ -82,12 +82,8 @@ def fly_batch(
     count = job.count * len(flown)
     plant, rng = batch_plant(experiment, plant_name, job.target, job.batch, count, job.seed)
     home = place_in_hover(plant, experiment, rng)
-    pilots = Policies(
-        flown,
-        np.tile([job.target, 0.0, 0.0], (count, 1)),
-        _goal_velocities(experiment, count, rng),
-        eyes=eyes,
-    )
+    goal_w = np.tile([job.target, 0.0, 0.0], (count, 1))
+    pilots = Policies(flown, goal_w, _goal_velocities(experiment, count, rng), eyes=eyes)
     flight = Flight(plant, pilots, scores := _Scores(pilots), home)
     flight.run([hover(HOVER_TIME), throw()])
     return scores.columns(flight)
@@ -196,9 +192,7 @@ class Throwing(Workers):
         for job, part in zip(self.jobs, parts):
             if job.target == target and policy in job.policies:
                 first = job.policies.index(policy) * job.count
-                units.append(
-                    {name: values[first : first + job.count] for name, values in part.items()}
-                )
-        return Throws(
-            target, **{name: np.concatenate([part[name] for part in units]) for name in units[0]}
-        )
+                rows = slice(first, first + job.count)
+                units.append({name: values[rows] for name, values in part.items()})
+        columns = {name: np.concatenate([part[name] for part in units]) for name in units[0]}
+        return Throws(target, **columns)

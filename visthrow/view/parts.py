@@ -16,23 +16,14 @@ def aligned(header: Sequence[str], rows: Sequence[Sequence[str]], heads: int | N
     text_columns = len(header) if heads is None else heads
 
     def line(row: Sequence[str]) -> str:
-        return (
-            "| "
-            + " | ".join(
-                c.ljust(w) if i < text_columns else c.rjust(w)
-                for i, (c, w) in enumerate(zip(row, width))
-            )
-            + " |"
-        )
+        cells = [
+            cell.ljust(w) if i < text_columns else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, width))
+        ]
+        return f"| {' | '.join(cells)} |"
 
-    rule = (
-        "|"
-        + "|".join(
-            "-" * (w + 2) if i < text_columns else "-" * (w + 1) + ":" for i, w in enumerate(width)
-        )
-        + "|"
-    )
-    return "\n".join([line(header), rule, *map(line, rows)])
+    rules = ["-" * (w + 1) + ("-" if i < text_columns else ":") for i, w in enumerate(width)]
+    return "\n".join([line(header), f"|{'|'.join(rules)}|", *map(line, rows)])
 
 
 @dataclass(frozen=True)
