@@ -149,17 +149,13 @@ def _refine(grey: ndarray, corners: ndarray, share: float = 0.45) -> ndarray:
     """
     import cv2
 
-    distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1) + np.diag(
-        np.full(len(corners), np.inf)
-    )
+    distances = np.linalg.norm(corners[:, None] - corners[None], axis=-1)
+    np.fill_diagonal(distances, np.inf)
     half = int(np.clip(share * distances.min(), 1, 8))
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-4)
     start = corners.astype(np.float32).reshape(-1, 1, 2).copy()
-    return (
-        cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria)
-        .reshape(-1, 2)
-        .astype(np.float64)
-    )
+    refined = cv2.cornerSubPix(grey, start, (half, half), (-1, -1), criteria)
+    return refined.reshape(-1, 2).astype(np.float64)
 
 
 def calibrate_from_boards(
@@ -238,20 +234,14 @@ def _solved(views: list[View], width: int, height: int, fov_deg: float) -> Fishe
     )
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
-    _, matrix, k, _, _ = cv2.fisheye.calibrate(
-        [v.points_m[None] for v in views],
-        [v.pixels[None] for v in views],
-        (width, height),
-        start,
-        np.zeros((4, 1)),
-        flags=flags,
-        criteria=criteria,
-    )
-    fx, fy, cx, cy, k1, k2, k3, k4 = map(
-        float, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *k.ravel())
-    )
-    widest = 1.999 * float(np.degrees(monotonic_limit((k1, k2, k3, k4))))
-    return FisheyeParams(width, height, fx, fy, cx, cy, k1, k2, k3, k4, min(fov_deg, widest, 360.0))
+    points = [[v.points_m[None] for v in views], [v.pixels[None] for v in views]]
+    how = {"flags": flags, "criteria": criteria}
+    solution = cv2.fisheye.calibrate(*points, (width, height), start, np.zeros((4, 1)), **how)
+    matrix = solution[1]
+    k = tuple(solution[2].ravel().tolist())
+    focus = (*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist())
+    widest = 1.999 * float(np.degrees(monotonic_limit(k)))
+    return FisheyeParams(width, height, *focus, *k, min(fov_deg, widest, 360.0))
 
 
 def check_boards(images: list[ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:

@@ -173,21 +173,19 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         frame = _basis(mean / np.linalg.norm(mean))
         local = rays[good] @ frame
         plane = local[:, :2] / local[:, 2:]
-        unknown = np.linalg.lstsq(
-            np.column_stack([plane, np.ones(len(plane))]), 1.0 / local[:, 2], rcond=None
-        )[0]
-        normal = frame @ unknown
+        columns = np.column_stack([plane, np.ones(len(plane))])
+        normal = frame @ np.linalg.lstsq(columns, 1.0 / local[:, 2], rcond=None)[0]
         size = float(np.linalg.norm(normal))
         if not size > 1.0:
             return axis / np.linalg.norm(axis), 0.0, math.inf, 0.0
         axis = normal / size
         half_angle = math.acos(1.0 / size)
-        off = (
-            np.arctan2(np.linalg.norm(np.cross(rays, axis), axis=1), rays @ axis) / half_angle - 1.0
-        )
+        sine = np.linalg.norm(np.cross(rays, axis), axis=1)
+        off = np.arctan2(sine, rays @ axis) / half_angle - 1.0
         # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
         # points count.
-        outer = np.quantile(off[np.abs(off) < 0.5], OUTER) if (np.abs(off) < 0.5).any() else 0.0
+        inner = off[np.abs(off) < 0.5]
+        outer = np.quantile(inner, OUTER) if len(inner) else 0.0
         good = np.abs(off - outer) < width
         if good.sum() < 6:
             return axis, half_angle, math.inf, 0.0
@@ -280,11 +278,8 @@ def _refined(
         ]
         length = np.linalg.norm(way, axis=1)
         reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
-        values = _sample(
-            level,
-            start[:, 0, None] + way[:, 0, None] * reach,
-            start[:, 1, None] + way[:, 1, None] * reach,
-        )
+        u, v = (start[:, i, None] + way[:, i, None] * reach for i in range(2))
+        values = _sample(level, u, v)
         hit, distance = _first_crossing(values, reach)
         if hit.sum() < SIDE_SAMPLES // 3:
             return None

@@ -118,7 +118,7 @@ class Networks(nn.Module):
             "made_by": self.made_by,
         }
         arrays = {
-            name: value.detach().cpu().numpy().astype(np.float16)
+            name: value.numpy(force=True).astype(np.float16)
             for name, value in self.state_dict().items()
         }
         with open(path, "wb") as file:
@@ -183,11 +183,13 @@ def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
 
     The world's x where the attitude is known, so that a square that is laid along the world's axes
     shows its corners in one order."""
-    up = north_c - (north_c * rays).sum(-1, keepdim=True) * rays
-    spare = torch.tensor([[0.0, -1.0, 0.0]], dtype=rays.dtype, device=rays.device)
-    up = torch.where(
-        up.norm(dim=-1, keepdim=True) > 0.1, up, spare - (spare * rays).sum(-1, keepdim=True) * rays
-    )
+
+    def perpendicular(vector: Tensor) -> Tensor:
+        return vector - (vector * rays).sum(-1, keepdim=True) * rays
+
+    up = perpendicular(north_c)
+    spare = perpendicular(rays.new_tensor([[0.0, -1.0, 0.0]]))
+    up = torch.where(up.norm(dim=-1, keepdim=True) > 0.1, up, spare)
     down = -F.normalize(up, dim=-1)
     right = torch.linalg.cross(down, rays)
     return Views(torch.stack([right, down, rays], 1), reach)
@@ -201,9 +203,7 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
         views: of the patches. lens: of the frames. side: S.
     """
     centres = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
-    grid = torch.stack(
-        [centres[None, :].expand(side, -1), centres[:, None].expand(-1, side)], -1
-    ).reshape(1, -1, 2)
+    grid = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1).reshape(1, -1, 2)
     rays = views.rays(grid.expand(len(index), -1, -1))
     pixels, _ = lens.project(rays)
     height, width = frames.shape[1:3]
@@ -316,11 +316,8 @@ class LearntDetector(Detector):
             return probability
         cosine = rays @ torch.from_numpy(expected_c).float()
         variance = (tolerance / GATE) ** 2
-        likelier = (
-            (1.0 - math.cos(self.lens.params.half_fov))
-            / variance
-            * (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp()
-        )
+        density = (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp() / variance
+        likelier = (1.0 - math.cos(self.lens.params.half_fov)) * density
         odds = probability / (1.0 - probability).clamp(min=1e-6) * likelier
         return odds / (1.0 + odds)
 
@@ -362,15 +359,8 @@ def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]
 def ball_of(views: Views, outputs: Tensor) -> Tensor:
     """Unit ray and half-angle [rad] of balls, shape (B, 4)."""
     ray = views.rays(outputs[:, None, 2:4])[:, 0]
-    return torch.cat(
-        [
-            ray,
-            (views.reach / REACH["ball"] * outputs[:, 4].clamp(-3.0, 1.5).exp())[:, None].clamp(
-                1e-3, 1.2
-            ),
-        ],
-        -1,
-    )
+    half_angle = views.reach / REACH["ball"] * outputs[:, 4].clamp(-3.0, 1.5).exp()
+    return torch.cat([ray, half_angle[:, None].clamp(1e-3, 1.2)], -1)
 
 
 def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
@@ -383,24 +373,28 @@ def places_of(grids: Tensor, lens: Fisheye) -> dict[str, tuple[Tensor, Tensor]]:
     for k, kind in enumerate(KINDS):
         logits = grids[0, k, 0]
         peak = F.max_pool2d(logits[None, None], 3, 1, 1)[0, 0]
-        best = (
-            torch.where(logits == peak, logits, logits.new_full((), -1e3))
-            .flatten()
-            .topk(PLACES)
-            .indices
-        )
-        j = best // logits.shape[1]
-        i = best % logits.shape[1]
-        du, dv, size = grids[0, k, 1:, j, i]
-        pixels = torch.stack(
-            [(i + 0.5 + du.clamp(-1, 1)) * CELL - 0.5, (j + 0.5 + dv.clamp(-1, 1)) * CELL - 0.5], -1
-        )
-        rays, _ = lens.unproject(pixels)
-        places[kind] = (
-            F.normalize(rays, dim=-1),
-            size.clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx),
-        )
+        peaks = torch.where(logits == peak, logits, -1e3)
+        best = peaks.flatten().topk(PLACES).indices
+        places[kind] = places_in(grids[:, k], torch.zeros_like(best), best, lens)
     return places
+
+
+def places_in(grids: Tensor, frames: Tensor, cells: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
+    """Unit rays (B, 3) and sizes [rad] (B,) that cells name.
+
+    Args:
+        grids: of one kind, shape (F, 4, h, w). frames, cells: which frame, and which of its cells
+            counted row by row, shape (B,).
+        lens: of the frames.
+    """
+    width = grids.shape[-1]
+    j = cells // width
+    i = cells % width
+    numbers = grids[frames, :, j, i]
+    position = torch.stack([i, j], -1) + 0.5 + numbers[:, 1:3].clamp(-1, 1)
+    rays, _ = lens.unproject(position * CELL - 0.5)
+    sizes = numbers[:, 3].clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx)
+    return F.normalize(rays, dim=-1), sizes
 
 
 def log_size(angle: Tensor, lens: Fisheye) -> Tensor:

@@ -137,9 +137,9 @@ def throw(args: argparse.Namespace) -> int:
     }
     jobs = plan(1, (args.target,), args.throws, args.seed, size=TOGETHER)
     flown = dict(done(partial(_thrown, loaded, args.plant, looks), jobs, args.jobs))
-    throws, found = zip(*(flown[i] for i in range(len(jobs))))
+    throws, counters = zip(*(flown[i] for i in range(len(jobs))))
     columns = {name: np.concatenate([part[name] for part in throws]) for name in throws[0]}
-    counts = {name: sum(part[name] for part in found) for name in found[0]}
+    counts = {name: sum(part[name] for part in counters) for name in counters[0]}
     share = {name: counts[name] / max(counts["frames"], 1) for name in ("ball", "goal")}
     figures = Throws(args.target, **columns).summary() | share | {"refused": counts["refused"]}
     error = columns["error"][np.isfinite(columns["error"])]

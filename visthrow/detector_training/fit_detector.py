@@ -28,6 +28,7 @@ from camera.detectors.learnt import (
     log_size,
     look_closely,
     patches_of,
+    places_in,
     places_of,
     spread_of,
     views_about,
@@ -39,6 +40,7 @@ from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Truth, lens_row, random_scenes, truth_of
 
 Count = Annotated[int, Bound(1.0)]
+STATES = ("networks", "optimizer", "rates")  # of a `Fit`, in its checkpoint
 MATCH_RADIUS = 0.5  # a finding within this many sizes of the thing is of it
 
 
@@ -154,10 +156,8 @@ def rendered(
     """Frames of random scenes, their labels and their lens."""
     lens = Fisheye(camera.fisheye)
     scenes = random_scenes(camera, renderer.textures, count, seed)
-    scenes = replace(
-        scenes,
-        lens=torch.cat([lens_row(camera.fisheye)[:9].expand(count, -1), scenes.lens[:, 9:]], -1),
-    )
+    row = lens_row(camera.fisheye)[:9].expand(count, -1)
+    scenes = replace(scenes, lens=torch.cat([row, scenes.lens[:, 9:]], -1))
     truth = truth_of(scenes, lens)
     thing = scenes.things[:, 0, 1:4].double() - scenes.pose[:, :3].double()
     things_c = torch.einsum("eji,ej->ei", truth.rot_wc, thing)
@@ -201,10 +201,9 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
         peak = grids[rows, k, :, cell[:, 1], cell[:, 0]]
         p = peak[:, 0].sigmoid().clamp(1e-5, 1 - 1e-5)
         positive = -((1 - p) ** 2 * p.log())
-        off = (peak[:, 1:3] - (position - cell - 0.5)).abs().sum(-1) + 0.5 * (
-            peak[:, 3] - log_size(labels.sizes[kind], lens)
-        ).abs()
-        total = total + (negative + present * (positive + off)).mean()
+        off = (peak[:, 1:3] - (position - cell - 0.5)).abs().sum(-1)
+        size_off = (peak[:, 3] - log_size(labels.sizes[kind], lens)).abs()
+        total = total + (negative + present * (positive + off + 0.5 * size_off)).mean()
     return total
 
 
@@ -229,8 +228,8 @@ def looks(
     anywhere = F.normalize(draw(count, 3), dim=-1)
     anywhere[:, 2] = anywhere[:, 2].abs()
     peak, peak_size = (value[index] for value in peaks)
-    others = (labels.distractor[index], anywhere, labels.rays[other_kind][index], peak)
-    for number, rays in enumerate(others, 4):
+    candidates = (labels.distractor[index], anywhere, labels.rays[other_kind][index], peak)
+    for number, rays in enumerate(candidates, 4):
         ray = torch.where((source == number)[:, None], rays, ray)
     return index, ray, torch.where(source == 7, peak_size.clamp(5e-3, 0.5), size)
 
@@ -241,19 +240,14 @@ def offsets(kind: str, views: Views, detections: Tensor, labels: Labels, index: 
     """
     if kind == "ball":
         size = (labels.sizes["ball"][index] * REACH["ball"] / views.reach).log()
-        return torch.cat(
-            [
-                detections[:, 2:4] - views.points(labels.rays["ball"][index, None])[:, 0],
-                0.5 * (detections[:, 4] - size)[:, None],
-            ],
-            -1,
-        )
+        point = views.points(labels.rays["ball"][index, None])[:, 0]
+        true = torch.cat([point, size[:, None]], -1)
+        return (detections[:, 2:5] - true) * true.new_tensor([1.0, 1.0, 0.5])
     corners = views.points(labels.corners[index])
-    quadrants = torch.tensor(
-        [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]], device=corners.device
-    )
+    quadrants = corners.new_tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     off = corners - corners.mean(1, keepdim=True)
-    match = torch.stack([(off.roll(-k, 1) * quadrants).sum((1, 2)) for k in range(4)], 1).argmax(1)
+    scores = [(off.roll(-k, 1) * quadrants).sum((1, 2)) for k in range(4)]
+    match = torch.stack(scores, 1).argmax(1)
     order = (torch.arange(4, device=corners.device)[None] + match[:, None]) % 4
     corners = torch.gather(corners, 1, order[..., None].expand(-1, -1, 2))
     return detections[:, 2:] - corners.clamp(-3.0, 3.0).flatten(1)
@@ -395,12 +389,10 @@ class Fit:
 
     def save(self, path: Path) -> None:
         """Write a checkpoint, whole or not at all."""
-        parts = {"networks": self.networks, "optimizer": self.optimizer, "rates": self.rates}
-        torch.save(
-            {name: part.state_dict() for name, part in parts.items()} | {"step": self.step},
-            path.with_suffix(".part"),
-        )
-        path.with_suffix(".part").replace(path)
+        states = {name: getattr(self, name).state_dict() for name in STATES}
+        part = path.with_suffix(".part")
+        torch.save(states | {"step": self.step}, part)
+        part.replace(path)
 
     def load(self, path: Path) -> None:
         """Take up a checkpoint; the pool is filled anew.
@@ -409,7 +401,7 @@ class Fit:
         """
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
-            for name in ("networks", "optimizer", "rates"):
+            for name in STATES:
                 getattr(self, name).load_state_dict(saved[name])
             self.step = saved["step"]
         except Exception as error:  # of a file that is none, torch raises what its bytes lead to
@@ -460,17 +452,13 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
             networks, kind, frame, rays, sizes, lens, labels.north
         )
         error = _angle_between(rays, labels.rays[kind])
-        hit = (
-            labels.seen[kind]
-            & (error < MATCH_RADIUS * labels.sizes[kind])
-            & ((sizes / labels.sizes[kind]).log().abs() < 0.5)
-        )
+        size = labels.sizes[kind]
+        visible = labels.seen[kind]
+        hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
+        clear = visible | (error > 2.0 * size)  # else half in view
         if kind == "goal":
-            error = _angle_between(
-                views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1], labels.corners
-            ).amin(-1)
-        apart = _angle_between(rays, labels.rays[kind]) > 2.0 * labels.sizes[kind]
-        clear = labels.seen[kind] | apart  # else half in view
+            first = views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1]
+            error = _angle_between(first, labels.corners).amin(-1)
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
         scores[kind] = rows[clear.expand(len(rows))]
     return scores
@@ -494,9 +482,9 @@ def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
 
 def _angle_between(rays: Tensor, references: Tensor) -> Tensor:
     """Angles between unit rays [rad], exact for small ones."""
-    return torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1).clamp(
-        max=1.0
-    ).asin() + (((rays * references).sum(-1) < 0.0) * math.pi / 2)
+    sine = torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1)
+    backward = (rays * references).sum(-1) < 0.0
+    return sine.clamp(max=1.0).asin() + backward * math.pi / 2
 
 
 def _chosen(labels: Labels, rows: Tensor) -> Labels:
@@ -512,15 +500,6 @@ def _peaks(grids: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:
     """Ray and size of one of the three likeliest cells of each frame, of grids (F, 4, h, w) of one
     kind.
     """
-    logits = grids[:, 0].flatten(1)
-    best = logits.topk(3, dim=1).indices
+    best = grids[:, 0].flatten(1).topk(3, dim=1).indices
     best = best.gather(1, torch.randint(3, (len(best), 1), device=best.device))[:, 0]
-    width = grids.shape[-1]
-    rows = torch.arange(len(grids), device=grids.device)
-    j = best // width
-    i = best % width
-    place = torch.stack([i, j], -1) + 0.5 + grids[rows, 1:3, j, i].clamp(-1, 1)
-    rays, _ = lens.unproject(place * CELL - 0.5)
-    return F.normalize(rays, dim=-1), grids[rows, 3, j, i].clamp(-6.0, 3.0).exp() * (
-        CELL / lens.params.fx
-    )
+    return places_in(grids, torch.arange(len(grids), device=grids.device), best, lens)

@@ -309,10 +309,10 @@ class CalibrationProblem:
         perpendicular = falling - direction * (falling * direction).sum(-1, keepdim=True)
         # Magnus: of a rate that is linear in a step
         coning = torch.linalg.cross(rate[:, :-1], rate[:, 1:]) * dt * dt / 12.0
-        back = rot[:, :-1].mT
-        turned = _vector(back @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
+        inverse = rot[:, :-1].mT
+        turned = _vector(inverse @ rot[:, 1:]) - (self.mean_rate - c["gyro"][:, None]) * dt - coning
         off = (
-            _turned(back, momentum) / self.push,
+            _turned(inverse, momentum) / self.push,
             perpendicular[..., :2] / s.pendulum,
             (jump(pos) - mean(vel) * dt) / 1e-4,
             (jump(swing) - mean(swing_rate) * dt) / 2e-4,
@@ -368,8 +368,8 @@ class CalibrationProblem:
         box = _box(box_midpoints(points[:, 4:])).unflatten(0, body_w.shape[:2])
         ball = size * box + c["ball"][:, None] - self.ball
         corners = size * middle + c["corners"][:, None] - self.corners
-        seen = (ball * self.ball_seen[:, None], corners * self.corners_seen[:, None])
-        return torch.cat(seen, -1) / (0.5 * s.keypoint + 1e-4)
+        visible = (ball * self.ball_seen[:, None], corners * self.corners_seen[:, None])
+        return torch.cat(visible, -1) / (0.5 * s.keypoint + 1e-4)
 
 
 def _box(points: Tensor) -> Tensor:

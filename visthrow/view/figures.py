@@ -130,13 +130,13 @@ def marks(
         paper = row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
         axis.plot([value.low, value.high], [y, y], "-", color=colour, **LOOKS["interval"])
-        drawn = axis.plot(value.value, y, marker, color=colour, **LOOKS["value"])
-        handles[row.series] = drawn[0]
+        artists = axis.plot(value.value, y, marker, color=colour, **LOOKS["value"])
+        handles[row.series] = artists[0]
         if paper is not None:
             ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
             axis.plot(ends, [y + 0.14] * 2, "-", **LOOKS["paper_interval"])
-            drawn = axis.plot(paper.value, y + 0.14, "x", **LOOKS["paper_value"])
-            handles[len(series)] = drawn[0]
+            artists = axis.plot(paper.value, y + 0.14, "x", **LOOKS["paper_value"])
+            handles[len(series)] = artists[0]
     if zero is not None:
         axis.axvline(zero, **LOOKS["zero"])
     if log:
@@ -246,8 +246,8 @@ def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
         bar = {"color": colour, **LOOKS["bar"]}
         axis.plot([duration.value] * 2, [error.low, error.high], "-", **bar)
         axis.plot([duration.low, duration.high], [error.value] * 2, "-", **bar)
-        drawn = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])
-        labels[label] = drawn[0]
+        artists = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])
+        labels[label] = artists[0]
     return labels
 
 
@@ -262,8 +262,8 @@ def trades(panels: Sequence[Trade]) -> bytes:
             colour, marker = _look(series)
             best = points[pareto(points)] if len(points) else points
             axis.plot(*points.T, marker, color=colour, **LOOKS["settings"])
-            drawn = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])
-            labels[label] = drawn[0]
+            artists = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])
+            labels[label] = artists[0]
         for label, points in panel.crosses:
             look = LOOKS["paper_stars" if len(points) <= 2 else "paper_front"]
             labels[label] = axis.plot(*points.T, **look)[0]

@@ -47,7 +47,7 @@ class Grid:
     heads: int = 1
 
     @classmethod
-    def of(
+    def from_rows(
         cls,
         title: str,
         header: str,

@@ -70,19 +70,10 @@ class Renderer:
             return wp.array(ptr=tensor.data_ptr(), dtype=struct, shape=shape, device=self.device)
 
         def launch(part: slice) -> None:
-            wp.launch(
-                render,
-                dim=(len(table[part]), p.height, p.width),
-                device=self.device,
-                inputs=[
-                    seed,
-                    self.samples,
-                    rows(table[part], SceneRow),
-                    rows(things[part], ThingRow),
-                    self._pixels,
-                ],
-                outputs=[wp.from_torch(image[part])],
-            )
+            structs = (rows(table[part], SceneRow), rows(things[part], ThingRow))
+            inputs = [seed, self.samples, *structs, self._pixels]
+            outputs = [wp.from_torch(image[part])]
+            wp.launch(render, image[part].shape[:3], inputs, outputs, device=self.device)
 
         if self.device.startswith("cuda"):
             torch.cuda.synchronize(self.device)  # Warp's stream is not torch's

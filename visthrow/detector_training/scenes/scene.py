@@ -178,19 +178,14 @@ def posed_scenes(
     mount = rot_wb @ (torch.tensor([0.0, 0.0, -0.02]) - lens_b)
     radius = 0.0012 * hangs.float()
     light = F.normalize(torch.tensor([0.35, 0.25, 0.9]), dim=0)
-    return Scenes(
-        lens=lens_row(params.fisheye, 0.0).repeat(count, 1),
-        pose=_flat(eye, _quat(rot_wc), torch.zeros(count, 6)),
-        shutter=torch.zeros(count, 3),
-        ball=_flat(ball_w.float(), params.payload_radius * size, plain["ball"]),
-        goal=_flat(goal_w[:, :2].float(), params.goal_side * size, plain["goal"]),
-        ground=plain["ground"],
-        walls=plain["walls"],
-        light=_flat(light.repeat(count, 1), plain["light"]),
-        rope=_flat(mount, radius, plain["rope"]),
-        sensor=plain["sensor"],
-        things=torch.zeros(count, THINGS, 12),
-    )
+    plain["lens"] = lens_row(params.fisheye, 0.0).repeat(count, 1)
+    plain["pose"] = _flat(eye, _quat(rot_wc), torch.zeros(count, 6))
+    plain["shutter"] = torch.zeros(count, 3)
+    plain["ball"] = _flat(ball_w.float(), params.payload_radius * size, plain["ball"])
+    plain["goal"] = _flat(goal_w[:, :2].float(), params.goal_side * size, plain["goal"])
+    plain["light"] = _flat(light.repeat(count, 1), plain["light"])
+    plain["rope"] = _flat(mount, radius, plain["rope"])
+    return Scenes(**plain, things=torch.zeros(count, THINGS, 12))
 
 
 def _flat(*columns: Tensor) -> Tensor:
@@ -299,13 +294,13 @@ def _things(scenes: Scenes, d: Draw, n: Nuisances) -> Tensor:
     height = torch.where(kind == 3, raised, 0.0)
     off = (place - scenes.goal[:, None, :2]).norm(dim=-1)
     distance = (place - scenes.ball[:, None, :2]).norm(dim=-1)
-    beside = off > 0.22 + torch.maximum(size, breadth)
+    on_ground = off > 0.22 + torch.maximum(size, breadth)
     clear = (kind != 3) | (distance > 0.25 + size)
     rimmed = d.chance(0.3, THINGS)
     rim_from = torch.where(rimmed, d.uniform(0.6, 0.9, THINGS), 9.0)
     turn = d.uniform(0.0, 3.14, THINGS, 1)
     rim = d.uniform(0.0, 1.0, THINGS, 1)
-    stays = kind * (beside & clear)
+    stays = kind * (on_ground & clear)
     return _flat(stays, place, height, size, breadth, turn, colour, rim_from, rim)
 
 

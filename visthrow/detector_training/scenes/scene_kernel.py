@@ -42,14 +42,28 @@ Textures = wp.array2d(dtype=wp.uint8)
 
 
 @wp.func
+def theta_d(theta: float, k: wp.vec4) -> float:
+    """Distance from the principal point of an angle off the axis [rad]."""
+    t2 = theta * theta
+    return theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+
+
+@wp.func
+def in_axes(x: float, y: float, yaw: float) -> wp.vec2:
+    """A place on axes that are turned by an angle."""
+    c = wp.cos(yaw)
+    s = wp.sin(yaw)
+    return wp.vec2(c * x + s * y, c * y - s * x)
+
+
+@wp.func
 def angle_of(radius: float, k: wp.vec4, limit: float) -> float:
     """Angle off the axis at a distance from the principal point, theta_d [rad]."""
     theta = wp.min(radius, limit)
     for _ in range(LENS_STEPS):
         t2 = theta * theta
-        value = theta * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
         slope = 1.0 + t2 * (3.0 * k[0] + t2 * (5.0 * k[1] + t2 * (7.0 * k[2] + t2 * 9.0 * k[3])))
-        theta = wp.clamp(theta - (value - radius) / wp.max(slope, 0.05), 0.0, limit)
+        theta = wp.clamp(theta - (theta_d(theta, k) - radius) / wp.max(slope, 0.05), 0.0, limit)
     return theta
 
 
@@ -101,15 +115,15 @@ def texture(
     j = int(y)
     a = x - float(i)
     b = y - float(j)
-    top = (
-        texel(textures, which, base, size, i, j) * (1.0 - a)
-        + texel(textures, which, base, size, i + 1, j) * a
+    first = wp.lerp(
+        texel(textures, which, base, size, i, j), texel(textures, which, base, size, i, j + 1), b
     )
-    low = (
-        texel(textures, which, base, size, i, j + 1) * (1.0 - a)
-        + texel(textures, which, base, size, i + 1, j + 1) * a
+    second = wp.lerp(
+        texel(textures, which, base, size, i + 1, j),
+        texel(textures, which, base, size, i + 1, j + 1),
+        b,
     )
-    return top * (1.0 - b) + low * b
+    return wp.lerp(first, second, a)
 
 
 @wp.func
@@ -161,12 +175,9 @@ def thing_over(thing: ThingRow, point: wp.vec3, below: wp.vec3) -> wp.vec3:
     kind = int(thing.kind)
     if kind != 1 and kind != 2:
         return below
-    c = wp.cos(thing.yaw)
-    s = wp.sin(thing.yaw)
-    dx = point[0] - thing.place[0]
-    dy = point[1] - thing.place[1]
-    lateral = (c * dx + s * dy) / thing.size[0]
-    axial = (c * dy - s * dx) / thing.size[1]
+    place = in_axes(point[0] - thing.place[0], point[1] - thing.place[1], thing.yaw)
+    lateral = place[0] / thing.size[0]
+    axial = place[1] / thing.size[1]
     reach = wp.max(wp.abs(lateral), wp.abs(axial))
     covered = wp.where(kind == 1, lateral * lateral + axial * axial < 1.0, reach < 1.0)
     rim = wp.vec3(thing.rim, thing.rim, thing.rim)
@@ -202,25 +213,26 @@ def on_ground(
     """
     ground = scene.ground
     point = eye + ray * depth
-    c = wp.cos(ground.yaw)
-    s = wp.sin(ground.yaw)
-    u = (c * point[0] + s * point[1]) / ground.tile + ground.offset[0]
-    v = (c * point[1] - s * point[0]) / ground.tile + ground.offset[1]
+    tile = in_axes(point[0], point[1], ground.yaw) / ground.tile + ground.offset
     pixel = 1.0 / scene.lens.focus[0]
     footprint = depth * pixel / (wp.max(-ray[2], 0.03) * ground.tile)
-    colour = texture(textures, int(ground.texture), u, v, footprint, chance)
+    colour = texture(textures, int(ground.texture), tile[0], tile[1], footprint, chance)
     colour = wp.cw_mul(colour, ground.tint)
     for i in range(things.shape[1]):
         colour = thing_over(things[e, i], point, colour)
     goal = scene.goal
-    gc = wp.cos(goal.yaw)
-    gs = wp.sin(goal.yaw)
-    dx = point[0] - goal.place[0]
-    dy = point[1] - goal.place[1]
-    colour = square(gc * dx + gs * dy, gc * dy - gs * dx, goal, colour)
+    place = in_axes(point[0] - goal.place[0], point[1] - goal.place[1], goal.yaw)
+    colour = square(place[0], place[1], goal, colour)
     colour = shadowed(colour, point, scene.ball.centre, scene.ball.radius, scene.light)
     colour = shadowed(colour, point, eye, VEHICLE_RADIUS, scene.light)
     return colour * lit(wp.vec3(0.0, 0.0, 1.0), scene.light)
+
+
+@wp.func
+def to_wall(half: float, eye: float, ray: float) -> float:
+    """Distance along a ray to one of two opposite walls, from numbers of one axis."""
+    wall = wp.where(ray > 0.0, half, -half)
+    return (wall - eye) / wp.where(wp.abs(ray) < 1.0e-6, 1.0e-6, ray)
 
 
 @wp.func
@@ -229,12 +241,8 @@ def on_walls(
 ) -> wp.vec3:
     """Walls and ceiling of the hall, a box with a photograph on each side."""
     walls = scene.walls
-    tx = (wp.where(ray[0] > 0.0, walls.half, -walls.half) - eye[0]) / wp.where(
-        wp.abs(ray[0]) < 1.0e-6, 1.0e-6, ray[0]
-    )
-    ty = (wp.where(ray[1] > 0.0, walls.half, -walls.half) - eye[1]) / wp.where(
-        wp.abs(ray[1]) < 1.0e-6, 1.0e-6, ray[1]
-    )
+    tx = to_wall(walls.half, eye[0], ray[0])
+    ty = to_wall(walls.half, eye[1], ray[1])
     tz = wp.where(ray[2] > 1.0e-4, (walls.height - eye[2]) / wp.max(ray[2], 1.0e-4), 1.0e9)
     depth = wp.min(wp.min(tx, ty), tz)
     point = eye + ray * depth
@@ -323,8 +331,7 @@ def render(
     height = float(image.shape[1])
     chance = wp.rand_init(seed + int(sensor.seed), (v * image.shape[2] + u))
     k = lens.k
-    t2 = lens.limit * lens.limit
-    edge = lens.limit * (1.0 + t2 * (k[0] + t2 * (k[1] + t2 * (k[2] + t2 * k[3]))))
+    edge = theta_d(lens.limit, k)
     row = ((float(v) + 0.5) / height - 0.5) * shutter.readout
     total = wp.vec3()
     for i in range(samples):
@@ -348,10 +355,8 @@ def render(
             total += incoming * wp.pow(wp.max(wp.cos(0.5 * theta), 0.0), lens.vignetting)
     colour = total * (sensor.gain / float(samples))
     for c in range(3):
-        value = (
-            colour[c]
-            + wp.sqrt(wp.max(colour[c], 0.0)) * sensor.shot * wp.randn(chance)
-            + sensor.read * wp.randn(chance)
-        )
+        value = colour[c]
+        value += wp.sqrt(wp.max(value, 0.0)) * sensor.shot * wp.randn(chance)
+        value += sensor.read * wp.randn(chance)
         value = wp.pow(wp.clamp(value, 0.0, 1.0), sensor.gamma)
         image[e, v, u, c] = wp.uint8(value * 255.0 + 0.5)

@@ -76,7 +76,7 @@ def section(thrown: ResultSet) -> Section:
             elif layout == "state" or variant in PAPER_FOUR:
                 missing.append(f"{TITLES[variant]} ({layout}, {SHORT[plant]})")
         title = f"{SHORT_LAYOUT[layout].capitalize()} at {TARGET:.1f} m on the {SHORT[plant]}"
-        grids.append(Grid.of(title, HEADER, rows, NOTE))
+        grids.append(Grid.from_rows(title, HEADER, rows, NOTE))
     picture = None
     if marks:
         series = [f"{a},\n{SHORT[b]}" for a, b in product(SHORT_LAYOUT.values(), PLANTS)]

@@ -40,7 +40,7 @@ def section(thrown: ResultSet) -> Section:
         "policy | training | plant | flown with | target [m] | throws | landed | landing error [m]"
     )
     note = "'its own': the conditions of its own training; else what was changed."
-    table = Grid.of("Payload, drag and distance", header, rows, note, heads=4)
+    table = Grid.from_rows("Payload, drag and distance", header, rows, note, heads=4)
     return parts.section("beyond", "Beyond the paper", lead, *moving, table, missing=missing)
 
 
@@ -124,7 +124,7 @@ def _moving(thrown: ResultSet, missing: list[str]) -> list:
         )
         content.append(Picture("moving", figures.curves([panel], "landing error [m]"), text))
     header = "policy | plant | speed [m/s] | throws | landed | landing error [m]"
-    return [*content, Grid.of("Moving targets", header, rows)]
+    return [*content, Grid.from_rows("Moving targets", header, rows)]
 
 
 def training_section(thrown: ResultSet) -> Section:
@@ -162,7 +162,7 @@ def training_section(thrown: ResultSet) -> Section:
         "Time: all pieces of the run. Final: throws from hover at 2.0 m in its own simulator, at"
         " the end of the training."
     )
-    table = Grid.of("Training runs", header, map(_run_row, thrown.runs), note)
+    table = Grid.from_rows("Training runs", header, map(_run_row, thrown.runs), note)
     return parts.section("training", "Training runs", lead, picture, table)
 
 
@@ -212,7 +212,7 @@ def origin_section(thrown: ResultSet) -> Section:
         " and count against 'landed'."
     )
     header = "command | commit | plant | sets | throws | seeds | made on | seconds of work"
-    table = Grid.of("Throws behind this page", header, rows, heads=3)
+    table = Grid.from_rows("Throws behind this page", header, rows, heads=3)
     return parts.section(
         "origin",
         "Where the figures come from",

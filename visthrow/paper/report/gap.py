@@ -75,7 +75,7 @@ def section(thrown: ResultSet) -> Section:
             " | added to its own [m]"
         )
         curves = Picture("gap", figures.curves(panels, "landing error [m]", log=True), text)
-        content += [curves, Grid.of("The curves in figures", header, rows)]
+        content += [curves, Grid.from_rows("The curves in figures", header, rows)]
     return parts.section(
         "gap", "What vision costs, and why", *content, *_trained(thrown, missing), missing=missing
     )
@@ -138,5 +138,5 @@ def _trained(thrown: ResultSet, missing: list[str]) -> list:
     picture = figures.marks(marks, axis, [SHORT[plant] for plant in plants])
     return [
         Picture("gap_trained", picture, text),
-        Grid.of("Trained with other sight", header, rows),
+        Grid.from_rows("Trained with other sight", header, rows),
     ]

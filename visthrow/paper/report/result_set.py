@@ -154,9 +154,11 @@ def cells(*results: Result) -> dict[str, str]:
 
 
 def line(
-    label: str, points: list[tuple[float, Result]], series: int, own: float | None = None
+    label: str, points: list[tuple[float, Result]], series: int, nominal: float | None = None
 ) -> Line:
-    """Return the curve of mean landing errors over values; ``own``: the policy's value."""
+    """Return the curve of mean landing errors over values; ``nominal``: the policy's value."""
     intervals = [st.mean(result.of("error")) for _, result in points]
     values = [value for value, _ in points]
-    return Line(label, values, intervals, series, values.index(own) if own in values else None)
+    return Line(
+        label, values, intervals, series, values.index(nominal) if nominal in values else None
+    )

@@ -38,7 +38,7 @@ def throws_section(thrown: ResultSet) -> Section:
         f"policy | target [m] | plant | throws | landed | {ERROR} | deviation [m] | duration [s]"
         f" | bias along / left [m] | {VEHICLE}"
     )
-    table = Grid.of("Landing error and duration", header, rows, PAPER_NOTE, heads=3)
+    table = Grid.from_rows("Landing error and duration", header, rows, PAPER_NOTE, heads=3)
     return section(
         "throws",
         "What the policies do",
@@ -125,7 +125,10 @@ def vision_section(thrown: ResultSet) -> Section:
         axis = "landing error, vision minus state [m]"
         picture = figures.marks(marks, axis, [SHORT[plant] for plant in PLANTS], zero=0.0)
         text = "Difference of mean landing errors with 95 % intervals; left: vision lands nearer."
-        parts += [Grid.of("Vision against state", header, rows), Picture("vision", picture, text)]
+        parts += [
+            Grid.from_rows("Vision against state", header, rows),
+            Picture("vision", picture, text),
+        ]
     return section(
         "vision", "Vision against state", *parts, missing=missing, head="Not thrown by both"
     )

@@ -101,7 +101,7 @@ def by_target(results: Sequence[Result]) -> Grid | None:
         "e_p and e_v: payload's position and velocity at separation against the plan; tracking:"
         " root mean square distance from the planned path until the release."
     )
-    return Grid.of("The baseline by target", header, map(_row, results), note, heads=3)
+    return Grid.from_rows("The baseline by target", header, map(_row, results), note, heads=3)
 
 
 PARTS = {
@@ -137,7 +137,7 @@ def _steps() -> list[Grid | Text | None]:
         title = f"Step of the controller, one core of an {cpu}"
         note = f"{measurements.made_by(record)}. {record['notes'][0]}"
         header = " | ".join(table["header"])
-        grids.append(Grid.of(title, header, map(tuple, table["rows"]), note, heads=2))
+        grids.append(Grid.from_rows(title, header, map(tuple, table["rows"]), note, heads=2))
     return grids
 
 
@@ -191,7 +191,7 @@ def front_section(
         " Correlations are over throws of all settings; the paper states that the error follows"
         " e_v."
     )
-    table = Grid.of("Fronts in figures", header, sums, note, heads=2)
+    table = Grid.from_rows("Fronts in figures", header, sums, note, heads=2)
     findings = (Text(text, "finding") for text in sentences)
     return parts.section(
         "front",
@@ -272,8 +272,8 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
     rng = np.random.default_rng(0)
     samples = []
     for _ in range(DRAWS):
-        drawn = [s[rng.integers(len(s), size=len(s))].mean(0) for s in sets]
-        samples.append(front.hypervolume(np.stack(drawn)))
+        resampled = [s[rng.integers(len(s), size=len(s))].mean(0) for s in sets]
+        samples.append(front.hypervolume(np.stack(resampled)))
     low, high = np.quantile(samples, (0.025, 0.975))
     value = front.hypervolume(np.stack([s.mean(0) for s in sets]))
     return st.Interval(value, float(low), float(high), "throws")
@@ -366,7 +366,7 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
             rows.append((*head, f"landed {landed(r, digits=0)}", "-", "-", "-"))
     header = "v [m/s] | w_t | rho | plan | landing error [m] | duration [s] | e_p [cm] | e_v [cm/s]"
     title = "Breakdown of the front in the own model; the paper's are of ten throws each"
-    return Grid.of(title, header, rows, heads=0)
+    return Grid.from_rows(title, header, rows, heads=0)
 
 
 def _setting(speed: float, w_t: float, rho: float) -> tuple[str, str, str]:
