@@ -22,8 +22,14 @@ class Bound:
 
     def holds(self, value: float) -> bool:
         """Whether a finite number lies within."""
-        above = value > self.low if self.ends[0] == "(" else value >= self.low
-        below = value < self.high if self.ends[1] == ")" else value <= self.high
+        if self.ends[0] == "(":
+            above = value > self.low
+        else:
+            above = value >= self.low
+        if self.ends[1] == ")":
+            below = value < self.high
+        else:
+            below = value <= self.high
         return above and below and math.isfinite(value)
 
     def __str__(self) -> str:

@@ -49,11 +49,10 @@ def apply_noise(
     detected = draw.uniforms >= params.drop_probability
     visible = valid & detected
     # Clipped points carry no noise: they are a rule, not a measurement.
-    unseen = (
-        keypoints * detected.unsqueeze(-1)
-        if params.invalid_reads == "edge"
-        else torch.zeros_like(keypoints)
-    )
+    if params.invalid_reads == "edge":
+        unseen = keypoints * detected.unsqueeze(-1)
+    else:
+        unseen = torch.zeros_like(keypoints)
     points = torch.where(visible.unsqueeze(-1), noisy, unseen)
     if draw.wrong is None:
         return points, visible

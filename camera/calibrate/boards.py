@@ -114,7 +114,10 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
     """
     import cv2
 
-    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    if image.ndim == 2:
+        grey = image
+    else:
+        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if board.pattern == "charuco":
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
         if ids is None or len(ids) < VIEW_AT_LEAST:
@@ -234,14 +237,16 @@ def _solved(views: list[View], width: int, height: int, fov_deg: float) -> Fishe
     )
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
-    points = [[v.points_m[None] for v in views], [v.pixels[None] for v in views]]
-    how = {"flags": flags, "criteria": criteria}
-    solution = cv2.fisheye.calibrate(*points, (width, height), start, np.zeros((4, 1)), **how)
-    matrix = solution[1]
-    k = tuple(solution[2].ravel().tolist())
-    focus = (*matrix.diagonal()[:2].tolist(), *matrix[:2, 2].tolist())
-    widest = 1.999 * float(np.degrees(monotonic_limit(k)))
-    return FisheyeParams(width, height, *focus, *k, min(fov_deg, widest, 360.0))
+    points = [v.points_m[None] for v in views]
+    pixels = [v.pixels[None] for v in views]
+    size = (width, height)
+    how = (size, start, np.zeros((4, 1)))
+    solution = cv2.fisheye.calibrate(points, pixels, *how, flags=flags, criteria=criteria)
+    (fx, _, cx), (_, fy, cy), _ = np.asarray(solution[1]).tolist()
+    k1, k2, k3, k4 = np.asarray(solution[2]).ravel().tolist()
+    widest = 1.999 * float(np.degrees(monotonic_limit((k1, k2, k3, k4))))
+    fov_deg = min(fov_deg, widest, 360.0)
+    return FisheyeParams(*size, fx, fy, cx, cy, k1, k2, k3, k4, fov_deg)
 
 
 def check_boards(images: list[ndarray], board: BoardParams, fisheye: FisheyeParams) -> BoardReport:

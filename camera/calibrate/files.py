@@ -127,7 +127,10 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
 
 def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
     names = [name for *_, name in entries]
-    number = int(camera) if str(camera).isdigit() else -1
+    if str(camera).isdigit():
+        number = int(camera)
+    else:
+        number = -1
     if camera in names:
         return entries[names.index(str(camera))]
     if 0 <= number < len(entries):
@@ -226,7 +229,10 @@ def _uniform(tree: Node) -> Node:
     lenses = tree.get("intrinsics") if "resolution" in tree else None
     if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
         sizes = tree["resolution"]
-        sizes = sizes[: len(lenses)] if isinstance(sizes, list) else [sizes]
+        if isinstance(sizes, list):
+            sizes = sizes[: len(lenses)]
+        else:
+            sizes = [sizes]
         pairs = zip_longest(lenses, sizes)
         return {f"cam{i}": {**lens, "resolution": size} for i, (lens, size) in enumerate(pairs)}
     return {re.sub(r"^Camera1\.", "Camera.", str(key)): entry for key, entry in tree.items()}
@@ -243,9 +249,15 @@ def _find(node: Node, names: str) -> Any:
         value: Any = node
         for part in [name] if name in node else name.split("."):
             if isinstance(value, list) and part.isdigit():
-                value = value[int(part)] if int(part) < len(value) else None
+                if int(part) < len(value):
+                    value = value[int(part)]
+                else:
+                    value = None
             else:
-                value = value.get(part) if isinstance(value, dict) else None
+                if isinstance(value, dict):
+                    value = value.get(part)
+                else:
+                    value = None
         if value is not None:
             return value
     return None
@@ -266,7 +278,10 @@ def _any(node: Node, names: str) -> Any:
 
 def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
     """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
-    flat = value.get("data", value) if isinstance(value, dict) else value
+    if isinstance(value, dict):
+        flat = value.get("data", value)
+    else:
+        flat = value
     if isinstance(flat, list) and all(isinstance(row, list) for row in flat):
         flat = list(chain.from_iterable(flat))
     try:
@@ -275,7 +290,10 @@ def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
             raise ValueError
     except (TypeError, ValueError):
         text = repr(value)
-        text = text if len(text) <= 80 else text[:77] + "..."
+        if len(text) <= 80:
+            text = text
+        else:
+            text = text[:77] + "..."
         raise ValueError(f"{name} is {text}; expected {count or 'some'} numbers") from None
     return numbers
 
@@ -285,8 +303,13 @@ def _number(node: Node, place: str) -> float:
     if place.replace(".", "").isdigit():
         return float(place)
     name = place.removesuffix("?")
-    value = _find(node, name) if name != place else _any(node, name)
-    return 0.0 if value is None else _floats([value], name)[0]
+    if name != place:
+        value = _find(node, name)
+    else:
+        value = _any(node, name)
+    if value is None:
+        return 0.0
+    return _floats([value], name)[0]
 
 
 def _values(node: Node, numbers: list[str]) -> Values:
@@ -519,11 +542,10 @@ def _contradictions(
     names = values.keys() & set(["k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"])
     remarks = []
     if names and not any(values[k] for k in names):
-        focal = (
-            "; its focal length is the image's width over pi"
-            if math.isclose(values["fx"], size[0] / math.pi, rel_tol=1e-4)
-            else ""
-        )
+        if math.isclose(values["fx"], size[0] / math.pi, rel_tol=1e-4):
+            focal = "; its focal length is the image's width over pi"
+        else:
+            focal = ""
         remarks.append(
             f"all distortion coefficients are zero{focal}: was this lens calibrated, or are its"
             " pictures rectified?"

@@ -233,9 +233,10 @@ class Detector:
             score = edge.share * share
             if score < 0.5 * self.params.coverage or not half_angle > 0.0:
                 return None
-            best = (
-                BallSeen(ray, half_angle, score - misfit) if score >= self.params.coverage else None
-            )
+            if score >= self.params.coverage:
+                best = BallSeen(ray, half_angle, score - misfit)
+            else:
+                best = None
             middle, visible = self.lens.project(torch.from_numpy(ray[None]))
             if misfit > self.params.misfit or not bool(visible):
                 return None

@@ -87,7 +87,10 @@ def colour_maps(
     mask = cv2.morphologyEx(
         cv2.bitwise_and(selected, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
     )
-    pair = (cv2.min(red, green), blue) if kind == "yellow" else (green, cv2.max(red, blue))
+    if kind == "yellow":
+        pair = (cv2.min(red, green), blue)
+    else:
+        pair = (green, cv2.max(red, blue))
     return mask, cv2.subtract(*pair, dtype=cv2.CV_32F)
 
 
@@ -185,7 +188,10 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
         # points count.
         inner = off[np.abs(off) < 0.5]
-        outer = np.quantile(inner, OUTER) if len(inner) else 0.0
+        if len(inner):
+            outer = np.quantile(inner, OUTER)
+        else:
+            outer = 0.0
         good = np.abs(off - outer) < width
         if good.sum() < 6:
             return axis, half_angle, math.inf, 0.0
@@ -216,7 +222,10 @@ def fit_goal(
         return None  # as wide as the whole view
     corners = _quadrangle((local[:, :2] / local[:, 2:]).astype(np.float32))
     for _ in range(2):  # the second time from better corners
-        refined = None if corners is None else _refined(lens, corners, frame, level)
+        if corners is None:
+            refined = None
+        else:
+            refined = _refined(lens, corners, frame, level)
         if refined is None:
             return None
         corners, misfit, share = refined
@@ -366,7 +375,9 @@ def _pixels(lens: Fisheye, plane: ndarray, frame: ndarray) -> ndarray | None:
     """
     rays = np.column_stack([plane, np.ones(len(plane))]) @ frame.T
     pixels, valid = lens.project(torch.from_numpy(rays))
-    return pixels.numpy() if bool((valid & lens.on_sensor(pixels)).all()) else None
+    if bool((valid & lens.on_sensor(pixels)).all()):
+        return pixels.numpy()
+    return None
 
 
 def rays_of(lens: Fisheye, pixels: ndarray) -> ndarray:
@@ -378,7 +389,10 @@ def _basis(ray: ndarray) -> ndarray:
     """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to
     the camera.
     """
-    helper = np.array([1.0, 0.0, 0.0]) if abs(ray[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
+    if abs(ray[0]) < 0.7:
+        helper = np.array([1.0, 0.0, 0.0])
+    else:
+        helper = np.array([0.0, 1.0, 0.0])
     x = helper - ray * (helper @ ray)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(ray, x), ray])
@@ -389,7 +403,10 @@ def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
     import cv2
 
     u, v = (np.ascontiguousarray(a, np.float32) for a in (u, v))
-    flat = (u.reshape(1, -1), v.reshape(1, -1)) if u.ndim == 1 else (u, v)
+    if u.ndim == 1:
+        flat = (u.reshape(1, -1), v.reshape(1, -1))
+    else:
+        flat = (u, v)
     values = cv2.remap(
         picture.astype(np.float32, copy=False),
         *flat,

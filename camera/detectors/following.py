@@ -143,9 +143,10 @@ class BallGoalTracker:
             self._begin = None
         where = {}
         if self._ball is not None:
-            pull = (
-                THRUST * math.sin(self._half_angle) / self._radius if distance is not None else 0.0
-            )
+            if distance is not None:
+                pull = THRUST * math.sin(self._half_angle) / self._radius
+            else:
+                pull = 0.0
             self._ball.predict(stamp, -pull * _perpendicular(up_w, self._ball.ray_w))
             where = {
                 "ball_ray_c": rot_wc.T @ self._ball.ray_w,
@@ -215,7 +216,9 @@ class BallGoalTracker:
             square.place_w = place_w
             square.stamp = self._stamp
             square.log_odds += self._weight * math.log(sure / (1.0 - sure))
-        return squares.get(self._squares.index(self._likeliest())) if self._squares else None
+        if self._squares:
+            return squares.get(self._squares.index(self._likeliest()))
+        return None
 
     def _likeliest(self) -> Square:
         return max(self._squares, key=lambda square: square.log_odds)

@@ -270,11 +270,10 @@ class LearntDetector(Detector):
             self.networks, kind, frames, rays, sizes, self.lens, north
         )
         probability = torch.sigmoid(factor * outputs[:, 0] + offset)
-        things = (
-            ball_of(views, outputs)
-            if kind == "ball"
-            else views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
-        )
+        if kind == "ball":
+            things = ball_of(views, outputs)
+        else:
+            things = views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
         return probability, things
 
     def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:

@@ -94,8 +94,14 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
         weak = world < faults
         late = world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
-        gain = between(team.weak, part) if weak else 1.0
-        delay = between(team.late, part) if late else 0.0
+        if weak:
+            gain = between(team.weak, part)
+        else:
+            gain = 1.0
+        if late:
+            delay = between(team.late, part)
+        else:
+            delay = 0.0
         for v in range(team.vehicles):
             vehicles.append(_weakened(vehicle, gain if v == 0 else 1.0))
             lag = release.lag + (delay if v == 0 else 0.0)

@@ -44,7 +44,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Throw once, or many times."""
-    return _compare(args) if args.action == "compare" else _fly(args)
+    if args.action == "compare":
+        return _compare(args)
+    return _fly(args)
 
 
 def load(name: str, solver: str) -> tuple[Any, Any, Any]:

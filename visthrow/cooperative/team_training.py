@@ -34,7 +34,10 @@ class TeamTraining(PPOTraining):
         self._eager = eager
 
     def rollout(self) -> None:
-        work = self._rollout if self._eager else super().rollout
+        if self._eager:
+            work = self._rollout
+        else:
+            work = super().rollout
         work()
 
     def collect(self, done: float) -> None:
@@ -62,7 +65,10 @@ class TeamTraining(PPOTraining):
                 figures = self.learn(done)
             count += 1
             spent = time.perf_counter() - start
-            done = count / iterations if iterations else min(spent / seconds, 1.0)
+            if iterations:
+                done = count / iterations
+            else:
+                done = min(spent / seconds, 1.0)
             yield figures | {"iteration": count, "seconds": spent}
 
 
@@ -89,7 +95,10 @@ def fly(
         build: another solver of the bodies.
         record: called with the environment before each step.
     """
-    devices = [device] if device.startswith("cuda") else []
+    if device.startswith("cuda"):
+        devices = [device]
+    else:
+        devices = []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
         rows = count * experiment.team.vehicles

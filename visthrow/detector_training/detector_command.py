@@ -143,7 +143,10 @@ def throw(args: argparse.Namespace) -> int:
     share = {name: counts[name] / max(counts["frames"], 1) for name in ("ball", "goal")}
     figures = Throws(args.target, **columns).summary() | share | {"refused": counts["refused"]}
     error = columns["error"][np.isfinite(columns["error"])]
-    width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error)) if len(error) > 1 else math.nan
+    if len(error) > 1:
+        width = 1.96 * float(error.std(ddof=1)) / math.sqrt(len(error))
+    else:
+        width = math.nan
     print(
         f"{loaded.name} by {args.by} on {args.plant}, {args.target:g} m: {len(error)} of"
         f" {args.throws} landed, {counts['refused']} refused, error"
@@ -198,7 +201,10 @@ def train(args: argparse.Namespace) -> int:
         else:
             present = "no checkpoint to resume from"
         raise VisthrowError(f"{folder}: {present}")
-    files = None if args.textures is None else photographs(args.textures)
+    if args.textures is None:
+        files = None
+    else:
+        files = photographs(args.textures)
     fit = Fit(
         params,
         config.load(CameraParams, config.find("camera", "fisheye")),

@@ -428,7 +428,10 @@ class Fit:
             rows = torch.cat(samples[kind]).cpu().double()
             factor, offset = platt(rows[:, 0], rows[:, 1])
             hits = rows[rows[:, 1] > 0.5]
-            scale = float((hits[:, 2] / hits[:, 3]).median() / math.log(2.0)) if len(hits) else 1.0
+            if len(hits):
+                scale = float((hits[:, 2] / hits[:, 3]).median() / math.log(2.0))
+            else:
+                scale = 1.0
             self.networks.calibration[kind] = (factor, offset, scale)
             figures[kind] = {
                 "places": len(rows),

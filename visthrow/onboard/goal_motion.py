@@ -174,7 +174,10 @@ def fitted_goal(
     if layout.name == "state" or not layout.located:
         sums, velocity = fit(sums, time, *measured_goal(layout, frame, valid, camera), fresh)
         moves = velocity if layout.motion else None
-        places = place(sums, time, moves) - frame[:, :2] if layout.located else None
+        if layout.located:
+            places = place(sums, time, moves) - frame[:, :2]
+        else:
+            places = None
         return GoalEstimate(sums, moves, places, frame, valid)
     return _located(layout, frame, valid, camera, sums, time, fresh)
 

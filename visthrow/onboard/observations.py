@@ -121,7 +121,10 @@ def layout_of(params: Any) -> Layout:
     motion = 2 if getattr(params, "goal_velocity", False) else 0
     response = getattr(params, "response", 0)
     setup = SETUPS[getattr(params, "setup", "none")]
-    places = LOCATED.get(params.layout, 0) if getattr(params, "located", False) else 0
+    if getattr(params, "located", False):
+        places = LOCATED.get(params.layout, 0)
+    else:
+        places = 0
     if params.layout == "state":
         return Layout("state", 2, 3, params.history, 0, motion, places, response, setup)
     if params.layout == "vision":
@@ -248,11 +251,18 @@ def observe(
         Observation, shape (E, layout.dimension), and the new history.
     """
     goal_end = VEHICLE + layout.goal
-    bits = [valid.to(frame.dtype)] if layout.validity and valid is not None else []
-    moving = [places] if layout.located and places is not None else []
-    moving += [goal_vel_w] if layout.motion and goal_vel_w is not None else []
-    moving += [answers.flatten(1)] if layout.response and answers is not None else []
-    moving += [setup] if layout.setup and setup is not None else []
+    optional = {
+        "validity": valid,
+        "located": places,
+        "motion": goal_vel_w,
+        "response": answers,
+        "setup": setup,
+    }
+    further = [
+        value.flatten(1).to(frame.dtype)
+        for name, value in optional.items()
+        if getattr(layout, name) and value is not None
+    ]
     history = push(history, frame[:, goal_end:], fresh)
     parts = [
         frame[:, :VEHICLE],
@@ -261,4 +271,4 @@ def observe(
         history.flatten(1),
         attached.unsqueeze(-1),
     ]
-    return torch.cat(parts + bits + moving, dim=-1), history
+    return torch.cat(parts + further, dim=-1), history

@@ -146,7 +146,10 @@ class Pilot:
             policy.require(seen, sections={"camera"}, allow=allow)
         self.policy = policy
         self.count = count
-        self.camera = None if camera_params is None else KeypointCamera(camera_params)
+        if camera_params is None:
+            self.camera = None
+        else:
+            self.camera = KeypointCamera(camera_params)
         self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
         self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._time = np.zeros(count, dtype=np.float32)
@@ -346,7 +349,10 @@ class Pilot:
             )
             sums = (new,)
         answers = tuple(push(buffer, ob.answer(frame, previous), fresh) for buffer in answers)
-        earlier = answers[0][:, 1:] if answers else None
+        if answers:
+            earlier = answers[0][:, 1:]
+        else:
+            earlier = None
         observation, history = ob.observe(
             self.layout,
             frame,

@@ -75,9 +75,10 @@ class Policy:
         _check_shapes(self)
         for part, declared in (("observation", self.obs_dim), ("action", self.action_dim)):
             section = self.contract.get(part)
-            dimension = (
-                section.get("dimension", declared) if isinstance(section, Mapping) else declared
-            )
+            if isinstance(section, Mapping):
+                dimension = section.get("dimension", declared)
+            else:
+                dimension = declared
             if dimension != declared:
                 raise PolicyError(
                     f"the contract says {part} dimension {dimension}, the network has {declared}"
@@ -86,7 +87,9 @@ class Policy:
     @property
     def obs_dim(self) -> int:
         """Number of observations D."""
-        return self.weights[0].shape[1] if self.estimator is None else self.estimator.obs_dim
+        if self.estimator is None:
+            return self.weights[0].shape[1]
+        return self.estimator.obs_dim
 
     @property
     def action_dim(self) -> int:
@@ -119,7 +122,10 @@ class Policy:
 
     def begin(self, count: int) -> Tensor:
         """Memory at the beginning of a throw, shape (E, H); H is 0 for a policy without one."""
-        width = 0 if self.estimator is None else self.estimator.memory
+        if self.estimator is None:
+            width = 0
+        else:
+            width = self.estimator.memory
         return torch.zeros(count, width, device=self.weights[0].device, dtype=self.weights[0].dtype)
 
     @torch.no_grad()

@@ -84,7 +84,10 @@ class Pilots(ABC):
         self.experiment = experiment
         self.goal_w = goal_w
         self.first_action = first_action
-        self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
+        if goal_vel_w is None:
+            self.goal_vel_w = np.zeros_like(goal_w)
+        else:
+            self.goal_vel_w = goal_vel_w
 
     @abstractmethod
     def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
@@ -155,7 +158,10 @@ class Policies(Pilots):
             else:
                 looked = self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
-            keypoints = None if looked is None else (looked[0][part], looked[1][part])
+            if looked is None:
+                keypoints = None
+            else:
+                keypoints = (looked[0][part], looked[1][part])
             views = [getattr(snapshot, name)[part] for name in VIEWS]
             outs.append(pilot.act(*views, goal_w[part], snapshot.attached[part], keypoints))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
@@ -229,7 +235,10 @@ class Flight:
         self.pilots = pilots
         self.recorder = recorder or FlightObserver()
         self._now: Snapshot | None = None
-        self.home_w = self.now.pos_w if home_w is None else home_w
+        if home_w is None:
+            self.home_w = self.now.pos_w
+        else:
+            self.home_w = home_w
         self.begin = math.nan
         self.open = np.ones(count, bool)
         self.flown = np.zeros(count, bool)
@@ -399,7 +408,10 @@ class Scores(FlightObserver):
         blank = np.where(success, 1.0, np.nan)
         point = landing.point_w[:, :2] * blank[:, None]
         goal = flight.goal_at(landing.time)[:, :2]
-        moving = {"goal_w": goal * blank[:, None]} if np.any(flight.pilots.goal_vel_w) else {}
+        if np.any(flight.pilots.goal_vel_w):
+            moving = {"goal_w": goal * blank[:, None]}
+        else:
+            moving = {}
         return {
             "success": success,
             "landing_w": point,

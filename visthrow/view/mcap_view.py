@@ -57,7 +57,10 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     ):
         if topic not in channels:
             name = topic.removeprefix("/signals/")
-            metadata = {"unit": log[name].unit, "frame": log[name].frame} if name != topic else {}
+            if name != topic:
+                metadata = {"unit": log[name].unit, "frame": log[name].frame}
+            else:
+                metadata = {}
             channels[topic] = writer.register_channel(
                 topic, "json", schemas[schema], metadata=metadata
             )

@@ -64,7 +64,9 @@ class Grid:
             row if isinstance(row, tuple) else tuple(row.get(name, "-") for name in names)
             for row in rows
         )
-        return cls(title, tuple(names), cells, note, heads) if cells else None
+        if cells:
+            return cls(title, tuple(names), cells, note, heads)
+        return None
 
     def markdown(self) -> str:
         """Text of the table, columns aligned."""

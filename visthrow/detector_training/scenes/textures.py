@@ -79,4 +79,6 @@ def pyramid(files: list[Path]) -> np.ndarray:
             )
             levels.append(level)
         rows.append(np.concatenate([np.ascontiguousarray(one).reshape(-1) for one in levels]))
-    return np.stack(rows) if rows else np.zeros((0, 1), np.uint8)
+    if rows:
+        return np.stack(rows)
+    return np.zeros((0, 1), np.uint8)
