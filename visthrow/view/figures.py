@@ -18,7 +18,7 @@ from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # width of a picture over the whole page [inch]
 
-LOOKS = tomllib.loads(Path(__file__).with_name("looks.toml").read_text(encoding="utf-8"))
+LOOKS = tomllib.loads((Path(__file__).parent / "data/looks.toml").read_text(encoding="utf-8"))
 """Part of a picture -> matplotlib's keywords."""
 for _look_of_part in LOOKS.values():
     if isinstance(_look_of_part.get("ls"), list):

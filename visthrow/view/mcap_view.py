@@ -24,7 +24,7 @@ from visthrow.logs.flightlog import FlightLog
 
 IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
 
-_SCHEMAS = Path(__file__).with_name("mcap_schemas.json")
+_SCHEMAS = Path(__file__).parent / "data/mcap_schemas.json"
 """Name -> JSON schema, of Foxglove's and of ours.
 
 Rates are in rad/s; a signal's unit and frame are its channel's metadata.

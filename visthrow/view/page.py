@@ -25,7 +25,9 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     import jinja2
     import markupsafe
 
-    template = resources.files("visthrow.view").joinpath("page.html.j2").read_text(encoding="utf-8")
+    template = (
+        resources.files("visthrow.view").joinpath("data/page.html.j2").read_text(encoding="utf-8")
+    )
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )

@@ -26,7 +26,7 @@ from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
 
 TIMELINE = "throw_time"
-SIGNALS = tomllib.loads(Path(__file__).with_name("signals.toml").read_text(encoding="utf-8"))
+SIGNALS = tomllib.loads((Path(__file__).parent / "data/signals.toml").read_text(encoding="utf-8"))
 FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
 

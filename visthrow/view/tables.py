@@ -13,7 +13,7 @@ import numpy as np
 
 from visthrow.view.parts import aligned
 
-_TABLES = tomllib.loads(Path(__file__).with_name("paper.toml").read_text(encoding="utf-8"))
+_TABLES = tomllib.loads((Path(__file__).parent / "data/paper.toml").read_text(encoding="utf-8"))
 
 PAPER = {
     (layout, float(target)): tuple(figures)
