@@ -172,6 +172,49 @@ def test_a_payload_belongs_to_the_path_that_it_hangs_below():
     assert made == {"pos_w": "pos_b_x", "payload_pos_w": "pos_c_x"}
 
 
+@pytest.mark.parametrize(
+    ("thrust", "load", "angles", "rates", "acc"),
+    [
+        ("thrust_cmd", "ball_", "phi theta psi", "gx gy gz", "ax ay az"),
+        ("cmd_thrust", "slung_", "phi_deg theta_deg psi_deg", "p q r", "acc_x acc_y acc_z"),
+        ("T", "obj_", "roll pitch yaw", "gyr_x gyr_y gyr_z", "ax_mps2 ay_mps2 az_mps2"),
+        ("collective_des", "payload_", "phi theta psi", "gx_dps gy_dps gz_dps", "ax ay az"),
+    ],
+)
+def test_a_column_is_found_under_another_laboratorys_name(thrust, load, angles, rates, acc):
+    columns = flight(20.0)
+    lean = Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX", degrees=True)[:, ::-1]
+    swing = 0.2 * np.sin(3.0 * columns["time"])
+    below = 0.5 * np.column_stack([np.sin(swing), 0.0 * swing, -np.cos(swing)])
+    table = {"utc_ms": 1.7e12 + 1e3 * columns["time"], thrust: columns["command"][:, 0]}
+    table |= {f"p{a}": c for a, c in zip("xyz", 1e3 * columns["pos_w"].T)}
+    body = np.degrees(columns["rate_b"]), columns["acc_b"]
+    for names, values in zip((angles, rates, acc), (lean, *body)):
+        table |= dict(zip(names.split(), values.T))
+    hung = {f"{load}{a}": c for a, c in zip("xyz", 1e3 * (columns["pos_w"] + below).T)}
+    found = propose(table | hung, "a.csv", mass=0.15)
+    made = {c.name: (" ".join(c.columns), c.unit) for c in found.mapping.channels}
+    assert made == {
+        "pos_w": ("px py pz", "mm"),
+        "payload_pos_w": (" ".join(hung), "mm"),
+        "quat_wb": (angles, "deg"),
+        "rate_b": (rates, "deg/s"),
+        "acc_b": (acc, "m/s^2"),
+        "thrust_command": (thrust, "N"),
+    }
+    assert found.flyer["cable"]["length"] == approx(0.5, abs=0.01)
+    (question,) = propose(table, "a.csv", mass=0.15).questions
+    assert "does a load hang below?" in question
+
+
+@pytest.mark.parametrize(("reach", "unit"), [(40.0, "deg"), (0.6, "rad")])
+def test_an_angle_is_in_the_unit_of_its_reach(reach, unit):
+    time = 0.01 * np.arange(500)
+    found = propose({"time": time, "theta": reach * np.sin(time)}, "a.csv")
+    assert [(c.name, c.unit) for c in found.mapping.channels] == [("angle", unit)]
+    assert "deg or rad?" in found.questions[0]
+
+
 def test_the_imu_of_euroc_is_proposed(tmp_path):
     time = 0.005 * np.arange(400)
     rates = np.column_stack([np.sin(3.0 * time), np.cos(2.0 * time), 0.1 * time])

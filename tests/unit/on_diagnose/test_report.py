@@ -172,8 +172,9 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND
 
 
-@mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1"])
+@mark.parametrize("item", ["effect_07", "effect_07=much", "effect_07=-1", "nobody=1,effect_07=1"])
 def test_measurements_that_are_none_are_refused(item):
+    assert measures.parsed(["a=1,b=2", "c=3"]) == {"a": 1.0, "b": 2.0, "c": 3.0}
     with raises(DiagnoseError, match=item.split("=")[0]):
         measures.narrowed(EFFECTS, measures.parsed([item]))
 

@@ -20,6 +20,7 @@ from visthrow.diagnose.select.search import diagnose, refused_of
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import derivative, relate
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -602,11 +603,21 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
         assert refused in capsys.readouterr().err
     assert run_command(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml") == 2
     assert refused in capsys.readouterr().err
+    assert run_command(f"diagnose explain {tmp_path}/t.csv --config {tmp_path}/mine.toml") == 2
+    assert "where that holds a model, such as [flyer]" in capsys.readouterr().err
     for files, setup in (
         (["a.npz", "t.csv"], str(tmp_path / "mine.toml")),
         (["a.npz"], "cf_payload"),
     ):
         assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)
+
+
+@mark.parametrize(("mass", "hangs"), [(0.15, True), (0.25, False)])
+def test_a_thrust_that_carries_more_than_the_model_weighs_hints_at_a_load(mass, hangs):
+    rows = thrust_checks.look(log_of(flight(20.0)), KnownVehicle(mass=mass))
+    (row,) = [row for row in rows if row.topic == "thrust"]
+    assert row.verdict == "warn"
+    assert ("hangs below" in row.text) == hangs
 
 
 @mark.parametrize(("count", "judged"), [(20, False), (60, True)])

@@ -49,7 +49,7 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     expect_known(
         measured,
         [e.name for e in effects],
-        "no effect '{}' that could have been measured",
+        "--measured: no effect '{}' among those considered, which --only may limit",
         DiagnoseError,
     )
     for name, sd in measured.items():
@@ -67,9 +67,11 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:
-    """Read ``NAME=DEVIATION`` of the command line. Raises DiagnoseError: something else."""
+    """Read ``NAME=DEVIATION`` of the command line, several by commas.
+
+    Raises DiagnoseError: something else."""
     out = {}
-    for item in items:
+    for item in ",".join(items).split(","):
         name, _, sd = item.partition("=")
         try:
             out[name.strip()] = float(sd)

@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         help=(
             "the configured value behind this effect was measured with this deviation, such as"
-            " mass_quad=0.0003 from a scale"
+            " mass_quad=0.0003 from a scale; several by commas, or one an option"
         ),
     )
     parser.add_argument(

@@ -40,6 +40,7 @@ def _pattern(name: str) -> re.Pattern[str]:
 _TIME = _pattern("time")
 _TARGET = _pattern("target")
 _NOT_VEHICLE = _pattern("not_vehicle")
+_THRUST = _pattern("thrust")
 _ESTIMATE = _pattern("estimate")
 _CAPTURE = _pattern("capture")
 _COMPONENT = _pattern("component")
@@ -56,6 +57,7 @@ _LATEST = 0.15  # the longest delay that counts [s]
 _SPAN = 0.1  # over which a path is differentiated [s]
 _COARSE = 0.02  # step of the grid on which many pairs are compared [s]
 _COMPARED = 1000  # rows on which the distance of two paths is judged
+_LARGEST_THRUST = 5000.0  # in any unit: what is larger counts to 65535, as a Crazyflie's
 _TURN = 7.0  # above a full turn in radians: degrees
 
 
@@ -242,8 +244,8 @@ def _groups(numbers: Table) -> list[Group]:
         if digit:
             digits.setdefault((digit[1], unit), {})[int(digit[2])] = name
         if match:
-            angle = "rpy" if match[2].lower() in ("roll", "pitch", "yaw") else ""
-            key = (match[1] + angle, unit or _SUFFIX.get((match[3] or "").lower(), ""))
+            family = _NAMES["families"].get(match[2].lower(), "")
+            key = (match[1] + family, unit or _SUFFIX.get((match[3] or "").lower(), ""))
             parts.setdefault(key, {}).setdefault(_ENDINGS[match[2].lower()], name)
     listed = [("motor", unit, names) for (_, unit), names in motors.items() if len(names) == 4]
     listed += [
@@ -297,6 +299,13 @@ def _without_names(numbers: Table) -> list[list[str]]:
             groups.append(run)
             run = []
     return groups
+
+
+def _angle_unit(group: Group) -> str:
+    """Return the unit of angles, as named, else by how far they reach."""
+    if group.unit in ("deg", "rad"):
+        return group.unit
+    return "deg" if np.nanpercentile(np.abs(group.values), 99) > _TURN else "rad"
 
 
 class _Chooser:
@@ -364,11 +373,13 @@ class _Chooser:
                 )
         return [entry for entry, _ in self.made.values()]
 
-    def _open(self, size: int) -> list[Group]:
+    def _open(self, size: int, targets: bool = False) -> list[Group]:
         return [
             g
             for g in self.groups
-            if id(g) not in self.taken and g.values.shape[1] == size and not _TARGET.search(g.stem)
+            if id(g) not in self.taken
+            and g.values.shape[1] == size
+            and (targets or not _TARGET.search(g.stem))
         ]
 
     def _take(self, name: str, group: Group, unit: str, why: str, **options: Any) -> None:
@@ -493,13 +504,13 @@ class _Chooser:
         smooth = [g for g in self._open(3) if self._smooth(g)]
         smooth = [g for g in smooth if g.unit not in ("deg", "rad")]
         groups = [g for g in smooth if self._hinted(g, "position") or g.unit in ("mm", "cm", "m")]
+        others = [
+            g
+            for g in smooth
+            if not any(re.search(pattern, g.stem.lower()) for pattern in _HINTS.values())
+        ]
         if not groups:  # no name speaks of a place
-            patterns = [pattern for name, pattern in _HINTS.items() if name != "position"]
-            groups = [
-                g
-                for g in smooth
-                if not any(re.search(pattern, g.stem.lower()) for pattern in patterns)
-            ]
+            groups = others
             listed = "; ".join(", ".join(group.columns) for group in groups)
             if groups:
                 self.found.questions.append(f"are these positions? Names do not say: {listed}")
@@ -522,7 +533,7 @@ class _Chooser:
             if "cam" not in g.stem.lower()
         }
         paths = [(g, units[g.columns]) for g in groups if units.get(g.columns)]
-        pay = self._payload(paths)
+        pay = self._payload(paths, others)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[1]]
         if pay is not None and not _ESTIMATE.search(getattr(pay[0], "stem", "")):
             vehicles.sort(key=lambda path: path[0] is not pay[0])  # the payload hangs below it
@@ -660,16 +671,17 @@ class _Chooser:
             )
 
     def _payload(
-        self, paths: list[tuple[Group, str]]
+        self, paths: list[tuple[Group, str]], others: list[Group]
     ) -> tuple[Group | None, Group, str, str] | None:
-        """Find the path below another one that keeps its distance from it.
+        """Find the path below another one that keeps its distance from it, or what nothing names
+        and does so in its unit.
 
         Returns that other one, the path, its unit and the reason.
         """
         candidates = []
         rows = slice(None, None, max(1, len(self.time) // _COMPARED))
         for upper, a in paths:
-            for lower, b in paths:
+            for lower, b in [*paths, *((group, a) for group in others)]:
                 if upper is lower:
                     continue
                 gap = lower.values[rows] * UNITS[b][1] - upper.values[rows] * UNITS[a][1]
@@ -828,9 +840,7 @@ class _Chooser:
             ):
                 continue
             largest = float(np.nanpercentile(np.abs(group.values), 99))
-            unit = (
-                group.unit if group.unit in ("deg", "rad") else "deg" if largest > _TURN else "rad"
-            )
+            unit = _angle_unit(group)
             self._take(
                 "quat_wb", group, unit, f"roll, pitch, yaw up to {largest:.3g} {unit}", kind="euler"
             )
@@ -957,11 +967,24 @@ class _Chooser:
                 and "angle" not in self.made
                 and not self.made.keys() & {"quat_wb"}
             ):
-                unit = group.unit if group.unit in ("deg", "rad") else "rad"
+                unit = _angle_unit(group)
                 self._take("angle", group, unit, f"an angle, by its name; a middle of {middle:.3g}")
-            elif re.search(r"thrust", stem) and "thrust_command" not in self.made:
-                unit = group.unit if group.unit in ("N", "gf") else "N"
-                self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
+                if not group.unit:
+                    self.found.questions.append(
+                        f"angle '{group.stem}': '{unit}' is taken by its reach: deg or rad?"
+                    )
+        self._thrust()
+
+    def _thrust(self) -> None:
+        """Take the collective thrust, a command before what else bears its name."""
+        groups = [g for g in self._open(1, targets=True) if _THRUST.search(_split_unit(g.stem)[0])]
+        groups = [g for g in groups if not _rises(g.values[:, 0])]  # f of frames, t of times
+        for group in sorted(groups, key=lambda g: not _TARGET.search(g.stem)):
+            middle = float(np.nanmedian(group.values))
+            if middle > _LARGEST_THRUST or "thrust_command" in self.made:
+                continue
+            unit = group.unit if group.unit in unit_evidence.THRUSTS else "N"
+            self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
 
 
 def _corrected(table: Table, source: str, proposal: MappingProposal, weighed: float | None) -> None:
@@ -1045,7 +1068,14 @@ def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -
             " vehicle, or no force?"
         )
         return log
-    proposal.why[entry.name] += f"; {unit} by the mass: it carries {one * UNITS[unit][1]:.4g} kg"
+    whole = one * UNITS[unit][1]
+    proposal.why[entry.name] += f"; {unit} by the mass: it carries {whole:.4g} kg"
+    if np.log(whole / weighed) > thrust_checks.MASS_WARN and "payload_pos_w" not in log:
+        proposal.questions.append(
+            f"thrust '{entry.columns[0]}' carries {whole:.4g} kg, and the vehicle weighs"
+            f" {weighed:g} kg: does a load hang below? The model has none; map its position as"
+            " payload_pos_w and add [flyer.cable]"
+        )
     if in_grams:
         proposal.questions.append(
             f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or"

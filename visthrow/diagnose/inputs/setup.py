@@ -134,6 +134,7 @@ def read_logs(
     logs = read_all(paths, chosen.table if chosen is not None else None)
     if (
         chosen is not None
+        and paths
         and chosen.table is not None
         and chosen.model not in models
         and not any(map(takes_mapping, paths))

@@ -169,7 +169,9 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
         raise DiagnoseError(
             f"flight {number} holds no {' and no '.join(missing)}; a replay needs command (or an"
             " autopilot's throttle and rate_setpoint_b, of which it is made), pos_w and quat_wb; it"
-            f" has {', '.join(sorted(log.channels))}; a table's columns get these names by --config"
+            f" has {', '.join(sorted(log.channels))}; a table's columns get these names by"
+            " --config; where that holds a model, such as [flyer], other channels suffice"
+            " (docs/reference/models.md)"
         )
     pos = _samples(log, "pos_w")
     quat = _samples(log, "quat_wb")

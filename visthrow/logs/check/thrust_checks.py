@@ -37,7 +37,7 @@ _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
 _MOTORS = 0.07  # what they usually take [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
-_MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
+MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
 MASS_BAD = 1.0  # likewise: another unit or map
 IDLE_PULSE = 1000.0  # length of a pulse at which a motor stands [us]
 _OUTLIER = 4.0  # robust deviations beyond which a crash or a tumble has its say cut
@@ -255,10 +255,10 @@ def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
             f"{text}: {words}",
             {"mass_kg": mass, "model_kg": vehicle.mass},
         )
-    verdict = "warn" if abs(off) > _MASS_WARN else "ok"
-    text += (
-        ": the thrust map is of another vehicle, battery or channel" if verdict == "warn" else ""
-    )
+    verdict = "warn" if abs(off) > MASS_WARN else "ok"
+    if verdict == "warn":
+        text += ": the thrust map is of another vehicle, battery or channel"
+        text += ", or a load that the model lacks hangs below" if off > 0.0 else ""
     return Row("thrust", channels, verdict, text, {"mass_kg": mass, "model_kg": vehicle.mass})
 
 
