@@ -1,6 +1,9 @@
 """Start of an episode on the device: placing a plant at rest in its actuators, and the paper's
 randomisation.
 
+The release's lag is not drawn here: it is constant in a plant, and drawn with each vehicle of a
+fleet (:mod:`sim.vehicle_class`).
+
 Random numbers are counter-based: they depend on the seed, the environment and how often it was
 reset, so a masked reset leaves all others untouched and a batch draws what its members alone would
 draw."""

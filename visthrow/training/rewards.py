@@ -28,8 +28,8 @@ def command(p: RewardParams, action: Tensor, weights: Tensor) -> Tensor:
 
 
 def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -> Tensor:
-    """r_rate: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) over the four commands, shape (E,).
-    weights: shape (4,).
+    """r_rate, which keeps commands smooth: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) punishes
+    jerks of the four, shape (E,). weights: shape (4,).
     """
     delta = action[:, :4] - previous[:, :4]
     return -p.smoothness * (weights * (p.l1_mix * delta.abs() + delta.square())).sum(-1)

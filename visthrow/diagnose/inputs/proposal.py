@@ -22,8 +22,8 @@ from visthrow.logs.check import physics, relations, thrust_checks
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, TableMap, TimeColumn
-from visthrow.logs.readers.layout import unit_of
 from visthrow.logs.readers.table import Table, logs_of, lost_rows, make_channel
+from visthrow.logs.readers.text_table import unit_of
 from visthrow.logs.unit_names import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")

@@ -29,7 +29,7 @@ from visthrow.common.storage import require_room, unpack
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
-from visthrow.logs.readers.layout import TextTable, is_number, layout_of
+from visthrow.logs.readers.text_table import TextTable, is_number, layout_of
 from visthrow.logs.unit_names import to_si
 
 Table = dict[str, np.ndarray]
@@ -67,7 +67,7 @@ def read_table(path: str | Path) -> Columns:
 
     Cells may be separated by commas, semicolons, tabs or blanks, decimals written with a comma,
     lists stand in a cell (``[1.0, 2.0]`` becomes ``name[0]``, ``name[1]``); several lines may name
-    the columns (:mod:`visthrow.logs.readers.layout`), and without any they are called ``column 1``
+    the columns (:mod:`visthrow.logs.readers.text_table`); without any they are called ``column 1``
     and so on. Frames of a known rate get a column ``time [s]``. Raises LogError: it cannot be read,
     has no rows, or a row has another number of cells than the header.
 

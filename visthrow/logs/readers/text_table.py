@@ -1,4 +1,5 @@
-"""Layout of a text table: which lines hold numbers, what its columns are called, in which units.
+"""Text tables as laboratories export them (Motive, Vicon, Qualisys, TUM, EuRoC): which lines hold
+numbers, what columns are called, in which units.
 
 Tables of motion capture carry several lines above their numbers: settings, the name of a body, what
 is measured of it, its unit. A table's numbers begin where rows of one width, mostly of numbers,
