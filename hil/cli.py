@@ -4,13 +4,12 @@ Each action is imported when chosen.
 """
 
 import argparse
-import tomllib
-from pathlib import Path
 
 from hil.commands import examples
 from visthrow.common.arguments import add_commands, run_command
+from visthrow.common.toml_text import tables_beside
 
-ACTIONS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+ACTIONS = tables_beside(__file__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -7,9 +7,7 @@
 import argparse
 import os
 import sys
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 
 from visthrow import __version__
 from visthrow.common.arguments import (
@@ -20,8 +18,9 @@ from visthrow.common.arguments import (
     run_command,
 )
 from visthrow.common.errors import VisthrowError
+from visthrow.common.toml_text import tables_beside
 
-_TABLES = tomllib.loads(Path(__file__).with_name("commands.toml").read_text(encoding="utf-8"))
+_TABLES = tables_beside(__file__, "commands.toml")
 
 COMMANDS: dict[str, tuple[str, str]] = _TABLES["commands"]
 """Name -> help and module."""

@@ -1,11 +1,21 @@
-"""Writes nested dictionaries as TOML; the standard library only reads it."""
+"""Tables of modules, and nested dictionaries as TOML, which the standard library only reads."""
 
 import json
 import math
 import re
+import tomllib
+from pathlib import Path
 from typing import Any
 
 _BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
+
+
+def tables_beside(module: str, name: str = "") -> dict[str, Any]:
+    """Read the TOML file that stands beside a module, by its ``__file__``; of the module's own name
+    where none is given.
+    """
+    path = Path(module).with_suffix(".toml")
+    return tomllib.loads((path.parent / name if name else path).read_text(encoding="utf-8"))
 
 
 def dumps(tree: dict[str, Any]) -> str:

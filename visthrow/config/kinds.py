@@ -1,14 +1,11 @@
 """Which schema each folder of configs, and each file that differs from its folder, is read with."""
 
 import importlib
-import tomllib
-from pathlib import Path
 
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.toml_text import tables_beside
 
-SCHEMAS: dict[str, str] = tomllib.loads(
-    Path(__file__).with_name("kinds.toml").read_text(encoding="utf-8")
-)
+SCHEMAS: dict[str, str] = tables_beside(__file__, "kinds.toml")
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
 
 

@@ -4,7 +4,6 @@ flight as a whole. `STANDARD_CHANNELS`, of ``flightlog.toml``, lists the channel
 Onboard-safe (numpy only). The same record serves simulated throws, throws of the reference plant
 and flights of a real vehicle, so that whatever reads one reads them all."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
+from visthrow.common.toml_text import tables_beside
 
 FORMAT_VERSION = 1
 FRAMES = ("world", "body", "camera", "image", "mocap", "none")
@@ -30,7 +30,7 @@ class ChannelSpec:
 
 
 def _standard_channels() -> dict[str, ChannelSpec]:
-    rows = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    rows = tables_beside(__file__)
     for row in rows.values():
         row["shape"] = tuple(None if size < 0 else size for size in row["shape"])
     return {name: ChannelSpec(**row) for name, row in rows.items()}

@@ -1,13 +1,11 @@
 """Units at the edge of the house: what each is worth in ours."""
 
-import tomllib
-from pathlib import Path
-
 from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.toml_text import tables_beside
 
 G = 9.80665  # standard gravity [m/s^2]: what a datasheet's g and gram-force mean; not the local one
 
-_TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_TABLES = tables_beside(__file__)
 UNITS: dict[str, tuple[str, float]] = {
     name: (ours, size) for ours, sizes in _TABLES.items() for name, size in sizes.items()
 }

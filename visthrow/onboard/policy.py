@@ -16,7 +16,6 @@ fit the network. ``made_by`` tells config, commit, command, seed and figures; no
 import json
 import math
 import re
-import tomllib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,6 +28,7 @@ from torch import Tensor
 
 from visthrow.common.errors import MismatchError, PolicyError, expect_known, suggest
 from visthrow.common.storage import from_json_array, json_array, loadz, savez
+from visthrow.common.toml_text import tables_beside
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.shipped import find_policy as find_policy
 
@@ -45,9 +45,7 @@ RSL_RL_EPS = 1e-2
 state.
 """
 
-ACTIVATIONS: dict[str, dict[str, str]] = tomllib.loads(
-    Path(__file__).with_name("activations.toml").read_text(encoding="utf-8")
-)
+ACTIVATIONS: dict[str, dict[str, str]] = tables_beside(__file__, "activations.toml")
 """Activations by rsl_rl's names, and what torch, ONNX and C call them."""
 
 

@@ -15,9 +15,7 @@ sensors are older or younger. ``exact`` adds :data:`HIDDEN`, which nobody knows 
 bound, and what the critic is given."""
 
 import math
-import tomllib
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
@@ -26,13 +24,13 @@ from sim.units import PLANT, Units, dimensions_of, in_units
 from sim.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
+from visthrow.common.toml_text import tables_beside
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of, plant_of
 
-_FILE = Path(__file__).with_name("dimensions.toml")
-TASK = PLANT | dimensions_of(tomllib.loads(_FILE.read_text(encoding="utf-8")))
+TASK = PLANT | dimensions_of(tables_beside(__file__, "dimensions.toml"))
 """Dimensions of the fields of plant and task."""
 
 HIDDEN = (

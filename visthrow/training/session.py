@@ -12,7 +12,6 @@ import os
 import signal
 import sys
 import time
-import tomllib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from visthrow.common import provenance, statistics
 from visthrow.common.arguments import EXIT_INTERRUPTED, StopRequest
 from visthrow.common.errors import CheckpointError, StorageError, TrainError
 from visthrow.common.storage import write_json
+from visthrow.common.toml_text import tables_beside
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws
@@ -33,7 +33,6 @@ from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, f
 
 EVALUATION_TARGET = 2.0  # [m]
 
-RECORDED = Path(__file__).with_name("recorded.toml")
 
 # shares of the wall time that each may take where the command does not say how often
 EVALUATION_SHARE = 0.05
@@ -290,7 +289,7 @@ def _compare(name: str | None, rows: list[dict]) -> None:
     """Print how a training's landing error compares with that of recorded seeds, where there are
     any of its configuration.
     """
-    recorded = tomllib.loads(RECORDED.read_text(encoding="utf-8")).get(name)
+    recorded = tables_beside(__file__, "recorded.toml").get(name)
     errors = [row.get("error_mean") for row in rows if row["target"] == EVALUATION_TARGET]
     if recorded is None or errors == [None]:
         return

@@ -3,10 +3,8 @@
 All in the style of :mod:`visthrow.common.style`.
 """
 
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +12,12 @@ from numpy import ndarray
 
 from visthrow.common import style
 from visthrow.common.statistics import Interval, pareto
+from visthrow.common.toml_text import tables_beside
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # width of a picture over the whole page [inch]
 
-LOOKS = tomllib.loads((Path(__file__).parent / "data/looks.toml").read_text(encoding="utf-8"))
+LOOKS = tables_beside(__file__, "data/looks.toml")
 """Part of a picture -> matplotlib's keywords."""
 for _look_of_part in LOOKS.values():
     if isinstance(_look_of_part.get("ls"), list):

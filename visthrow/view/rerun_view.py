@@ -6,7 +6,6 @@ motion capture knows no motor speeds, a simulated one no age of its poses. Sizes
 experiment, or from anything with ``camera``, ``vehicle.rotors`` and ``rope.payload_radius``."""
 
 import tempfile
-import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,10 +22,11 @@ from camera.params import CameraParams
 from visthrow.common import style
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import FlightLog
 
 TIMELINE = "throw_time"
-SIGNALS = tomllib.loads((Path(__file__).parent / "data/signals.toml").read_text(encoding="utf-8"))
+SIGNALS = tables_beside(__file__, "data/signals.toml")
 FIELD = 2.0  # half-width of the drawn floor about the throw [m]
 
 

@@ -5,15 +5,14 @@ Markdown for people, CSV for programs. Every table says which plant it was measu
 
 import csv
 import io
-import tomllib
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
+from visthrow.common.toml_text import tables_beside
 from visthrow.view.parts import aligned
 
-_TABLES = tomllib.loads((Path(__file__).parent / "data/paper.toml").read_text(encoding="utf-8"))
+_TABLES = tables_beside(__file__, "data/paper.toml")
 
 PAPER = {
     (layout, float(target)): tuple(figures)

@@ -3,14 +3,13 @@ refuses to fly, and nothing is written unless the operator said so.
 """
 
 import math
-import tomllib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from hil.links.facts import values
 from hil.links.roster import Announce
+from visthrow.common.toml_text import tables_beside
 
 ASK_AGAIN = 0.2  # between two questions for a value that has not come [s]
 # after a value was written, answers may still be on their way that were given before; then it is
@@ -20,7 +19,7 @@ GIVE_UP = 5.0  # a value that has not come within this time is missing [s]
 GIVE_UP_OPTIONAL = 1.0  # likewise one that not all firmware has [s]
 NO_SUCH_PARAMETER = 1  # MAV_PARAM_ERROR_DOES_NOT_EXIST
 ROUNDING = 1e-6  # tolerance of values
-RULES = tomllib.loads(Path(__file__).with_name("rules.toml").read_text(encoding="utf-8"))
+RULES = tables_beside(__file__, "rules.toml")
 MOST_NAMED = 4  # parameters that a fault names; the table has all
 
 

@@ -17,12 +17,12 @@ import socket
 import subprocess
 import sys
 import time
-import tomllib
 from pathlib import Path
 
 from hil.errors import RunError
 from hil.links.backends.betaflight import FACTS, STICKS, BetaflightParams
 from hil.rehearsal.bridges.packets import at_rest, stood
+from visthrow.common.toml_text import tables_beside
 
 # TCP ports of the first two serial ports: the first is the runner's, the second the bridge's
 PORTS = (FACTS["serial_port"] + 1, FACTS["serial_port"] + 2)
@@ -33,7 +33,6 @@ ANSWER = 20.0  # time for an answer of the command line [s]
 END = 10.0  # time for the process's end [s]
 FREED = 90.0  # after which a port that the last firmware left is free again [s]: TIME_WAIT is 60 s
 
-SETTINGS = Path(__file__).with_name("firmware_settings.toml")
 LOCKSTEP = Path(__file__).with_name("lockstep.c")
 
 PR_SET_PDEATHSIG = 1  # of prctl
@@ -48,7 +47,7 @@ def needed(params: BetaflightParams) -> dict[str, str]:
     prints them under.
     """
     rates = params.rates
-    out = tomllib.loads(SETTINGS.read_text(encoding="utf-8"))
+    out = tables_beside(__file__, "firmware_settings.toml")
     out |= {"rates_type": rates.type.upper(), "min_check": str(params.minimum_us)}
     for i, axis in enumerate(("roll", "pitch", "yaw")):
         out |= {

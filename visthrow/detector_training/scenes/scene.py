@@ -3,9 +3,7 @@ picture.
 """
 
 import math
-import tomllib
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -17,6 +15,7 @@ from camera.fisheye import Fisheye
 from camera.keypoints import ball_extremes_c, goal_square
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams
+from visthrow.common.toml_text import tables_beside
 
 THINGS = 10  # most things on the ground and about the hall
 
@@ -25,7 +24,7 @@ ALIKE = ((0.75, 0.80, 0.25), (0.20, 0.50, 0.28), (0.85, 0.75, 0.20), (0.9, 0.9, 
 
 
 def _table(name: str) -> dict[str, Any]:
-    return tomllib.loads(Path(__file__).with_name(name).read_text(encoding="utf-8"))
+    return tables_beside(__file__, name)
 
 
 ROW_COLUMNS = _table("rows.toml")

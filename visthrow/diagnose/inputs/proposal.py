@@ -7,15 +7,14 @@ the derivative of a position, rates are those of the attitude, a payload keeps i
 none of them tells becomes a question."""
 
 import re
-import tomllib
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.common.rotations import rotate_back
+from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.inputs import unit_evidence
 from visthrow.logs.axes import turn_of
 from visthrow.logs.check import physics, relations, thrust_checks
@@ -27,7 +26,7 @@ from visthrow.logs.readers.text_table import unit_of
 from visthrow.logs.unit_names import UNITS
 
 _SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
-_NAMES = tomllib.loads(Path(__file__).with_name("column_names.toml").read_text(encoding="utf-8"))
+_NAMES = tables_beside(__file__, "column_names.toml")
 _SUFFIX = _NAMES["units"]
 _ENDINGS = _NAMES["components"]
 _HINTS = _NAMES["hints"]

@@ -1,12 +1,11 @@
 """What a log excites, and what it can therefore answer."""
 
-import tomllib
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import Row
 from visthrow.logs.check.thrust_checks import IDLE_SHARE, IDLE_SPEED
@@ -33,7 +32,7 @@ class Question:
 
 
 def _questions() -> tuple[Question, ...]:
-    rows = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    rows = tables_beside(__file__)
     groups = {"thrusts": THRUSTS, "positions": POSITIONS, "attitudes": ATTITUDES, "motors": MOTORS}
     questions = []
     for name, row in rows.items():

@@ -6,7 +6,6 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 forward, left, up."""
 
 import math
-import tomllib
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import rotate
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.messages import (
@@ -29,7 +29,6 @@ from visthrow.logs.readers.table import make_channel
 from visthrow.logs.readers.vehicles import Vehicle, vehicle_of
 
 NED = "x,-y,-z"  # our axes in the autopilot's, world and body alike
-FIELDS = Path(__file__).with_name("autopilot_fields.toml")
 POSE_PARTS = ("pos_w", "quat_wb", "vel_w", "rate_b")
 EARTH_RADIUS = 6378100.0  # ArduPilot's scale of latitude [m]
 BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
@@ -37,7 +36,9 @@ BODY_FRAME = 3  # VELOCITY_FRAME_BODY_FRD
 
 @dataclass(frozen=True)
 class Tap:
-    """Fields of one kind of message that make a channel; a row of `FIELDS`, which describes it."""
+    """Fields of one kind of message that make a channel; a row of ``autopilot_fields.toml``, which
+    describes it.
+    """
 
     message: str
     channel: str
@@ -75,8 +76,8 @@ class Tap:
 
 @cache
 def fields_of_autopilots() -> dict[str, Any]:
-    """Return the tables of `FIELDS`, the taps of each kind of log as such."""
-    tables = tomllib.loads(FIELDS.read_text(encoding="utf-8"))
+    """Return the tables of `autopilot_fields.toml`, the taps of each kind of log as such."""
+    tables = tables_beside(__file__, "autopilot_fields.toml")
     for taps in (tables["taps"], tables["pose_taps"]):
         taps |= {kind: tuple(Tap(**row) for row in rows) for kind, rows in taps.items()}
     return tables

@@ -11,18 +11,17 @@ Manager (TSV, 3D and 6D); trajectories of TUM (blank-separated) and EuRoC."""
 import csv
 import io
 import re
-import tomllib
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
 from visthrow.common.storage import counted
+from visthrow.common.toml_text import tables_beside
 
 MARKS = (",", ";", "\t", " ")
 SAMPLED = 60  # lines of numbers by which the separator is told
-_UNIT_WORDS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+_UNIT_WORDS = tables_beside(__file__)
 _NUMBER = re.compile(r"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?(nan|inf|infinity)", re.I)
 _WORDS = ("true", "false")
 _FRAME = re.compile(r"sub ?frame|frame( ?(number|no\.?|#))?|time.*|timestamp.*", re.I)

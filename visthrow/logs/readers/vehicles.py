@@ -4,16 +4,15 @@
 
 Source: PX4, CA_ROTOR_COUNT, CA_ROTORn_PX, _PY (forward, right); ArduPilot, SERVOn_FUNCTION."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.readers.messages import Messages
 
 QUADROTOR = "quadrotor"
-TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+TABLES = tables_beside(__file__)
 ARDUPILOT_MOTOR1 = 33  # SERVOn_FUNCTION of the first motor
 
 X = (2, 0, 1, 3)

@@ -1,7 +1,6 @@
 """The results that are there, and questions to them."""
 
 import json
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +11,7 @@ from numpy import ndarray
 
 from visthrow.common import statistics as st
 from visthrow.common.errors import StorageError
+from visthrow.common.toml_text import tables_beside
 from visthrow.paper import RECORDS
 from visthrow.throws.results import PROTOCOL, Result, join, load_all
 from visthrow.view.figures import Line
@@ -22,7 +22,7 @@ ANY = object()  # any departures
 
 PARTS = ("throws", "training", "findings")  # folders of a folder of records
 
-WORDS = tomllib.loads(Path(__file__).with_name("report.toml").read_text(encoding="utf-8"))
+WORDS = tables_beside(__file__, "report.toml")
 
 SHORT: dict[str, str] = WORDS["plants"]
 """Plant -> its name in tables."""

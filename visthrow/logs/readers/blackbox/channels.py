@@ -4,19 +4,19 @@ Convention: Betaflight's body axes are ours (x forward, y left, z up; a level ve
 +1 g along z). Its motors are rear right, front right, rear left, front left."""
 
 import re
-import tomllib
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from visthrow.common.errors import LogError
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.blackbox.decoder import BlackboxLog, read_blackbox
 from visthrow.logs.readers.table import Table, make_channel
 
-TABLES = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+TABLES = tables_beside(__file__)
 MOTOR_ORDER = (3, 1, 2, 0)
 """Betaflight's motor of each of ours: front left, front right, rear left, rear right."""
 
