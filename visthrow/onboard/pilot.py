@@ -151,7 +151,6 @@ class Pilot:
         else:
             self.camera = KeypointCamera(camera_params)
         self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
-        self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._time = np.zeros(count, dtype=np.float32)
         self._observe, self._observe_given = Compiled(self._observed), Compiled(self._observed)
         self._decide = Compiled(self._decision)
@@ -164,6 +163,7 @@ class Pilot:
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
+        self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._previous = self._first.repeat(self.count, 0)
         self._history = np.zeros(
             (self.count, 1 + self.layout.history, self.layout.payload), dtype=np.float32
