@@ -319,6 +319,7 @@ class _Chooser:
     ) -> None:
         self.time = time
         self.found = proposal
+        self.ask = proposal.questions.append
         self.settings = settings
         for group in groups:
             group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
@@ -349,7 +350,7 @@ class _Chooser:
         self._forces()
         self._inputs()
         if self.unproven and not self.made.keys() & {"pos_w", "rate_b"}:
-            self.found.questions.append(
+            self.ask(
                 f"are {self.unproven} angles, as taken, or body rates? Nothing in the motion says"
             )
         if "pos_w" in self.made and not self.made.keys() & {
@@ -359,7 +360,7 @@ class _Chooser:
             "motor_command",
             "vel_w",
         }:
-            self.found.questions.append(
+            self.ask(
                 "nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w"
             )
         for group in self._open(1):
@@ -367,9 +368,7 @@ class _Chooser:
             whole = 1 < len(values) <= 64 and np.all(values == np.round(values))
             if whole and re.search(r"ball|track|body|id$|test|run|flight", group.stem):
                 ask = f'[table.split] column = "{group.stem}"'
-                self.found.questions.append(
-                    f"'{group.stem}' has {len(values)} values: one log for each? {ask}"
-                )
+                self.ask(f"'{group.stem}' has {len(values)} values: one log for each? {ask}")
         return [entry for entry, _ in self.made.values()]
 
     def _open(self, size: int, targets: bool = False) -> list[Group]:
@@ -450,7 +449,7 @@ class _Chooser:
                 self._take("quat_wb", group, "1" if size == 9 else unit, why, kind=kind)
                 if size == 3 and "quat_wb" in self.made:
                     listed = ", ".join(group.columns)
-                    self.found.questions.append(
+                    self.ask(
                         f"are {listed} a rotation vector (Vicon's angle-axis), as taken, or roll,"
                         ' pitch and yaw (kind = "euler")?'
                     )
@@ -497,7 +496,7 @@ class _Chooser:
                 "" if named else f"is the order of {', '.join(entry.columns)} {order}, as taken? "
             )
             question += f"which axis is up? '{axes or 'x,y,z'}' is taken; " if len(ups) > 1 else ""
-            self.found.questions.append(question + "nothing in the motion says")
+            self.ask(question + "nothing in the motion says")
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g)]
@@ -512,7 +511,7 @@ class _Chooser:
             groups = others
             listed = "; ".join(", ".join(group.columns) for group in groups)
             if groups:
-                self.found.questions.append(f"are these positions? Names do not say: {listed}")
+                self.ask(f"are these positions? Names do not say: {listed}")
         moving = [g for g in smooth if self._hinted(g, "velocity")] + groups
         derived = self._derivatives(moving, groups)
         groups = [group for group, is_rate in zip(groups, derived) if not is_rate]
@@ -537,44 +536,25 @@ class _Chooser:
         if pay is not None and not _ESTIMATE.search(getattr(pay[0], "stem", "")):
             vehicles.sort(key=lambda path: path[0] is not pay[0])  # the payload hangs below it
         for group, unit in vehicles:
-            usual = (
-                "est_pos_w"
-                if _ESTIMATE.search(group.stem)
-                else "mocap_pos_w"
-                if _CAPTURE.search(group.stem)
-                else "pos_w"
-            )
-            name = next(
-                (
-                    n
-                    for n in (
-                        ["pos_w", usual]
-                        if len(vehicles) == 1 or usual == "pos_w" or group is vehicles[0][0]
-                        else [usual]
-                    )
-                    if n not in self.made
-                ),
-                "",
-            )
+            usual = "mocap_pos_w" if _CAPTURE.search(group.stem) else "pos_w"
+            usual = "est_pos_w" if _ESTIMATE.search(group.stem) else usual
+            first = usual == "pos_w" or group is vehicles[0][0]
+            names = ["pos_w"] * first + [usual]
+            name = next((n for n in names if n not in self.made), "")
             if name:
                 wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
                 why = f"three columns that move smoothly, by {wide:.3g} {unit} (sd)"
-                why += f"; {self.by[group.columns]}" if group.columns in self.by else ""
+                why += self.by.get(group.columns, "")
                 self._take(name, group, unit, why, frame="" if name == "pos_w" else "world")
         if len(vehicles) > 1:
             listed = "; ".join(", ".join(g.columns) for g, _ in vehicles)
-            self.found.questions.append(
+            self.ask(
                 f"several positions ({listed}): which is the vehicle's, and by which sensor? The"
                 " first is taken"
             )
         if pay is not None:
             _, group, unit, why = pay
-            self._take(
-                "payload_pos_w",
-                group,
-                unit,
-                why + (f"; {self.by[group.columns]}" if group.columns in self.by else ""),
-            )
+            self._take("payload_pos_w", group, unit, why + self.by.get(group.columns, ""))
 
     def _length_unit(self, group: Group) -> str:
         """Unit of a position: as named, else by physics, else that in which it stays in a hall; ""
@@ -609,22 +589,22 @@ class _Chooser:
             return named
         if len(leans) == 1:
             self.by[group.columns] = (
-                f"{leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its lean"
-                " makes"
+                f"; {leans[0][0]} by gravity: it accelerates by {leans[0][2]:.2g} times what its"
+                " lean makes"
             )
             return leans[0][0]
         if unit := unit_evidence.by_fall(self.time, group.values):
-            self.by[group.columns] = f"{unit} by gravity: a part of it falls freely"
+            self.by[group.columns] = f"; {unit} by gravity: a part of it falls freely"
             return unit
         if leans:
             return self._guess_pair(group, leans)
         unit = next(iter(fit), "m")
-        self.by[group.columns] = f"{unit} by the size of a hall: {reach:.3g} from the origin"
+        self.by[group.columns] = f"; {unit} by the size of a hall: {reach:.3g} from the origin"
         if len(fit) != 1:
             alternatives = (
                 f"{' and '.join(fit[1:])} fit a hall too" if fit else "no unit fits a hall"
             )
-            self.found.questions.append(
+            self.ask(
                 f"{', '.join(group.columns)} reach {reach:.3g} from the origin: '{unit}' is a "
                 f"guess;"
                 f" {alternatives}"
@@ -642,13 +622,13 @@ class _Chooser:
         pairs = " or ".join(
             f"{unit_name} and {leaning} ({times:.2g} times)" for unit_name, leaning, times in leans
         )
-        self.found.questions.append(
+        self.ask(
             f"{listed} and the angles {angles}: are they in {pairs}? So many times what its lean"
             f" makes it accelerates, and all of these may be; '{unit}' and '{angle}' are a guess"
         )
         self._settle_angles(angle, f"{angle} is a guess")
         self.by[path.columns] = (
-            f"{unit} is a guess: it accelerates by {ratio:.2g} times what its lean makes"
+            f"; {unit} is a guess: it accelerates by {ratio:.2g} times what its lean makes"
         )
         return unit
 
@@ -664,7 +644,7 @@ class _Chooser:
         if len(self.attitudes) > 1:
             entry = self.made["quat_wb"][0]
             listed = ", ".join(entry.columns)
-            self.found.questions.append(
+            self.ask(
                 f"angles {listed}: {entry.unit} is taken; are they in"
                 f" {' or '.join(self.attitudes)}?"
             )
@@ -708,23 +688,20 @@ class _Chooser:
         steps = np.std(np.diff(values, axis=0), axis=0)
         return bool(np.max(moves) > 0.0 and np.max(steps) < 0.3 * np.max(moves))
 
+    def _slope(self, group: Group) -> tuple[np.ndarray, np.ndarray]:
+        """Return times at which a group's derivative is known, and it; few or none of a short
+        one.
+        """
+        time, values = unit_evidence.rising(self.time, group.values)
+        return relations.derivative(time, values, _SPAN) if len(time) >= 100 else (time, values)
+
     def _relation(self, path: Group, rate: Group, threshold: float) -> relations.Relation | None:
         if rate.unit in unit_evidence.LENGTHS:
             return None  # a length is no velocity, whatever it goes with
-        time, columns = unit_evidence.rising(self.time, np.hstack((path.values, rate.values)))
-        if len(time) < 100:
+        relation = self._compared(*self._slope(path), rate)
+        if relation is None or relation.correlation <= threshold:
             return None
-        stamps, derived = relations.derivative(time, columns[:, : path.values.shape[1]], _SPAN)
-        relation = relations.relate(
-            stamps, derived, time, columns[:, path.values.shape[1] :], reach=_REACH
-        )
-        return (
-            relation
-            if relation is not None
-            and relation.correlation > threshold
-            and abs(relation.delay) < _LATEST
-            else None
-        )
+        return relation if abs(relation.delay) < _LATEST else None
 
     def _derivatives(self, paths: list[Group], rates: list[Group]) -> list[bool]:
         """Tell which groups are the derivative of another path.
@@ -756,9 +733,10 @@ class _Chooser:
         """Return a group's values, or their slope, at times of a grid; zeros where too few are
         known.
         """
-        time, values = unit_evidence.rising(self.time, group.values)
-        if len(time) >= 100 and slope:
-            time, values = relations.derivative(time, values, _SPAN)
+        if slope:
+            time, values = self._slope(group)
+        else:
+            time, values = unit_evidence.rising(self.time, group.values)
         if len(time) < 100:
             return np.zeros((len(grid), group.values.shape[1]))
         return relations.on_grid(time, values, grid)
@@ -766,9 +744,13 @@ class _Chooser:
     def _compared(
         self, stamps: np.ndarray, derived: np.ndarray, group: Group
     ) -> relations.Relation | None:
-        """Relate a group's columns to what was derived of other ones."""
-        good = np.all(np.isfinite(group.values), axis=1)
-        return relations.relate(stamps, derived, self.time[good], group.values[good], reach=_REACH)
+        """Relate a group's columns to what was derived of other ones; None where too few are
+        known.
+        """
+        time, values = unit_evidence.rising(self.time, group.values)
+        if min(len(stamps), len(time)) < 100:
+            return None
+        return relations.relate(stamps, derived, time, values, reach=_REACH)
 
     def _velocities(self) -> None:
         for name in ("pos_w", "payload_pos_w", "est_pos_w"):
@@ -806,15 +788,13 @@ class _Chooser:
         attitude = self.made.get("quat_wb", (None, None))[1]
         if attitude is None or len(attitude.time) < 100:
             return False
-        time, columns = unit_evidence.rising(self.time, path.values)
-        stamps, derived = relations.derivative(time, columns, 0.1)
+        stamps, derived = self._slope(path)
         if len(stamps) < 100:
             return False
         turned = rotate_back(relations.attitude_at(*attitude.samples(), stamps), derived)
         best = max((correlation for correlation, *_ in world), default=0.0)
         for group in self._open(3):
-            good = np.all(np.isfinite(group.values), axis=1)
-            if not self._hinted(group, "velocity") or np.sum(good) < 100:
+            if not self._hinted(group, "velocity"):
                 continue
             relation = self._compared(stamps, turned, group)
             if relation is None or relation.correlation < _FIRMLY:
@@ -890,7 +870,7 @@ class _Chooser:
             if group.columns == ("gyro.x", "gyro.y", "gyro.z"):
                 unit = "deg/s"
                 why += "; a Crazyflie's gyro.x is in deg/s"
-            self.found.questions.append(
+            self.ask(
                 f"are the rates {listed} in rad/s or deg/s? '{unit}' is taken: no attitude says"
             )
         self._take("rate_b", group, unit, why)
@@ -925,7 +905,7 @@ class _Chooser:
         named = group.unit in ("rpm", "rad/s")
         unit = group.unit if named else "rpm" if re.search("rpm", words, re.IGNORECASE) else "rad/s"
         self._take("motor_speed", group, unit, f"four rotors' speeds up to {high:.5g} {unit}")
-        self.found.questions.append(
+        self.ask(
             f"rotors {', '.join(group.columns)}: order them front left, front right, rear left,"
             " rear right; are they electrical revolutions (divide by pole pairs)?"
         )
@@ -939,7 +919,7 @@ class _Chooser:
                     continue
                 unit = next(unit for above, unit in _MOTOR_UNITS if high > above)
                 self._take("motor_command", group, unit, f"four motors up to {high:.5g}")
-                self.found.questions.append(
+                self.ask(
                     f"motors {', '.join(group.columns)}: order them front left, front right, rear"
                     " left, rear right (Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1,"
                     " 2, 4). Are they commands, or speeds?"

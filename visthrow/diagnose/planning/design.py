@@ -50,6 +50,8 @@ SCATTER_SHARE = 0.5
 with all sweeps at once, few fly.
 """
 
+ROUNDING = 1e-9  # by which a path that is known to be safe may leave its own limits [m, m/s, m/s^2]
+HALVINGS = 20  # until the share of a sweep that fits is known
 SCATTERED = 16  # points of the first look, a power of 2 as a Sobol sequence wants it
 
 
@@ -79,49 +81,47 @@ class Limits:
         ):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
-    def share(self, path: np.ndarray, rates: np.ndarray) -> float:
-        """Largest share of a further way, 1 at most, that keeps a path within the limits; rows of
-        both ``PERIOD`` apart, (N, 3).
-        """
-        middle = (0.0, 0.0, 0.5 * (self.highest + self.lowest))
-        room = (
-            *self.half,
-            0.5 * (self.highest - self.lowest),
+    def hold(self, path: np.ndarray) -> bool:
+        """Tell whether a path keeps within them; its rows are ``PERIOD`` apart, shape (N, 3)."""
+        half, lowest, highest, speed, acceleration = _extremes(path)
+        return bool(
+            np.all(half <= np.add(self.half, ROUNDING))
+            and self.lowest - ROUNDING <= lowest <= highest <= self.highest + ROUNDING
+            and speed <= self.speed + ROUNDING
+            and acceleration <= self.acceleration + ROUNDING
         )
-        ways = [((path - middle)[:, [i]], rates[:, [i]], room[i]) for i in range(3)]
-        ways += zip(_derivatives(path), _derivatives(rates), (self.speed, self.acceleration))
-        return min(1.0, *(_leaving(*way) for way in ways))
+
+    def share(self, path: np.ndarray, added: np.ndarray) -> float:
+        """Largest share of a further way, 1 at most, with which a path keeps within them."""
+        if self.hold(path + added):
+            return 1.0
+        share, step = 0.0, 0.5
+        for _ in range(HALVINGS):
+            share += step * self.hold(path + (share + step) * added)
+            step /= 2.0
+        return share
 
     def around(self, path: np.ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""
-        speed, acceleration = (
-            float(np.linalg.norm(rows, axis=1).max()) for rows in _derivatives(path)
-        )
+        half, lowest, highest, speed, acceleration = _extremes(path)
         return replace(
             self,
-            half=tuple(np.maximum(self.half, np.abs(path[:, :2]).max(0)).tolist()),
-            lowest=min(self.lowest, path[:, 2].min()),
-            highest=max(self.highest, path[:, 2].max()),
+            half=tuple(np.maximum(self.half, half).tolist()),
+            lowest=min(self.lowest, lowest),
+            highest=max(self.highest, highest),
             speed=max(self.speed, speed),
             acceleration=max(self.acceleration, acceleration),
         )
 
 
-def _derivatives(path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity [m/s] and acceleration [m/s^2]."""
+def _extremes(path: np.ndarray) -> tuple[np.ndarray, float, float, float, float]:
+    """Farthest from the hall's middle along x and y, lowest and highest [m], speed [m/s] and
+    acceleration [m/s^2] of a path.
+    """
     vel = np.gradient(path, PERIOD, axis=0)
-    return vel, np.gradient(vel, PERIOD, axis=0)
-
-
-def _leaving(position: np.ndarray, velocity: np.ndarray, radius: float) -> float:
-    """Share of a way from within a ball about 0 at which its first row leaves it, shapes (N, D)."""
-    inward = -(position * velocity).sum(1)
-    square = (velocity**2).sum(1)
-    slack = np.maximum(radius**2 - (position**2).sum(1), 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of a row that does not move
-        return float(
-            np.nanmin((inward + np.sqrt(inward**2 + square * slack)) / square, initial=np.inf)
-        )
+    sizes = [np.linalg.norm(rows, axis=1) for rows in (vel, np.gradient(vel, PERIOD, axis=0))]
+    height = path[:, 2]
+    return np.abs(path[:, :2]).max(0), height.min(), height.max(), *(x.max() for x in sizes)
 
 
 @dataclass(frozen=True)
@@ -163,58 +163,51 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     seconds = base.seconds - 2.0 * SETTLE
     limits = limits.around(base.reference().pos_w)
     middle = np.array([0.0, 0.0, base.path(np.zeros(1))[0, 2]])
+    most = {
+        "x": (limits.half[0], limits.speed, limits.acceleration),
+        "y": (limits.half[1], limits.speed, limits.acceleration),
+        "z": (0.5 * (limits.highest - limits.lowest), limits.speed, limits.acceleration),
+        "yaw": (np.pi, YAW_RATE, np.inf),
+    }
 
-    def sweep(axis: str) -> Sweep:
+    def swept(axis: str, t: np.ndarray) -> np.ndarray:
+        reach, speed, acceleration = most[axis]
         low, high = (SLOWEST * (FASTEST / SLOWEST) ** x[f"{end}_{axis}"] for end in ("from", "to"))
-        return Sweep(low, high, seconds)
 
-    def farthest(
-        reach: float, speed: float, acceleration: float
-    ) -> Callable[[np.ndarray], np.ndarray]:
-        return lambda f: np.minimum(
-            np.minimum(reach, speed / (2.0 * np.pi * f)), acceleration / (2.0 * np.pi * f) ** 2
-        )
+        def farthest(frequency: np.ndarray) -> np.ndarray:
+            turned = 2.0 * np.pi * frequency
+            return np.minimum(np.minimum(reach, speed / turned), acceleration / turned**2)
 
-    reach = dict(zip("xyz", (*limits.half, 0.5 * (limits.highest - limits.lowest))))
+        return x[f"share_{axis}"] * Sweep(low, high, seconds).at(t, farthest)
 
     def ramped(t: np.ndarray) -> np.ndarray:
         return middle + x["kept"] * (base.path(t) - middle)
 
-    def swept(t: np.ndarray) -> np.ndarray:
-        return np.column_stack(
-            [
-                x[f"share_{axis}"]
-                * sweep(axis).at(t, farthest(reach[axis], limits.speed, limits.acceleration))
-                for axis in "xyz"
-            ]
-        )
+    def moved(t: np.ndarray) -> np.ndarray:
+        return np.column_stack([swept(axis, t) for axis in "xyz"])
 
     rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
-    fitting = limits.share(ramped(rows), swept(rows))
+    fitting = limits.share(ramped(rows), moved(rows))
     top = ADDED[0] * (ADDED[1] / ADDED[0]) ** x["added_to"]
     added = [Sweep(ADDED[0], top, seconds, phase=2.0 * np.pi * i / 3.0) for i in range(3)]
+    pushed = Sweep(top, ADDED[0], seconds)
 
     def rates(t: np.ndarray) -> np.ndarray:
-        sweeps = [
-            limits.rate * x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)
-        ]
-        return x["kept"] * base.rates(t) + np.column_stack(sweeps)
+        sweeps = [x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)]
+        return x["kept"] * base.rates(t) + limits.rate * np.column_stack(sweeps)
+
+    def thrust(t: np.ndarray) -> np.ndarray:
+        kept = 1.0 + x["kept"] * (base.thrust(t) - 1.0)
+        return kept + limits.thrust * x["thrust"] * pushed.at(t, np.ones_like)
 
     return replace(
         base,
         name=base.name + OPTIMISED,
         purpose="the most nats a second within the limits",
         rates=rates,
-        path=lambda t: ramped(t) + fitting * swept(t),
-        yaw=lambda t: (
-            x["kept"] * base.yaw(t)
-            + x["share_yaw"] * sweep("yaw").at(t, farthest(np.pi, YAW_RATE, np.inf))
-        ),
-        thrust=lambda t: (
-            1.0
-            + x["kept"] * (base.thrust(t) - 1.0)
-            + limits.thrust * x["thrust"] * Sweep(top, ADDED[0], seconds).at(t, np.ones_like)
-        ),
+        path=lambda t: ramped(t) + fitting * moved(t),
+        yaw=lambda t: x["kept"] * base.yaw(t) + swept("yaw", t),
+        thrust=thrust,
     )
 
 

@@ -5,9 +5,12 @@ A pilot or controller follows the position; doublets and thrust steps are added 
 Each stays within a box of a few metres and leaves the payload well below the rotors;
 :meth:`Reference.limits` says when to abort."""
 
+import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -15,11 +18,6 @@ PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
 # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
 HEIGHT = 1.5
-
-RUN = 3.6
-"""Way of a throw from rest to rest [m], released half way: over a shorter one the payload would
-trail as high as the rotors.
-"""
 
 
 @dataclass(frozen=True)
@@ -120,46 +118,17 @@ def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
 
 
-def _hold_at(x=0.0, y=0.0, z=HEIGHT) -> Callable[[np.ndarray], np.ndarray]:
-    def path(t: np.ndarray) -> np.ndarray:
-        parts = [part(t) if callable(part) else np.full_like(t, part) for part in (x, y, z)]
-        return np.column_stack(parts)
-
-    return path
-
-
-def _passes(
-    length: float, speeds: tuple[float, ...]
-) -> tuple[Callable[[np.ndarray], np.ndarray], float]:
-    """Back and forth over a length, each way in the time that its mean speed takes, a second
-    between.
-    """
-
-    def position(t: np.ndarray) -> np.ndarray:
-        value = np.zeros_like(t)
-        begin = 0.0
-        forth = 1.0
-        for speed in speeds:
-            value += forth * length * rise(t, begin, length / speed)
-            begin = begin + length / speed + 1.0
-            forth = -forth
-        return value - 0.5 * length
-
-    return position, sum(length / speed + 1.0 for speed in speeds)
+def _doublets(t: np.ndarray) -> np.ndarray:
+    """Rates of 3 rad/s about roll, pitch and yaw in turn, every 0.8 s, 0.08 s there and back."""
+    out = np.zeros((len(t), 3))
+    number = np.floor(t / 0.8).astype(int)
+    phase = np.mod(t, 0.8)
+    out[np.arange(len(t)), number % 3] = 3.0 * (1.0 * (phase < 0.08) - _between(phase, 0.08, 0.16))
+    return out
 
 
-def _doublets(size: float, width: float) -> Callable[[np.ndarray], np.ndarray]:
-    """Roll, pitch and yaw in turn, every 0.8 s, there and back."""
-
-    def rates(t: np.ndarray) -> np.ndarray:
-        out = np.zeros((len(t), 3))
-        number = np.floor(t / 0.8).astype(int)
-        phase = np.mod(t, 0.8)
-        value = size * ((phase < width) * 1.0 - ((phase >= width) & (phase < 2 * width)))
-        out[np.arange(len(t)), number % 3] = value
-        return out
-
-    return rates
+def _between(t: np.ndarray, begin: float, end: float) -> np.ndarray:
+    return (t >= begin) & (t < end)
 
 
 def _steps(t: np.ndarray) -> np.ndarray:
@@ -167,7 +136,7 @@ def _steps(t: np.ndarray) -> np.ndarray:
     height back.
     """
     phase = np.mod(t, 1.5)
-    return 1.0 + 0.4 * ((phase < 0.15) * 1.0 - ((phase >= 0.15) & (phase < 0.3)))
+    return 1.0 + 0.4 * ((phase < 0.15) * 1.0 - _between(phase, 0.15, 0.3))
 
 
 def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
@@ -185,8 +154,10 @@ def _stop(t: np.ndarray) -> np.ndarray:
     return velocity - distance * rise(t, 3.9, 2.5) - 0.5 * distance
 
 
-def _run(speed: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda t: RUN * rise(t, 0.0, RUN * 1.875 / speed) - 0.5 * RUN
+def _sine(t: np.ndarray) -> np.ndarray:
+    """Height that swings by 0.25 m at 0.8 Hz, begun and ended within a second."""
+    grown = rise(t, 0.0, 1.0) * (1.0 - rise(t, 5.0, 1.0))
+    return HEIGHT + 0.25 * np.sin(2 * np.pi * 0.8 * t) * grown
 
 
 def _round(t: np.ndarray) -> np.ndarray:
@@ -194,108 +165,38 @@ def _round(t: np.ndarray) -> np.ndarray:
     return 4.0 * np.pi * rise(t, 0.0, 8.0)
 
 
-def _turns(t: np.ndarray) -> np.ndarray:
-    return 0.5 * np.pi * sum(rise(t, 2.0 + 3.0 * i, 1.0) for i in range(4))
+SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "sine": _sine,
+    "stop": _stop,
+    "cosine": lambda t: np.cos(_round(t)),
+    "turning sine": lambda t: np.sin(_round(t)),
+    "doublets": _doublets,
+    "steps": _steps,
+}
+"""What the table of manoeuvres names."""
+
+
+def _along(shape: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a function of time: a named shape, or a value and its rises, each with its size, its
+    begin and its length [s].
+    """
+    if isinstance(shape, str):
+        return SHAPES[shape]
+    start, *rises = shape if isinstance(shape, list) else [shape]
+    return lambda t: start + sum((size * rise(t, *span) for size, *span in rises), 0.0 * t)
+
+
+def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
+    axes = [_along(row.pop(a, default)) for a, default in zip("xyz", (0.0, 0.0, HEIGHT))]
+    shapes = {key: _along(row.pop(key)) for key in ("yaw", "rates", "thrust") if key in row}
+
+    def path(t: np.ndarray) -> np.ndarray:
+        return np.column_stack([axis(t) for axis in axes])
+
+    return Manoeuvre(name, path=path, **shapes, **row)
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:
     """All manoeuvres, in the order in which they would be flown on a day."""
-    slow, slow_time = _passes(3.0, (0.8, 0.8, 1.2, 1.2))
-    fast, fast_time = _passes(4.8, (1.6, 1.6, 1.9, 1.9))
-    runs = tuple(
-        Manoeuvre(
-            f"throw at {speed:.0f} m/s",
-            "when the payload leaves, at several speeds and pulls",
-            2.8 + RUN * 1.875 / speed,
-            _hold_at(x=_run(speed), z=1.7),
-            release=0.5 * RUN * 1.875 / speed,
-        )
-        for speed in (2.0, 3.0, 4.0)
-    )
-    return (
-        Manoeuvre(
-            "hover", "thrust against weight, battery, frame against gravity", 8.0, _hold_at()
-        ),
-        Manoeuvre(
-            "hover without payload",
-            "thrust against the vehicle's weight alone",
-            7.0,
-            _hold_at(),
-            payload=False,
-        ),
-        Manoeuvre(
-            "hover low without payload",
-            "ground effect",
-            11.0,
-            _hold_at(
-                z=lambda t: (
-                    0.6
-                    - 0.3 * rise(t, 0.0, 1.5)
-                    - 0.15 * rise(t, 4.0, 1.0)
-                    - 0.04 * rise(t, 6.5, 0.7)
-                )
-            ),
-            payload=False,
-        ),
-        Manoeuvre(
-            "vertical sine",
-            "drag and inflow along the rotors' axis, delay against clock",
-            8.0,
-            _hold_at(
-                z=lambda t: (
-                    HEIGHT
-                    + 0.25
-                    * np.sin(2 * np.pi * 0.8 * t)
-                    * rise(t, 0.0, 1.0)
-                    * (1.0 - rise(t, 5.0, 1.0))
-                )
-            ),
-        ),
-        Manoeuvre("thrust steps", "motor lag, thrust curve", 8.0, _hold_at(), thrust=_steps),
-        Manoeuvre(
-            "rate doublets",
-            "motor lag, rate controller, inertia, delay",
-            8.0,
-            _hold_at(),
-            rates=_doublets(3.0, 0.08),
-        ),
-        Manoeuvre(
-            "yaw turns",
-            "centre of mass and markers (turn along) against frame and wind (stay)",
-            16.0,
-            _hold_at(),
-            yaw=_turns,
-        ),
-        Manoeuvre(
-            "slow passes x",
-            "drag along x, both ways: wind against drag",
-            2.0 + slow_time,
-            _hold_at(x=slow),
-        ),
-        Manoeuvre("slow passes y", "drag along y, both ways", 2.0 + slow_time, _hold_at(y=slow)),
-        Manoeuvre(
-            "fast passes x",
-            "drag that grows with the square of the speed, lift by translation",
-            2.0 + fast_time,
-            _hold_at(x=fast),
-        ),
-        Manoeuvre(
-            "circle",
-            "drag in all directions, lever arms",
-            10.0,
-            _hold_at(x=lambda t: np.cos(_round(t)), y=lambda t: np.sin(_round(t))),
-        ),
-        Manoeuvre(
-            "swing and decay",
-            "rope length by period, damping by decay, payload drag",
-            9.0,
-            _hold_at(x=lambda t: 0.35 * rise(t, 0.0, 0.8)),
-        ),
-        Manoeuvre(
-            "stop after speed",
-            "rope mass and bending, payload's second mode, mount",
-            9.0,
-            _hold_at(x=_stop),
-        ),
-        *runs,
-    )
+    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    return tuple(_manoeuvre(name, row) for name, row in table.items())

@@ -23,6 +23,9 @@ from visthrow.view.parts import png_of
 WIDTH = 9.2  # [inch]
 BEFORE = style.COLOURS[1]
 AFTER = style.COLOURS[0]
+REFERENCE = ("x [m]", "y [m]", "z [m]", "heading [deg]", "thrust [%]")
+REFERENCE += tuple(f"rate {axis} [rad/s]" for axis in "xyz")
+"""What is drawn of a reference, in the order of its columns."""
 SHOWN_WINDOWS = 3
 SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
@@ -90,22 +93,14 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
 
     ``rates``: expected nats a second of manoeuvres by their name.
     """
-    rows = {
-        "x [m]": lambda r: r.pos_w[:, 0],
-        "y [m]": lambda r: r.pos_w[:, 1],
-        "z [m]": lambda r: r.pos_w[:, 2],
-        "heading [deg]": lambda r: np.degrees(r.yaw),
-        "thrust [%]": lambda r: 100.0 * (r.thrust_factor - 1.0),
-        "rate x [rad/s]": lambda r: r.rates_b[:, 0],
-        "rate y [rad/s]": lambda r: r.rates_b[:, 1],
-        "rate z [rad/s]": lambda r: r.rates_b[:, 2],
-    }
     figure, axes = _figure(3, 3, 6.2)
-    for axis, (label, value) in zip(axes.flat, rows.items()):
-        for manoeuvre, colour in ((base, BEFORE), (designed, AFTER)):
-            reference = manoeuvre.reference()
-            axis.plot(reference.time, value(reference), color=colour, lw=1.0, label=manoeuvre.name)
-        axis.set(ylabel=label, xlabel="time [s]")
+    for manoeuvre, colour in ((base, BEFORE), (designed, AFTER)):
+        r = manoeuvre.reference()
+        percent = 100.0 * (r.thrust_factor - 1.0)
+        columns = np.column_stack((r.pos_w, np.degrees(r.yaw), percent, r.rates_b)).T
+        for axis, label, values in zip(axes.flat, REFERENCE, columns):
+            axis.plot(r.time, values, color=colour, lw=1.0, label=manoeuvre.name)
+            axis.set(ylabel=label, xlabel="time [s]")
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     best = sorted(rates, key=rates.get)[-6:]
     axes[2, 2].barh(
