@@ -142,8 +142,7 @@ class Pilot:
             if camera_params is None:
                 raise PolicyError("a vision policy needs a camera; got none")
             camera_params = by_own_rule(policy, camera_params)
-            seen = {"camera": camera_conditions(camera_params)}
-            policy.require(seen, sections={"camera"}, allow=allow)
+            policy.require({"camera": camera_conditions(camera_params)}, {"camera"}, allow)
         self.policy = policy
         self.count = count
         if camera_params is None:
@@ -156,9 +155,8 @@ class Pilot:
         self._decide = Compiled(self._decision)
         self._later = np.zeros(count, dtype=bool)
         self.spent = (0.0, 0.0)
-        self._first = np.array(
-            [act.hover_action(GRAVITY * mass, self._max_thrust)], dtype=np.float32
-        )
+        first = act.hover_action(GRAVITY * mass, self._max_thrust)
+        self._first = np.array([first], dtype=np.float32)
         self.start()
 
     def start(self) -> None:
