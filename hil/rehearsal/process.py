@@ -1,13 +1,13 @@
 """The fake autopilot's process: a fake around an injected plant, flown in real time."""
 
 import contextlib
-import importlib
 import inspect
 import json
 import math
 import signal
 from collections.abc import Sequence
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from hil.control.realtime import collected
@@ -28,7 +28,7 @@ def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ())
     that makes no plant of these two.
     """
     try:
-        make = _named(target)
+        make = resolve_name(target)
         given = (policy, seed, *([changes] if changes else []))
         inspect.signature(make).bind(*given)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
@@ -48,14 +48,9 @@ def load_fake(kind: str) -> type[Fake]:
     if ":" not in target:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, FAKES)}, or module:class")
     try:
-        return _named(target)
+        return resolve_name(target)
     except (ImportError, AttributeError) as error:
         raise RunError(f"fake of kind '{kind}': {error}; expected module:class") from error
-
-
-def _named(target: str) -> Any:
-    module, _, name = target.partition(":")
-    return getattr(importlib.import_module(module), name)
 
 
 def serve(

@@ -1,6 +1,6 @@
 """Which schema each folder of configs, and each file that differs from its folder, is read with."""
 
-import importlib
+from pkgutil import resolve_name
 
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.toml_text import tables_beside
@@ -19,8 +19,7 @@ def schema_of(kind: str, name: str = "") -> type:
             f"no kind of config '{kind}';"
             f" {suggest(kind, (key for key in SCHEMAS if '/' not in key))}"
         )
-    module, attribute = target.split(":")
-    return getattr(importlib.import_module(module), attribute)
+    return resolve_name(target)
 
 
 def kinds_of(schema: type) -> list[str]:
