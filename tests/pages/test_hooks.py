@@ -1,5 +1,6 @@
 """The reference prints itself: every key of the shipped configurations, every command."""
 
+from dataclasses import fields
 from types import SimpleNamespace
 
 from pytest import mark
@@ -8,6 +9,8 @@ from docs import hooks
 from tests.pages.blocks import ROOT, pages
 from visthrow import __version__, cli, config
 from visthrow.config import kinds
+from visthrow.logs.check.thrust_checks import INPUTS
+from visthrow.logs.mapping import ChannelMap, Split, TimeColumn
 
 SHOWN = [
     found for page in pages() for found in hooks.KEYS.findall(page.read_text(encoding="utf-8"))
@@ -22,6 +25,12 @@ def test_every_key_has_a_row(kind, name, only):
     keys = values[only] if only else values
     assert keys
     assert all(f"| `{key}` |" in text for key in keys)
+
+
+def test_the_page_shows_what_a_mapping_may_say_without_being_built():
+    page = (ROOT / "docs/reference/models.md").read_text("utf-8")
+    keys = [f.name for cls in (TimeColumn, ChannelMap, Split) for f in fields(cls)]
+    assert not [name for name in (*keys, *INPUTS, "acc_b", "pos_w") if f"`{name}`" not in page]
 
 
 def test_a_row_has_unit_value_and_source():

@@ -92,9 +92,10 @@ class ChannelMap(Bounded):
             return
         ours = "1" if self.kind != "vector" else to_si(self.unit, where)[0]
         if ours not in spec.unit.split(", "):
+            kinds = f"; expected kind, one of {', '.join(_WIDTH)}" if "quat" in self.name else ""
             raise ConfigError(
                 f"{where}: unit '{self.unit}' is of the kind '{ours}'; the channel is in"
-                f" '{spec.unit}'"
+                f" '{spec.unit}'{kinds}"
             )
 
 

@@ -1,6 +1,6 @@
 """Units at the edge of the house: what each is worth in ours."""
 
-from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.errors import ConfigError
 from visthrow.common.toml_text import tables_beside
 
 G = 9.80665  # standard gravity [m/s^2]: what a datasheet's g and gram-force mean; not the local one
@@ -18,5 +18,5 @@ def to_si(unit: str, where: str) -> tuple[str, float]:
     Raises ConfigError: an unknown unit.
     """
     if unit not in UNITS:
-        raise ConfigError(f"{where}: unit '{unit}'; {suggest(unit, UNITS)}")
+        raise ConfigError(f"{where}: unit '{unit}'; known: {', '.join(UNITS)}")
     return UNITS[unit]

@@ -256,7 +256,9 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert {f["verdict"] for f in data["findings"]} <= set(result.VERDICTS)
     assert set(data["theta"]) == set(TRUTH)
     assert data["gain"]["channels"][0]["channel"] == "pos_w"
-    text = report.summary(degenerate)
+    weighed = [replace(f, partners=(*f.partners, "mass_quad")) for f in degenerate.findings]
+    text = report.summary(replace(degenerate, findings=tuple(weighed)))
+    assert "weigh the vehicle (--measured mass_quad=0.0003)" in text
     assert "CLASS" in text
     assert "cannot tell it from" in text
 

@@ -612,6 +612,13 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
         assert cli.main([*check_with, setup, *(str(tmp_path / file) for file in files)]) in (0, 1)
 
 
+def test_a_thrust_that_the_model_reads_and_the_log_lacks_is_a_warning():
+    log = log_of(flight(5.0), thrust_cmd=Channel(np.arange(9.0), np.ones(9), "N"))
+    (row,) = thrust_checks.look(log, KnownVehicle(thrust_input="thrust_command"))
+    assert row.verdict == "warn"
+    assert "did you mean 'thrust_cmd'?" in row.text
+
+
 @mark.parametrize(("mass", "hangs"), [(0.15, True), (0.25, False)])
 def test_a_thrust_that_carries_more_than_the_model_weighs_hints_at_a_load(mass, hangs):
     rows = thrust_checks.look(log_of(flight(20.0)), KnownVehicle(mass=mass))

@@ -396,6 +396,7 @@ class TestTables:
         [
             ({"unit": "parsec"}, "unit 'parsec'"),
             ({"unit": "deg"}, "is of the kind 'rad'"),
+            ({"name": "quat_wb", "unit": "deg"}, "expected kind, one of quaternion, euler"),
             ({"columns": ()}, "no columns"),
             ({"axes": "x,y"}, "expected x, y and z once each"),
             ({"axes": "x,y,-z"}, "mirror the world"),

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from visthrow.diagnose.inputs.measures import MEASUREMENTS
 from visthrow.diagnose.likelihood.forms import HEAD_SECONDS
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
@@ -47,11 +48,12 @@ def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]
     moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
     moves = {name: f" It moves landings by {1e3 * size:.0f} mm." for name, size in moved.items()}
     named = [f for f in diagnosis.findings if f.verdict in result.NAMED]
-    separations = {
-        f.name: f" To tell them apart: {'; '.join(f.manoeuvres)}."
-        for f in named
-        if f.partners and f.manoeuvres
-    }
+    measured = {m.effect: f"{m.name} (--measured {m.effect}={m.sd:g})" for m in MEASUREMENTS}
+    separations = {}
+    for f in named:
+        ways = [*f.manoeuvres, *(measured[n] for n in (f.name, *f.partners) if n in measured)]
+        if f.partners and ways:
+            separations[f.name] = f" To tell them apart: {'; '.join(ways)}."
     named_findings = [
         (f.verdict, f.sentence + moves.get(f.name, "") + separations.get(f.name, "")) for f in named
     ]

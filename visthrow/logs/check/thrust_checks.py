@@ -4,6 +4,7 @@ and rotor against rotor.
 
 import numpy as np
 
+from visthrow.common.errors import suggest
 from visthrow.common.rotations import rotate_back
 from visthrow.logs.check import relations
 from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
@@ -112,6 +113,10 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     """Hold the thrust against the force along body z, by the accelerometer and by the path:
     vibration spoils the one, a draught none.
     """
+    driver = vehicle.thrust_input
+    if driver and driver not in log:
+        text = f"the model reads it, and the log lacks it; {suggest(driver, log.channels)}"
+        return [Row("thrust", driver, "warn", text)]
     thrust = thrust_of(log, vehicle)
     if thrust is None or np.median(thrust[2]) <= 0.0:
         return []
