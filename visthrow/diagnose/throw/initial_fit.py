@@ -31,10 +31,6 @@ DAMPING, DAMPING_MOST = (
     1e5,
 )  # of the Levenberg-Marquardt steps: at first, and where a window counts as settled
 ROUNDS = 25
-LADDER = np.array([1.0, 10.0, 100.0, 1000.0])
-"""Dampings that are tried at once, in the one at hand, for windows whose last step did not bring
-what it promised.
-"""
 DRIFT = 0.02, 0.02, 0.02, 0.04
 """Deviation that gusts bring a flight to in a second: position [m], attitude [rad], payload [m],
 rate [rad/s]. Fitted as though there were none, states took their place: bends of the rope of ten
@@ -53,9 +49,7 @@ SHRINKING = 0.1
 """Of what the next step promises against what the last one did, below which derivatives from
 elsewhere lead to the goal.
 """
-# What a step must bring for derivatives to be used further:
-TRUE = 0.5  # of what it promised
-WHOLE = 0.8  # of what the least damped step promised
+TRUE = 0.5  # of what it promised, which a step must bring for derivatives to be used further
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
 FITTED_SPAN = 0.25  # before that, without which an initial state is fitted to the whole window [s]
@@ -72,9 +66,7 @@ class _Trial:
     """A step of each of L windows."""
 
     states: States  # where it leads
-    damping: np.ndarray  # shape (L,)
     hoped: np.ndarray  # fall of the cost that it promises, shape (L,)
-    whole: np.ndarray  # that of the least damped one that was tried, shape (L,)
     cost: np.ndarray  # there, shape (L,)
     residuals: list[np.ndarray]
 
@@ -134,17 +126,15 @@ class InitialFit:
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals, cost = self._best(starts)
         stale = ~aged
-        doubtful = np.zeros(count, dtype=bool)
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, remaining[stale[remaining]])
             aged &= ~stale
-            trial = self._tried(states, remaining, residuals, damping, doubtful)
+            trial = self._tried(states, remaining, residuals, damping[remaining])
             helps = trial.cost < cost[remaining]
-            tried, hoped, whole = (np.full(count, value) for value in (np.inf, 0.0, 0.0))
+            tried = np.full(count, np.inf)
+            hoped = np.zeros(count)
             tried[remaining] = trial.cost
-            hoped[remaining] = np.where(helps, trial.hoped, trial.whole)
-            whole[remaining] = trial.whole
-            damping[remaining] = np.where(helps, trial.damping, damping[remaining])
+            hoped[remaining] = trial.hoped
             better = tried < cost
             rows = np.flatnonzero(helps)
             residuals |= {remaining[row]: trial.residuals[row] for row in rows}
@@ -157,11 +147,9 @@ class InitialFit:
             settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < tolerance) & (
                 damping <= DAMPING
             )
-            true = (fall > TRUE * hoped) & (hoped > WHOLE * whole)
-            stale = np.where(better, ~settled & (little | ~true), aged & ~settled)
-            raised = damping * np.where(doubtful, 10.0 * LADDER[-1], 10.0)
-            damping = np.where(better, damping / 10.0, np.where(aged, damping, raised))
-            doubtful = ~(better & true)
+            stale = np.where(better, ~settled & (little | (fall <= TRUE * hoped)), aged & ~settled)
+            raised = np.where(aged, damping, 10.0 * damping)
+            damping = np.where(better, damping / 10.0, raised)
             promised = np.where(better, hoped, promised)
             aged = aged | better
             cost = np.where(better, tried, cost)
@@ -214,37 +202,20 @@ class InitialFit:
         states: States,
         windows: np.ndarray,
         residuals: Mapping[int, np.ndarray],
-        damping: np.ndarray,
-        doubtful: np.ndarray,
+        dampings: np.ndarray,
     ) -> _Trial:
-        """The next step of each window that is left, or the best of several."""
-        rungs = np.where(doubtful[windows], len(LADDER), 1)
-        which = np.repeat(windows, rungs)
-        first = np.cumsum(rungs) - rungs
-        dampings = [damping[w] * LADDER[:n] for w, n in zip(windows, rungs)]
+        """The next step of each window that is left, with its damping."""
         parallel_map(self._scaled, windows)
-        trials = [
-            self._increments(w, residuals[w], states[MOVED][w], its)
-            for w, its in zip(windows, dampings)
+        increments = [
+            self._increment(w, residuals[w], states[MOVED][w], damping)
+            for w, damping in zip(windows, dampings)
         ]
-        tries = np.concatenate(dampings)
-        steps, hoped = map(np.concatenate, zip(*trials))
-        states_moved = moved_along(rows_of(states, which), self.directions, steps)
+        steps, hoped = map(np.array, zip(*increments))
+        states_moved = moved_along(rows_of(states, windows), self.directions, steps)
         states_moved[MOVED] = states_moved[MOVED] + steps
-        left_over = self._residuals(states_moved, which)
-        cost = np.array([self._cost(w, residual) for w, residual in zip(which, left_over)])
-        best = np.array(
-            [start + cost[start : start + n].argmin() for start, n in zip(first, rungs)]
-        )
-        best_residuals = [left_over[lane] for lane in best]
-        return _Trial(
-            rows_of(states_moved, best),
-            tries[best],
-            hoped[best],
-            hoped[first],
-            cost[best],
-            best_residuals,
-        )
+        reached = self._residuals(states_moved, windows)
+        cost = np.array([self._cost(w, residual) for w, residual in zip(windows, reached)])
+        return _Trial(states_moved, hoped, cost, reached)
 
     def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
         """Residuals of windows, of what depends on their initial states; a row of the states for
@@ -323,30 +294,26 @@ class InitialFit:
             scales = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
         return scales[2]
 
-    def _increments(
-        self, w: int, residual: np.ndarray, done: np.ndarray, dampings: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Levenberg-Marquardt steps of a window's state with its vague prior, and the falls that
-        they promise.
+    def _increment(
+        self, w: int, residual: np.ndarray, done: np.ndarray, damping: float
+    ) -> tuple[np.ndarray, float]:
+        """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,),
+        and the fall of the cost that it promises.
 
-        ``done``: how far it has been moved, shape (directions,); ``dampings``: of the steps, shape
-        (T,). Returns steps, shape (T, directions); falls of the cost, shape (T,)."""
+        ``done``: how far it has been moved, shape (directions,)."""
         ds = self._free[w]
         sd, scaled, bend = self._scaled(w)
         off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         if np.any(weight < 1.0):
             bend = scaled.T @ (scaled * weight[:, None])
-        diagonal = bend.diagonal() + 1.0
         slope = scaled.T @ (off * weight)
-        damped = np.repeat(bend[None], len(dampings), axis=0)
-        damped.reshape(len(dampings), -1)[:, :: len(ds) + 1] = (
-            diagonal + dampings[:, None] * diagonal
-        )
-        step = np.linalg.solve(damped, (slope - done[ds] / sd)[:, None])[..., 0]
-        out = np.zeros((len(dampings), len(done)))
-        out[:, ds] = step * sd
-        return out, step @ slope - 0.5 * np.sum(step @ bend * step, axis=1)
+        diagonal = (1.0 + damping) * (bend.diagonal() + 1.0)
+        damped = bend - np.diag(bend.diagonal()) + np.diag(diagonal)
+        step = np.linalg.solve(damped, slope - done[ds] / sd)
+        out = np.zeros(len(done))
+        out[ds] = step * sd
+        return out, step @ slope - 0.5 * step @ bend @ step
 
 
 def drift(flights: ReplayedFlights, w: int) -> np.ndarray:
