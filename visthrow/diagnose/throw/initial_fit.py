@@ -45,10 +45,6 @@ GROWTH = (
 )  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
 HUBER = 30.0  # deviations, beyond which a sample counts less
 SETTLED = 1.0, 0.01  # fall of the cost, and relative one, below which an initial state is settled
-SHRINKING = 0.1
-"""Of what the next step promises against what the last one did, below which derivatives from
-elsewhere lead to the goal.
-"""
 TRUE = 0.5  # of what it promised, which a step must bring for derivatives to be used further
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
 EARLIER = 0.05  # by which a payload may leave before it is expected to [s]
@@ -102,9 +98,6 @@ class InitialFit:
         # deviation of each window's samples from a flight without gusts: noise, and how far gusts
         # may have led by then
         self._spreads = [np.hypot(flights.sigma[w], spread) for w, spread in enumerate(self._drift)]
-        self._scales: dict[
-            int, tuple
-        ] = {}  # the last slopes and deviations of a window, and what comes of them
         self._sensitive, ends = zip(
             *[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))]
         )
@@ -121,7 +114,6 @@ class InitialFit:
         count = len(self.flights.cuts)
         damping = np.full(count, DAMPING)
         remaining = self.retained
-        promised = np.full(count, np.inf)
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
         states, residuals, cost = self._best(starts)
@@ -144,19 +136,15 @@ class InitialFit:
             fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
             tolerance = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
             little = better & (fall < tolerance)
-            settled = little & (~aged | (hoped < SHRINKING * promised)) | (hoped < tolerance) & (
-                damping <= DAMPING
-            )
+            settled = little & ~aged | (hoped < tolerance) & (damping <= DAMPING)
             stale = np.where(better, ~settled & (little | (fall <= TRUE * hoped)), aged & ~settled)
             raised = np.where(aged, damping, 10.0 * damping)
             damping = np.where(better, damping / 10.0, raised)
-            promised = np.where(better, hoped, promised)
             aged = aged | better
             cost = np.where(better, tried, cost)
             for w in remaining[settled[remaining]]:
                 if self._lower_gusts(w, residuals[w]):
                     settled[w] = False
-                    promised[w] = np.inf
                     cost[w] = self._cost(w, residuals[w])
             remaining = remaining[~settled[remaining] & (damping[remaining] < DAMPING_MOST)]
             if not len(remaining):
@@ -205,12 +193,8 @@ class InitialFit:
         dampings: np.ndarray,
     ) -> _Trial:
         """The next step of each window that is left, with its damping."""
-        parallel_map(self._scaled, windows)
-        increments = [
-            self._increment(w, residuals[w], states[MOVED][w], damping)
-            for w, damping in zip(windows, dampings)
-        ]
-        steps, hoped = map(np.array, zip(*increments))
+        columns = windows, [residuals[w] for w in windows], states[MOVED][windows], dampings
+        steps, hoped = map(np.array, zip(*parallel_map(self._increment, *columns)))
         states_moved = moved_along(rows_of(states, windows), self.directions, steps)
         states_moved[MOVED] = states_moved[MOVED] + steps
         reached = self._residuals(states_moved, windows)
@@ -281,19 +265,6 @@ class InitialFit:
             slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._sensitive[w][:, None]
         return slopes
 
-    def _scaled(self, w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Prior deviations of a window's state, its derivatives in these and the samples'
-        deviations, and their inner products.
-        """
-        slopes = self.slopes[w]
-        spread = self._spreads[w]
-        scales = self._scales.get(w)
-        if scales is None or scales[0] is not slopes or scales[1] is not spread:
-            sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in self._free[w]])
-            scaled = slopes * sd / spread[:, None]
-            scales = self._scales[w] = slopes, spread, (sd, scaled, scaled.T @ scaled)
-        return scales[2]
-
     def _increment(
         self, w: int, residual: np.ndarray, done: np.ndarray, damping: float
     ) -> tuple[np.ndarray, float]:
@@ -302,11 +273,11 @@ class InitialFit:
 
         ``done``: how far it has been moved, shape (directions,)."""
         ds = self._free[w]
-        sd, scaled, bend = self._scaled(w)
+        sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
+        scaled = self.slopes[w] * sd / self._spreads[w][:, None]
         off = residual / self._spreads[w]
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
-        if np.any(weight < 1.0):
-            bend = scaled.T @ (scaled * weight[:, None])
+        bend = scaled.T @ (scaled * weight[:, None])
         slope = scaled.T @ (off * weight)
         diagonal = (1.0 + damping) * (bend.diagonal() + 1.0)
         damped = bend - np.diag(bend.diagonal()) + np.diag(diagonal)
