@@ -21,13 +21,6 @@ MOST = 13
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
-    "long: visthrow.diagnose.extend.apply_cli.add_arguments",
-    "long: visthrow.diagnose.extend.apply_cli.run",
-    "long: visthrow.diagnose.extend.patch.text",
-    "long: visthrow.diagnose.inputs.proposal._flyer",
-    "long: visthrow.diagnose.inputs.proposal._weighed",
-    "long: visthrow.diagnose.reporting.plan_cli.run",
-    "long: visthrow.diagnose.reporting.diagnosis_report.sections",
     "long: visthrow.diagnose.select.scatter.varying",
     "long: visthrow.diagnose.select.verdicts.conclude",
 }

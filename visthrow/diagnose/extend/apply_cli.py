@@ -23,57 +23,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         " diagnose explain others.csv --config mine.toml              of another model: its worth"
         " on flights that it never saw\n"
     )
-    parser.add_argument(
-        "diagnosis",
-        metavar="FILE",
-        help="diagnosis.json of an explain, or a blackbox: its firmware's rate controller",
+    add = parser.add_argument
+    what = "diagnosis.json of an explain, or a blackbox: its firmware's rate controller"
+    add("diagnosis", metavar="FILE", help=what)
+    what = "the configuration that was diagnosed (default: as it says; with a blackbox "
+    what += f"{DEFAULT_PLANT})"
+    add("--plant", metavar="NAME", help=what)
+    add("--config", metavar="NAME", help="likewise the setup, of another model than the throw")
+    what = "to write (default: extended.toml)"
+    add("--out", metavar="FILE", default="extended.toml", help=what)
+    what = "plants that training draws from the joint posterior; 1: the estimate alone (default: "
+    what += f"{DEFAULT_PLANTS})"
+    add("--plants", type=int, default=DEFAULT_PLANTS, metavar="N", help=what)
+    what = (
+        "write the laws of the N-th best explanation outside the catalogue, which belong together,"
+        " as well (default: 0, none)"
     )
-    parser.add_argument(
-        "--plant",
-        metavar="NAME",
-        help=(
-            "the configuration that was diagnosed (default: as it says; with a blackbox"
-            f" {DEFAULT_PLANT})"
-        ),
-    )
-    parser.add_argument(
-        "--config", metavar="NAME", help="likewise the setup, of another model than the throw"
-    )
-    parser.add_argument(
-        "--out", metavar="FILE", default="extended.toml", help="to write (default: extended.toml)"
-    )
-    parser.add_argument(
-        "--plants",
-        type=int,
-        default=DEFAULT_PLANTS,
-        metavar="N",
-        help=(
-            "plants that training draws from the joint posterior; 1: the estimate alone (default:"
-            f" {DEFAULT_PLANTS})"
-        ),
-    )
-    parser.add_argument(
-        "--laws",
-        type=int,
-        default=0,
-        metavar="N",
-        help=(
-            "write the laws of the N-th best explanation outside the catalogue, which belong"
-            " together, as well (default: 0, none)"
-        ),
-    )
-    parser.add_argument(
-        "--hover", type=NUMBER, metavar="SHARE", help="with a blackbox: throttle in hover, 0 to 1"
-    )
-    parser.add_argument(
-        "--delay",
-        type=NUMBER,
-        metavar="S",
-        help="with a blackbox: from a command to the mixer, where it is known [s]",
-    )
-    parser.add_argument(
-        "--anyway", action="store_true", help="write it even if held-out flights saw no gain"
-    )
+    add("--laws", type=int, default=0, metavar="N", help=what)
+    what = "with a blackbox: throttle in hover, 0 to 1"
+    add("--hover", type=NUMBER, metavar="SHARE", help=what)
+    what = "with a blackbox: from a command to the mixer, where it is known [s]"
+    add("--delay", type=NUMBER, metavar="S", help=what)
+    add("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,25 +54,12 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.extend import patch
     from visthrow.diagnose.inputs import setup
-    from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT, THROW
+    from visthrow.diagnose.inputs.model_arguments import THROW
     from visthrow.logs import BLACKBOX
     from visthrow.task import Experiment
 
     if Path(args.diagnosis).suffix.lower() in BLACKBOX:
-        if args.hover is None:
-            raise DiagnoseError(
-                "a blackbox without --hover; expected the share of throttle in hover, such as"
-                " --hover 0.36"
-            )
-        plant = args.plant or DEFAULT_PLANT
-        base = _named("train", plant)
-        experiment = config.load(Experiment, config.find("train", plant))
-        atomic_write(
-            args.out, patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
-        )
-        config.load(Experiment, Path(args.out))
-        print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
-        return 0
+        return _apply_firmware(args)
     try:
         report = json.loads(Path(args.diagnosis).read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -118,15 +76,10 @@ def run(args: argparse.Namespace) -> int:
         patch.refuse_strange(report, args.diagnosis, theta)
         theta, covariance = patch.with_scatter(theta, covariance, report)
     if not theta and not laws:
-        unused = (
-            ", but a law outside the catalogue explains the flights: --laws 1 writes it"
-            if report.get("laws")
-            else ""
-        )
-        print(
-            f"nothing was named{unused}; the {'configuration' if of_throw else 'setup'} stands as"
-            " it is"
-        )
+        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
+        unused = unused if report.get("laws") else ""
+        what = "configuration" if of_throw else "setup"
+        print(f"nothing was named{unused}; the {what} stands as it is")
         return 0
     _bear_out(report, args.anyway)
     folder, option, schema = (
@@ -147,14 +100,32 @@ def run(args: argparse.Namespace) -> int:
     config.load(
         schema, Path(args.out)
     )  # what was written is what training, or the next diagnosis, will read
-    named = [
-        *theta,
-        *(
-            f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})"
-            for law in laws
-        ),
-    ]
+    named = list(theta)
+    for law in laws:
+        named.append(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})")
     print(f"{args.out}: {', '.join(named)} on top of {base}")
+    return 0
+
+
+def _apply_firmware(args: argparse.Namespace) -> int:
+    """Write the configuration that flies the rate controller of a blackbox's firmware."""
+    from visthrow.common.storage import atomic_write
+    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
+    from visthrow.task import Experiment
+
+    if args.hover is None:
+        raise DiagnoseError(
+            "a blackbox without --hover; expected the share of throttle in hover, such as"
+            " --hover 0.36"
+        )
+    plant = args.plant or DEFAULT_PLANT
+    base = _named("train", plant)
+    experiment = config.load(Experiment, config.find("train", plant))
+    text = patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
+    atomic_write(args.out, text)
+    config.load(Experiment, Path(args.out))
+    print(f"{args.out}: the rate controller of {args.diagnosis} on top of {base}")
     return 0
 
 

@@ -100,12 +100,23 @@ def text(
     plain = config.load(Experiment, config.find("train", base))
     changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
+    return "\n".join([*lines, *_commented(changed, named, theta, covariance)]).rstrip() + "\n"
+
+
+def _commented(
+    changed: Mapping[str, Any],
+    named: Sequence[Effect],
+    theta: Mapping[str, float],
+    covariance: np.ndarray,
+) -> list[str]:
+    """Return the lines of what changes, each with the effects that change it."""
+    sd = np.sqrt(np.diag(covariance))
     values = {
-        e.name: f"{e.name} {theta[e.name]:+.4g} +- {covariance[i][i] ** 0.5:.2g} {e.unit}"
-        for i, e in enumerate(named)
+        e.name: f"{e.name} {theta[e.name]:+.4g} +- {s:.2g} {e.unit}" for e, s in zip(named, sd)
     }
-    section = ""
     switched = [e.name for e in named if e.switch]
+    lines = []
+    section = ""
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
         path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
@@ -122,7 +133,7 @@ def text(
                 else switched
             )
         lines.append(f"{line}  # {'; '.join(words)}" if words else line)
-    return "\n".join(lines).rstrip() + "\n"
+    return lines
 
 
 def with_scatter(

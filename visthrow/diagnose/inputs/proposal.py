@@ -7,6 +7,7 @@ the derivative of a position, rates are those of the attitude, a payload keeps i
 none of them tells becomes a question."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -1003,9 +1004,8 @@ def _corrected(table: Table, source: str, proposal: MappingProposal, weighed: fl
 def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> FlightLog:
     """Hold the thrust against the mass.
 
-    Returns the log with its thrust in the unit in which it carries what was weighed.
-
-    Raises LogError: in grams it fits, in kilograms it does not.
+    Returns the log with its thrust in the unit in which it carries what was weighed. Raises
+    LogError: see :func:`_unit_by_mass`.
     """
     entry = next((c for c in proposal.mapping.channels if c.name == "thrust_command"), None)
     carried = _carried(log)
@@ -1028,6 +1028,32 @@ def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -
                 f" {masses}"
             )
         return log
+    unit = _unit_by_mass(log, proposal, entry, one, weighed, units)
+    if unit == entry.unit:
+        return log
+    mine = [replace(c, unit=unit) if c is entry else c for c in proposal.mapping.channels]
+    proposal.mapping = replace(proposal.mapping, channels=tuple(mine))
+    channel = log[entry.name]
+    times = UNITS[unit][1] / UNITS[entry.unit][1]
+    return FlightLog(
+        {**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta
+    )
+
+
+def _unit_by_mass(
+    log: FlightLog,
+    proposal: MappingProposal,
+    entry: ChannelMap,
+    one: float,
+    weighed: float,
+    units: Sequence[str],
+) -> str:
+    """Find the unit in which a thrust carries what was weighed, and say why or ask; the one that it
+    has where none does.
+
+    ``one``: what a number of its column carries if it is a newton [kg]. Raises LogError: in grams
+    it fits, in kilograms it does not.
+    """
     unit = unit_evidence.by_mass(one, weighed, units)
     in_grams = (
         unit_evidence.by_mass(one, 1e-3 * weighed, units)
@@ -1041,12 +1067,13 @@ def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -
             f" {weighed / 1e3:g}"
         )
     if not unit:
+        carried = one * UNITS[entry.unit][1]
         proposal.questions.append(
             f"thrust '{entry.columns[0]}' carries {carried:.3g} kg in {entry.unit}, and the vehicle"
             f" weighs {weighed:g} kg: no unit explains that; is it of one motor, of another"
             " vehicle, or no force?"
         )
-        return log
+        return entry.unit
     whole = one * UNITS[unit][1]
     proposal.why[entry.name] += f"; {unit} by the mass: it carries {whole:.4g} kg"
     if np.log(whole / weighed) > thrust_checks.MASS_WARN and "payload_pos_w" not in log:
@@ -1060,15 +1087,7 @@ def _weighed(log: FlightLog, proposal: MappingProposal, weighed: float | None) -
             f"the vehicle weighs {weighed:g} kg and '{entry.columns[0]}' is in {unit}, or"
             f" {weighed:g} g and {in_grams}?"
         )
-    if unit == entry.unit:
-        return log
-    mine = [replace(c, unit=unit) if c is entry else c for c in proposal.mapping.channels]
-    proposal.mapping = replace(proposal.mapping, channels=tuple(mine))
-    channel = log[entry.name]
-    times = UNITS[unit][1] / UNITS[entry.unit][1]
-    return FlightLog(
-        {**log.channels, entry.name: replace(channel, values=times * channel.values)}, log.meta
-    )
+    return unit
 
 
 def _carried(log: FlightLog) -> float | None:
@@ -1107,12 +1126,9 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     small quadrotor at rest air.
     """
     applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
-    if (
-        applied is None
-        or "quat_wb" not in log
-        or "pos_w" not in log
-        or np.median(applied[2]) <= 0.0
-    ):
+    if applied is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
+        return None
+    if np.median(applied[2]) <= 0.0:
         return None
     mass = thrust_checks.mass_of(log)
     gap = None
@@ -1126,19 +1142,16 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     share = 0.85 if gap else 1.0  # of the vehicle in what flies, until both are weighed
     whole = weighed / share if weighed else mass or 1.0
     first = 1.0 if mass else whole * physics.GRAVITY / motors / hover
+    payload = (1.0 - share) * whole
     if weighed is None:
-        why = (
-            "is what its thrust carries"
-            if mass
-            else "stands for any, and the thrust is scaled to it"
-        )
+        why = "stands for any, and the thrust is scaled to it"
+        why = "is what its thrust carries" if mass else why
         proposal.questions.append(
             f"what does the vehicle weigh? {whole:.4g} kg {why}; call map again with --mass KG"
         )
     if gap:
-        proposal.questions.append(
-            f"what does the payload weigh? {(1.0 - share) * whole:.3g} kg is a guess"
-        )
+        proposal.questions.append(f"what does the payload weigh? {payload:.3g} kg is a guess")
+    volts = log["battery_voltage"].values if "battery_voltage" in log else [1.0]
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
     period = float(np.median(np.diff(log["pos_w"].time)))
     table = {
@@ -1150,11 +1163,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         "thrust_map": [float(f"{x:.4g}") for x in power],
         "motor_time_constant": 0.03,
         "command_delay": 0.0,
-        "reference_voltage": (
-            float(np.round(np.median(log["battery_voltage"].values), 2))
-            if "battery_voltage" in log
-            else 1.0
-        ),
+        "reference_voltage": float(np.round(np.median(volts), 2)),
         "voltage_coefficient": 0.0,
         "drag_xy": 0.0,
         "drag_z": 0.0,
@@ -1164,6 +1173,6 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         "every": max(1, round(0.03 / period)),
         "most_windows": 24,
     }
-    return table | (
-        {"cable": {"length": round(gap, 4), "mass": round((1.0 - share) * whole, 5)}} if gap else {}
-    )
+    if gap:
+        table["cable"] = {"length": round(gap, 4), "mass": round(payload, 5)}
+    return table

@@ -5,15 +5,15 @@ A sweep of 20 s holds all frequencies between slow sway and the noise of the gyr
 does not; the autopilot adds it behind the radio, at its own loop's rate. Its blackbox tells the
 set-point with the sweep in it, ArduPilot's log the sweep beside it."""
 
-import tomllib
 from pathlib import Path
 
 from visthrow.common.storage import atomic_write
+from visthrow.common.toml_text import tables_beside
 
 
 def write(folder: str | Path) -> list[Path]:
     """Write the settings of all; returns the files."""
-    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
+    table = tables_beside(__file__)
     files = {"betaflight_chirp.txt": table["betaflight"]}
     for name, numbers in table["axes"].items():
         files[f"ardupilot_systemid_{name}.param"] = table["ardupilot"].format_map(numbers)

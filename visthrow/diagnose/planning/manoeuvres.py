@@ -5,14 +5,14 @@ A pilot or controller follows the position; doublets and thrust steps are added 
 Each stays within a box of a few metres and leaves the payload well below the rotors;
 :meth:`Reference.limits` says when to abort."""
 
-import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from visthrow.common.toml_text import tables_beside
 
 PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
@@ -198,5 +198,4 @@ def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
 
 def catalogue() -> tuple[Manoeuvre, ...]:
     """All manoeuvres, in the order in which they would be flown on a day."""
-    table = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
-    return tuple(_manoeuvre(name, row) for name, row in table.items())
+    return tuple(_manoeuvre(name, row) for name, row in tables_beside(__file__).items())

@@ -168,72 +168,51 @@ def sections(
     parts = [_verdict(diagnosis, gain)]
     work = diagnosis.work
     if work is not None and diagnosis.theta:
-        fitted = (
-            ", with each window's initial state fitted"
-            if any(w.nuisance.size for w in work.after.windows)
-            else ""
-        )
-        variations = tuple(
-            Picture(
-                f"residual_{name}",
-                pictures.residuals(work, c),
-                f"{name}: residuals before and after{fitted}.",
-            )
-            for c, name in enumerate(work.problem.model.channels)
-            if any(np.any(w.channel == c) for w in work.after.windows)
-        )
-        parts.append(Section("residuals", "Residuals before and after", variations))
+        parts.append(_residuals(work))
     if gain is not None:
         parts.append(_gain(gain, diagnosis))
     if diagnosis.steps:
-        rows = tuple(
-            (", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets
-        )
-        alike = (
-            [Grid("Sets of causes that explain the flights as well", ("set", "nats behind"), rows)]
-            if len(rows) > 1
-            else []
-        )
-        text = Text(
-            "Nats of evidence that each candidate would bring, or a set in place of the names"
-            " before; as a line what it must exceed; marks: with the simulation run again (circle:"
-            " taken, triangle: beaten)."
-        )
-        parts.append(
-            Section(
-                "ladder",
-                "Candidates",
-                (
-                    text,
-                    Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates."),
-                    *alike,
-                ),
-            )
-        )
+        parts.append(_candidates(diagnosis))
     if diagnosis.levels:
         parts.append(_levels(diagnosis))
     if diagnosis.laws:
         parts.append(_laws(diagnosis))
     if work is not None:
         parts.append(_catalogue(diagnosis))
-        parts.append(
-            Section(
-                "confusion",
-                "What looks alike",
-                (
-                    Picture(
-                        "confusion",
-                        pictures.confusion(diagnosis),
-                        "Correlation of the estimates with every effect free.",
-                    ),
-                ),
-            )
-        )
+        caption = "Correlation of the estimates with every effect free."
+        alike = Picture("confusion", pictures.confusion(diagnosis), caption)
+        parts.append(Section("confusion", "What looks alike", (alike,)))
     if blind is not None:
         parts.append(_blind(blind, diagnosis))
     parts += _next_flights(diagnosis)
     parts.append(_ground(diagnosis, step_check, provenance))
     return parts
+
+
+def _residuals(work: Any) -> Section:
+    fitted = any(w.nuisance.size for w in work.after.windows)
+    caption = "residuals before and after"
+    caption += ", with each window's initial state fitted." if fitted else "."
+    drawn = tuple(
+        Picture(f"residual_{name}", pictures.residuals(work, c), f"{name}: {caption}")
+        for c, name in enumerate(work.problem.model.channels)
+        if any(np.any(w.channel == c) for w in work.after.windows)
+    )
+    return Section("residuals", "Residuals before and after", drawn)
+
+
+def _candidates(diagnosis: Diagnosis) -> Section:
+    text = Text(
+        "Nats of evidence that each candidate would bring, or a set in place of the names"
+        " before; as a line what it must exceed; marks: with the simulation run again (circle:"
+        " taken, triangle: beaten)."
+    )
+    parts = [text, Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates.")]
+    rows = tuple((", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets)
+    if len(rows) > 1:
+        title = "Sets of causes that explain the flights as well"
+        parts.append(Grid(title, ("set", "nats behind"), rows))
+    return Section("ladder", "Candidates", tuple(parts))
 
 
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:

@@ -5,6 +5,7 @@ reference to fly.
 import argparse
 import math
 from pathlib import Path
+from typing import Any
 
 from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
 from visthrow.common.errors import DiagnoseError, expect_known
@@ -53,11 +54,10 @@ def run(args: argparse.Namespace) -> int:
     """Search, simulate the manoeuvres, optimise, rank, write."""
     import dataclasses
 
-    from visthrow.common.storage import atomic_write, check_place, write_json
+    from visthrow.common.storage import atomic_write, check_place
     from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.planning import design, plan
-    from visthrow.diagnose.planning import manoeuvre_excitation as excitation
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
     from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.reporting import pictures
@@ -93,34 +93,35 @@ def run(args: argparse.Namespace) -> int:
     if designed:
         informed.append((designed.manoeuvre, designed.information))
         rates = {m.name: aim.nats(information) / m.seconds for m, information in informed}
-        atomic_write(
-            Path(args.out) / "plan.png", pictures.planned(designed.base, designed.manoeuvre, rates)
-        )
+        picture = pictures.planned(designed.base, designed.manoeuvre, rates)
+        atomic_write(Path(args.out) / "plan.png", picture)
     ranked = plan.propose(aim, informed)
     for manoeuvre, _ in informed:
         atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.reference().csv())
     _print(ranked)
     session = plan.session(ranked)
     if session:
-        print(
-            "together they settle the most:"
-            f" {', '.join(p.name + f' x{p.repeats}' * (p.repeats > 1) for p in session)}"
-        )
+        times = [p.name + f" x{p.repeats}" * (p.repeats > 1) for p in session]
+        print(f"together they settle the most: {', '.join(times)}")
     extra = {
         "proposals": [dataclasses.asdict(p) for p in ranked],
         "session": [p.name for p in session],
         "optimised": designed.record() if designed else None,
     }
-    value = report.to_json(diagnosis, extra=extra)
+    _write(args, report.to_json(diagnosis, extra=extra))
+    return 0
+
+
+def _write(args: argparse.Namespace, value: dict[str, Any]) -> None:
+    """Write the plan, and settings of autopilots that sweep by themselves."""
+    from visthrow.common.storage import write_json
+    from visthrow.diagnose.planning import manoeuvre_excitation as excitation
+
     write_json(Path(args.out) / "plan.json", value)
-    print(f"references as CSV: {args.out}")
-    print(
-        "sweeps that autopilots fly by themselves:"
-        f" {', '.join(path.name for path in excitation.write(args.out))}"
-    )
+    sweeps = ", ".join(path.name for path in excitation.write(args.out))
+    print(f"references as CSV: {args.out}\nsweeps that autopilots fly by themselves: {sweeps}")
     if args.json:
         write_json(args.json, value)
-    return 0
 
 
 def _limits(args: argparse.Namespace):
