@@ -29,8 +29,9 @@ class MujocoTeam:
         self.team = team
         self.worlds = world.count // team
         pairs, kinds = world.models()
-        masses = [(pairs[kinds[row]][0].body, pairs[kinds[row]][1]) for row in range(world.count)]
-        self._nominal = [_compile(masses[w * team : (w + 1) * team]) for w in range(self.worlds)]
+        members = [pairs[kinds[row]] for row in range(world.count)]
+        teams = [members[first : first + team] for first in range(0, world.count, team)]
+        self._nominal = [_compile(members) for members in teams]
         self._data = [mujoco.MjData(model) for model in self._nominal]
         self._repeats = max(round(world.substep / STEP), 1)
         segments = world.params.rope.segments
@@ -61,8 +62,8 @@ class MujocoTeam:
                 model.body_mass[body] = w.vehicles[row % len(w.vehicles)].body.mass * scale[row]
             data.qpos[:3] = load[rows[0]]
             data.qvel[:3] = load_vel[rows[0]]
-            data.qpos[3:] = np.concatenate((pose[rows], angles[rows]), axis=1).flat
-            data.qvel[3:] = np.concatenate((velocity[rows], rates[rows]), axis=1).flat
+            data.qpos[3:] = np.hstack((pose[rows], angles[rows])).flat
+            data.qvel[3:] = np.hstack((velocity[rows], rates[rows])).flat
             self._show(world)
 
     def advance(self, duration: float) -> None:
@@ -117,8 +118,9 @@ def _compile(members: list[tuple]) -> "mujoco.MjModel":
     load.add_site(name="load")
     for axis in np.eye(3):
         load.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE, axis=axis)
-    for k, (body, rope) in enumerate(members):
-        spec.attach(_vehicle(body, rope), prefix=f"{k}_", frame=spec.worldbody.add_frame())
+    for k, (vehicle, rope) in enumerate(members):
+        frame = spec.worldbody.add_frame()
+        spec.attach(_vehicle(vehicle.body, rope), prefix=f"{k}_", frame=frame)
         hold = spec.add_equality(type=mujoco.mjtEq.mjEQ_CONNECT, name1=f"{k}_end", name2="load")
         hold.objtype = mujoco.mjtObj.mjOBJ_SITE
         hold.solref = list(STIFF)
@@ -131,8 +133,7 @@ def _vehicle(body, rope: RopeParams) -> "mujoco.MjSpec":
     spec = new_spec(constraints=True)
     vehicle = add_vehicle(spec, body)
     mount = list(rope.mount)
-    last = add_chain(
-        spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=False
-    )
+    how = {"free_root": False, "load": False}
+    last = add_chain(spec, rope, vehicle, mount, "universal", 0.0, None, **how)
     last.add_site(name="end", pos=[0.0, 0.0, -rope.segment_length])
     return spec

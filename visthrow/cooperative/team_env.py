@@ -185,7 +185,8 @@ class TeamEnv(VecEnv):
         self._start(done)
         rows = self._rows(done)
         self._observations = self._observe(rows)
-        return self._observations, self._joined(reward).mean(1), self._joined(rows).amax(1), {}
+        paid = self._joined(reward).mean(1)
+        return self._observations, paid, self._joined(rows).amax(1), {}
 
     def _apply(self, actions: Tensor) -> Tensor:
         """Fly one control period; returns the clipped actions.
@@ -231,7 +232,8 @@ class TeamEnv(VecEnv):
         gaps = [load.norm(dim=-1) - radius]
         for k in range(1, self.team):
             gaps.append((self._neighbour(pos, k) - pos).norm(dim=-1) - 2.0 * reach)
-            cable = (self._neighbour(joints, k) - pos[:, None]).square().sum(-1).amin(-1).sqrt()
+            offsets = self._neighbour(joints, k) - pos[:, None]
+            cable = offsets.square().sum(-1).amin(-1).sqrt()
             gaps.append(torch.where(self._neighbour(attached, k), cable - reach, 10.0))
         return self._worlds(torch.stack(gaps).amin(0)).amin(1)
 
@@ -287,17 +289,17 @@ class TeamEnv(VecEnv):
             release.landing_height,
         )
         negative = ~released & (self._worlds(ended).any(1) | contact)
-        error = (landing["landing_w"] - self.views.goal_w[:: self.team])[:, :2].norm(dim=-1)
-        attached = (
-            rewards.kinetic(p, state["vel_w"], state["rate_b"], self._rows(self.load_vel_w))
-            + rewards.command(p, action, self._rate_weights)
-            + rewards.change(p, action, self._memory["previous"], self._change_weights)
-        )
-        at_release = (
-            rewards.landing(p, error)
-            + rewards.time_of_flight(p, landing["time_to_impact"])
-            + rewards.proximity(p, landing["clearance"], release.clearance_margin)
-        )
+        miss = landing["landing_w"] - self.views.goal_w[:: self.team]
+        error = miss[:, :2].norm(dim=-1)
+        load_vel = self._rows(self.load_vel_w)
+        previous = self._memory["previous"]
+        attached = rewards.kinetic(p, state["vel_w"], state["rate_b"], load_vel)
+        attached = attached + rewards.command(p, action, self._rate_weights)
+        attached = attached + rewards.change(p, action, previous, self._change_weights)
+        at_release = rewards.landing(p, error)
+        at_release = at_release + rewards.time_of_flight(p, landing["time_to_impact"])
+        proximity = rewards.proximity(p, landing["clearance"], release.clearance_margin)
+        at_release = at_release + proximity
         shared = rewards.carry_time(p, period) - p.termination * negative.float()
         shared = shared - team.contact_cost * contact.float()
         shared = shared - team.margin_cost * (team.margin - gap).clamp(0.0, team.margin)
@@ -342,8 +344,8 @@ class TeamEnv(VecEnv):
         draw = torch.rand(self.worlds, 4, device=self.device)
         heading = 2.0 * math.pi * draw[:, 0]
         distance = between(team.goal, draw[:, 1])
-        offsets = [distance * heading.cos(), distance * heading.sin(), torch.zeros_like(distance)]
-        goals = torch.stack(offsets, -1)
+        x, y = (distance * part for part in (heading.cos(), heading.sin()))
+        goals = torch.stack([x, y, torch.zeros_like(x)], -1)
         if self._goal is not None:
             goals = self._goal.expand_as(goals)
             heading = torch.atan2(goals[:, 1], goals[:, 0])
@@ -352,20 +354,17 @@ class TeamEnv(VecEnv):
         rows = torch.arange(self.rows, device=self.device)
         place = 2.0 * math.pi / self.team * (rows % self.team)
         azimuth = self._rows(heading + spread) + 0.5 * math.pi + place
-        side = -tilt.sin()
-        down = torch.stack([side * azimuth.cos(), side * azimuth.sin(), -tilt.cos()], -1)
+        x, y = (-tilt.sin() * part for part in (azimuth.cos(), azimuth.sin()))
+        down = torch.stack([x, y, -tilt.cos()], -1)
         load, vel = (self._rows(state[name][:: self.team]) for name in ("pos_w", "vel_w"))
         load = load.clone()
         load[:, 2] -= self.cfg.rope.length * tilt.cos()
         turn = ob.rotation_from_quat(state["quat_wb"])
         turning = torch.linalg.cross(state["rate_b"], self._mount.expand_as(state["rate_b"]))
         length = self._segment * self.cfg.rope.segments
-        formed = {
-            "pos_w": load - length[:, None] * down - turn @ self._mount,
-            "vel_w": vel - (turn @ turning[..., None])[..., 0],
-            "cable_dir_w": down,
-            "cable_vel_w": torch.zeros_like(down),
-        }
+        formed = {"cable_dir_w": down, "cable_vel_w": torch.zeros_like(down)}
+        formed["pos_w"] = load - length[:, None] * down - turn @ self._mount
+        formed["vel_w"] = vel - (turn @ turning[..., None])[..., 0]
         where = self._rows(fresh)[:, None]
         goal.copy_(torch.where(where, self._rows(goals), goal))
         for name, value in formed.items():
@@ -423,7 +422,8 @@ class TeamEnv(VecEnv):
             neighbour = self._neighbour(late, k)
             place = neighbour[:, :3] + torch.randn_like(pos_w) * noise - pos_w
             parts += [place, neighbour[:, 9 : ob.VEHICLE]]
-        return torch.cat([*parts, age[:, None], self._rows(self._memory["tripped"])[:, None]], -1)
+        tripped = self._rows(self._memory["tripped"])
+        return torch.cat([*parts, torch.stack([age, tripped], -1)], -1)
 
     def _privileged(self, vehicle: Tensor, load: Tensor, attached: Tensor, fresh: Tensor) -> Tensor:
         """Critic's view."""

@@ -140,11 +140,8 @@ def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict
     released = values["released"]
     touched = values["contact"] | (released & (values["clearance"] < radii))
     good = released & ~touched
-    result = {
-        "throws": len(good),
-        "landed": float(released.mean()),
-        "contact": float(touched.mean()),
-    }
+    result: dict[str, Any] = {"throws": len(good)}
+    result |= {"landed": float(released.mean()), "contact": float(touched.mean())}
     if not good.any():
         return result
     error = values["landing_error"][good]

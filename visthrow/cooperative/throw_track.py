@@ -59,19 +59,17 @@ def record_throw(
         rows.append((pos, frames, env.sim.cable_points_w(), attached, load.copy()))
 
     values = fly(experiment, policy, count=1, record=record, **options)
+    one = {name: value[0] for name, value in values.items()}
     time = experiment.sim.control_period * np.arange(len(rows) + 1)
-    end = max(float(values["duration"][0]), time[-1])
+    end = max(float(one["duration"]), time[-1])
     flight = np.linspace(0.0, end - time[-1], 30)[:, None]
-    released = bool(values["released"][0])
-    return ThrowTrack(
-        time[:-1],
-        *(np.stack(column) for column in zip(*rows, strict=True)),
-        flight_time=time[-1] + flight[:, 0],
-        flight_w=free_flight(values["load_w"][0], values["load_vel_w"][0], flight),
-        goal_w=np.array([options.get("target", 2.0), 0.0, 0.0]),
-        landing_error=float(values["landing_error"][0]) if released else np.nan,
-        released=released,
-    )
+    flight_w = free_flight(one["load_w"], one["load_vel_w"], flight)
+    goal_w = np.array([options.get("target", 2.0), 0.0, 0.0])
+    released = bool(one["released"])
+    error = float(one["landing_error"]) if released else np.nan
+    columns = [np.stack(column) for column in zip(*rows, strict=True)]
+    flown = (time[-1] + flight[:, 0], flight_w, goal_w, error, released)
+    return ThrowTrack(time[:-1], *columns, *flown)
 
 
 HUES = (style.COLOURS[0], style.COLOURS[3], style.COLOURS[5])  # of vehicles

@@ -52,11 +52,10 @@ def calibrated_start(
         estimates = _calibrations(experiment, _hovered(env))
         if records is not None:
             records[:] = estimates
-        turn = [c.turn_b if c else (0.0, 0.0, 0.0) for c in estimates]
-        scale = [c.scale if c else 0.0 for c in estimates]
-        return env.begin_throws(
-            (torch.tensor(turn, device=env.device), torch.tensor(scale, device=env.device))
-        )
+        turns = [c.turn_b if c else (0.0, 0.0, 0.0) for c in estimates]
+        scales = [c.scale if c else 0.0 for c in estimates]
+        turn, scale = (torch.tensor(values, device=env.device) for values in (turns, scales))
+        return env.begin_throws((turn, scale))
 
     return begin
 
@@ -82,11 +81,11 @@ def _hovered(env: "ThrowEnv") -> list[Hovered]:
         if k < steps:
             time = np.full(env.num_envs, k * period)
             rows.append((time, *measured[:4], command[:, 0], *measured[4:]))
-        action = act.action_from_command(
-            torch.from_numpy(command).float(), cfg.task.action.max_thrust, rate
-        )
+        sent = torch.from_numpy(command).float()
+        action = act.action_from_command(sent, cfg.task.action.max_thrust, rate)
         env.episode_length_buf.zero_()  # a hover has no time limit
-        env.carry(torch.cat([action, -torch.ones(env.num_envs, 1)], -1).to(env.device))
+        latch = -torch.ones(env.num_envs, 1)
+        env.carry(torch.cat([action, latch], -1).to(env.device))
     columns = [np.stack(column, 1) for column in zip(*rows)]
     columns.append(env.views.goal_w.cpu().numpy())
     return [Hovered(*(column[i] for column in columns)) for i in range(env.num_envs)]
@@ -98,9 +97,8 @@ def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
     """
     frame, valid = (part.cpu() for part in env.measured)
     vehicle = frame[:, : ob.VEHICLE].double().numpy()
-    quat = Rotation.from_matrix(
-        ob.rotation_in(frame.double()).numpy()
-    ).as_quat()  # the nearest rotation
+    measured = ob.rotation_in(frame.double()).numpy()
+    quat = Rotation.from_matrix(measured).as_quat()  # the nearest rotation
     points = frame[:, ob.VEHICLE :].unflatten(1, (KEYPOINTS, 2)).double().numpy()
     return vehicle[:, :3], quat, vehicle[:, 3:6], vehicle[:, 6:9], points, valid.numpy()
 
@@ -108,8 +106,7 @@ def _measured(env: "ThrowEnv") -> tuple[np.ndarray, ...]:
 def _calibrations(experiment: Experiment, hovered: list[Hovered]) -> list[Calibration | None]:
     """Return the calibration of each hover; None where it shows too little."""
     solve = partial(solved, camera=experiment.camera, contract=contract_of(experiment))
-    estimates = dict(done(solve, hovered, cores() if len(hovered) > TOO_FEW else 1, "calibrations"))
-    return [
-        None if isinstance(estimates[place], str) else estimates[place]
-        for place in range(len(hovered))
-    ]
+    processes = cores() if len(hovered) > TOO_FEW else 1
+    estimates = dict(done(solve, hovered, processes, "calibrations"))
+    ordered = [estimates[place] for place in range(len(hovered))]
+    return [None if isinstance(one, str) else one for one in ordered]

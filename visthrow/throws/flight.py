@@ -7,7 +7,7 @@ failed. A recorder sees each period, whatever it keeps of it."""
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -127,16 +127,12 @@ class Policies(Pilots):
         looks = [
             draws or item.policy.contract["observation"]["layout"] == "vision" for item in loaded
         ]
-        self.pilots = [
-            Pilot(item.policy, item.experiment.camera if look else None, share, item.departures)
-            for item, look in zip(loaded, looks)
-        ]
-        super().__init__(
-            loaded[0].experiment,
-            goal_w,
-            np.vstack([pilot.previous_action for pilot in self.pilots]),
-            goal_vel_w,
-        )
+        self.pilots = []
+        for item, look in zip(loaded, looks):
+            camera = item.experiment.camera if look else None
+            self.pilots.append(Pilot(item.policy, camera, share, item.departures))
+        first_action = np.vstack([pilot.previous_action for pilot in self.pilots])
+        super().__init__(loaded[0].experiment, goal_w, first_action, goal_vel_w)
 
     def wait(self, flight: "Flight", snapshot: Snapshot) -> dict[int, str]:
         self._waited += 1
@@ -304,9 +300,8 @@ class Flight:
         if throws:
             decision = self.pilots.decide(self, measurement, hold_command)
             command = np.where(self.flown[:, None], decision.command, hold_command)
-            sent = Decision(
-                command, decision.release & self.flown, decision.action, decision.observation
-            )
+            release = decision.release & self.flown
+            sent = replace(decision, command=command, release=release)
         self.recorder.before(self, measurement, sent)
         self.commands.append(sent.command)
         plant.step(sent.command, sent.release)

@@ -156,7 +156,8 @@ class HybridPlant:
         self._age = self._rng.uniform(*self.latency, count)
         self._error = np.zeros((5, count, 3))
         # newest first
-        self._past = [self.state] * max(math.ceil(self.latency[1] / self.period - 1e-9), 1)
+        oldest = math.ceil(self.latency[1] / self.period - 1e-9)
+        self._past = [self.state] * max(oldest, 1)
 
     def step(self, command: ndarray, release: ndarray | bool = False) -> None:
         release = np.broadcast_to(np.asarray(release, dtype=bool), (self.count,))
@@ -210,9 +211,8 @@ class HybridPlant:
         """
         timer = self._sim.get("release_timer")
         waits = self._latched & (self._sim.get("attached") != 0) & (timer >= 0.0)
-        self._sim.state.release_timer.assign(
-            np.where(waits, timer + time, timer).astype(timer.dtype)
-        )
+        later = np.where(waits, timer + time, timer).astype(timer.dtype)
+        self._sim.state.release_timer.assign(later)
 
     def _disturbed(self, command: ndarray) -> ndarray:
         """Commands with the training's noise, which is on their normalised form."""

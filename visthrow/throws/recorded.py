@@ -84,13 +84,8 @@ class _Full(LogRecorder):
         points, valid = looked or self.pilots.pilots[0].see(
             snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, self.pilots.goal_w
         )
-        recorder.add(
-            state.time,
-            goal_w=self.pilots.goal_w[0],
-            mode=int(throws),
-            keypoints=points[0],
-            keypoints_valid=valid[0],
-        )
+        keypoints = {"keypoints": points[0], "keypoints_valid": valid[0]}
+        recorder.add(state.time, goal_w=self.pilots.goal_w[0], mode=int(throws), **keypoints)
         if sent.action is not None and sent.observation is not None:
             recorder.add(state.time, action=sent.action[0], observation=sent.observation[0])
         self.sample(flight)
@@ -104,9 +99,8 @@ class _Full(LogRecorder):
         self.recorders[0].add(flight.now.time, cable_points_w=points)
         sample = flight.plant.sample
         if sample.time > self._sampled:
-            self.recorders[0].add(
-                sample.time, **{f"measured_{name}": getattr(sample, name)[0] for name in MEASURED}
-            )
+            values = {f"measured_{name}": getattr(sample, name)[0] for name in MEASURED}
+            self.recorders[0].add(sample.time, **values)
             self._sampled = sample.time
         self._before = flight.now
 
@@ -168,22 +162,19 @@ def fly(
     pilots = Policies([loaded], np.asarray(goal_w, dtype=float)[None], draws=True, eyes=eyes)
     recording = _Full(pilots, _meta(loaded, plant_name, goal_w, seed))
     flight = Flight(plant, pilots, recording, home)
-    hangs_still = _hovering(
-        lambda snapshot: bool(np.linalg.norm(snapshot.payload_vel_w[0]) < QUIET_SPEED),
-        home,
-        HOVER_LEAST,
-        HOVER_MOST,
-    )
-    flight.run(
-        [hangs_still, Phase(True, lambda flight: not np.any(flight.open & flight.now.attached))]
-    )
+
+    def hangs_still(snapshot: Snapshot) -> bool:
+        return _speed(snapshot.payload_vel_w) < QUIET_SPEED
+
+    def let_go(flight: Flight) -> bool:
+        return not np.any(flight.open & flight.now.attached)
+
+    flight.run([_hovering(hangs_still, home, HOVER_LEAST, HOVER_MOST), Phase(True, let_go)])
     recovery = plant.time
 
     def recovered(snapshot: Snapshot) -> bool:  # the payload lies on the ground or hangs still
-        return bool(
-            np.linalg.norm(snapshot.vel_w[0]) < QUIET_SPEED
-            and (plant.landing.landed[0] or snapshot.attached[0])
-        )
+        at_rest = plant.landing.landed[0] or snapshot.attached[0]
+        return _speed(snapshot.vel_w) < QUIET_SPEED and bool(at_rest)
 
     flight.run([_hovering(recovered, home, 0.0, RECOVERY_MOST)])
     return _finished(flight, recording, recovery)
@@ -268,13 +259,17 @@ def _finished(flight: Flight, recording: _Full, recovery: float) -> FlightLog:
             "error": float(np.hypot(*off)),
             "duration": when - flight.begin,
         }
-    result["hovering_again"] = bool(
-        np.linalg.norm(state.vel_w[0]) < 2 * QUIET_SPEED and state.pos_w[0, 2] > 0.5
-    )
+    high = bool(state.pos_w[0, 2] > 0.5)
+    result["hovering_again"] = _speed(state.vel_w) < 2 * QUIET_SPEED and high
     recorder.meta |= {"times": times, "result": result}
     log = recorder.log()
-    if (begins := times.get("separation")) is not None:
-        log.channels["separation"] = Channel(
-            np.array([begins]), log["payload_pos_w"].at(begins)[None], "m", "world"
-        )
+    begins = times.get("separation")
+    if begins is not None:
+        place = log["payload_pos_w"].at(begins)[None]
+        log.channels["separation"] = Channel(np.array([begins]), place, "m", "world")
     return log
+
+
+def _speed(vel_w: ndarray) -> float:
+    """Return the speed of the only vehicle or payload [m/s]."""
+    return float(np.linalg.norm(vel_w[0]))

@@ -50,9 +50,9 @@ def batch_plant(
 ) -> tuple[Plant, np.random.Generator]:
     """Plant of one batch, and the generator of its starts: the same for whoever throws."""
     seeds = np.random.SeedSequence([seed, round(1000 * target), batch])
-    return make_plant(
-        plant_name, experiment, count, int(seeds.generate_state(1)[0])
-    ), np.random.default_rng(seeds)
+    plant_seed = int(seeds.generate_state(1)[0])
+    plant = make_plant(plant_name, experiment, count, plant_seed)
+    return plant, np.random.default_rng(seeds)
 
 
 def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generator) -> ndarray:
@@ -62,9 +62,8 @@ def place_in_hover(plant: Plant, experiment: Experiment, rng: np.random.Generato
     start = pilots_hover()
     home = np.array([0.0, 0.0, start.spawn_height])
     spread = np.array(start.position) * rng.uniform(-1.0, 1.0, (plant.count, 3))
-    ropes = random_ropes(
-        rng, plant.count, experiment.rope.segments, math.radians(start.cable_angle_deg)
-    )
+    angle = math.radians(start.cable_angle_deg)
+    ropes = random_ropes(rng, plant.count, experiment.rope.segments, angle)
     plant.reset(home + spread, ropes)
     return home
 
@@ -167,9 +166,8 @@ class Throwing(Workers):
                 Other sizes, other draws.
         """
         importlib.import_module("mujoco")  # said here rather than by every worker
-        if together and any(
-            plant_of(item.experiment) != plant_of(loaded[0].experiment) for item in loaded
-        ):
+        plant = plant_of(loaded[0].experiment)
+        if together and any(plant_of(item.experiment) != plant for item in loaded):
             raise ConfigError("policies of different plants cannot fly in one batch")
         self.jobs = plan(len(loaded), targets, throws, seed, together, size)
         self._count = len(loaded)
@@ -184,10 +182,10 @@ class Throwing(Workers):
         self.label *= show
         results = dict(self)
         parts = [results[index] for index in range(len(self.jobs))]
-        return [
-            [self._throws(parts, policy, target) for target in self._targets]
-            for policy in range(self._count)
-        ]
+        rows = []
+        for policy in range(self._count):
+            rows.append([self._throws(parts, policy, target) for target in self._targets])
+        return rows
 
     def _throws(self, parts: Sequence[dict[str, ndarray]], policy: int, target: float) -> Throws:
         """All throws of one policy at one target."""

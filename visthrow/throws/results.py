@@ -82,14 +82,16 @@ class Entry:
 
 def key_of(unit: dict[str, Any]) -> str:
     """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
-    return hashlib.sha256(json.dumps(unit, sort_keys=True, allow_nan=False).encode()).hexdigest()[
-        :16
-    ]
+    return _digest(json.dumps(unit, sort_keys=True, allow_nan=False).encode())
 
 
 def hash_of(path: str | Path) -> str:
     """Hash of a file's content: 16 hexadecimal digits."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()[:16]
+    return _digest(Path(path).read_bytes())
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:16]
 
 
 def policy_unit(
@@ -139,12 +141,11 @@ def columns_of(throws: Any) -> dict[str, ndarray]:
     :class:`visthrow.paper.baseline.fly_plan.Flown`).
     """
     count = len(throws.success)
-    columns = {
-        name: np.asarray(value)
-        for name, value in vars(throws).items()
-        if isinstance(value, ndarray)
-    }
-    return {name: value for name, value in columns.items() if value.ndim and len(value) == count}
+    columns = {}
+    for name, value in vars(throws).items():
+        if isinstance(value, ndarray) and value.ndim and len(value) == count:
+            columns[name] = value
+    return columns
 
 
 def save(folder: str | Path, result: Result) -> Path:
@@ -176,12 +177,9 @@ def load_all(places: Iterable[str | Path]) -> dict[str, Result]:
     """Read all results in folders and files, by key; of two with one key the later place counts."""
     results: dict[str, Result] = {}
     for place in map(Path, places):
-        if place.is_dir():
-            files = sorted(place.glob("*.json"))
-        elif place.exists():
+        files = sorted(place.glob("*.json"))
+        if place.is_file():
             files = [place]
-        else:
-            files = []
         for path in files:
             results.update({result.key: result for result in load(path)})
     return results
@@ -199,11 +197,10 @@ def join(results: Iterable[Result]) -> list[Result]:
         if "batch" not in result.unit:
             whole.append(result)
             continue
-        common = {
-            name: value for name, value in result.unit.items() if name not in ("batch", "throws")
-        }
+        common = dict(result.unit)
+        del common["throws"]
+        batch = common.pop("batch")
         group = groups.setdefault(key_of(common), {})
-        batch = result.unit["batch"]
         if batch not in group or result.unit["throws"] > group[batch].unit["throws"]:
             group[batch] = result
     return whole + [_joined([group[batch] for batch in sorted(group)]) for group in groups.values()]
@@ -212,12 +209,12 @@ def join(results: Iterable[Result]) -> list[Result]:
 def _joined(group: list[Result]) -> Result:
     if len(group) == 1:
         return group[0]
-    unit = {name: value for name, value in group[0].unit.items() if name != "batch"}
+    unit = dict(group[0].unit)
+    del unit["batch"]
     unit["throws"] = sum(result.unit["throws"] for result in group)
-    columns = {
-        name: np.concatenate([result.columns[name] for result in group])
-        for name in group[0].columns
-    }
+    columns = {}
+    for name in group[0].columns:
+        columns[name] = np.concatenate([result.columns[name] for result in group])
     seconds = sum(result.provenance.get("seconds", 0.0) for result in group)
     return Result(unit, columns, {**group[0].provenance, "seconds": seconds}, group[0].extra)
 

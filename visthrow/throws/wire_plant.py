@@ -45,10 +45,8 @@ class HybridWirePlant:
         self.mass = (plant_of(experiment).total_mass, experiment.vehicle.body.mass)
         self.max_thrust = experiment.task.action.max_thrust
         rng = np.random.default_rng(seed)
-        self._plant.reset(
-            self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3)),
-            random_ropes(rng, 1, experiment.rope.segments, 0.05),
-        )
+        place = self.home_w + 0.1 * rng.uniform(-1, 1, (1, 3))
+        self._plant.reset(place, random_ropes(rng, 1, experiment.rope.segments, 0.05))
 
     def _built(self, experiment: Experiment) -> HybridPlant:
         return HybridPlant(self._fine(experiment))
@@ -85,13 +83,14 @@ class HybridWirePlant:
     def landing(self) -> dict[str, list[float] | float | None]:
         """The payload's landing and separation, None before them."""
         landing = self._plant.landing
-        landed = bool(landing.landed[0])
-        separation = float(landing.separation_time[0])
-        return {
-            "landing_w": landing.point_w[0].tolist() if landed else None,
-            "landing_time": float(landing.time[0]) if landed else None,
-            "separation_time": None if np.isnan(separation) else separation,
-        }
+        report: dict[str, list[float] | float | None]
+        report = dict.fromkeys(("landing_w", "landing_time", "separation_time"))
+        if landing.landed[0]:
+            report["landing_w"] = landing.point_w[0].tolist()
+            report["landing_time"] = float(landing.time[0])
+        if not np.isnan(landing.separation_time[0]):
+            report["separation_time"] = float(landing.separation_time[0])
+        return report
 
 
 def make(policy: str, seed: int, changes: Sequence[str] = ()) -> HybridWirePlant:
@@ -176,9 +175,8 @@ class HybridMotorPlant(HybridWirePlant):
         `HybridWirePlant`.
         """
         vel_w = self._now["vel_w"]
-        speed = (
-            self._full_speed * np.clip(command, 0.0, 1.0) * self._now["voltage"] / self._reference
-        )
+        drive = np.clip(command, 0.0, 1.0) * self._now["voltage"]
+        speed = self._full_speed * drive / self._reference
         super().step(speed, release and not self.held, after)
         self._look()
         if self._stand is None and self._now["pos_w"][2] < self._ground:

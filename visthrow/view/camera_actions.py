@@ -51,14 +51,9 @@ def board_of(words: list[str] | None) -> BoardParams:
     ):
         raise ConfigError(f"--board {' '.join(words or ['(missing)'])}; expected {expected}")
     try:
-        return BoardParams(
-            int(words[1]),
-            int(words[2]),
-            float(words[3]),
-            words[0],
-            *map(float, words[4:5]),
-            *words[5:],
-        )  # type: ignore[arg-type]
+        sizes = (int(words[1]), int(words[2]), float(words[3]))
+        marker = map(float, words[4:5])
+        return BoardParams(*sizes, words[0], *marker, *words[5:])  # type: ignore[arg-type]
     except ValueError as error:
         raise ConfigError(f"--board {' '.join(words)}: {error}; expected {expected}") from error
 
@@ -69,11 +64,10 @@ def pictures_of(names: list[str]) -> tuple[list[Path], list[ndarray]]:
     """
     paths: list[Path] = []
     for name in map(Path, names):
-        paths += (
-            sorted(p for p in name.iterdir() if p.suffix.lower() in PICTURES)
-            if name.is_dir()
-            else [name]
-        )
+        if name.is_dir():
+            paths += sorted(p for p in name.iterdir() if p.suffix.lower() in PICTURES)
+        else:
+            paths.append(name)
     images = [cv2.imread(str(path)) if path.is_file() else None for path in paths]
     for path, image in zip(paths, images, strict=True):
         if image is None:
@@ -265,7 +259,8 @@ def _draw_board(canvas: ndarray, image: ndarray, lens: Fisheye, args: argparse.N
     for pixels, colour, size in ((view.pixels, YELLOW, 5), (expected, BLUE, 2)):
         for u, v in pixels:
             cv2.circle(canvas, (round(u), round(v)), size, colour, 1, cv2.LINE_AA)
-    off = np.sqrt(np.mean(np.sum((expected - view.pixels) ** 2, axis=1)))
+    squares = np.sum((expected - view.pixels) ** 2, axis=1)
+    off = np.sqrt(np.mean(squares))
     print(f"corners found (yellow) and reprojected (blue): {off:.3f} px rms")
 
 

@@ -82,15 +82,9 @@ def _axes(
     import matplotlib.pyplot as plt
 
     rows = -(-count // columns)
-    figure, axes = plt.subplots(
-        rows,
-        columns,
-        figsize=(width, height * rows + margin),
-        layout="constrained",
-        squeeze=False,
-        sharex=sharex,
-        sharey=True,
-    )
+    how = {"layout": "constrained", "squeeze": False, "sharex": sharex, "sharey": True}
+    size = (width, height * rows + margin)
+    figure, axes = plt.subplots(rows, columns, figsize=size, **how)
     for axis in axes.flat[count:]:
         axis.set_visible(False)
     return figure, axes
@@ -119,9 +113,8 @@ def marks(
 
     names = list(dict.fromkeys(row.label for row in rows))
     count = len({row.series for row in rows})
-    figure, axis = plt.subplots(
-        figsize=(WIDTH, 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)), layout="constrained"
-    )
+    height = 1.2 + 0.26 * len(names) * max(1.0, 0.55 * count)
+    figure, axis = plt.subplots(figsize=(WIDTH, height), layout="constrained")
     handles = {}
     for row in rows:
         (colour, marker) = _look(row.series)
@@ -174,10 +167,8 @@ def scatter(
 
     A panel is a title and, for each colour, its label and misses (N, 2) [m]: along the throw, to
     the left."""
-    reach = max(
-        (np.abs(points).max() for _, series in panels for _, points in series if len(points)),
-        default=0.2,
-    )
+    sets = [points for _, series in panels for _, points in series if len(points)]
+    reach = max((np.abs(points).max() for points in sets), default=0.2)
     half = float(np.clip(1.06 * reach, 0.12, 0.7))
     columns = min(columns, len(panels))
     size = WIDTH / max(columns, 3)
@@ -308,12 +299,9 @@ def curves(panels: Sequence[Panel], ylabel: str, log: bool = False) -> bytes:
             axis.set_ylim(bottom=0.0)
     _labelled(axes, None, ylabel)
     if len(labels) > 1:
-        figure.legend(
-            labels.values(),
-            labels.keys(),
-            loc="outside upper center",
-            ncols=min(len(labels), 4 if columns > 1 else 2),
-        )
+        limit = 4 if columns > 1 else 2
+        how = {"loc": "outside upper center", "ncols": min(len(labels), limit)}
+        figure.legend(labels.values(), labels.keys(), **how)
     return png_of(figure)
 
 
@@ -335,7 +323,8 @@ def learning(groups: Sequence[tuple[str, Sequence[ndarray]]]) -> bytes:
     figure, axes = _axes(len(groups), min(6, len(groups)), WIDTH, 1.5, 0.3, sharex=True)
     for axis, (title, runs) in zip(axes.flat, groups):
         for i, run in enumerate(runs):
-            axis.plot(run[0] / 1e6, run[1], color=style.COLOURS[i % len(style.COLOURS)], lw=1.2)
+            colour, _ = _look(i)
+            axis.plot(run[0] / 1e6, run[1], color=colour, lw=1.2)
         _log_axis(axis, "y")
         axis.set_title(title, fontsize=7.5)
         axis.tick_params(labelsize=7.5)

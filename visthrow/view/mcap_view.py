@@ -31,7 +31,7 @@ Rates are in rad/s; a signal's unit and frame are its channel's metadata.
 """
 
 Message = tuple[float, str, str, dict[str, Any]]
-"""Time [s], topic, schema, content."""
+"""Time [s], topic, schema, content, to which a message of Foxglove's is given its time."""
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
@@ -47,52 +47,51 @@ def write(path: str | Path, log: FlightLog, experiment: Any) -> None:
     stream = io.BytesIO()
     writer = writing.Writer(stream)
     writer.start(library="visthrow")
-    schemas = {
-        name: writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
-        for name, schema in json.loads(_SCHEMAS.read_text(encoding="utf-8")).items()
-    }
+    schemas = {}
+    for name, schema in json.loads(_SCHEMAS.read_text(encoding="utf-8")).items():
+        schemas[name] = writer.register_schema(name, "jsonschema", json.dumps(schema).encode())
     channels: dict[str, int] = {}
-    for time, topic, schema, content in sorted(
-        _messages(log, experiment, begin), key=lambda message: message[0]
-    ):
+    messages = sorted(_messages(log, experiment), key=lambda message: max(message[0], begin))
+    for time, topic, schema, content in messages:
         if topic not in channels:
             name = topic.removeprefix("/signals/")
             if name != topic:
                 metadata = {"unit": log[name].unit, "frame": log[name].frame}
             else:
                 metadata = {}
-            channels[topic] = writer.register_channel(
-                topic, "json", schemas[schema], metadata=metadata
-            )
-        stamp = round((time - begin) * 1e9)
+            channel = writer.register_channel(topic, "json", schemas[schema], metadata=metadata)
+            channels[topic] = channel
+        stamp = round(max(time - begin, 0.0) * 1e9)
+        if schema.startswith("foxglove."):
+            (stamped,) = content.get("entities", [content])
+            stamped["timestamp"] = {"sec": stamp // 10**9, "nsec": stamp % 10**9}
         writer.add_message(channels[topic], stamp, json.dumps(content).encode(), stamp)
     writer.add_metadata("flight", {key: json.dumps(value) for key, value in log.meta.items()})
     writer.finish()
     atomic_write(path, stream.getvalue())
 
 
-def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
+def _messages(log: FlightLog, experiment: Any) -> Iterator[Message]:
     """Messages of a whole flight, topic after topic."""
     if "pos_w" in log and "quat_wb" in log:
         turns = log["quat_wb"].hold(log["pos_w"].time)
         for time, place, turn in zip(log["pos_w"].time, log["pos_w"].values, turns, strict=True):
             moved = {
-                "timestamp": _stamp(time - begin),
                 "parent_frame_id": "world",
                 "child_frame_id": "vehicle",
                 "translation": _named("xyz", place),
                 "rotation": _named("xyzw", turn),
             }
             yield time, "/tf", "foxglove.FrameTransform", moved
-            yield _placed(time, begin, "/vehicle", _pose(place, turn))
+            yield _placed(time, "/vehicle", _pose(place, turn))
     for name, topic in (("payload_pos_w", "/payload"), ("goal_w", "/goal")):
         for time, place in _rows(log, name):
-            yield _placed(time, begin, topic, _pose(place))
+            yield _placed(time, topic, _pose(place))
     for time, row in _rows(log, "command"):
         command = _named(("thrust_n", "rate_x", "rate_y", "rate_z"), row)
         yield time, "/command", "visthrow.Command", command
-    yield from _scene(log, experiment, begin)
-    yield from _pictures(log, experiment, begin)
+    yield from _scene(log, experiment)
+    yield from _pictures(log, experiment)
     for name, channel in log.channels.items():
         samples = zip(channel.time, channel.values, np.asarray(channel.valid), strict=True)
         for time, row, valid in samples:
@@ -101,25 +100,23 @@ def _messages(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
             yield time, f"/signals/{name}", "visthrow.Signal", signal
     for time, state, reason in log.meta.get("events", ()):
         message = {
-            "timestamp": _stamp(time - begin),
             "level": 3 if state == "abort" else 2,
             "message": f"{state}: {reason}",
             "name": "run",
         }
-        yield max(time, begin), "/events", "foxglove.Log", message
+        yield time, "/events", "foxglove.Log", message
 
 
-def _placed(time: float, begin: float, topic: str, pose: dict[str, Any]) -> Message:
-    content = {"timestamp": _stamp(time - begin), "frame_id": "world", "pose": pose}
+def _placed(time: float, topic: str, pose: dict[str, Any]) -> Message:
+    content = {"frame_id": "world", "pose": pose}
     return time, topic, "foxglove.PoseInFrame", content
 
 
-def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
+def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
     """Rope, ball and goal as things of the 3D panel."""
 
     def thing(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
         entity = {
-            "timestamp": _stamp(time - begin),
             "frame_id": "world",
             "id": name,
             "frame_locked": False,
@@ -155,7 +152,7 @@ def _scene(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
             yield thing(time, name, kind, solid)
 
 
-def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message]:
+def _pictures(log: FlightLog, experiment: Any) -> Iterator[Message]:
     """The image plane with its keypoints, as pictures of the camera's size."""
     if "keypoints" not in log or "keypoints_valid" not in log:
         return
@@ -167,14 +164,11 @@ def _pictures(log: FlightLog, experiment: Any, begin: float) -> Iterator[Message
         if time - last < IMAGE_PERIOD - 1e-6:
             continue
         last = time
-        image = draw_overlay(
-            camera,
-            torch.from_numpy(np.array(points, dtype=float)),
-            torch.from_numpy(np.array(valid, dtype=bool)),
-        )
+        pixels = torch.from_numpy(np.array(points, dtype=float))
+        visible_pixels = torch.from_numpy(np.array(valid, dtype=bool))
+        image = draw_overlay(camera, pixels, visible_pixels)
         data = base64.b64encode(cv2.imencode(".png", image)[1].tobytes()).decode()
         picture = {
-            "timestamp": _stamp(time - begin),
             "frame_id": "camera",
             "data": data,
             "format": "png",
@@ -187,11 +181,6 @@ def _rows(log: FlightLog, name: str) -> Iterator[tuple[float, np.ndarray]]:
         channel = log[name]
         rows = np.flatnonzero(np.asarray(channel.valid))
         yield from zip(channel.time[rows].tolist(), channel.values[rows], strict=True)
-
-
-def _stamp(seconds: float) -> dict[str, int]:
-    nanoseconds = max(round(seconds * 1e9), 0)
-    return {"sec": nanoseconds // 10**9, "nsec": nanoseconds % 10**9}
 
 
 def _named(names: Iterable[str], values: Any) -> dict[str, float]:

@@ -1,6 +1,7 @@
 """Puts sections into one self-contained page, and into Markdown with its pictures beside it."""
 
 import base64
+import functools
 import html
 import re
 from collections.abc import Sequence
@@ -20,6 +21,10 @@ def _marked(text: str) -> str:
     return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
 
 
+def _is_kind(kind: type, part: object) -> bool:
+    return isinstance(part, kind)
+
+
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the whole page; it loads nothing from elsewhere."""
     import jinja2
@@ -35,10 +40,9 @@ def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     environment.filters["inline"] = lambda png: (
         "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     )
-    environment.tests |= {
-        name: lambda part, kind=kind: isinstance(part, kind)
-        for name, kind in (("text", Text), ("grid", Grid), ("picture", Picture))
-    }
+    for kind in (Text, Grid, Picture):
+        test = functools.partial(_is_kind, kind)
+        environment.tests[kind.__name__.lower()] = test
     return environment.from_string(template).render(
         title=title, lead=lead, sections=sections, version=__version__
     )

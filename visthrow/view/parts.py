@@ -60,12 +60,13 @@ class Grid:
         ``header``: headings, with `` | `` between two. ``rows``: cells in their order, or by
         heading, where "-" stands for what a row lacks."""
         names = header.split(" | ")
-        cells = tuple(
-            row if isinstance(row, tuple) else tuple(row.get(name, "-") for name in names)
-            for row in rows
-        )
+        cells = []
+        for row in rows:
+            if isinstance(row, Mapping):
+                row = tuple(row.get(name, "-") for name in names)
+            cells.append(row)
         if cells:
-            return cls(title, tuple(names), cells, note, heads)
+            return cls(title, tuple(names), tuple(cells), note, heads)
         return None
 
     def markdown(self) -> str:
@@ -104,12 +105,11 @@ def section(
     head: str = "Not thrown yet",
 ) -> Section:
     """Return a section of the parts that there are; at its end what is missing."""
+    listed = list(filter(None, parts))
     reasons = "; ".join(dict.fromkeys(missing))
-    return Section(
-        name,
-        title,
-        (*filter(None, parts), *([Text(f"{head}: {reasons}.", "missing")] if reasons else [])),
-    )
+    if reasons:
+        listed.append(Text(f"{head}: {reasons}.", "missing"))
+    return Section(name, title, tuple(listed))
 
 
 def png_of(figure) -> bytes:

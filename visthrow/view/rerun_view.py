@@ -108,12 +108,9 @@ Shapes = dict[str, tuple[Any, ...]]
 def _scene(goal: ndarray, experiment: Any) -> Shapes:
     """Ground, goal, ball, rope and trails."""
     reach = 0.5 * np.abs(goal[:2]) + FIELD
-    floor = rr.Boxes3D(
-        centers=[[*(0.5 * goal[:2]), -0.011]],
-        half_sizes=[[*reach, 0.01]],
-        colors=[[232, 230, 224]],
-        fill_mode="solid",
-    )
+    middle = [*(0.5 * goal[:2]), -0.011]
+    box = {"centers": [middle], "half_sizes": [[*reach, 0.01]]}
+    floor = rr.Boxes3D(**box, colors=[[232, 230, 224]], fill_mode="solid")
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
     green = [colour_code(style.GOAL)]
@@ -122,18 +119,17 @@ def _scene(goal: ndarray, experiment: Any) -> Shapes:
     yellow = [colour_code(style.PAYLOAD)]
     ball = rr.Ellipsoids3D(half_sizes=sizes, colors=yellow, fill_mode="solid")
     strip = rr.LineStrips3D.from_fields
-    trails = {
-        entity: (strip(radii=0.004, colors=[colour_code(colour, 170)]),)
-        for _, entity, colour in TRAILS
-    }
-    return {
+    brown = [colour_code(style.ROPE)]
+    shapes: Shapes = {}
+    for _, entity, colour in TRAILS:
+        shapes[entity] = (strip(radii=0.004, colors=[colour_code(colour, 170)]),)
+    return shapes | {
         "world": (rr.ViewCoordinates.RIGHT_HAND_Z_UP,),
         "world/ground": (floor,),
         "world/goal": (square, rr.Transform3D(translation=goal)),
         "world/goal/centre": (rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=green),),
         "world/ball": (ball,),
-        "world/rope": (strip(radii=0.003, colors=[colour_code(style.ROPE)]),),
-        **trails,
+        "world/rope": (strip(radii=0.003, colors=brown),),
     }
 
 
@@ -174,13 +170,11 @@ def _vehicle(rotors: Any) -> Shapes:
     hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
     arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
     dark = [colour_code(style.VEHICLE)]
-    discs = rr.Ellipsoids3D(
-        centers=hubs + [0, 0, 0.008],
-        half_sizes=[[rotors.radius, rotors.radius, 0.002]] * 4,
-        fill_mode="solid",
-        # the front ones stand out
-        colors=[colour_code(style.COLOURS[0] if hub[0] > 0 else "#9AA5B1") for hub in hubs],
-    )
+    # the front ones stand out
+    colours = [style.COLOURS[0] if hub[0] > 0 else "#9AA5B1" for hub in hubs]
+    disc = [rotors.radius, rotors.radius, 0.002]
+    look = {"fill_mode": "solid", "colors": list(map(colour_code, colours))}
+    discs = rr.Ellipsoids3D(centers=hubs + [0, 0, 0.008], half_sizes=[disc] * 4, **look)
     body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
     return {
         "world/vehicle/arms": (rr.LineStrips3D(arms, radii=0.005, colors=dark),),
@@ -193,11 +187,11 @@ def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -
     """A line that grows from the policy's start to the landing."""
     times = log.meta["times"]
     time = log[name].time
-    rows = np.flatnonzero(
-        (time >= times["policy_start"] - 1e-9) & (time <= times.get("landing", np.inf) + 0.02)
-    )[1:]
+    last = times.get("landing", np.inf) + 0.02
+    rows = np.flatnonzero((time >= times["policy_start"] - 1e-9) & (time <= last))[1:]
     if len(rows):
-        strips = [log[name].values[rows[0] - 1 : row + 1].astype(np.float32) for row in rows]
+        places = log[name].values.astype(np.float32)
+        strips = [places[rows[0] - 1 : row + 1] for row in rows]
         column = rr.TimeColumn(TIMELINE, duration=time[rows] - times["policy_start"])
         stream.send_columns(entity, [column], rr.LineStrips3D.columns(strips=strips))
 
@@ -222,24 +216,21 @@ def _plane(camera: CameraParams) -> Shapes:
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     circle = 100 * np.column_stack((np.cos(angle), np.sin(angle)))
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
-    rings = rr.LineStrips2D(
-        [circle, right * circle],
-        colors=[[150, 150, 150], [80, 80, 80]],
-        radii=[0.7, 0.4],
-        show_labels=False,
-    )
+    grey = [150, 150, 150]
+    look = {"colors": [grey, [80, 80, 80]], "radii": [0.7, 0.4], "show_labels": False}
+    rings = rr.LineStrips2D([circle, right * circle], **look)
     # a strip's own label would stand in the middle, on the ball
     places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
     # rows: the body's x and y as directions in the image
     axes = 22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]
-    grey = [200, 200, 200]
-    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=grey, show_labels=False)
-    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=grey)
+    pale = [200, 200, 200]
+    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=pale, show_labels=False)
+    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=pale)
     point = rr.Points2D.from_fields
     shapes: Shapes = {
         "camera/field_of_view": (rings,),
-        "camera/angles": (rr.Points2D(places, labels=names, radii=0.1, colors=[150, 150, 150]),),
+        "camera/angles": (rr.Points2D(places, labels=names, radii=0.1, colors=grey),),
         "camera/body_axes": (arrows,),
         "camera/body_axes/names": (labels,),
         "camera/invalid": (point(radii=1.2, colors=[[170, 170, 170]]),),
@@ -330,11 +321,10 @@ def blueprint(goal: ndarray, channels: set[str]) -> rrb.Blueprint:
     image = rrb.Spatial2DView(
         origin="camera", name="Fisheye keypoints", background=[12, 12, 14], visual_bounds=bounds
     )
-    plots: list[Any] = [
-        _plot(plot["name"], *plot["range"], *plot["entities"])
-        for plot in SIGNALS["plots"]
-        if channels.issuperset(plot["needs"]) and channels.isdisjoint(plot["lacks"])
-    ]
+    plots: list[Any] = []
+    for plot in SIGNALS["plots"]:
+        if channels.issuperset(plot["needs"]) and channels.isdisjoint(plot["lacks"]):
+            plots.append(_plot(plot["name"], *plot["range"], *plot["entities"]))
     if "state" in channels:
         plots.append(rrb.TextLogView(origin="events", name="States"))
     top = rrb.Horizontal(scene, image, column_shares=[2.2, 1.0])
@@ -343,11 +333,10 @@ def blueprint(goal: ndarray, channels: set[str]) -> rrb.Blueprint:
 
 
 def _plot(name: str, low: float, high: float, *entities: str) -> rrb.TimeSeriesView:
-    return rrb.TimeSeriesView(
-        name=name,
-        origin="signals",
-        contents=[f"/signals/{e}/**" for e in entities],
-        axis_x=rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
-        axis_y=rrb.ScalarAxis(range=(low, high), zoom_lock=False),
-        plot_legend=rrb.PlotLegend(visible=True),
-    )
+    axes = {
+        "axis_x": rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal),
+        "axis_y": rrb.ScalarAxis(range=(low, high), zoom_lock=False),
+        "plot_legend": rrb.PlotLegend(visible=True),
+    }
+    contents = [f"/signals/{e}/**" for e in entities]
+    return rrb.TimeSeriesView(origin="signals", contents=contents, name=name, **axes)

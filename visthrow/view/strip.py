@@ -118,14 +118,14 @@ def drawn_larger(camera: CameraParams) -> CameraParams:
 def _bounds(log: FlightLog) -> tuple[float, float, float]:
     """Left, right and top of the side views [m]."""
     times = log.meta["times"]
-    paths = [
-        positions.values[
-            (positions.time >= times["policy_start"]) & (positions.time <= times["landing"] + 0.02)
-        ]
-        for positions in (log["pos_w"], log["payload_pos_w"])
-    ]
-    x = np.concatenate([*(path[:, 0] for path in paths), [log.meta["goal_w"][0]]])
-    top = max(path[:, 2].max() for path in paths)
+    paths = []
+    for positions in (log["pos_w"], log["payload_pos_w"]):
+        time = positions.time
+        during = (time >= times["policy_start"]) & (time <= times["landing"] + 0.02)
+        paths.append(positions.values[during])
+    path = np.concatenate(paths)
+    x = np.append(path[:, 0], log.meta["goal_w"][0])
+    top = path[:, 2].max()
     if top <= 0.0:
         raise LogError(
             f"vehicle and payload were below the floor all the time, {-top:.1f} m or more: there is"
@@ -142,9 +142,8 @@ def _side_view(
     origin_x, right, top = side
     times = log.meta["times"]
     goal = log.meta["goal_w"]
-    axis.set(
-        xlim=(origin_x, right), ylim=(-GROUND, top), aspect="equal", yticks=np.arange(0.0, top, 0.5)
-    )
+    axis.set(xlim=(origin_x, right), ylim=(-GROUND, top), aspect="equal")
+    axis.set_yticks(np.arange(0.0, top, 0.5))
     floor = Rectangle((origin_x, -GROUND), right - origin_x, GROUND, **LOOKS["floor"])
     axis.add_patch(floor)
     axis.axhline(0.0, **LOOKS["floor_line"])
