@@ -53,19 +53,13 @@ class Fisheye:
         reach_x = params.fx * self.edge_radius
         reach_y = params.fy * self.edge_radius
         slack = 1e-9
-        self._bounds = (
-            -0.5 - slack,
-            params.width - 0.5 + slack,
-            -0.5 - slack,
-            params.height - 0.5 + slack,
-        )
-        low, right, top, bottom = self._bounds
-        self.circle_inside_image = (
-            params.cx - reach_x >= low
-            and params.cx + reach_x <= right
-            and params.cy - reach_y >= top
-            and params.cy + reach_y <= bottom
-        )
+        low = -0.5 - slack
+        right = params.width - 0.5 + slack
+        bottom = params.height - 0.5 + slack
+        self._bounds = (low, right, low, bottom)
+        fits_x = params.cx - reach_x >= low and params.cx + reach_x <= right
+        fits_y = params.cy - reach_y >= low and params.cy + reach_y <= bottom
+        self.circle_inside_image = fits_x and fits_y
         self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
 
     def angle(
@@ -99,10 +93,8 @@ class Fisheye:
         k1, k2, k3, k4 = self.params.coefficients
         inner = theta.clamp(max=self.half_fov)
         t2 = inner * inner
-        return (
-            inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0)
-            + (theta - inner) * self._edge_slope
-        )
+        radius = inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0)
+        return radius + (theta - inner) * self._edge_slope
 
     def slope_from_angle(self, theta: Tensor) -> Tensor:
         """d theta_d / d theta [-], shape of theta; constant past the field of view."""

@@ -57,10 +57,8 @@ def apply_noise(
     if draw.wrong is None:
         return points, visible
     mistaken = draw.wrong[..., 0] < params.wrong_probability
-    return (
-        torch.where(mistaken.unsqueeze(-1), 2.0 * draw.wrong[..., 1:] - 1.0, points),
-        visible | mistaken,
-    )
+    places = 2.0 * draw.wrong[..., 1:] - 1.0
+    return torch.where(mistaken.unsqueeze(-1), places, points), visible | mistaken
 
 
 def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tuple[Tensor, Tensor]:

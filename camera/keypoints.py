@@ -199,13 +199,11 @@ def corrected_keypoints(
         Points [-], shape (E, K, 2), and validity, shape (E, K); what falls outside of the nominal
         field of view is invalid and reads zero.
     """
-    rays_c, _ = camera.fisheye.unproject(
-        camera.fisheye.denormalize(points / (1.0 + scale[:, None, None]))
-    )
+    plane = points / (1.0 + scale[:, None, None])
+    rays_c, _ = camera.fisheye.unproject(camera.fisheye.denormalize(plane))
     turn_c = camera.rot_cb @ rotation_from_vector(turn_b) @ camera.rot_cb.T
-    projected, visible = camera.fisheye.project_normalized(
-        rays_c @ turn_c.transpose(-1, -2), clip=True
-    )
+    rays_c = rays_c @ turn_c.transpose(-1, -2)
+    projected, visible = camera.fisheye.project_normalized(rays_c, clip=True)
     valid = valid & visible
     return projected * valid.unsqueeze(-1), valid
 
@@ -257,13 +255,11 @@ def keypoints(
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
     corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
-    points_c = points_c_from_w(
-        torch.cat([corners_w, payload_w.unsqueeze(-2)], -2), pos_w, rot_wb, rot_cb, position_b
-    )
+    points_w = torch.cat([corners_w, payload_w.unsqueeze(-2)], -2)
+    points_c = points_c_from_w(points_w, pos_w, rot_wb, rot_cb, position_b)
     rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._axes)
-    projected, valid = camera.fisheye.project_normalized(
-        torch.cat([points_c[:, :4], rays_c], -2), clip=True
-    )
+    marks_c = torch.cat([points_c[:, :4], rays_c], -2)
+    projected, valid = camera.fisheye.project_normalized(marks_c, clip=True)
     points = torch.cat([projected[:, :4], box_midpoints(projected[:, 4:])], -2)
     return by_rule(camera, points, valid)
 

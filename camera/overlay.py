@@ -84,22 +84,13 @@ def _draw_group(canvas, points, valid, outline, colour, thick) -> None:
         cv2.polylines(canvas, [_fixed(outline)[:, None]], True, colour, 1, cv2.LINE_AA, SHIFT)
     for point, ok in zip(points, valid, strict=True):
         if ok:
-            cv2.circle(
-                canvas,
-                tuple(map(int, _fixed(point))),
-                (thick + 1) << SHIFT,
-                colour,
-                -1,
-                cv2.LINE_AA,
-                SHIFT,
-            )
+            centre = tuple(map(int, _fixed(point)))
+            cv2.circle(canvas, centre, (thick + 1) << SHIFT, colour, -1, cv2.LINE_AA, SHIFT)
         else:
-            centre = tuple(
-                round(x) for x in np.clip(point, 0, [canvas.shape[1] - 1, canvas.shape[0] - 1])
-            )
-            cv2.drawMarker(
-                canvas, centre, GREY, cv2.MARKER_TILTED_CROSS, 8 * thick, thick, cv2.LINE_AA
-            )
+            height, width = canvas.shape[:2]
+            centre = tuple(map(round, np.clip(point, 0, [width - 1, height - 1])))
+            cross = (cv2.MARKER_TILTED_CROSS, 8 * thick)
+            cv2.drawMarker(canvas, centre, GREY, *cross, thick, cv2.LINE_AA)
             cv2.circle(canvas, centre, 6 * thick, colour, thick, cv2.LINE_AA)
 
 
@@ -113,18 +104,9 @@ def _draw_field_of_view(canvas, lens: Fisheye, thick: int) -> None:
         if radius <= lens.edge_radius:
             axes = (round(p.fx * radius * 2**SHIFT), round(p.fy * radius * 2**SHIFT))
             centre = tuple(map(int, _fixed(np.array([p.cx, p.cy]))))
-            cv2.ellipse(
-                canvas,
-                centre,
-                axes,
-                0,
-                0,
-                360,
-                colour,
-                1 if colour != GREY else thick,
-                cv2.LINE_AA,
-                SHIFT,
-            )
+            width = thick if colour == GREY else 1
+            whole = (0, 0, 360)  # rotation, from, to [deg]
+            cv2.ellipse(canvas, centre, axes, *whole, colour, width, cv2.LINE_AA, SHIFT)
 
 
 def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
@@ -144,13 +126,5 @@ def _draw_body_axes(canvas, camera: KeypointCamera, thick: int) -> None:
         start, end = (tuple(round(c) for c in q) for q in (centre, tip))
         cv2.arrowedLine(canvas, start, end, WHITE, thick, cv2.LINE_AA, 0, 0.14)
         corner = tuple(round(c) for c in tip + 0.02 * min(canvas.shape[:2]))
-        cv2.putText(
-            canvas,
-            name,
-            corner,
-            cv2.FONT_HERSHEY_SIMPLEX,
-            min(canvas.shape[:2]) / 1100,
-            WHITE,
-            thick,
-            cv2.LINE_AA,
-        )
+        font = (cv2.FONT_HERSHEY_SIMPLEX, min(canvas.shape[:2]) / 1100)
+        cv2.putText(canvas, name, corner, *font, WHITE, thick, cv2.LINE_AA)

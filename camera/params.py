@@ -72,9 +72,8 @@ class FisheyeParams(BoundedFields):
     def __post_init__(self) -> None:
         super().__post_init__()
         t2 = SEEN_AT_LEAST**2
-        slope = SEEN_AT_LEAST * (
-            1 + sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients))
-        )
+        bend = sum(k * t2 ** (n + 1) for n, k in enumerate(self.coefficients))
+        slope = SEEN_AT_LEAST * (1 + bend)
         if slope * min(self.fx, self.fy) > math.hypot(self.width, self.height):
             raise ValueError(
                 f"fisheye k = {self.coefficients} with fx = {self.fx}, fy = {self.fy}: a ray 1 deg"

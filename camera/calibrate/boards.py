@@ -69,9 +69,8 @@ class BoardParams:
                 f"ChArUco dictionary {self.dictionary!r}; expected one of {', '.join(names)}"
             )
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard(
-            (self.columns + 1, self.rows + 1), self.square_size, self.marker_size, markers
-        )
+        squares = (self.columns + 1, self.rows + 1)
+        return cv2.aruco.CharucoBoard(squares, self.square_size, self.marker_size, markers)
 
 
 @dataclass(frozen=True)
@@ -126,9 +125,8 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         margin = 0.5 * (1.0 - board.marker_size / board.square_size)
         return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
     if board.pattern == "circles":
-        success, centres = cv2.findCirclesGrid(
-            grey, (board.columns, board.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID
-        )
+        flags = cv2.CALIB_CB_SYMMETRIC_GRID
+        success, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
         if success:
             return View(board.corners_m(), centres.reshape(-1, 2).astype(np.float64))
         return None
@@ -228,13 +226,8 @@ def _solved(views: list[View], width: int, height: int, fov_deg: float) -> Fishe
 
     # The focal length that lets 180 deg fill the width: a start that keeps OpenCV's first step
     # inside the model.
-    start = np.array(
-        [
-            [width / np.pi, 0.0, width / 2 - 0.5],
-            [0.0, width / np.pi, height / 2 - 0.5],
-            [0.0, 0.0, 1.0],
-        ]
-    )
+    start = np.diag([width / np.pi, width / np.pi, 1.0])
+    start[:2, 2] = (width / 2 - 0.5, height / 2 - 0.5)
     flags = cv2.CALIB_RECOMPUTE_EXTRINSIC | cv2.CALIB_FIX_SKEW | cv2.CALIB_USE_INTRINSIC_GUESS
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 200, 1e-10)
     points = [v.points_m[None] for v in views]
@@ -308,16 +301,16 @@ def board_pose(lens: Fisheye, view: View) -> ndarray:
             " this the lens of these pictures?"
         )
     plane = rays[before, :2] / rays[before, 2:]
-    _, turn, place = cv2.solvePnP(
-        view.points_m[before], plane, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE
-    )
+    points = view.points_m[before]
+    lens_of_plane = (np.eye(3), np.zeros(4))
+    _, turn, place = cv2.solvePnP(points, plane, *lens_of_plane, flags=cv2.SOLVEPNP_IPPE)
 
     def residual(pose: ndarray) -> ndarray:
         return _residual(lens, view, pose)
 
-    return np.asarray(
-        least_squares(residual, np.concatenate([turn, place]).ravel(), x_scale="jac", method="lm").x
-    )
+    start = np.concatenate([turn, place]).ravel()
+    solution = least_squares(residual, start, x_scale="jac", method="lm")
+    return np.asarray(solution.x)
 
 
 def reprojected(lens: Fisheye, view: View) -> ndarray:
@@ -333,14 +326,18 @@ def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:
     """
     import cv2
 
-    points_c = view.points_m @ np.asarray(cv2.Rodrigues(pose[:3])[0]).T + pose[3:]
-    return np.asarray(lens.project(torch.from_numpy(points_c))[0].numpy() - view.pixels).ravel()
+    turn, _ = cv2.Rodrigues(pose[:3])
+    points_c = view.points_m @ np.asarray(turn).T + pose[3:]
+    pixels, _ = lens.project(torch.from_numpy(points_c))
+    return np.asarray(pixels.numpy() - view.pixels).ravel()
 
 
 def _report(residuals: list[ndarray | None]) -> BoardReport:
     """Errors of pictures from their residuals, shape (2 N,) each."""
+
+    def rms(residual: ndarray) -> float:
+        return float(np.sqrt(2.0 * np.mean(residual * residual)))
+
     together = np.concatenate([r for r in residuals if r is not None])
-    errors = (np.nan if r is None else float(np.sqrt(2.0 * np.mean(r * r))) for r in residuals)
-    return BoardReport(
-        float(np.sqrt(2.0 * np.mean(together**2))), tuple(errors), together.size // 2
-    )
+    errors = tuple(np.nan if r is None else rms(r) for r in residuals)
+    return BoardReport(rms(together), errors, together.size // 2)

@@ -88,10 +88,8 @@ def read(
         raise ValueError(f"{path}: {error}") from error
     if len(cameras) > 1:
         names = ", ".join(entry[2] for entry in cameras)
-        report = replace(
-            report,
-            remarks=(f"camera {name} of {len(cameras)} in the file ({names})", *report.remarks),
-        )
+        remark = f"camera {name} of {len(cameras)} in the file ({names})"
+        report = replace(report, remarks=(remark, *report.remarks))
     return box, lens, report
 
 
@@ -197,10 +195,11 @@ def _cameras_of(path: str | Path) -> list[tuple[str, Node, str]]:
     """Cameras of a file, each by a name of its own or its number."""
     cameras = _cameras(_tree(path))
     names = [name for *_, name in cameras]
-    return [
-        (box, node, name if name and names.count(name) == 1 else str(i))
-        for i, (box, node, name) in enumerate(cameras)
-    ]
+    named = []
+    for i, (box, node, name) in enumerate(cameras):
+        unique = name and names.count(name) == 1
+        named.append((box, node, name if unique else str(i)))
+    return named
 
 
 def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
@@ -215,11 +214,10 @@ def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
         named = [(str(key), entry) for key, entry in tree.items()]
     else:
         return []
-    return [
-        entries
-        for key, entry in named
-        for entries in _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
-    ]
+    cameras = []
+    for key, entry in named:
+        cameras += _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
+    return cameras
 
 
 def _uniform(tree: Node) -> Node:
@@ -522,15 +520,11 @@ def _fitted(
     if core not in (*DENOMINATORS, *ANGULAR):
         raise ValueError(f"camera model {model!r} is not known")
     if core == "ocam":
-        corner = (
-            max(values["cx"], size[0] - values["cx"]),
-            max(values["cy"], size[1] - values["cy"]),
-        )
-        values = values | {"farthest": 1.1 * math.hypot(*corner)}
-        if (
-            not values["a0"] < 0.0
-            or values["fx"] * values["fy"] == values["skew"] * values["shear"]
-        ):
+        x, y = values["cx"], values["cy"]
+        corner = math.hypot(max(x, size[0] - x), max(y, size[1] - y))
+        values = values | {"farthest": 1.1 * corner}
+        flat = values["fx"] * values["fy"] == values["skew"] * values["shear"]
+        if flat or not values["a0"] < 0.0:
             raise ValueError(f"direct polynomial begins with {values['a0']:g}; expected below 0")
     return fit_fisheye(model, values, *size, fov)
 

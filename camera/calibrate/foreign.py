@@ -123,24 +123,20 @@ def project(model: str, values: Values, rays: Array) -> Array:
             radius = _RADII[core](values, np.arctan2(side, rays[:, 2]))
             plane = rays[:, :2] * (radius / side)[:, None]
         else:
-            divisor = DENOMINATORS[core][1](values, np.sum(rays[:, :2] ** 2, axis=1), rays[:, 2])
+            _, denominator = DENOMINATORS[core]
+            divisor = denominator(values, np.sum(rays[:, :2] ** 2, axis=1), rays[:, 2])
             plane = rays[:, :2] / np.where(divisor > 1e-9, divisor, np.nan)[:, None]
             plane = DISTORTIONS[distortion or "none"][1](values, plane)
-    stretch = np.array(
-        [
-            [values["fx"], values.get("skew", 0.0)],
-            [values.get("shear", 0.0), values["fy"]],
-        ]
-    )
+    skew, shear = (values.get(name, 0.0) for name in ("skew", "shear"))
+    stretch = np.array([[values["fx"], skew], [shear, values["fy"]]])
     return plane @ stretch.T + [values["cx"], values["cy"]]
 
 
 def _kb4_radius(values: Values, theta: Array) -> Array:
     """Kannala and Brandt's, as :class:`camera.params.FisheyeParams` says."""
     t2 = theta * theta
-    return theta * (
-        1.0 + t2 * (values["k1"] + t2 * (values["k2"] + t2 * (values["k3"] + t2 * values["k4"])))
-    )
+    k1, k2, k3, k4 = (values[f"k{i}"] for i in range(1, 5))
+    return theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
 
 
 def _polyfisheye_radius(values: Values, theta: Array) -> Array:
@@ -286,9 +282,8 @@ def _fitted(theta: Array, direction: Array, pixels: Array, centre: Array, values
         whole[free] = unknown
         return np.asarray((_project_ours(whole, theta, direction) - pixels).ravel())
 
-    fit = least_squares(
-        residual, start[free], x_scale="jac", method="lm", xtol=1e-14, ftol=1e-14, max_nfev=400
-    )
+    how = {"x_scale": "jac", "method": "lm", "xtol": 1e-14, "ftol": 1e-14, "max_nfev": 400}
+    fit = least_squares(residual, start[free], **how)
     parameters = start.copy()
     parameters[free] = fit.x
     return parameters
@@ -302,9 +297,8 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     right = fisheye.width - 0.5
     low = fisheye.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
-    radius = np.linalg.norm(
-        (corners - [fisheye.cx, fisheye.cy]) / [fisheye.fx, fisheye.fy], axis=1
-    ).max()
+    plane = (corners - [fisheye.cx, fisheye.cy]) / [fisheye.fx, fisheye.fy]
+    radius = np.linalg.norm(plane, axis=1).max()
     values = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
     low_angle = 0.0
     high_angle = limit

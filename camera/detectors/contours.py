@@ -135,13 +135,10 @@ class Detector:
         self.params = params or DetectorParams()
         self.radius = payload_radius
         self.side = goal_side
-        shape = (lens.params.height, lens.params.width)
-        v, u = np.mgrid[: shape[0], : shape[1]]
-        edge = self.lens.edge_radius
-        plane = np.hypot(
-            (u - lens.params.cx) / lens.params.fx, (v - lens.params.cy) / lens.params.fy
-        )
-        self._in_view = (plane < edge).astype(np.uint8)
+        p = lens.params
+        v, u = np.mgrid[: p.height, : p.width]
+        plane = np.hypot((u - p.cx) / p.fx, (v - p.cy) / p.fy)
+        self._in_view = (plane < lens.edge_radius).astype(np.uint8)
 
     def detect(self, image: ndarray, prior: Prior | None = None) -> FrameDetections:
         """Find ball and goal. Raises ValueError: an image of another size or type.
@@ -154,12 +151,9 @@ class Detector:
         p = self.params
         prior = prior or Prior()
         colours = colours_of(image)
-        ball = colour_maps(
-            colours, p.ball_hue_deg, p.saturation, p.brightness, self._in_view, "yellow"
-        )
-        goal = colour_maps(
-            colours, p.goal_hue_deg, p.saturation, p.brightness, self._in_view, "green"
-        )
+        limits = (p.saturation, p.brightness, self._in_view)
+        ball = colour_maps(colours, p.ball_hue_deg, *limits, "yellow")
+        goal = colour_maps(colours, p.goal_hue_deg, *limits, "green")
         squares = self._squares(*goal, colours.bright, prior)
         return FrameDetections(self._ball(*ball, prior), squares[0] if squares else None, squares)
 
@@ -191,11 +185,8 @@ class Detector:
                 continue
             score = cone.score
             if prior.ball_ray_c is not None:
-                score -= (
-                    0.5
-                    * math.acos(min(1.0, float(cone.ray_c @ prior.ball_ray_c)))
-                    / prior.ball_within
-                )
+                turn = math.acos(min(1.0, float(cone.ray_c @ prior.ball_ray_c)))
+                score -= 0.5 * turn / prior.ball_within
             if best is None or score > best.score:
                 best = BallSeen(cone.ray_c, cone.half_angle, score)
         return best
@@ -206,9 +197,8 @@ class Detector:
         """
         import cv2
 
-        middle, visible = self.lens.project(
-            torch.from_numpy(np.ascontiguousarray(prior.ball_ray_c, np.float64)[None])
-        )
+        ray_c = np.ascontiguousarray(prior.ball_ray_c, np.float64)
+        middle, visible = self.lens.project(torch.from_numpy(ray_c[None]))
         if not bool(visible):
             return None
         low, high = prior.ball_distance or self.params.ball_distance
@@ -263,13 +253,11 @@ class Detector:
         self, mask: ndarray, level: ndarray, bright: ndarray, prior: Prior
     ) -> tuple[GoalSeen, ...]:
         """The blobs that are squares with a rim, the best first."""
-        fits = [
-            fit_goal(self.lens, self.params.field_share, contour, level, bright)
-            for contour in outlines_of(mask)
-        ]
-        squares = [
-            GoalSeen(*fit) for fit in fits if fit is not None and self._right_size(fit[0], prior)
-        ]
+        squares = []
+        for contour in outlines_of(mask):
+            fit = fit_goal(self.lens, self.params.field_share, contour, level, bright)
+            if fit is not None and self._right_size(fit[0], prior):
+                squares.append(GoalSeen(*fit))
         return tuple(sorted(squares, key=lambda square: -square.score))
 
     def _right_size(self, rays_c: ndarray, prior: Prior) -> bool:
@@ -301,9 +289,9 @@ def ordered_corners(rays_c: ndarray, rot_wc: ndarray) -> ndarray:
     ground = rays_w[:, :2] / np.maximum(-rays_w[:, 2:], 1e-3)
     off = ground - ground.mean(axis=0)
     quadrants = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]])
-    orders = [
-        np.roll(base, shift) for base in (np.arange(4), np.arange(4)[::-1]) for shift in range(4)
-    ]
+    orders = []
+    for base in (np.arange(4), np.arange(4)[::-1]):
+        orders += [np.roll(base, shift) for shift in range(4)]
     best = max(orders, key=lambda order: float(np.sum(off[order] * quadrants)))
     return rays_c[best]
 
@@ -336,9 +324,8 @@ def detected_keypoints(
         points[:GOAL_KEYPOINTS] = corners
         valid[:GOAL_KEYPOINTS] = ok
     if detections.ball is not None:
-        ball_c = detections.ball.ray_c * (
-            camera.params.payload_radius / math.sin(detections.ball.half_angle)
-        )
+        distance = camera.params.payload_radius / math.sin(detections.ball.half_angle)
+        ball_c = detections.ball.ray_c * distance
         box, ok = payload_keypoints(camera, torch.from_numpy(ball_c[None]).float())
         points[GOAL_KEYPOINTS:] = box[0]
         valid[GOAL_KEYPOINTS:] = ok[0]

@@ -49,11 +49,9 @@ def colours_of(image: ndarray) -> Colours:
 
     smooth = cv2.GaussianBlur(image, (0, 0), 0.8)
     blue, green, red = cv2.split(smooth)
-    return Colours(
-        (blue, green, red),
-        cv2.cvtColor(smooth, cv2.COLOR_BGR2HSV_FULL),
-        cv2.max(cv2.max(blue, green), red),
-    )
+    hsv = cv2.cvtColor(smooth, cv2.COLOR_BGR2HSV_FULL)
+    bright = cv2.max(cv2.max(blue, green), red)
+    return Colours((blue, green, red), hsv, bright)
 
 
 def colour_maps(
@@ -81,12 +79,10 @@ def colour_maps(
 
     blue, green, red = colours.bgr
     low, high = (round(hue * 256.0 / 360.0) for hue in hue_deg)
-    selected = cv2.inRange(
-        colours.hsv, (low, 255.0 * saturation, 255.0 * brightness), (high, 255, 255)
-    )
-    mask = cv2.morphologyEx(
-        cv2.bitwise_and(selected, in_view), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)
-    )
+    lowest = (low, 255.0 * saturation, 255.0 * brightness)
+    selected = cv2.inRange(colours.hsv, lowest, (high, 255, 255))
+    selected = cv2.bitwise_and(selected, in_view)
+    mask = cv2.morphologyEx(selected, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     if kind == "yellow":
         pair = (cv2.min(red, green), blue)
     else:
@@ -99,11 +95,11 @@ def outlines_of(mask: ndarray) -> list[ndarray]:
     import cv2
 
     contours, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    return [
-        c[:, 0].astype(np.float64)
-        for c in contours
-        if cv2.contourArea(c) >= LEAST_AREA or len(c) >= LEAST_AREA
-    ]
+    outlines = []
+    for contour in contours:
+        if max(cv2.contourArea(contour), len(contour)) >= LEAST_AREA:
+            outlines.append(contour[:, 0].astype(np.float64))
+    return outlines
 
 
 def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
@@ -145,13 +141,11 @@ def polar_edge(level: ndarray, centre: ndarray, radius: float) -> Edge:
     """
     reach = np.arange(0.3 * radius, 1.5 * radius + 4.0, STEP)
     angle = 2.0 * math.pi * np.arange(ANGLES) / ANGLES
-    u = centre[0] + np.cos(angle)[:, None] * reach
-    v = centre[1] + np.sin(angle)[:, None] * reach
+    way = np.column_stack([np.cos(angle), np.sin(angle)])
+    u, v = (centre[i] + way[:, i, None] * reach for i in range(2))
     hit, distance = _last_crossing(_sample(level, u, v), reach)
-    points = np.column_stack(
-        [centre[0] + np.cos(angle) * distance, centre[1] + np.sin(angle) * distance]
-    )[hit]
-    return Edge(points, float(hit.mean()))
+    points = centre + way * distance[:, None]
+    return Edge(points[hit], float(hit.mean()))
 
 
 def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
@@ -234,10 +228,8 @@ def fit_goal(
     if misfit > MOST_BENT or share < 0.5 or rim < LEAST_RIM:
         return None
     rays_c = np.column_stack([outer, np.ones(4)]) @ frame.T
-    return (
-        rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True),
-        (share - misfit + min(rim, 0.5)) / 1.5,
-    )
+    rays_c = rays_c / np.linalg.norm(rays_c, axis=1, keepdims=True)
+    return rays_c, (share - misfit + min(rim, 0.5)) / 1.5
 
 
 def _quadrangle(points: ndarray) -> ndarray | None:
@@ -282,9 +274,8 @@ def _refined(
             return None
         way = end - start
         length = np.linalg.norm(way, axis=1)
-        way *= (1.0 + np.maximum(0.0, SEARCH_MARGIN / np.maximum(length, 1e-9) - 0.35 / 0.75))[
-            :, None
-        ]
+        lacking = SEARCH_MARGIN / np.maximum(length, 1e-9) - 0.35 / 0.75
+        way *= 1.0 + np.maximum(0.0, lacking)[:, None]
         length = np.linalg.norm(way, axis=1)
         reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
         u, v = (start[:, i, None] + way[:, i, None] * reach for i in range(2))
@@ -316,9 +307,9 @@ def _line(points: ndarray) -> tuple[ndarray, float]:
         distance = off @ normal
         scale = max(1.5 * float(np.median(np.abs(distance))), 1e-9)
         weights = 1.0 / (1.0 + (distance / scale) ** 2)
-    return np.array([*normal, normal @ mean]), float(
-        np.sqrt(np.average(distance**2, weights=weights))
-    )
+    line = np.array([*normal, normal @ mean])
+    rms = np.sqrt(np.average(distance**2, weights=weights))
+    return line, float(rms)
 
 
 def _meet(first: ndarray, second: ndarray) -> ndarray:
@@ -351,9 +342,8 @@ def _rim_contrast(
 
     def around(factor: float) -> ndarray:
         ring = _scaled(corners, factor)
-        points = np.concatenate(
-            [a + part * (b - a) for a, b in zip(ring, np.roll(ring, -1, axis=0))]
-        )
+        sides = np.roll(ring, -1, axis=0) - ring
+        points = (ring[:, None] + part * sides[:, None]).reshape(-1, 2)
         pixels = _pixels(lens, points, frame)
         if pixels is None:
             return np.full(len(points), math.nan)
@@ -403,16 +393,9 @@ def _sample(picture: ndarray, u: ndarray, v: ndarray) -> ndarray:
     import cv2
 
     u, v = (np.ascontiguousarray(a, np.float32) for a in (u, v))
-    if u.ndim == 1:
-        flat = (u.reshape(1, -1), v.reshape(1, -1))
-    else:
-        flat = (u, v)
-    values = cv2.remap(
-        picture.astype(np.float32, copy=False),
-        *flat,
-        cv2.INTER_LINEAR,
-        borderMode=cv2.BORDER_REPLICATE,
-    )
+    flat = np.atleast_2d(u), np.atleast_2d(v)
+    picture = picture.astype(np.float32, copy=False)
+    values = cv2.remap(picture, *flat, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return values.reshape(u.shape)
 
 
@@ -430,17 +413,20 @@ def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     start = round(BLUR_WIDTH / STEP)
     rows = np.arange(len(values))[:, None]
     peak = values.shape[1] - 1
+    last = last[:, None]
     distances = np.arange(start, 2 * start)
-    high = np.quantile(values[rows, np.clip(last[:, None] - distances, 0, peak)], 0.75, axis=1)
-    low = np.median(values[rows, np.clip(last[:, None] + distances, 0, peak)], axis=1)
-    window = np.clip(last[:, None] + np.arange(-2 * start, 2 * start + 1), 0, peak)
+    inner, outer = (np.clip(last + sign * distances, 0, peak) for sign in (-1, 1))
+    high = np.quantile(values[rows, inner], 0.75, axis=1)
+    low = np.median(values[rows, outer], axis=1)
+    window = np.clip(last + np.arange(-2 * start, 2 * start + 1), 0, peak)
     level = low + RIM_LEVEL * (high - low)
     local = values[rows, window]
     above = local > level[:, None]
     falls = above[:, :-1] & ~above[:, 1:]
     index = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
     hit &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
-    return hit, _between(values, reach, np.minimum(window[rows[:, 0], index], peak - 1), level)
+    place = np.minimum(window[rows[:, 0], index], peak - 1)
+    return hit, _between(values, reach, place, level)
 
 
 def _first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
@@ -448,9 +434,11 @@ def _first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     where.
     """
     plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
-    falls = (values[:, :-1] > 0.5 * plateau[:, None]) & (values[:, 1:] <= 0.5 * plateau[:, None])
+    level = 0.5 * plateau
+    above = values > level[:, None]
+    falls = above[:, :-1] & ~above[:, 1:]
     hit = falls.any(axis=1) & (plateau > LEAST_LEVEL)
-    return hit, _between(values, reach, np.argmax(falls, axis=1), 0.5 * plateau)
+    return hit, _between(values, reach, np.argmax(falls, axis=1), level)
 
 
 def _between(values: ndarray, reach: ndarray, index: ndarray, level: ndarray) -> ndarray:

@@ -136,10 +136,8 @@ class BallGoalTracker:
         """
         if self._begin is not None:
             length = float(np.linalg.norm(self._begin))
-            self._ball, self._half_angle = (
-                BallTrack(self._begin / length, stamp, *INITIAL_SPREADS),
-                math.asin(self._radius / length),
-            )
+            self._ball = BallTrack(self._begin / length, stamp, *INITIAL_SPREADS)
+            self._half_angle = math.asin(self._radius / length)
             self._begin = None
         where = {}
         if self._ball is not None:
@@ -148,10 +146,8 @@ class BallGoalTracker:
             else:
                 pull = 0.0
             self._ball.predict(stamp, -pull * _perpendicular(up_w, self._ball.ray_w))
-            where = {
-                "ball_ray_c": rot_wc.T @ self._ball.ray_w,
-                "ball_within": min(GATE * self._ball.spread, math.pi),
-            }
+            where["ball_ray_c"] = rot_wc.T @ self._ball.ray_w
+            where["ball_within"] = min(GATE * self._ball.spread, math.pi)
         self._squares = [square for square in self._squares if stamp - square.stamp < MEMORY]
         self._weight = -math.expm1(-max(stamp - self._stamp, 0.0) / MEMORY)
         for square in self._squares:
@@ -160,10 +156,8 @@ class BallGoalTracker:
         self._stamp = stamp
         if self._squares:
             offset = np.append(self._likeliest().place_w, 0.0) - eye_w
-            where |= {
-                "goal_ray_c": rot_wc.T @ _unit(offset),
-                "goal_within": self._side / float(np.linalg.norm(offset)),
-            }
+            where["goal_ray_c"] = rot_wc.T @ _unit(offset)
+            where["goal_within"] = self._side / float(np.linalg.norm(offset))
         return Prior(rot_wc[2], float(eye_w[2]), distance, north_c=rot_wc[0], **where)
 
     def take(
@@ -189,9 +183,8 @@ class BallGoalTracker:
                 self._ball = BallTrack(ray_w, stamp, READ, TURNS)
             self._half_angle = detections.ball.half_angle
         elif self._ball is not None and self._ball.spread < LOST:
-            return replace(
-                detections, ball=BallSeen(rot_wc.T @ self._ball.ray_w, self._half_angle, 0.0)
-            )
+            ball = BallSeen(rot_wc.T @ self._ball.ray_w, self._half_angle, 0.0)
+            return replace(detections, ball=ball)
         return detections
 
     def _goal(self, detections: FrameDetections, rot_wc: ndarray) -> GoalSeen | None:
@@ -202,9 +195,8 @@ class BallGoalTracker:
         for one in detections.squares:  # the likeliest first
             ray_w = rot_wc @ one.rays_c.mean(0)
             place_w = self._eye_w[:2] + ray_w[:2] * (self._eye_w[2] / -ray_w[2])
-            distances = [
-                float(np.linalg.norm(square.place_w - place_w)) for square in self._squares
-            ]
+            offsets = [square.place_w - place_w for square in self._squares]
+            distances = [float(np.linalg.norm(offset)) for offset in offsets]
             i = int(np.argmin([*distances, self._side]))  # the last: a new one
             if i in squares:
                 continue

@@ -117,14 +117,12 @@ class Networks(nn.Module):
             "calibration": self.calibration,
             "made_by": self.made_by,
         }
-        arrays = {
-            name: value.numpy(force=True).astype(np.float16)
-            for name, value in self.state_dict().items()
-        }
+        arrays = {}
+        for name, value in self.state_dict().items():
+            arrays[name] = value.numpy(force=True).astype(np.float16)
         with open(path, "wb") as file:
-            np.savez_compressed(
-                file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays
-            )
+            text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+            np.savez_compressed(file, header=text, **arrays)
 
     @staticmethod
     def load(path: str | Path = SHIPPED) -> "Networks":
@@ -138,9 +136,8 @@ class Networks(nn.Module):
                         f"format version {header['format_version']}, this program reads {FORMAT}"
                     )
                 names = [name for name in arrays.files if name != "header"]
-                networks.load_state_dict(
-                    {name: torch.from_numpy(arrays[name].astype(np.float32)) for name in names}
-                )
+                numbers = {name: arrays[name].astype(np.float32) for name in names}
+                networks.load_state_dict({n: torch.from_numpy(x) for n, x in numbers.items()})
         except (OSError, EOFError, KeyError, ValueError, RuntimeError, BadZipFile) as error:
             raise ValueError(
                 f"{path}: no detector written by `visthrow detector train`: {error}"
@@ -252,23 +249,20 @@ class LearntDetector(Detector):
         prior = prior or Prior()
         frames = torch.from_numpy(np.ascontiguousarray(image[..., ::-1]))[None]
         places = places_of(self.networks.search(halved(frames)), self.lens)
-        north = torch.tensor(
-            prior.north_c if prior.north_c is not None else (0.0, -1.0, 0.0), dtype=torch.float32
-        )
+        north_c = (0.0, -1.0, 0.0) if prior.north_c is None else prior.north_c
+        north = torch.tensor(north_c, dtype=torch.float32)
         ball, goal = (self._closest(kind, frames, *places[kind], north) for kind in KINDS)
         squares = self._squares(*goal, prior)
-        return FrameDetections(
-            self._best_ball(*ball, prior), squares[0] if squares else None, squares
-        )
+        best = squares[0] if squares else None
+        return FrameDetections(self._best_ball(*ball, prior), best, squares)
 
     def _closest(
         self, kind: str, frames: Tensor, rays: Tensor, sizes: Tensor, north: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Probabilities and findings at places."""
         factor, offset, _ = self.networks.calibration[kind]
-        views, outputs, _, _ = look_closely(
-            self.networks, kind, frames, rays, sizes, self.lens, north
-        )
+        places = (rays, sizes, self.lens, north)
+        views, outputs, _, _ = look_closely(self.networks, kind, frames, *places)
         probability = torch.sigmoid(factor * outputs[:, 0] + offset)
         if kind == "ball":
             things = ball_of(views, outputs)
@@ -277,9 +271,8 @@ class LearntDetector(Detector):
         return probability, things
 
     def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:
-        probability = self._expected_there(
-            probability, things[:, :3], prior.ball_ray_c, prior.ball_within
-        )
+        expected = (prior.ball_ray_c, prior.ball_within)
+        probability = self._expected_there(probability, things[:, :3], *expected)
         for i in probability.argsort(descending=True).tolist():
             ray = things[i, :3].double().numpy()
             half_angle = float(things[i, 3])
@@ -291,9 +284,9 @@ class LearntDetector(Detector):
         """Return detections that are certain, or certain where expected, the likeliest first; each
         by its own probability, which frames add up.
         """
-        raised = self._expected_there(
-            probability, F.normalize(things.mean(1), dim=-1), prior.goal_ray_c, prior.goal_within
-        )
+        middles = F.normalize(things.mean(1), dim=-1)
+        expected = (prior.goal_ray_c, prior.goal_within)
+        raised = self._expected_there(probability, middles, *expected)
         squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
@@ -337,10 +330,10 @@ def look_closely(
     """
     index = torch.zeros(len(rays), dtype=torch.long, device=rays.device)
     for _ in range(2):
-        views = views_about(
-            rays, (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0), north.expand_as(rays)
-        )
-        outputs = getattr(networks, kind)(patches_of(frame, index, views, lens, PATCH[kind]))
+        reach = (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0)
+        views = views_about(rays, reach, north.expand_as(rays))
+        patches = patches_of(frame, index, views, lens, PATCH[kind])
+        outputs = getattr(networks, kind)(patches)
         rays, sizes = middle_of(kind, views, outputs)
     return views, outputs, rays, sizes
 
@@ -352,7 +345,8 @@ def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]
         return thing[:, :3], thing[:, 3]
     corners = views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
     middle = F.normalize(corners.mean(1), dim=-1)
-    return middle, (corners @ middle[:, :, None])[..., 0].clamp(max=1.0 - 1e-7).acos().mean(1)
+    cosines = (corners @ middle[:, :, None])[..., 0]
+    return middle, cosines.clamp(max=1.0 - 1e-7).acos().mean(1)
 
 
 def ball_of(views: Views, outputs: Tensor) -> Tensor:

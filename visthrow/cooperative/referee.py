@@ -34,14 +34,13 @@ class MujocoTeam:
         self._nominal = [_compile(members) for members in teams]
         self._data = [mujoco.MjData(model) for model in self._nominal]
         self._repeats = max(round(world.substep / STEP), 1)
-        segments = world.params.rope.segments
-        shapes = ((world.count, 7), (world.count, 6), *((world.count, 2 * segments),) * 2)
+        hinges = 2 * world.params.rope.segments
+        shapes = [(world.count, width) for width in (7, 6, hinges, hinges)]
         self._arrays = [wp.zeros(shape, dtype=wp.float32) for shape in shapes]
         self._rows = wp.array(np.arange(world.count), dtype=wp.int32)
         self._kernel = build_place(world, hinges=True)
-        self.load_pos_w, self.load_vel_w = (
-            wp.zeros(self.worlds, dtype=world.types.vec3) for _ in range(2)
-        )
+        self.load_pos_w = wp.zeros(self.worlds, dtype=world.types.vec3)
+        self.load_vel_w = wp.zeros_like(self.load_pos_w)
 
     def place(self, mask) -> None:
         w = self.world

@@ -278,16 +278,11 @@ class TeamEnv(VecEnv):
         released, landing = self._landed(time[:: self.team])
         gap = self.gap()
         contact = (gap < 0.0) & ~released
-        ended = terminations.negative(
-            task.bounds,
-            state["pos_w"],
-            ob.rotation_from_quat(state["quat_wb"]),
-            load,
-            state["status"],
-            state["release_timer"] >= 0.0,
-            time,
-            release.landing_height,
-        )
+        turn = ob.rotation_from_quat(state["quat_wb"])
+        latched = state["release_timer"] >= 0.0
+        place = (state["pos_w"], turn, load)
+        height = release.landing_height
+        ended = terminations.negative(task.bounds, *place, state["status"], latched, time, height)
         negative = ~released & (self._worlds(ended).any(1) | contact)
         miss = landing["landing_w"] - self.views.goal_w[:: self.team]
         error = miss[:, :2].norm(dim=-1)

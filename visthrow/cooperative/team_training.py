@@ -146,12 +146,10 @@ def _summary(values: dict[str, np.ndarray], target: float, radii: float) -> dict
         return result
     error = values["landing_error"][good]
     bias = values["landing_w"][good, :2].mean(0) - [target, 0.0]
-    figures = {
-        "error_mean": error.mean(),
-        "error_median": np.median(error),
-        "error_p95": np.quantile(error, 0.95),
-        "duration_mean": values["duration"][good].mean(),
-        "apart_mean": values["apart"][good].mean(),
-    }
-    means = {name: float(value) for name, value in figures.items()}
-    return result | means | {"bias": bias.tolist()}
+    result["error_mean"] = float(error.mean())
+    result["error_median"] = float(np.median(error))
+    result["error_p95"] = float(np.quantile(error, 0.95))
+    for name in ("duration", "apart"):
+        result[f"{name}_mean"] = float(values[name][good].mean())
+    result["bias"] = bias.tolist()
+    return result

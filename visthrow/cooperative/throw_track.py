@@ -91,8 +91,9 @@ def picture(track: ThrowTrack, path: Path) -> None:
                 axis.plot(*track.frames_w[k, v][..., columns].T, color=colour, lw=2.0)
                 if track.attached[k, v]:
                     axis.plot(*track.cables_w[k, v][:, columns].T, color=style.ROPE, lw=0.8)
-        axis.plot(*track.load_w[:, columns].T, color=style.PAYLOAD, label="load")
-        axis.plot(*track.load_w[steps][:, columns].T, "o", color=style.PAYLOAD, ms=6.0)
+        load = track.load_w[:, columns].T
+        axis.plot(*load, color=style.PAYLOAD, label="load")
+        axis.plot(*load[:, steps], "o", color=style.PAYLOAD, ms=6.0)
         if track.released:
             axis.plot(*track.flight_w[:, columns].T, "--", color=style.PAYLOAD, label="its flight")
         axis.plot(*track.goal_w[columns], "x", color=style.GOAL, ms=9.0, label="target")

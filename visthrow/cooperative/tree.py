@@ -72,9 +72,8 @@ class TreeSolver:
         self.team = team
         self.worlds = world.count // team
         vec3 = world.types.vec3
-        self.load_pos_w, self.load_vel_w = (
-            wp.zeros(self.worlds, dtype=vec3, device=world.device) for _ in range(2)
-        )
+        self.load_pos_w = wp.zeros(self.worlds, dtype=vec3, device=world.device)
+        self.load_vel_w = wp.zeros_like(self.load_pos_w)
         self._place, self._advance = _kernels(world, team)
 
     def place(self, mask) -> None:

@@ -140,12 +140,10 @@ class Calibration:
     @classmethod
     def of(cls, values: dict[str, Any]) -> "Calibration":
         """Return the inverse of `values`."""
-        return cls(
-            **{
-                name: tuple(value) if isinstance(value, list) else value
-                for name, value in values.items()
-            }
-        )
+        fields = {}
+        for name, value in values.items():
+            fields[name] = tuple(value) if isinstance(value, list) else value
+        return cls(**fields)
 
     def __str__(self) -> str:
         """For the pilot."""
@@ -287,10 +285,8 @@ class CalibrationProblem:
         rate = self.rate - c["gyro"][:, None]
         rope, rope_rate = _rope(swing, swing_rate)
         hung = vel + _turned(rot, torch.linalg.cross(rate, self.mount.expand_as(rate)))
-        ball, swung = (
-            hung + length * (1.0 + c["length"][:, None]) * rope_rate
-            for length in (self.length, self.swung)
-        )
+        longer = 1.0 + c["length"][:, None]
+        ball, swung = (hung + size * longer * rope_rate for size in (self.length, self.swung))
         mean = lambda value: 0.5 * (value[:, :-1] + value[:, 1:])  # noqa: E731
         jump = lambda value: value[:, 1:] - value[:, :-1]  # noqa: E731
         total = self.vehicle + self.load
@@ -351,9 +347,8 @@ class CalibrationProblem:
         length = self.length * (1.0 + c["length"][:, None])
         ball_w = body_w + _turned(attitude, self.mount.expand_as(body_w)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
-        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)[:, None].expand(
-            -1, body_w.shape[1], -1, -1
-        )
+        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)
+        corners_w = corners_w[:, None].expand(-1, body_w.shape[1], -1, -1)
         offsets = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
         place = self.camera.position_b + c["lens"]
         in_body = torch.einsum("bnji,bnkj->bnki", attitude, offsets) - place[:, None, None]
@@ -518,7 +513,8 @@ def _linearised(problem: CalibrationProblem, x: Tensor, c: Tensor) -> tuple[Tens
         base = values[0]
         off = (values[1:] - values[:1]) / h
         if step is j:
-            misfit = float(base.square().sum().sqrt() / max(int((base != 0.0).sum()), 1) ** 0.5)
+            terms = max(int((base != 0.0).sum()), 1)
+            misfit = float(base.square().sum().sqrt() / terms**0.5)
             ball, goal = (part.norm(dim=-1, keepdim=True) for part in base.split((3, 2), -1))
             sizes = torch.cat([ball.expand(-1, 3), goal.expand(-1, 2)], -1)
             weight = (OUTLIER / sizes.clamp(min=1e-9)).clamp(max=1.0).sqrt()

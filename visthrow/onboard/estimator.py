@@ -119,11 +119,8 @@ class Estimator:
         memory = torch.gru_cell(
             x, memory, self.input_weight, self.memory_weight, self.input_bias, self.memory_bias
         )
-        return (
-            F.pad(obs, (0, 1))[:, self.kept]
-            + F.linear(memory, self.output_weight, self.output_bias),
-            memory,
-        )
+        correction = F.linear(memory, self.output_weight, self.output_bias)
+        return F.pad(obs, (0, 1))[:, self.kept] + correction, memory
 
     def to(self, device: str | torch.device) -> "Estimator":
         """Return the estimator with its tensors on another device."""

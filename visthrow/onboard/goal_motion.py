@@ -199,9 +199,9 @@ def _located(
     box = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2))
     box_valid = valid[:, GOAL_KEYPOINTS:]
     rot_wb = rotation_in(frame)
-    rays = rays_w(
-        camera, rot_wb, torch.cat([_corners(layout, frame), middle(box, box_valid)[:, None]], dim=1)
-    )
+    centre = middle(box, box_valid)
+    points = torch.cat([_corners(layout, frame), centre[:, None]], dim=1)
+    rays = rays_w(camera, rot_wb, points)
     goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays[:, :GOAL_KEYPOINTS])
     one, two, three, four = weight.unbind(-1)
     sums, velocity = fit(sums, time, middle(goals, weight > 0.0), one + two + three + four, fresh)
@@ -209,14 +209,9 @@ def _located(
     goal_xy = place(sums, time, moves)
     located = sums[:, :1] > 0.0
     hangs = box_valid.any(-1, keepdim=True)
-    places = torch.cat(
-        [
-            (goal_xy - frame[:, :2]) * located,
-            rays[:, GOAL_KEYPOINTS] * hangs,
-            located.to(frame.dtype),
-        ],
-        dim=-1,
-    )
+    goal = (goal_xy - frame[:, :2]) * located
+    ball = rays[:, GOAL_KEYPOINTS] * hangs
+    places = torch.cat([goal, ball, located.to(frame.dtype)], dim=-1)
     return GoalEstimate(
         sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, located)
     )

@@ -152,9 +152,8 @@ def _rates(rot_wb: ndarray, thrust_w: ndarray, yaw: ndarray, params: HoverParams
     angle = np.arctan2(sine, aim_b[:, 2])
     # e_z x aim = (-aim_y, aim_x, 0); upside down exactly, any axis will do.
     axis = np.where(sine[:, None] > 1e-9, np.column_stack((-aim_b[:, 1], aim_b[:, 0])), (1.0, 0.0))
-    tilt_rates = (
-        params.attitude_gain * angle[:, None] * axis / np.where(sine > 1e-9, sine, 1.0)[:, None]
-    )
+    divisor = np.where(sine > 1e-9, sine, 1.0)
+    tilt_rates = params.attitude_gain * angle[:, None] * axis / divisor[:, None]
     heading = np.arctan2(rot_wb[:, 1, 0], rot_wb[:, 0, 0])
     error = np.angle(np.exp(1j * (yaw - heading)))
     # A turn about the world's vertical has this much of body z in it; none where the vehicle lies

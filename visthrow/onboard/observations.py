@@ -102,12 +102,11 @@ class Layout:
         """Columns of these groups in the actor's input."""
         widths = list(self.groups.items())
         starts = [sum(width for _, width in widths[:k]) for k in range(len(widths))]
-        return [
-            start + i
-            for (name, width), start in zip(widths, starts)
-            if name in names
-            for i in range(width)
-        ]
+        places: list[int] = []
+        for (name, width), start in zip(widths, starts):
+            if name in names:
+                places += range(start, start + width)
+        return places
 
 
 def layout_of(params: Any) -> Layout:
@@ -169,20 +168,16 @@ def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tens
     one, two = ([5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5])
     signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
     identity = torch.eye(3, device=device, dtype=dtype).flatten()
-    return (
-        torch.tensor([*one, *two], device=device),
-        torch.tensor(signs, device=device, dtype=dtype),
-        identity,
-    )
+    chosen = torch.tensor([*one, *two], device=device)
+    return chosen, torch.tensor(signs, device=device, dtype=dtype), identity
 
 
 def rotation_from_quat(quat: Tensor) -> Tensor:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
     chosen, signs, identity = _of_rotation(quat.device, quat.dtype)
     products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
-    one, two = (
-        (products.flatten(-2).index_select(-1, chosen) * signs).unflatten(-1, (2, 9)).unbind(-2)
-    )
+    terms = products.flatten(-2).index_select(-1, chosen) * signs
+    one, two = terms.unflatten(-1, (2, 9)).unbind(-2)
     rot_wb: Tensor = (identity + (one + two)).unflatten(-1, (3, 3))
     return rot_wb
 
@@ -258,11 +253,10 @@ def observe(
         "response": answers,
         "setup": setup,
     }
-    further = [
-        value.flatten(1).to(frame.dtype)
-        for name, value in optional.items()
-        if getattr(layout, name) and value is not None
-    ]
+    further = []
+    for name, value in optional.items():
+        if getattr(layout, name) and value is not None:
+            further.append(value.flatten(1).to(frame.dtype))
     history = push(history, frame[:, goal_end:], fresh)
     parts = [
         frame[:, :VEHICLE],

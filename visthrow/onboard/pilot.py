@@ -82,9 +82,8 @@ def _resampled(history: ndarray, sample: ndarray, ages: list[float], period: flo
     """`visthrow.onboard.observations.resampled`, of arrays; ``sample``: history with this
     step in it.
     """
-    return ob.resampled(
-        torch.from_numpy(history), torch.from_numpy(sample)[:, 0], ages, period
-    ).numpy()
+    row = torch.from_numpy(sample)[:, 0]
+    return ob.resampled(torch.from_numpy(history), row, ages, period).numpy()
 
 
 class Pilot:
@@ -163,12 +162,10 @@ class Pilot:
         """Begin a throw from hover: the next call fills the history."""
         self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._previous = self._first.repeat(self.count, 0)
-        self._history = np.zeros(
-            (self.count, 1 + self.layout.history, self.layout.payload), dtype=np.float32
-        )
-        self._answers = np.zeros(
-            (self.count, 1 + self.layout.response, ob.RESPONSE), dtype=np.float32
-        )
+        shape = (self.count, 1 + self.layout.history, self.layout.payload)
+        self._history = np.zeros(shape, dtype=np.float32)
+        shape = (self.count, 1 + self.layout.response, ob.RESPONSE)
+        self._answers = np.zeros(shape, dtype=np.float32)
         self._memory = self.policy.begin(self.count).numpy()
         self._fresh = np.ones(self.count, dtype=bool)
         self._goal_fit = goal_motion.empty_sums(self.count).numpy()
@@ -276,9 +273,8 @@ class Pilot:
             for k in range(1, 1 + rows)
             if ages and k * period < ages[-1] + JITTER
         ]
-        late = len(due) != len(times) or any(
-            abs(time - when) > JITTER for time, when in zip(times, due)
-        )
+        errors = [abs(time - when) for time, when in zip(times, due)]
+        late = len(due) != len(times) or any(error > JITTER for error in errors)
         if late:
             self._history = _resampled(self._history, frame[0], ages, period)
             if self.layout.response:
@@ -387,9 +383,9 @@ class Pilot:
             raise PolicyError("this pilot has no camera")
         zero = np.zeros((self.count, 3))
         goal_w = np.asarray(goal_w).reshape(-1, 3)
-        views = torch.from_numpy(
-            self._measured(pos_w, quat_wb, zero, zero, payload_w, goal_w, np.ones((1, 1)))
-        )
+        attached = np.ones((1, 1))
+        measured = self._measured(pos_w, quat_wb, zero, zero, payload_w, goal_w, attached)
+        views = torch.from_numpy(measured)
         pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
         points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()

@@ -124,7 +124,8 @@ class Policy:
             width = 0
         else:
             width = self.estimator.memory
-        return torch.zeros(count, width, device=self.weights[0].device, dtype=self.weights[0].dtype)
+        weight = self.weights[0]
+        return torch.zeros(count, width, device=weight.device, dtype=weight.dtype)
 
     @torch.no_grad()
     def step(self, obs: Tensor, memory: Tensor) -> tuple[Tensor, Tensor]:
@@ -174,16 +175,14 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-        moved: dict[str, Any] = {
-            name: tuple(tensor.to(device) for tensor in getattr(self, name))
-            for name in ("weights", "biases")
-        }
+        moved: dict[str, Any] = {}
+        for name in ("weights", "biases"):
+            moved[name] = tuple(tensor.to(device) for tensor in getattr(self, name))
         parts = {name: getattr(self, name) for name in ("mean", "std", "estimator")}
-        return replace(
-            self,
-            **moved,
-            **{name: part.to(device) for name, part in parts.items() if part is not None},
-        )
+        for name, part in parts.items():
+            if part is not None:
+                moved[name] = part.to(device)
+        return replace(self, **moved)
 
     def require(
         self,
@@ -207,9 +206,8 @@ class Policy:
         trained = flattened(self.contract, sections)
         current = flattened(contract_now, sections)
         keys = sorted(trained.keys() | current.keys())
-        differing = [
-            key for key in keys if not _same(trained.get(key, _ABSENT), current.get(key, _ABSENT))
-        ]
+        pairs = [(trained.get(key, _ABSENT), current.get(key, _ABSENT)) for key in keys]
+        differing = [key for key, pair in zip(keys, pairs) if not _same(*pair)]
         allowed = [
             key
             for key in differing
@@ -311,11 +309,8 @@ class Policy:
         """
         prefixes = ("mlp.", "obs_normalizer.", "distribution.")
         foreign = sorted(key for key in state if not key.startswith(prefixes))
-        index = sorted(
-            int(key.split(".")[1])
-            for key in state
-            if key.startswith("mlp.") and key.endswith(".weight")
-        )
+        weights = [key for key in state if key.startswith("mlp.") and key.endswith(".weight")]
+        index = sorted(int(key.split(".")[1]) for key in weights)
         if foreign or not index:
             received = ", ".join(foreign) or "no mlp.<i>.weight"
             expected = "mlp.<i>.weight, mlp.<i>.bias, obs_normalizer._mean, obs_normalizer._std"
