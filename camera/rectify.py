@@ -55,7 +55,8 @@ def view_map(lens: Fisheye, view: ViewParams) -> tuple[Tensor, Tensor]:
     u = torch.arange(view.width, dtype=torch.float64) - (view.width - 1) / 2.0
     v = torch.arange(view.height, dtype=torch.float64) - (view.height - 1) / 2.0
     plane = torch.stack(torch.meshgrid(u, v, indexing="xy"), -1) / focal
-    rays = torch.cat([plane, torch.ones_like(plane[..., :1])], -1) @ view_rotation(view).T
+    depth = torch.ones_like(plane[..., :1])
+    rays = torch.cat([plane, depth], -1) @ view_rotation(view).T
     pixels, valid = lens.project(rays)
     return pixels, valid & lens.on_sensor(pixels)
 

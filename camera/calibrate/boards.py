@@ -123,7 +123,8 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
             return None
         # free of the marker about each corner, in squares
         margin = 0.5 * (1.0 - board.marker_size / board.square_size)
-        return View(board.corners_m()[ids.ravel()], _refine(grey, corners.reshape(-1, 2), margin))
+        points = board.corners_m()[ids.ravel()]
+        return View(points, _refine(grey, corners.reshape(-1, 2), margin))
     if board.pattern == "circles":
         flags = cv2.CALIB_CB_SYMMETRIC_GRID
         success, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
@@ -132,10 +133,9 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
         return None
     # Equalising the histogram helps in bad light and costs accuracy in good light, so it comes
     # second.
+    size = (board.columns, board.rows)
     for flags in (cv2.CALIB_CB_ACCURACY, cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE):
-        success, corners = cv2.findChessboardCornersSB(
-            grey, (board.columns, board.rows), flags=flags
-        )
+        success, corners = cv2.findChessboardCornersSB(grey, size, flags=flags)
         if success:
             return View(board.corners_m(), _refine(grey, corners.reshape(-1, 2)))
     return None
@@ -317,7 +317,8 @@ def reprojected(lens: Fisheye, view: View) -> ndarray:
     """Pixels [px], shape (N, 2), at which a lens expects the points of a board whose pose was
     fitted.
     """
-    return np.asarray(view.pixels + _residual(lens, view, board_pose(lens, view)).reshape(-1, 2))
+    residual = _residual(lens, view, board_pose(lens, view))
+    return np.asarray(view.pixels + residual.reshape(-1, 2))
 
 
 def _residual(lens: Fisheye, view: View, pose: ndarray) -> ndarray:

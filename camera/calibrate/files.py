@@ -120,7 +120,8 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     pitch = math.asin(max(-1.0, min(1.0, -turn[2][0])))
     yaw = math.atan2(turn[1][0], turn[0][0])
     x, y, z = position_b.tolist()
-    return MountParams((x, y, z), (math.degrees(roll), math.degrees(pitch), math.degrees(yaw)))
+    roll, pitch, yaw = map(math.degrees, (roll, pitch, yaw))
+    return MountParams((x, y, z), (roll, pitch, yaw))
 
 
 def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
@@ -521,7 +522,8 @@ def _fitted(
         raise ValueError(f"camera model {model!r} is not known")
     if core == "ocam":
         x, y = values["cx"], values["cy"]
-        corner = math.hypot(max(x, size[0] - x), max(y, size[1] - y))
+        width, height = size
+        corner = math.hypot(max(x, width - x), max(y, height - y))
         values = values | {"farthest": 1.1 * corner}
         flat = values["fx"] * values["fy"] == values["skew"] * values["shear"]
         if flat or not values["a0"] < 0.0:

@@ -124,7 +124,8 @@ def project(model: str, values: Values, rays: Array) -> Array:
             plane = rays[:, :2] * (radius / side)[:, None]
         else:
             _, denominator = DENOMINATORS[core]
-            divisor = denominator(values, np.sum(rays[:, :2] ** 2, axis=1), rays[:, 2])
+            side2 = np.sum(rays[:, :2] ** 2, axis=1)
+            divisor = denominator(values, side2, rays[:, 2])
             plane = rays[:, :2] / np.where(divisor > 1e-9, divisor, np.nan)[:, None]
             plane = DISTORTIONS[distortion or "none"][1](values, plane)
     skew, shear = (values.get(name, 0.0) for name in ("skew", "shear"))
@@ -149,7 +150,8 @@ def _ocam_radius(values: Values, theta: Array) -> Array:
     """Scaramuzza, Martinelli, Siegwart, "A Toolbox for Easily Calibrating Omnidirectional Cameras",
     IROS 2006, eq. 3: the direct polynomial a0 + a1 rho + ... is the ray's depth, inverted here.
     """
-    powers = np.array([values[f"a{i}"] for i in range(sum(name[0] == "a" for name in values))])
+    count = sum(name[0] == "a" for name in values)
+    powers = np.array([values[f"a{i}"] for i in range(count)])
     rho = np.linspace(0.0, values["farthest"], 4096)
     angles = np.arctan2(rho, -polyval(rho, powers))
     grows = int(np.argmin(np.append(np.diff(angles) > 0.0, False)))
@@ -297,7 +299,8 @@ def image_fov_deg(fisheye: FisheyeParams) -> float:
     right = fisheye.width - 0.5
     low = fisheye.height - 0.5
     corners = np.array([[-0.5, -0.5], [right, -0.5], [right, low], [-0.5, low]])
-    plane = (corners - [fisheye.cx, fisheye.cy]) / [fisheye.fx, fisheye.fy]
+    off = corners - [fisheye.cx, fisheye.cy]
+    plane = off / [fisheye.fx, fisheye.fy]
     radius = np.linalg.norm(plane, axis=1).max()
     values = {f"k{i}": k for i, k in enumerate(fisheye.coefficients, start=1)}
     low_angle = 0.0

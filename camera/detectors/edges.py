@@ -189,7 +189,8 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         good = np.abs(off - outer) < width
         if good.sum() < 6:
             return axis, half_angle, math.inf, 0.0
-    return axis, half_angle, float(np.sqrt(np.mean(off[good] ** 2))), float(good.mean())
+    misfit = np.sqrt(np.mean(off[good] ** 2))
+    return axis, half_angle, float(misfit), float(good.mean())
 
 
 def fit_goal(
@@ -277,7 +278,8 @@ def _refined(
         lacking = SEARCH_MARGIN / np.maximum(length, 1e-9) - 0.35 / 0.75
         way *= 1.0 + np.maximum(0.0, lacking)[:, None]
         length = np.linalg.norm(way, axis=1)
-        reach = np.linspace(0.0, 1.0, max(8, math.ceil(float(length.max()) / STEP)))
+        steps = math.ceil(float(length.max()) / STEP)
+        reach = np.linspace(0.0, 1.0, max(8, steps))
         u, v = (start[:, i, None] + way[:, i, None] * reach for i in range(2))
         values = _sample(level, u, v)
         hit, distance = _first_crossing(values, reach)
@@ -289,10 +291,8 @@ def _refined(
         misfit.append(off / np.linalg.norm(side))
         share.append(hit.mean())
     met = np.array([_meet(lines[i - 1], lines[i]) for i in range(4)])
-    if (
-        not np.isfinite(met).all()
-        or np.abs(met - corners).max() > 0.6 * np.abs(corners - middle).max()
-    ):
+    reach = 0.6 * np.abs(corners - middle).max()
+    if not np.isfinite(met).all() or np.abs(met - corners).max() > reach:
         return None
     return met, float(np.max(misfit)), float(np.mean(share))
 

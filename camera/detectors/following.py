@@ -194,7 +194,8 @@ class BallGoalTracker:
         squares: dict[int, GoalSeen] = {}
         for one in detections.squares:  # the likeliest first
             ray_w = rot_wc @ one.rays_c.mean(0)
-            place_w = self._eye_w[:2] + ray_w[:2] * (self._eye_w[2] / -ray_w[2])
+            distance = self._eye_w[2] / -ray_w[2]
+            place_w = self._eye_w[:2] + ray_w[:2] * distance
             offsets = [square.place_w - place_w for square in self._squares]
             distances = [float(np.linalg.norm(offset)) for offset in offsets]
             i = int(np.argmin([*distances, self._side]))  # the last: a new one

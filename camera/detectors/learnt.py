@@ -171,7 +171,8 @@ class Views:
     def points(self, rays: Tensor) -> Tensor:
         """The inverse of `rays`, of rays less than a right angle off (B, K, 3)."""
         local = rays @ self.axes.transpose(1, 2)
-        return local[..., :2] / (local[..., 2:].clamp(min=1e-3) * self.reach[:, None, None])
+        depth = local[..., 2:].clamp(min=1e-3)
+        return local[..., :2] / (depth * self.reach[:, None, None])
 
 
 def views_about(rays: Tensor, reach: Tensor, north_c: Tensor) -> Views:
@@ -200,7 +201,8 @@ def patches_of(frames: Tensor, index: Tensor, views: Views, lens: Fisheye, side:
         views: of the patches. lens: of the frames. side: S.
     """
     centres = (torch.arange(side, device=frames.device) + 0.5) * (2.0 / side) - 1.0
-    grid = torch.stack(torch.meshgrid(centres, centres, indexing="xy"), -1).reshape(1, -1, 2)
+    axes = torch.meshgrid(centres, centres, indexing="xy")
+    grid = torch.stack(axes, -1).reshape(1, -1, 2)
     rays = views.rays(grid.expand(len(index), -1, -1))
     pixels, _ = lens.project(rays)
     height, width = frames.shape[1:3]
@@ -290,9 +292,8 @@ class LearntDetector(Detector):
         squares = []
         for i in probability.argsort(descending=True).tolist():
             rays = things[i].double().numpy()
-            if max(probability[i], raised[i]) >= LEAST_PROBABILITY and self._right_size(
-                rays, prior
-            ):
+            certain = max(probability[i], raised[i]) >= LEAST_PROBABILITY
+            if certain and self._right_size(rays, prior):
                 squares.append(GoalSeen(rays, float(probability[i])))
         return tuple(squares)
 
@@ -308,7 +309,8 @@ class LearntDetector(Detector):
             return probability
         cosine = rays @ torch.from_numpy(expected_c).float()
         variance = (tolerance / GATE) ** 2
-        density = (-0.5 / variance * cosine.clamp(-1.0, 1.0).acos() ** 2).exp() / variance
+        angle = cosine.clamp(-1.0, 1.0).acos()
+        density = (-0.5 / variance * angle**2).exp() / variance
         likelier = (1.0 - math.cos(self.lens.params.half_fov)) * density
         odds = probability / (1.0 - probability).clamp(min=1e-6) * likelier
         return odds / (1.0 + odds)
@@ -384,9 +386,11 @@ def places_in(grids: Tensor, frames: Tensor, cells: Tensor, lens: Fisheye) -> tu
     j = cells // width
     i = cells % width
     numbers = grids[frames, :, j, i]
-    position = torch.stack([i, j], -1) + 0.5 + numbers[:, 1:3].clamp(-1, 1)
+    offset = numbers[:, 1:3].clamp(-1, 1)
+    position = torch.stack([i, j], -1) + 0.5 + offset
     rays, _ = lens.unproject(position * CELL - 0.5)
-    sizes = numbers[:, 3].clamp(-6.0, 3.0).exp() * (CELL / lens.params.fx)
+    extent = numbers[:, 3].clamp(-6.0, 3.0).exp()  # in cells
+    sizes = extent * (CELL / lens.params.fx)
     return F.normalize(rays, dim=-1), sizes
 
 
