@@ -36,7 +36,9 @@ def loaded() -> HilParams:
 def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     stream, params = STREAMS[name], loaded()
     sent = Sent(params, stream)
-    monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, None, True))
+    monkeypatch.setattr(
+        "hil.check.open_source", lambda *args: (sent, None, ManualClock(sent.start))
+    )
     words = [word for setting in SETTINGS for word in ("--set", setting)]
     status = run_command(f"hil check --seconds {SECONDS - 0.1}", *words)
     out = capsys.readouterr().out
@@ -55,7 +57,8 @@ def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
 
 def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, capsys):
     sent = Sent(loaded(), STREAMS["100 Hz"])
-    monkeypatch.setattr("hil.check.open_source", lambda *args: (sent, sent.links[0], True))
+    opened = sent, sent.links[0], ManualClock(sent.start)
+    monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
     words = [word for setting in (*SETTINGS, "backend=ardupilot") for word in ("--set", setting)]
     assert run_command(f"hil check --seconds {SECONDS - 0.1}", *words) == 1
     assert "FAIL  autopilot not ready (no heartbeat)" in capsys.readouterr().out

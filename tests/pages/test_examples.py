@@ -53,9 +53,7 @@ def test_poses_are_projected_as_a_picture_shows_them(tmp_path, monkeypatch, caps
     """Its source is replaced by one whose vehicle sees the whole square of its goal."""
     program = runpy.run_path(str(ROOT / "examples" / "add_source.py"))
     still = program["Still"]()
-    monkeypatch.setattr(
-        "hil.poses.sources.open_source.open_source", lambda *_: (still, None, False)
-    )
+    monkeypatch.setattr("hil.poses.sources.open_source.open_source", lambda *_: (still, None, None))
     run("project_poses", "--config ros2 --seconds 0.05", monkeypatch)
     assert "[True, True, True, True" in capsys.readouterr().out
 

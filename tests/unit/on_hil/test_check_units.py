@@ -4,11 +4,18 @@ import math
 
 from pytest import mark
 
+from hil.links.clock import ManualClock
 from hil.poses.pose import Pose
 from hil.poses.sources.pose_source import RecordedSource
 from tests.commands import run_command
 from tests.hil_flight import OURS
 from visthrow.cli import main
+
+
+def opened(poses):
+    """Recorded poses as `hil.poses.sources.open_source.open_source` returns them."""
+    source = RecordedSource(poses)
+    return source, None, ManualClock(source.start)
 
 
 @mark.parametrize("quat", [(0.0,) * 4, (math.nan,) * 4])
@@ -19,7 +26,7 @@ def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
         for i in range(200)
         for body, z in (("vehicle", 1.333), ("payload", 0.95))
     ]
-    monkeypatch.setattr("hil.check.open_source", lambda *args: (RecordedSource(poses), None, True))
+    monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
     settings = [word for setting in OURS for word in ("--set", setting)]
     assert run_command("hil check --seconds 1.9", *settings) == 1
     out = capsys.readouterr().out
@@ -35,7 +42,7 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
         for i in range(250)
         for body, z in (("vehicle", 1.333), ("payload", 0.95))
     ]
-    monkeypatch.setattr("hil.check.open_source", lambda *args: (RecordedSource(poses), None, True))
+    monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
     results = [(True, "parameters were read"), (False, "hover share measured 0.9")]
     monkeypatch.setattr("hil.check.AutopilotCheck.results", lambda *args: results)
     settings = [word for setting in OURS for word in ("--set", setting)]
@@ -53,8 +60,7 @@ def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
         t = 0.01 * i
         for body, z in (("vehicle", 1333.0), ("payload", 900.0)):
             poses.append(Pose(t, t, body, (300.0 * t, 0.0, z), (0.0, 0.0, 0.0, 1.0)))
-    opened = (RecordedSource(poses), None, True)
-    monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
+    monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
     command = [
         "hil",
         "check",
