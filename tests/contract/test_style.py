@@ -21,8 +21,6 @@ MOST = 13
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
 KNOWN = {
-    "long: visthrow.diagnose.select.scatter.varying",
-    "long: visthrow.diagnose.select.verdicts.conclude",
 }
 """What is still to be mended.
 

@@ -2,11 +2,18 @@
 looked at where they lead.
 """
 
+from dataclasses import replace
+
 import numpy as np
-from pytest import approx
+from numpy.random import default_rng
+from pytest import approx, mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.select import result, search
+from visthrow.diagnose.models.model_interface import Window
+from visthrow.diagnose.select import point as points
+from visthrow.diagnose.select import result, search, selection
+from visthrow.diagnose.select.point import fitted
+from visthrow.diagnose.select.selection import Selector
 
 EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -32,7 +39,7 @@ class Whipping(SyntheticModel):
     def residuals(self, theta, about=None):
         floor = EFFECTS[3].floor
         far = BUMP * (theta.get(NAME, 0.0) - self.at) / floor
-        rough = np.random.default_rng(3)
+        rough = default_rng(3)
         return [
             r + far * w.sigma * rough.choice((-1.0, 1.0), len(r))
             for r, w in zip(super().residuals(theta), self._windows)
@@ -48,3 +55,150 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
     assert diagnosis.named == (NAME,)
     assert diagnosis[NAME].estimate == approx(SIZE * EFFECTS[3].floor, rel=0.1)
     assert diagnosis.overall == result.KNOWN
+
+
+class Luckier(SyntheticModel):
+    """Initial states fitted anew explain more than the first at any size, and derivatives there
+    tell of more than the size does.
+    """
+
+    def __post_init__(self):
+        super().__post_init__()
+        self.fits = 0
+
+    def windows(self, theta):
+        self.fits += 1
+        found = super().windows(theta)
+        return [
+            replace(w, residual=r)
+            for w, r in zip(found, self._fitted(theta, [w.residual for w in found]))
+        ]
+
+    def residuals(self, theta, about=None):
+        return self._fitted(theta, super().residuals(theta))
+
+    def _fitted(self, theta, residuals):
+        rough, taken_back = default_rng(3), (1.0 - SHOWN) * theta.get(NAME, 0.0)
+        if self.fits > 1:
+            return [r + taken_back * w.effects[:, 3] for r, w in zip(residuals, self._windows)]
+        return [
+            r + LUCK * w.sigma * rough.choice((-1.0, 1.0), len(r))
+            for r, w in zip(residuals, self._windows)
+        ]
+
+
+def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
+    """Without it they explain the flights as well, which the simulation shows and derivatives do
+    not.
+    """
+    monkeypatch.setattr(
+        Selector,
+        "_settled",
+        lambda self, point, active: fitted(
+            self.problem, self._linearised(point.theta, point), active
+        ),
+    )
+    model = Luckier(effects=EFFECTS, truth={NAME: 1.0}, seed=8)
+    assert not search.explain(model, laws=False).named
+
+
+@mark.parametrize("alike", [(), ("effect_05", "effect_07")])
+def test_what_looks_like_the_best_candidate_is_simulated_as_well(alike, monkeypatch):
+    """Whatever derivatives promise: where a rope whips in two throws, they may say nothing of its
+    mass in all others.
+    """
+    plain, tried = points.candidate, []
+
+    def candidate(problem, point, active):
+        tried.append(tuple(active))
+        return plain(problem, point, active)
+
+    monkeypatch.setattr(points, "candidate", candidate)
+    effects = [replace(e, confused_with=alike) if e.name == NAME else e for e in EFFECTS]
+    diagnosis = search.explain(
+        SyntheticModel(effects=tuple(effects), truth={NAME: SIZE}, seed=5), laws=False
+    )
+    assert diagnosis.named == (NAME,)
+    assert {(5,), (7,)} <= set(tried) if alike else not {(5,), (7,)} & set(tried)
+
+
+def test_a_law_is_believed_only_where_derivatives_were_taken_at_the_causes(monkeypatch):
+    """Else it may explain what the bend of an effect leaves."""
+    taken, plain = [], Selector._go
+
+    def go(self, trial):
+        if any(c.law for c in trial.chosen):
+            taken.append(self.origin.theta[3])
+        plain(self, trial)
+
+    monkeypatch.setattr(Selector, "_go", go)
+    monkeypatch.setattr(selection, "curvature", lambda *_: 0.0)  # the first derivatives stay
+    model = SyntheticModel(effects=EFFECTS, law="swirl", law_size=0.01, truth={NAME: SIZE}, seed=5)
+    assert search.explain(model).overall == result.UNKNOWN
+    assert taken[-1] == approx(SIZE, rel=0.1)
+
+
+class Levered(SyntheticModel):
+    """A floor of one effect does what three floors of another do, and something of its
+    own besides.
+    """
+
+    by, lever = 1, 3.0
+
+    def _share(self, w):
+        return self.lever * w.effects[:, 3] * EFFECTS[3].floor / EFFECTS[self.by].floor
+
+    def windows(self, theta):
+        own = np.arange(len(EFFECTS)) == self.by
+        found = zip(super().windows(theta), self.residuals(theta))
+        return [
+            replace(w, residual=r, effects=w.effects + self._share(w)[:, None] * own)
+            for w, r in found
+        ]
+
+    def residuals(self, theta, about=None):
+        e = EFFECTS[self.by]
+        left = self.truth.get(e.name, 0.0) * e.floor - theta.get(e.name, 0.0)
+        return [r + left * self._share(w) for r, w in zip(super().residuals(theta), self._windows)]
+
+
+def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
+    """The configuration gets the sizes with which the named effects alone explain the flights; a
+    finding tells the cause's own.
+    """
+    off, off_alone = [], []
+    for seed in range(5):
+        truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
+        diagnosis = search.explain(
+            Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False
+        )
+        assert diagnosis.named == (NAME,)
+        size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
+        off.append((own.estimate - size) / own.sd)
+        off_alone.append((diagnosis.theta[NAME] - size) / own.sd)
+    assert abs(np.mean(off)) < 1.0 < 1.5 < np.mean(off_alone), (off, off_alone)
+
+
+class Sideways(SyntheticModel):
+    """A large effect_01 moves what effect_04 moves as well; its derivative at 0 does not say so."""
+
+    def _answer(self, effects: np.ndarray, sizes: dict[str, float]) -> np.ndarray:
+        j = self._at["effect_04"]
+        size = sizes.get("effect_01", 0.0)
+        aside = effects[:, j] * self.effects[j].floor * size**2 / 20.0
+        return super()._answer(effects, sizes) + aside
+
+    def windows(self, theta: dict[str, float]) -> list[Window]:
+        first, second = self._at["effect_01"], self._at["effect_04"]
+        floors = self.effects[second].floor / self.effects[first].floor
+        size = self._sizes(theta).get("effect_01", 0.0)
+        windows = super().windows(theta)
+        for window in windows:
+            window.effects[:, first] += window.effects[:, second] * floors * size / 10.0
+        return windows
+
+
+def test_of_causes_of_which_only_one_is_there_that_one_is_named():
+    """The simulated set holds a cause near 0; without it the other has hardly been listed."""
+    model = Sideways(truth={"effect_01": 40.0}, throws=6, free=2)
+    assert search.explain(model, laws=False).named == ("effect_01",)

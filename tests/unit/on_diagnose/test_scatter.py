@@ -12,12 +12,27 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares, varying
+from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
+from visthrow.diagnose.select.occam import Linear, window
+from visthrow.diagnose.select.scatter import DAY, Varies, freed, own_shares
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
 PRIORS = Priors.of(EFFECTS, ("pos_w", "quat_wb", "payload_pos_w"))
 LEAST = 4.0
+
+
+def chosen_of(statistics, days=()):
+    """Return the best set of candidates, and the deviations of its random shares in their unit."""
+    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, statistics, days)
+    linear = Linear(statistics, PRIORS, offered, lambda s: sum(LEAST + c.penalty for c in s), days)
+    near = window(linear, {NOTHING})
+    best = max(near, key=near.get)
+    sizes = {
+        c.name: size * c.deviations[0] * PRIORS.floor[c.columns[0]]
+        for c, size in linear.shares(best)[0].items()
+    }
+    return best, sizes
 
 
 def flights(rng, count=10, **deviation):
@@ -46,53 +61,50 @@ def campaign(rng, days, by_day, by_flight):
     )
 
 
-def on_days(rng, *deviations):
+def on_days(rng, *deviations) -> set[str]:
+    """Return who has a share of the release's lag."""
     statistics, days = campaign(rng, 5, *deviations)
-    return next(
-        s
-        for s in varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST, days=days)
-        if s.name == "lag_jitter"
-    )
+    return {c.group for c in chosen_of(statistics, days)[0] if c.name == "lag_jitter"}
 
 
 def test_what_is_drawn_anew_each_day_drifts():
     rng = default_rng(8)
-    worlds = [on_days(rng, 0.012, 0.0) for _ in range(40)]
-    assert all(w.by == DAY for w in worlds if w.found)
-    assert np.mean([w.found for w in worlds]) > 0.8
-    assert "drifts, a value for each day" in worlds[0].sentence
-    assert "5 days" in worlds[0].sentence
-    assert not any(on_days(rng, 0.0, 0.0).found for _ in range(40))
+    worlds = [on_days(rng, 0.012, 0.0) for _ in range(12)]
+    assert np.mean([w == {DAY} for w in worlds]) > 0.7
+    assert not any(on_days(rng, 0.0, 0.0) for _ in range(20))
 
 
-def test_what_is_drawn_anew_each_flight_does_not_drift():
-    rng = default_rng(9)
-    worlds = [on_days(rng, 0.0, 0.012) for _ in range(20)]
-    assert np.mean([w.found and w.by == FLIGHT for w in worlds]) > 0.9
+def test_a_mean_is_as_sure_as_there_are_days():
+    """Three flights of a day tell no more of what all days share than one does."""
+    statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
+    size = {0: 6.0}  # floors
+    by_flight, by_day = (
+        freed(statistics, Varies(days, flights=size)),
+        freed(statistics, Varies(days, drifts=size)),
+    )
+    assert len(by_day.flights) == 5
+    sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
+    assert_allclose(sd, 6.0 / np.sqrt([15.0, 5.0]), rtol=0.02)
 
 
-def told(rng, **deviation):
-    return {
-        s.name: s
-        for s in varying(flights(rng, **deviation), np.zeros(len(NAMES)), PRIORS, NAMES, LEAST)
-    }
+def test_shares_of_days_come_before_those_of_flights():
+    statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
+    moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
+    statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
+    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
+    assert_allclose(shares[:, 0], moved, atol=0.5)
+    assert np.all(shares[:, 1:] == 0.0)
 
 
 def test_deviations_are_found_with_their_size():
     rng = default_rng(5)
-    worlds = [told(rng, release_lag=0.012) for _ in range(40)]
-    assert np.mean([w["lag_jitter"].found for w in worlds]) > 0.9
-    assert not any(w["gust"].found for w in worlds)
-    inside = np.mean([w["lag_jitter"].low <= 0.012 <= w["lag_jitter"].high for w in worlds])
-    assert inside > 0.85, inside  # 95 %, less three deviations of 40 draws
-    gusts = [told(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25) for _ in range(15)]
-    assert np.mean([w["gust"].found for w in gusts]) > 0.9
-    assert abs(np.median([w["gust"].size for w in gusts]) - 0.25) < 0.06
-
-
-def test_three_flights_say_nothing():
-    statistics = flights(default_rng(7), count=3, release_lag=0.05)
-    assert varying(statistics, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST) == ()
+    worlds = [chosen_of(flights(rng, release_lag=0.012))[1] for _ in range(15)]
+    assert np.mean(["lag_jitter" in w for w in worlds]) > 0.9
+    assert not any("gust" in w for w in worlds)
+    assert abs(np.median([w.get("lag_jitter", 0.0) for w in worlds]) - 0.012) < 0.003
+    gusts = [chosen_of(flights(rng, wind_x=0.25, wind_y=0.25, wind_z=0.25))[1] for _ in range(25)]
+    assert np.mean(["gust" in w for w in gusts]) > 0.9
+    assert abs(np.median([w.get("gust", 0.0) for w in gusts]) - 0.25) < 0.08
 
 
 def test_training_draws_what_varies():
@@ -112,12 +124,3 @@ def test_training_draws_what_varies():
     theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
     assert theta == {"release_lag": 0.02}
     assert_allclose(covariance, [[1.01e-4]])
-
-
-def test_shares_of_days_come_before_those_of_flights():
-    statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
-    moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
-    statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
-    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
-    assert_allclose(shares[:, 0], moved, atol=0.5)
-    assert np.all(shares[:, 1:] == 0.0)

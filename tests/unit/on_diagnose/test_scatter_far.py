@@ -4,9 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from tests.unit.on_diagnose.test_scatter import LEAST, NAMES, PRIORS
+from tests.unit.on_diagnose.test_scatter import EFFECTS, LEAST, NAMES, PRIORS
+from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.scatter import varying
+from visthrow.diagnose.select import verdicts
+from visthrow.diagnose.select.candidates import random_shares, shared
+from visthrow.diagnose.select.occam import Linear
+from visthrow.diagnose.select.scatter import relinearised_per_flight
 
 BENT = 0.1
 """A release early by a floor tells so much more of itself than its derivative says, and twice as
@@ -53,9 +57,16 @@ def world(seed: int, count: int = 12):
     return found, again
 
 
+EFFECT = next(v for v in random_effects() if v.name == "lag_jitter")
+
+
 def jitter(found, again):
-    told = varying(found, np.zeros(len(NAMES)), PRIORS, NAMES, LEAST, again)
-    return next(s for s in told if s.name == "lag_jitter")
+    if again is not None:
+        found = relinearised_per_flight(found, np.zeros(len(NAMES)), PRIORS, 0, again)
+    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, found, ())
+    share = next(c for c in offered if c.name == "lag_jitter")
+    linear = Linear(found, PRIORS, offered, lambda _: 0.0)
+    return verdicts.share_verdict(linear, share, frozenset(offered[:1]), {}, EFFECT, LEAST)
 
 
 def test_flights_far_apart_are_told_by_simulations_where_they_lie():

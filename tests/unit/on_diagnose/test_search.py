@@ -11,10 +11,12 @@ from pytest import approx, mark, raises
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
-from visthrow.diagnose.likelihood.evidence import INEXACT, Priors
+from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import result, search, selector
-from visthrow.diagnose.select.scatter import Varies, disagreement
+from visthrow.diagnose.select import held_out, result, search
+from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
+from visthrow.diagnose.select.occam import Linear, window
+from visthrow.diagnose.select.selection import Selector
 
 EFFECTS = catalogue(12)
 
@@ -71,6 +73,19 @@ def test_one_effect_is_named_with_its_size_and_interval(sign):
     assert found.nats > diagnosis.threshold
 
 
+TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
+
+
+@mark.parametrize("curvature", [0.0, 2.0])
+def test_three_effects_are_named_also_where_bends_would_fake_one(curvature):
+    """A bend of 2 at 30 floors is taken for more than a third of each size."""
+    model = world(truth=TRIPLE, seed=1, curvature=curvature)
+    diagnosis = search.explain(model, laws=False)
+    assert set(diagnosis.named) == set(TRIPLE)
+    for name, size in sizes(model, diagnosis).items():
+        assert abs(size - TRIPLE[name]) < 1.5
+
+
 def hiding(own: float, **options) -> SyntheticModel:
     """Flights in which effect 7 undoes effect 3, of the same size, but for its ``own`` share."""
 
@@ -94,10 +109,8 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
     assert set(diagnosis.named) == {"effect_03", "effect_07", *beside}
     for name in ("effect_03", "effect_07"):
         assert diagnosis[name].low < 14.0 * diagnosis[name].floor < diagnosis[name].high
-    named = [{"effect_03", "effect_07"} & set(step.named.split(", ")) for step in diagnosis.steps]
-    assert sorted(map(len, named)) == [*[0] * len(beside), 2]
     last = diagnosis.steps[-1]
-    assert last.nats == last.refitted[last.named] > last.least == selector.EXCHANGE_MARGIN
+    assert last.nats == last.refitted[last.named] > last.least
     assert last.named in list(last.screened)[:3]
 
 
@@ -130,6 +143,7 @@ def test_what_happened_in_one_flight_is_an_event_and_no_cause():
     diagnosis = search.explain(model, laws=False)
     assert not diagnosis.theta
     assert diagnosis.events == (4,)
+    assert [set(names) for names, _ in diagnosis.sets] == [{"effect_03 in flight 4"}]
 
 
 def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
@@ -142,24 +156,36 @@ def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     assert diagnosis.overall == result.KNOWN
 
 
-def test_flights_disagree_by_more_than_form_and_noise():
+def best_set(sizes) -> set[str]:
+    """Return the names of the set that flights ask for, each with its own size of one effect."""
     priors = replace(_priors(1), slab=np.full(1, 20.0))
+    own = np.full((len(sizes), 1, 1), 4.0)  # information: half a floor's deviation each
+    none = np.zeros(len(sizes))
+    statistics = Statistics(
+        np.arange(len(sizes)), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
+    )
+    effects = [replace(EFFECTS[3], prior_sd=20.0, floor=1.0)]
+    offered = shared(effects) + random_shares(effects, priors, statistics, ())
+    near = window(
+        Linear(statistics, priors, offered, lambda s: sum(5.0 + c.penalty for c in s)), {NOTHING}
+    )
+    return {c.name for c in max(near, key=near.get)}
 
-    def verdict(sizes, share=INEXACT):
-        own = np.full((8, 1, 1), 4.0)  # information: half a floor's deviation each
-        none = np.zeros(8)
-        statistics = Statistics(
-            np.arange(8), own, 4.0 * np.array(sizes)[:, None], none, none, np.zeros(1)
-        )
-        return disagreement(statistics, priors, Varies(), [0], 0, 5.0, share)
 
-    sizes = np.array([9.0, 11.0, 8.0, 12.0, 10.0, 9.5, 10.5, 10.0])
-    assert verdict(sizes) is None
-    assert verdict(sizes * (-1.0) ** np.arange(8)) == (None,)
-    far = sizes + np.array([0.0, 0.0, 0.0, 25.0, 0.0, -18.0, 0.0, 0.0])
-    assert verdict(far) == (None,)
-    assert verdict(far, share=2.0) is None
-    assert verdict(np.where(np.arange(8) == 3, 25.0, 0.0)) == (3,)
+@mark.parametrize(
+    ("sizes", "expected"),
+    [
+        ([9.5, 10.5, 9.0, 10.5, 10.0, 9.5, 10.5, 10.0], {"effect_03"}),
+        ([9.0, -11.0, 8.0, -12.0, 10.0, -9.5, 10.5, -10.0], {"effect_03_by_flight"}),
+        ([26.0, 34.0, 28.0, 32.0, 25.0, 35.0, 29.0, 31.0], {"effect_03", "effect_03_by_flight"}),
+        ([0.0, 0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 0.0], {"effect_03 in flight 3"}),
+        ([23.0, 13.0], {"effect_03_by_flight"}),
+        ([10.0, 10.5], {"effect_03"}),
+    ],
+)
+def test_what_flights_share_and_what_each_has_for_itself_are_weighed_alike(sizes, expected):
+    """Also of two flights: two scales are two scales."""
+    assert best_set(sizes) == expected
 
 
 def test_commands_of_other_flights_are_inconsistent_data():
@@ -234,6 +260,12 @@ def test_catalogues_that_contradict_themselves_are_refused():
         Priors.of(twice, ("pos_w", "payload_pos_w"))
     with raises(ValueError, match=r"floor is 0\.0; expected above 0"):
         replace(EFFECTS[0], floor=0.0)
+
+
+def small_causes(seed: int) -> SyntheticModel:
+    """Every effect at its floor: nothing that matters."""
+    signs = default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
+    return world(truth={e.name: s for e, s in zip(EFFECTS, signs)}, seed=seed, gust=0.3, noise=0.5)
 
 
 def test_flights_without_a_window_are_counted(monkeypatch):
@@ -344,3 +376,52 @@ def _threshold(count: int) -> float:
         _priors(count),
         default_rng(1),
     )
+
+
+def test_a_window_that_no_force_explains_is_left_out():
+    rng = default_rng(0)
+
+    def spoil(model, window):
+        if window is not model._windows[3]:
+            return window
+        return replace(
+            window,
+            residual=window.residual + 10.0 * window.sigma * rng.standard_normal(len(window.sigma)),
+        )
+
+    model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.windows == len(model.windows({})) - 1
+    assert tuple(diagnosis.theta) == ("effect_03",)
+
+
+def test_a_set_that_is_not_admissible_does_not_end_the_search(monkeypatch):
+    plain = Selector.is_admissible
+
+    def refusing(self, trial):
+        return not any(c.name == "effect_03" for c in trial.chosen) and plain(self, trial)
+
+    monkeypatch.setattr(Selector, "is_admissible", refusing)
+    diagnosis = search.explain(
+        world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False
+    )
+    assert "effect_07" in diagnosis.theta
+    assert "effect_03" not in diagnosis.theta
+
+
+def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
+    """A drag in one throw alone, five times its usual size: sizes fitted once, under gusts that
+    hold it, stay a fifth too small.
+
+    Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
+    """
+    monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
+    model = SyntheticModel(effects=EFFECTS, throws=1, free=2, law="speed", law_size=0.0, seed=4)
+    model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
+    model.law_size = 1.0
+    for w in model._windows:
+        w.effects[:, 1] = w.latent @ model._law(w.knots) if w.phase == "throw" else 0.0
+        w.residual[:] += 0.02 * w.effects[:, 1]
+    diagnosis = search.explain(model, laws=False)
+    assert diagnosis.named == ("effect_01",)
+    assert diagnosis["effect_01"].estimate == approx(0.02, abs=1e-3)

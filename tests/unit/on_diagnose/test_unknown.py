@@ -17,10 +17,12 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
-from visthrow.diagnose.select import result, search, selector, terms
+from visthrow.diagnose.select import result, search, terms, verdicts
+from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
 from visthrow.diagnose.select.scatter import Varies
+from visthrow.diagnose.select.selection import Selector, Trial
 
 EFFECTS = catalogue(12)
 IN_THE_BODY = ("vehicle torque", laws.JOINT)
@@ -215,18 +217,76 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
-def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> selector.Selector:
-    """A search that has come to some names and laws."""
+def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> Selector:
+    """A selection that has come to some names and laws."""
     problem = Problem(model, tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if told:
         problem, (point,) = terms.extended(
             problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told]
         )
-    named = [*active, *range(len(model.effects), len(problem.priors.floor))]
-    return selector.Selector(
-        problem, point, 4.0, lambda _: None, active=named, point=candidate(problem, point, named)
+    columns = [*active, *range(len(model.effects), len(problem.priors.floor))]
+    found = Selector(problem, point, 4.0)
+    chosen = frozenset(c for c in found.candidates if c.group == ALL and c.columns[0] in columns)
+    found.best = Trial(chosen, candidate(problem, point, columns))
+    return found
+
+
+@mark.parametrize("block", ["vehicle force", "payload force"])
+def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
+    """Information and score of a column that the windows' inner products were given, and of no
+    further simulation.
+    """
+    at = beside_a_law(
+        SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )
+    known = [laws.KnotValues(w.knots) for w in at.best.point.windows]
+    of = terms.screen(
+        at.best.point,
+        terms.statistics(at.best.point.grams, at.best.point.noise, "cpu"),
+        block,
+        known,
+    )
+    for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
+        problem, (point,) = terms.extended(
+            at.problem, [at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
+        )
+        scale = problem.priors.floor[-1]
+        assert point.information[-1, -1] == approx(scale**2 * of.own[i], rel=1e-6)
+        assert point.score[-1] == approx(
+            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i])
+        )
+        cross, most = scale * of.cross, scale * np.abs(of.cross).max()
+        assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
+
+
+def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
+    at = beside_a_law(with_a_name_for_the_law(0.1), [1])
+    strongest = terms.strongest_forces(at.nominal)
+    found, beside = (
+        terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1])
+    )
+    assert DRAG in [effect.term for effect in found]
+    assert DRAG not in [effect.term for effect in beside]
+
+
+def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
+    """Appended to what the windows say it is the column that a linearisation gives; without it
+    nothing has changed.
+    """
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    at, plain = beside_a_law(model, [3], DRAG), beside_a_law(model, [3])
+    again = linearise(at.problem, np.zeros(len(EFFECTS) + 1))
+    assert_allclose(at.nominal.information, again.information, rtol=1e-2)
+    law = terms.laws(at.problem, at.best.point, at.best.columns, 0.0)[0]
+    assert law.coefficient == approx(-0.02, rel=0.05)
+    assert at.best.point.theta[-1] * at.problem.priors.floor[-1] == approx(
+        law.coefficient, rel=0.05
+    )
+    problem, off = terms.without_laws(at.problem, at.nominal)
+    assert problem.model is model
+    assert_allclose(off.information, plain.nominal.information, rtol=1e-9)
+    assert_allclose(off.score, plain.nominal.score, rtol=1e-9)
 
 
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
@@ -237,15 +297,30 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
         [3, 6],
         DRAG,
     )
-    assert acts_on(at.point, at.names) == ["vehicle force", "payload force"]
-    assert at.law()[0] == {3}
+    assert acts_on(at.best.point, at.names) == ["vehicle force", "payload force"]
+    assert verdicts._law(at)[0] == {3}
+
+
+def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
+    """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is
+    a force on the vehicle.
+    """
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    for w in model._windows:
+        w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
+    at = beside_a_law(model, [6, 8], DRAG)
+    assert acts_on(at.best.point, at.names) == ["payload force"] * 2
+    assert [acts_on(at.best.point, [j], free_effects=[14 - j])[0] for j in at.names] == [
+        "vehicle force"
+    ] * 2
+    assert verdicts._law(at)[0] == {6, 8}
 
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(
         effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
     )
-    assert beside_a_law(model, [3, 6], DRAG).law()[0] == {3, 6}
+    assert verdicts._law(beside_a_law(model, [3, 6], DRAG))[0] == {3, 6}
 
 
 def test_the_table_takes_up_what_no_name_explains():
@@ -279,7 +354,7 @@ def test_terms_are_screened_beside_what_varies(days):
     model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
-    calm, parts = terms.calmed(replace(linearise(problem, np.zeros(12)), varies=varies))
+    calm, parts = terms.with_capped_gusts(replace(linearise(problem, np.zeros(12)), varies=varies))
     screen = terms.screen(
         calm, parts, "payload force", [laws.KnotValues(w.knots) for w in calm.windows]
     )

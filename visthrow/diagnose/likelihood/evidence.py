@@ -10,6 +10,7 @@ deviations; a named one has N(0, prior^2) within its bounds (the slab):
 All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K)
 for n draws at once."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -58,7 +59,9 @@ class Priors:
 
     floor: np.ndarray  # in the effects' units
     slab: np.ndarray  # deviation of a named effect
-    low: np.ndarray
+    low: (
+        np.ndarray
+    )  # of a named effect; another kind of block is there as a whole, but for its form
     high: np.ndarray
     visible: np.ndarray  # bool: all its channels are there
 
@@ -83,7 +86,10 @@ class Priors:
                 f" {', '.join(sorted({n for n in names if names.count(n) > 1}))}"
             )
         floor = np.array([e.floor for e in effects], dtype=float)
-        bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2) / floor[:, None]
+        bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2)
+        switch = np.array([bool(e.switch) for e in effects], dtype=bool)
+        bounds[switch, 0] = (1.0 - INEXACT) * bounds[switch, 1]
+        bounds /= floor[:, None]
         slab = np.array([e.prior_sd for e in effects], dtype=float) / floor
         visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
         return Priors(floor, np.maximum(slab, 1.5), bounds[:, 0], bounds[:, 1], visible)
@@ -251,6 +257,22 @@ def certainty(
     columns = list(active)
     spread = np.diag(covariance(information, priors.deviation(columns)))[columns]
     return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(spread), SPIKE))
+
+
+def surely_there(
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
+) -> list[int]:
+    """Return the named effects that are surely not 0 beside one another; the least certain is left
+    out first.
+    """
+    remaining = list(active)
+    while remaining:
+        theta = estimate(information, score, priors, remaining)
+        sure = certainty(information, theta, priors, remaining)
+        if sure.min() > 1.0:
+            break
+        remaining.pop(int(np.argmin(sure)))
+    return remaining
 
 
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:

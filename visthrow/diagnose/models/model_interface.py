@@ -1,7 +1,7 @@
 """What a model must give to be diagnosed: effects that could be missing from it, and its residuals
 linearised in them.
 
-The search for causes (:mod:`visthrow.diagnose.select.selector`) knows nothing of vehicles or ropes.
+The selection of causes (:mod:`visthrow.diagnose.select`) knows nothing of vehicles or ropes.
 It sees windows of residuals
 
     r = S theta + X b + G a + e

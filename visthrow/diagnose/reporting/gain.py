@@ -17,9 +17,8 @@ from visthrow.diagnose.likelihood.noise_levels import without_outliers
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import Point, Work
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
-from visthrow.diagnose.select.search_state import Work
 from visthrow.diagnose.throw.landing import PredictedLandings
 
 

@@ -16,8 +16,8 @@ from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.point import Work
 from visthrow.diagnose.select.result import Diagnosis
-from visthrow.diagnose.select.search_state import Work
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # [inch]

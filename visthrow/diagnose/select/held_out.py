@@ -17,11 +17,8 @@ from visthrow.diagnose.likelihood.evidence import (
     NORMAL_95,
     OWN_FLOOR,
     STRONG,
-    Priors,
-    additions,
     covariance,
     estimate,
-    log_evidence,
 )
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
@@ -34,12 +31,13 @@ from visthrow.diagnose.likelihood.forms import (
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select import result
+from visthrow.diagnose.select.candidates import NOTHING, Names, columns_of, shared
 from visthrow.diagnose.select.excess import compares_phases, floors_of
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
+from visthrow.diagnose.select.occam import Linear
+from visthrow.diagnose.select.occam import window as occam_window
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, Work
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
-from visthrow.diagnose.select.scatter import allowed, between_flights, deviations, freed
-from visthrow.diagnose.select.search_state import Work
-from visthrow.diagnose.select.selector import MOST_NAMES
+from visthrow.diagnose.select.scatter import allowed, between_flights, freed
 
 MOST_FOLDS = 12
 PARTS = 3
@@ -67,41 +65,6 @@ class Crossed:
     named: Mapping[str, float]  # effect -> share of the folds that named it
 
 
-def select(
-    information: np.ndarray,
-    score: np.ndarray,
-    priors: Priors,
-    threshold: float,
-    begin: Sequence[int] = (),
-) -> list[int]:
-    """Forward search with backward elimination by the statistics alone.
-
-    Args:
-        information: of the flights, shape (K, K).
-        score: about 0, shape (K,).
-        threshold: threshold [nats].
-        begin: a set to begin from; causes that hide each other are not found one by one.
-    """
-    active = list(begin)
-    new = []
-    while True:
-        whole = log_evidence(information, score, priors, [*active, *new])
-        for j in list(active):  # without those that the others make superfluous
-            remaining = [k for k in active if k != j]
-            if (
-                whole - (reduced := log_evidence(information, score, priors, [*remaining, *new]))
-                < threshold
-            ):
-                active = remaining
-                whole = reduced
-        active += new
-        gain = additions(information, score, priors, active)
-        best = int(np.argmax(gain))
-        if len(active) >= MOST_NAMES or gain[best] <= threshold:
-            return active
-        new = [best]
-
-
 def groups_of(point: Point, windows: Sequence[int]) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
@@ -120,40 +83,35 @@ def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
 
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
-    """Repeat a search without each of the flights, by statistics; what an effect that varies has of
-    its own there is integrated out.
+    """Repeat a selection without each of the flights, by statistics; random shares are integrated
+    out.
     """
-    work = diagnosis.work
-    threshold = diagnosis.threshold
-    point = work.after
-    priors = work.problem.priors
+    work, priors = diagnosis.work, diagnosis.work.problem.priors
+    point, effects = work.after, work.problem.effects
     groups, left_out = groups_of(point, work.problem.kept)
-    varies = deviations(diagnosis.scatter, priors, [e.name for e in work.problem.effects], ())
-    statistics = freed(regrouped(point, groups), varies.by_flight)
+    statistics = freed(regrouped(point, groups), point.varies.by_flight)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
-    trained = np.zeros((count, len(priors.floor)))
-    named = Counter()
+    trained, named = np.zeros((count, len(priors.floor))), Counter()
+    candidates = shared(effects)
+    selected = frozenset(candidates[j] for j in work.active)
+
+    def penalty(chosen: Names) -> float:
+        return sum(diagnosis.threshold + c.penalty for c in chosen)
+
     for fold in folds:
         training = np.setdiff1d(np.arange(count), fold)
         if not len(training):
             continue
-        information = statistics.information[training].sum(0)
-        score = statistics.absolute[training].sum(0)
-        anew, active = (
-            select(information, score, priors, threshold, begin=begin)
-            for begin in ((), work.active)
-        )
-        worth = [
-            log_evidence(information, score, priors, s) - threshold * len(s) for s in (anew, active)
-        ]
-        if (
-            worth[0] > worth[1] + STRONG
-        ):  # else the rest cannot tell these names from others, and does not deny them
-            active = anew
-        trained[fold] = estimate(information, score, priors, active)
+        linear = Linear(statistics.only(training), priors, candidates, penalty)
+        near = occam_window(linear, {NOTHING, selected}, pairs=False)
+        chosen = max(near, key=near.get)
+        if near[chosen] < linear.value(selected) + STRONG:
+            chosen = selected  # the training cannot tell it from others, and does not deny it
+        active = columns_of(chosen)
+        trained[fold] = estimate(*linear.total(chosen), priors, active)
         named.update(active)
-    shares = {work.problem.effects[j].name: n / len(folds) for j, n in named.items()}
+    shares = {effects[j].name: n / len(folds) for j, n in named.items()}
     return Crossed(groups, left_out, statistics, folds, trained, shares)
 
 

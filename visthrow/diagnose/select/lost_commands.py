@@ -23,9 +23,11 @@ from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
 from visthrow.diagnose.likelihood.marginal import correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point, Problem
-from visthrow.diagnose.select.scatter import COMMAND, LOOK, REACH, Scatter, judged
+from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, judged
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
+
+FEW = 5  # every which deviation is tried in a few windows, before all are asked
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely.
@@ -138,9 +140,9 @@ def verdict(
     priors = problem.priors
     sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
-    sets = active, np.flatnonzero(priors.visible).tolist()  # what is still missing must not be why
-    windows_all = range(len(problem.kept))
-    for rows, shares in ((few_of(windows_all), reach[::LOOK]), (windows_all, reach)):
+    sets = active, np.flatnonzero(priors.visible & ~problem.switches).tolist()
+    every = range(len(problem.kept))
+    for rows, shares in ((few_of(every), reach[::FEW]), (every, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         if not columns:
             return None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
@@ -61,9 +62,7 @@ class Problem:
     correlated: Mapping[int, Correlation] = field(
         default_factory=dict
     )  # channels whose noise is not white
-    varies: Varies = field(
-        default_factory=Varies
-    )  # effects that differ from flight to flight, or from day to day
+    days: tuple[int, ...] = ()  # of each flight, by its number; none where the logs do not say
     terms: tuple[
         TermEffect, ...
     ] = ()  # of laws: further effects, whose columns follow from those of the latent forces
@@ -74,7 +73,7 @@ class Problem:
         """The problem of some of a model's windows, with the correlation of their
         channels' noise.
         """
-        plain = Problem(model, tuple(numbers), varies=Varies(tuple(model.days)))
+        plain = Problem(model, tuple(numbers), days=tuple(model.days))
         slabs = plain.priors.slab * plain.priors.floor
         return replace(
             plain,
@@ -115,7 +114,11 @@ class Problem:
         """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
         floors.
         """
-        return {e.name: float(t * e.floor) for e, t in zip(self.model.effects, theta) if t != 0.0}
+        return {
+            e.name: float(np.clip(t * e.floor, *e.bounds))
+            for e, t in zip(self.model.effects, theta)
+            if t != 0.0
+        }
 
 
 @dataclass(frozen=True)
@@ -127,7 +130,7 @@ class Point:
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
     plain: Statistics  # of flights without anything of their own
-    varies: Varies  # see :attr:`Problem.varies`
+    varies: Varies  # effects that differ from flight to flight, or from day to day
     integrals: stack.Integrals  # of the grams under these noise levels
     about: (
         Linearised | None
@@ -202,13 +205,13 @@ def linearise(
     theta: np.ndarray,
     start: Noise | None = None,
     windows: Sequence[Window] | None = None,
+    varies: Varies | None = None,
 ) -> Point:
     """Simulate and linearise at ``theta``, estimate the noise levels, gather.
 
     ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
-    model gave there, if it was asked already."""
-    sizes = problem.sizes(theta)
-    channels = len(problem.model.channels)
+    model gave there, if it was asked already; ``varies``: effects that differ among flights."""
+    sizes, channels = problem.sizes(theta), len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
@@ -243,7 +246,7 @@ def linearise(
         grams,
         noise,
         statistics,
-        problem.varies,
+        varies or Varies(problem.days),
         integrals,
         linearised,
         commands,
@@ -286,17 +289,17 @@ def only(point: Point, windows: Sequence[int]) -> Point:
     return regathered(point, noise=noise, **parts)
 
 
-def lost(point: Point) -> list[int]:
+def untracked_windows(point: Point) -> list[int]:
     """Numbers of windows that the simulation does not follow, whatever forces act: a crash, a rope
     that whips beyond prediction.
 
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
     lost, but something is missing."""
-    shares = point.integrals.shares(point.grams, point.noise)
-    log_dets = point.integrals.log_dets
+    grams = with_shares(point, point.theta)
+    shares, log_dets = point.integrals.shares(grams, point.noise), point.integrals.log_dets
     misfit = [
         (share.square - log_det) / max(gram.count.sum(), 1.0)
-        for share, log_det, gram in zip(shares, log_dets, point.grams)
+        for share, log_det, gram in zip(shares, log_dets, grams)
     ]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
     limit = min(
@@ -347,29 +350,9 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     )
 
 
-def advantage(
-    priors: Priors,
-    first: tuple[Point, Sequence[int]],
-    second: tuple[Point, Sequence[int]],
-    switches: np.ndarray,
-) -> float:
-    """Nats by which the first set of effects is ahead, each set at whichever of both points suits
-    it better.
-
-    The noise levels of a point were estimated without the floors; a set may do better with the
-    levels of another set. Between points that fly different kinds of blocks there is no such
-    choice: neither's derivatives hold for the other. ``switches``: which effects are another kind
-    of block, shape (K,), bool."""
-    points = first[0], second[0]
-    if not np.array_equal(*(point.theta[switches] != 0.0 for point in points)):
-        return first[0].evidence(priors, first[1]) - second[0].evidence(priors, second[1])
-    first_value, second_value = (
-        max(point.evidence(priors, active) for point in points) for active in (first[1], second[1])
-    )
-    return first_value - second_value
-
-
-def bend(problem: Problem, origin: Point, moved_point: Point, active: Sequence[int]) -> np.ndarray:
+def linearisation_bias(
+    problem: Problem, origin: Point, moved_point: Point, active: Sequence[int]
+) -> np.ndarray:
     """Return the sizes of all effects that the simulation's distance from its linearisation would
     be taken for, in floors, shape (K,).
 
@@ -386,12 +369,14 @@ def bend(problem: Problem, origin: Point, moved_point: Point, active: Sequence[i
 
 
 def curvature(problem: Problem, origin: Point, moved_point: Point) -> float:
-    """The largest size that :func:`bend` says of any effect while none is named."""
-    return float(np.abs(bend(problem, origin, moved_point, ())).max(initial=0.0))
+    """The largest size that :func:`linearisation_bias` says of any effect while none is named."""
+    return float(np.abs(linearisation_bias(problem, origin, moved_point, ())).max(initial=0.0))
 
 
 def with_fitted_noise(point: Point) -> Point:
-    """Return the point with noise levels estimated from its residuals."""
+    """Return the point with noise levels estimated from its residuals and the random shares."""
+    if point.varies:
+        return with_varying(point, point.varies)
     return regathered(point, noise=levels.maximised(point.grams, point.noise, point.device)[0])
 
 
@@ -401,7 +386,7 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
 
     A large missing effect is taken for noise as long as it is not named; these levels show what may
     be hidden under it."""
-    visible = np.flatnonzero(problem.priors.visible)
+    visible = np.flatnonzero(problem.priors.visible & ~problem.switches)
     return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
@@ -413,27 +398,38 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
     either; nor is what an effect that varies has of its own in each flight. ``point``: whose
     derivatives and residuals are taken."""
     theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
-    return _with_noise_at(point, theta, own_shares(point.plain, theta, point.varies))
+    return _with_noise_at(point, theta)
+
+
+def with_noise_of(point: Point, other: Point) -> Point:
+    """Return the point with its residuals under the noise levels of another."""
+    alike = point.grams[0].inner is other.grams[0].inner  # the same derivatives
+    return regathered(point, other.integrals if alike else None, noise=other.noise)
 
 
 def with_varying(point: Point, varies: Varies) -> Point:
     """Return the point with other random effects, and the noise levels that this leaves."""
-    return _with_noise_at(
-        replace(point, varies=varies), point.theta, own_shares(point.plain, point.theta, varies)
-    )
+    return _with_noise_at(replace(point, varies=varies), point.theta)
 
 
-def _with_noise_at(point: Point, theta: np.ndarray, shares: np.ndarray | None = None) -> Point:
+def _with_noise_at(point: Point, theta: np.ndarray) -> Point:
     """Return the point with noise levels estimated from the residuals at ``theta``, and each
-    flight's ``shares`` shares beside it, shape (F, K).
+    flight's random shares beside it.
     """
-    positions = np.tile(theta - point.theta, (len(point.plain.flights), 1)) + (
-        0.0 if shares is None else shares
-    )
-    row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
-    moves = [positions[row[window.flight]] for window in point.windows]
-    grams = [shifted(gram, move) for gram, move in zip(point.grams, moves)]
+    grams = with_shares(point, theta)
     return regathered(point, noise=levels.maximised(grams, point.noise, point.device)[0])
+
+
+def with_shares(point: Point, theta: np.ndarray) -> list[Gram]:
+    """Return the inner products of a point's windows at ``theta``, and with each flight's random
+    shares beside it.
+    """
+    shares = own_shares(point.plain, theta, point.varies) + theta - point.theta
+    row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
+    if not shares.any():
+        return list(point.grams)
+    moves = [shares[row[window.flight]] for window in point.windows]
+    return [shifted(gram, move) for gram, move in zip(point.grams, moves)]
 
 
 def shifted(gram: Gram, change: np.ndarray) -> Gram:
@@ -465,17 +461,20 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
         if trial is None:
             break
         best = trial
-        if to_gain(problem, best, active) < 0.05:
+        if predicted_gain(problem, best, active) < 0.05:
             break
     return best
 
 
-def to_gain(problem: Problem, point: Point, active: Sequence[int]) -> float:
+def predicted_gain(
+    problem: Problem, point: Point, active: Sequence[int], switches: bool = False
+) -> float:
     """Nats that another step of these effects' sizes would bring by the derivatives, no block
-    turned into another.
+    turned into another; ``switches``: of blocks of another kind as well, to another part of them.
     """
     remaining = estimate(point.information, point.score, problem.priors, active) - point.theta
-    remaining[problem.switches] = 0.0
+    if not switches:
+        remaining[problem.switches] = 0.0
     return float(0.5 * remaining @ point.information @ remaining)
 
 
@@ -499,11 +498,11 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first
     goes over to the sizes.
 
-    ``point``: whose derivatives and noise levels it begins with.
+    ``point``: whose derivatives and noise levels it begins with, and whose kinds of blocks.
     """
-    point = with_fitted_noise(fitted(problem, _switched(problem, point, active), active))
+    point = with_fitted_noise(fitted(problem, point, active))
     for _ in range(TURNS):
-        if to_gain(problem, point, active) < TURNED:
+        if predicted_gain(problem, point, active) < TURNED:
             break
         before = point
         point = fitted(problem, point, active)
@@ -513,29 +512,44 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     return point
 
 
-def candidates(problem: Problem, point: Point, sets: Sequence[Sequence[int]]) -> list[Point]:
-    """Simulate several sets: side by side where they wait for a GPU, but for those that turn on
-    another kind of block.
+def candidates(
+    problem: Problem, points: Sequence[Point], sets: Sequence[Sequence[int]]
+) -> list[Point | DiagnoseError]:
+    """Return :func:`candidate` of several sets, or why there is none: side by side where they wait
+    for a GPU.
     """
-    if point.device == "cpu":
-        return [candidate(problem, point, active) for active in sets]
-    turned = [i for i, active in enumerate(sets) if _off(problem, point, active)]
-    plain = [i for i in range(len(sets)) if i not in turned]
-    simulated = {i: candidate(problem, point, sets[i]) for i in turned}
-    simulated |= zip(plain, run_concurrently(lambda i: candidate(problem, point, sets[i]), plain))
-    return [simulated[i] for i in range(len(sets))]
+    asked = list(zip(points, sets))
+
+    def simulated(i: int) -> Point | DiagnoseError:
+        try:
+            return candidate(problem, *asked[i])
+        except DiagnoseError as error:
+            return error
+
+    if not asked or points[0].device == "cpu":
+        return [simulated(i) for i in range(len(asked))]
+    return run_concurrently(simulated, range(len(asked)))
 
 
-def _off(problem: Problem, point: Point, active: Sequence[int]) -> list[int]:
-    """Other kinds of blocks in a set that a point does not fly."""
-    return [j for j in active if problem.switches[j] and point.theta[j] == 0.0]
-
-
-def _switched(problem: Problem, point: Point, active: Sequence[int]) -> Point:
-    """The point, linearised with another kind of block on where a set asks for one that is off."""
-    off = _off(problem, point, active)
+def switched(problem: Problem, point: Point, active: Sequence[int]) -> np.ndarray | None:
+    """Return where a set is to be linearised, in floors, if it asks for another kind of block than
+    a point flies; else None.
+    """
+    off = [j for j in active if problem.switches[j] and point.theta[j] == 0.0]
     if not off:
-        return point
+        return None
     theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
     theta[off] = 1.0 / problem.priors.floor[off]
-    return linearise(problem, theta, point.noise)
+    return theta
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a diagnosis leaves behind for gain, report, plan and blind: its problem, the model as it
+    stands, and the model with what was selected.
+    """
+
+    problem: Problem
+    before: Point
+    after: Point
+    active: tuple[int, ...]

@@ -1,52 +1,31 @@
-"""What varies from flight to flight or from day to day: random effects, each weighed by the same
-evidence as a name.
+"""Random shares of effects: what a flight, or a day, has for itself.
 
 A flight, or a day, has its own share of an effect, normal about what all share, with a deviation
-theta that is looked for. The shares are integrated out of the statistics (:func:`freed`), the size
-that all share may be any that its prior allows, and effects that are not named stay below their
-floors. The evidence of theta against that of none says whether the effect varies, and more evidence
-for shares of days than for shares of flights that it drifts. A flight far from the others is
-simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
+theta. The shares are integrated out of the statistics (:func:`freed`). A flight far from the others
+is simulated again at other sizes: a release 40 ms early tells twice of it by its derivative.
 
 Source: Laird and Ware 1982 (random effects).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from sim.effects.effect import Effect, RandomEffect
-from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import (
-    INEXACT,
-    Priors,
-    additions,
-    covariance,
-    estimate,
-    log_evidence,
-)
+from sim.effects.effect import RandomEffect
+from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, log_evidence
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-FLIGHT = "flight"  # what may differ: from flight to flight, from day to day, among commands
-DAY = "day"
-COMMAND = "command"
-# before these, at the end of the names of effects that differ and are none of the catalogue's
-# random effects
-FORM = "_by_"
-LEAST_FLIGHTS = 4  # or days: with fewer a deviation is anybody's guess
-REACH = np.geomspace(0.02, 6.0, 25)  # deviations that are tried, in their prior's
-LOOK = 5  # every fifth of them is tried where flights are left out
-# floors of a flight's own estimate from which its derivative is not relied upon
-UNRELIABLE_FLOORS = 3.0
+FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
+EVENT = "event"  # one flight alone has one
+REACH = np.geomspace(0.02, 6.0, 25)
+"""Deviations that are tried, in their prior's."""
+COARSE = 3  # every which of them suffices to compare candidates
+FAR = 3.0  # floors of a flight's own estimate from which its derivative is not relied upon
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at
-CHAIN = 2
-"""More effects that differ, or more names, are a wrong form, which brings one after the other:
-terms are weighed at once, and in a block whose latent forces stay excessive none is told.
-"""
 
 
 @dataclass(frozen=True)
@@ -81,151 +60,46 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Varies:
-    """Effects that have shares of their own: by the effect's number, the deviation of the shares in
-    its floor.
+    """Effects that have random shares: by the effect's number, the deviation of the shares in its
+    floor.
     """
 
-    days: Sequence[int] = ()  # of each flight, by its number; none where nobody told
+    days: Sequence[int] = ()  # of each flight, by its number; none where the logs do not say
     flights: Mapping[int, float] = field(default_factory=dict)  # shares of flights
     drifts: Mapping[int, float] = field(default_factory=dict)  # shares of days
+    events: Mapping[tuple[int, int], float] = field(default_factory=dict)  # (effect, flight)
 
     def __bool__(self) -> bool:
-        return bool(self.flights or self.drifts)
+        return bool(self.flights or self.drifts or self.events)
 
     @property
     def effects(self) -> dict[int, float]:
-        """Deviations of all."""
+        """Return the deviations of all effects with shares in every flight or day."""
         return {**self.flights, **self.drifts}
 
     @property
     def by_flight(self) -> "Varies":
-        """Return these random effects as if every flight were a day: of days of which only some
-        flights are looked at.
-        """
-        return Varies((), self.effects)
+        """Return the same as if every flight were a day."""
+        return Varies((), self.effects, events=self.events)
 
-    def also(
-        self, columns: Sequence[int], size: Mapping[int, float], group: str = FLIGHT
-    ) -> "Varies":
-        """Return these random effects with more of them."""
-        new = {j: size[j] for j in columns}
-        return (
-            replace(self, drifts={**self.drifts, **new})
-            if group == DAY
-            else replace(self, flights={**self.flights, **new})
-        )
-
-    def levels(self, statistics: Statistics) -> tuple[str, ...]:
-        """Return what may have shares: days too, where there are enough of them, each of several
-        flights.
-        """
-        days = {self.days[f] for f in statistics.flights.tolist()} if self.days else ()
-        return (FLIGHT, DAY) if LEAST_FLIGHTS <= len(days) < len(statistics.flights) else (FLIGHT,)
-
-
-def varying(
-    statistics: Statistics,
-    theta: np.ndarray,
-    priors: Priors,
-    names: Sequence[str],
-    threshold: float,
-    simulate: Callable[[np.ndarray], Statistics | None] | None = None,
-    further: Sequence[RandomEffect] = (),
-    active: Sequence[int] = (),
-    days: Sequence[int] = (),
-) -> tuple[Scatter, ...]:
-    """Verdicts on everything that may vary among these flights.
-
-    Args:
-        theta: sizes found, in floors, shape (K,).
-        threshold: nats that a finding needs.
-        simulate: the flights simulated at other sizes, in floors; None where that fails.
-        further: what may vary besides the catalogue's random effects; told where it does.
-        active: effects that are named.
-        days: of each flight, by its number; none where nobody told.
-    """
-    effect_names = list(names)
-    verdicts = {}
-    selected = Varies(days)
-    may_vary = [*(v for v in random_effects() if v.of), *further]
-    columns = {
-        v.name: [
-            j
-            for name in v.of
-            if name in effect_names and priors.visible[j := effect_names.index(name)]
-        ]
-        for v in may_vary
-    }
-    price = {
-        v: threshold + (np.log(len(theta)) if v in further else 0.0) for v in may_vary
-    }  # of all effects, one varies more by chance
-    for _ in range(CHAIN + 1):
-        context = priors, selected, active
-        likely = _likely(freed(statistics, selected), priors, active, threshold) if further else ()
-        free = [
-            v
-            for v in may_vary
-            if not (v.name in verdicts and verdicts[v.name].found)
-            and (v not in further or likely[columns[v.name]].any())
-        ]
-        new = {
-            v: s
-            for v in free
-            if (s := _verdict(v, statistics, columns[v.name], price[v], *context)) is not None
-        }
-        positive = [
-            v
-            for v, s in new.items()
-            if s.found and not _one_alone(v, statistics, columns[v.name], *context)
-        ]
-        verdicts |= {v.name: replace(s, found=False) for v, s in new.items() if v not in further}
-        best = max(positive, key=lambda v: new[v].nats, default=None)
-        if best is None:
-            break
-        verdicts[best.name] = new[best]
-        if simulate is not None and len(columns[best.name]) == 1:
-            statistics = straightened(statistics, theta, priors, columns[best.name][0], simulate)
-            verdicts[best.name] = _verdict(
-                best, statistics, columns[best.name], price[best], *context
+    def also(self, sizes: Mapping[int, float], group: str = FLIGHT, flight: int = -1) -> "Varies":
+        """Return the same with shares of more effects."""
+        if group == EVENT:
+            return replace(
+                self, events={**self.events, **{(j, flight): s for j, s in sizes.items()}}
             )
-            if not verdicts[best.name].found:
-                break
-        selected = selected.also(
-            columns[best.name], verdicts[best.name].size / priors.floor, verdicts[best.name].by
-        )
-    forms = {
-        v.name for v in further
-    }  # whose names say what has the shares: the catalogue's random effects need no such
-    return tuple(
-        replace(s, name=f"{s.name}{FORM}{s.by}") if s.name in forms else s
-        for s in verdicts.values()
-    )
+        name = "drifts" if group == DAY else "flights"
+        return replace(self, **{name: {**getattr(self, name), **sizes}})
+
+    def of(self, statistics: Statistics) -> Iterator[tuple[int, np.ndarray]]:
+        """Yield effects with the deviation of each flight's share, shape (F,)."""
+        for j, size in self.flights.items():
+            yield j, np.full(len(statistics.flights), size)
+        for (j, flight), size in self.events.items():
+            yield j, size * (statistics.flights == flight)
 
 
-def by_flight(effects: Sequence[Effect]) -> tuple[RandomEffect, ...]:
-    """Every effect as one that differs from flight to flight, but for those of the catalogue's
-    random effects.
-    """
-    covered = {name for v in random_effects() for name in v.of}
-    return tuple(
-        RandomEffect(
-            e.name,
-            f"{e.cause}, now more, now less",
-            f"{e.name} ~ N({e.name}, theta^2) in each flight",
-            (e.name,),
-            e.unit,
-            e.block,
-            e.prior_sd,
-            e.floor,
-            e.source,
-            manoeuvres=tuple(e.manoeuvres),
-        )
-        for e in effects
-        if e.name not in covered
-    )
-
-
-def straightened(
+def relinearised_per_flight(
     statistics: Statistics,
     theta: np.ndarray,
     priors: Priors,
@@ -235,7 +109,8 @@ def straightened(
     """Statistics whose scores are those about the size of one effect at which each flight fits best
     by itself.
 
-    ``theta``: sizes found, in floors; ``simulate``: see :func:`varying`.
+    ``theta``: estimated sizes, in floors; ``again``: the flights simulated at other sizes, in
+    floors; None where that fails.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
     diagonal = statistics.information[:, j, j]
@@ -243,7 +118,7 @@ def straightened(
     reach = np.abs(
         np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
     ).max(initial=0.0)
-    if reach < UNRELIABLE_FLOORS:
+    if reach < FAR:
         return statistics
     sizes = []
     simulated = []
@@ -275,52 +150,6 @@ def straightened(
             + information @ (position - statistics.theta)
         )
     return replace(statistics, score=scores)
-
-
-def _likely(
-    statistics: Statistics, priors: Priors, active: Sequence[int], threshold: float
-) -> np.ndarray:
-    """Which effects may vary by more than ``threshold`` nats, as if there were no other that could
-    in their stead, shape (K,).
-    """
-    theta = covariance(
-        statistics.information.sum(0), priors.deviation(list(active))
-    ) @ statistics.absolute.sum(0)
-    precision = np.maximum(np.diagonal(statistics.information, axis1=1, axis2=2), 1e-12)
-    square = (statistics.absolute - statistics.information @ theta) ** 2 / precision
-    part = precision * (REACH[::LOOK, None, None] * priors.slab) ** 2
-    return (0.5 * (square * part / (1.0 + part) - np.log1p(part)).sum(1)).max(0) > threshold
-
-
-def _verdict(
-    v: RandomEffect,
-    statistics: Statistics,
-    columns: Sequence[int],
-    threshold: float,
-    priors: Priors,
-    selected: Varies,
-    active: Sequence[int],
-) -> Scatter | None:
-    """The verdict on one quantity, at the level that says more; None where too few flights say
-    something of it.
-    """
-    reach = REACH * v.prior_sd
-    verdicts = []
-    for group in selected.levels(statistics):
-        groups = by_day(statistics, selected.days) if group == DAY else statistics
-        informed = np.count_nonzero((groups.information[:, columns, columns] > 0.0).any(axis=1))
-        if informed >= LEAST_FLIGHTS:
-            verdicts.append(
-                judged(
-                    v,
-                    reach,
-                    _nats_of_sizes(statistics, columns, reach, priors, selected, active, group),
-                    threshold,
-                    int(informed),
-                    group,
-                )
-            )
-    return max(verdicts, key=lambda s: s.nats, default=None)
 
 
 def judged(
@@ -374,78 +203,6 @@ def judged(
     )
 
 
-def _nats_of_sizes(
-    statistics: Statistics,
-    columns: Sequence[int],
-    sizes: np.ndarray,
-    priors: Priors,
-    selected: Varies,
-    active: Sequence[int],
-    group: str = FLIGHT,
-) -> np.ndarray:
-    """Nats of deviations of some effects against none, beside what varies already; all flights may
-    share any size of these effects.
-    """
-    named = sorted({*active, *columns})
-    nothing = _evidence(freed(statistics, selected), priors, named)
-    return np.array(
-        [
-            _evidence(
-                freed(statistics, selected.also(columns, size / priors.floor, group)), priors, named
-            )
-            - nothing
-            for size in sizes
-        ]
-    )
-
-
-def disagreement(
-    statistics: Statistics,
-    priors: Priors,
-    selected: Varies,
-    active: Sequence[int],
-    j: int,
-    threshold: float,
-    share: float = INEXACT,
-) -> tuple[int | None] | None:
-    """Whether flights disagree on an effect of a set: shares of their own say more than a floor and
-    a part of the effect's size would.
-
-    ``threshold``: nats that a finding needs; ``share``: of the effect, by which flights may differ
-    for its form alone. Returns the flight that alone disagrees, or None in its place where all do;
-    None where they agree, too few can say, or other effects that are still missing may be why they
-    differ."""
-    if np.count_nonzero(statistics.information[:, j, j] > 0.0) < LEAST_FLIGHTS:
-        return None
-
-    def differ(statistics: Statistics, active: Sequence[int]) -> bool:
-        freed_flights = freed(statistics, selected)
-        size = estimate(
-            freed_flights.information.sum(0), freed_flights.absolute.sum(0), priors, active
-        )[j]
-        least_sd = max(allowed(size, share), selected.effects.get(j, 0.0))
-        reach = least_sd * np.geomspace(
-            1.0, max(REACH[-1] * priors.slab[j] / least_sd, 2.0), len(REACH[::LOOK])
-        )
-        nats = _nats_of_sizes(statistics, [j], reach * priors.floor[j], priors, selected, active)
-        return bool(nats.max() - nats[0] > threshold)
-
-    if not all(
-        differ(statistics, named) for named in (active, np.flatnonzero(priors.visible).tolist())
-    ):
-        return None
-    remaining = [k for k in active if k != j]
-    for f in range(len(statistics.flights)):
-        other_flights = statistics.only(np.arange(len(statistics.flights)) != f)
-        freed_flights = freed(other_flights, selected)
-        advantage = additions(
-            freed_flights.information.sum(0), freed_flights.absolute.sum(0), priors, remaining
-        )[j]
-        if advantage < threshold and not differ(other_flights, active):
-            return (int(statistics.flights[f]),)
-    return (None,)
-
-
 def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | float:
     """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
     floors.
@@ -473,26 +230,15 @@ def between_flights(
     freed_flights = [
         freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH
     ]
-    value = np.array([_evidence(flights, priors, active) for flights in freed_flights])
+    value = np.array([evidence_of(flights, priors, active) for flights in freed_flights])
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
     return float(weight @ REACH**2 / weight.sum()) * bool(active), mean_part
 
 
-def _evidence(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
+def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
+    """Return log Z of a set of effects, comparable between shares that were integrated out."""
     total = statistics.information.sum(0), statistics.absolute.sum(0)
     return log_evidence(*total, priors, named) - 0.5 * float(statistics.absolute_square.sum())
-
-
-def _one_alone(v: RandomEffect, statistics: Statistics, columns: Sequence[int], *context) -> bool:
-    """Whether it is one flight alone that differs: that is an event there."""
-    flights = np.arange(len(statistics.flights))
-    return any(
-        _nats_of_sizes(
-            statistics.only(flights != f), columns, REACH[::LOOK] * v.prior_sd, *context
-        ).max()
-        <= 0.0
-        for f in flights
-    )
 
 
 def freed(statistics: Statistics, varies: Varies) -> Statistics:
@@ -501,10 +247,10 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
 
     ``varies``: effects that have such shares. Where days have some, what is returned is of days.
     """
-    by_flights = _integrated(statistics, varies.flights)
-    return (
-        _integrated(by_day(by_flights, varies.days), varies.drifts) if varies.drifts else by_flights
-    )
+    left = integrated(statistics, varies.of(statistics))
+    if not varies.drifts:
+        return left
+    return integrated(by_day(left, varies.days), varies.drifts.items())
 
 
 def freed_beside(
@@ -520,21 +266,21 @@ def freed_beside(
     ``information``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
     information with the effects, shape (F, T, K)."""
     rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
-    for shares in (varies.flights, varies.drifts):
-        if shares is varies.drifts and shares:
+    for by_day_too in (False, True):
+        if by_day_too and varies.drifts:
             member = _members(rows, varies.days)[1]
             information = member @ information
             score = member @ score
             cross = np.tensordot(member, cross, 1)
             rows = by_day(rows, varies.days)
-        for j, size in shares.items():
-            column = rows.information[:, :, j]
-            cross_column = cross[:, :, j]
+        for j, size in varies.drifts.items() if by_day_too else varies.of(rows):
+            column, cross_column = rows.information[:, :, j], cross[:, :, j]
             part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * cross_column
-            information = information - part * cross_column
-            score = score - part * rows.score[:, j, None]
-            cross = cross - part[..., None] * column[:, None]
-            rows = _integrated(rows, {j: size})
+            information, score = (
+                information - part * cross_column,
+                score - part * rows.score[:, j, None],
+            )
+            cross, rows = cross - part[..., None] * column[:, None], integrated(rows, [(j, size)])
     return information.sum(0), score.sum(0), cross.sum(0)
 
 
@@ -557,13 +303,15 @@ def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     )
 
 
-def _integrated(statistics: Statistics, deviation: Mapping[int, float]) -> Statistics:
-    """Statistics without the shares that each row has of some effects; ``deviation`` is theirs, in
-    floors.
-    """
-    for j, size in deviation.items():
-        column = statistics.information[:, :, j]
-        score = statistics.score
+def integrated(
+    statistics: Statistics, deviation: Iterable[tuple[int, float | np.ndarray]]
+) -> Statistics:
+    """Integrate out the shares that each row has of some effects.
+
+    ``deviation``: number of each effect, and the shares' deviation in floors, of all rows or of
+    each, shape (F,)."""
+    for j, size in deviation:
+        column, score = statistics.information[:, :, j], statistics.score
         diagonal = column[:, j]
         part = size**2 / (1.0 + size**2 * diagonal)
         explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
@@ -584,51 +332,35 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
     of days come first, and flights share what is left of them."""
     positions = np.tile(theta, (len(statistics.flights), 1))
     if varies.drifts:
-        by_days = by_day(_integrated(statistics, varies.flights), varies.days)
+        by_days = by_day(integrated(statistics, varies.of(statistics)), varies.days)
         row = np.searchsorted(
             by_days.flights, [varies.days[f] for f in statistics.flights.tolist()]
         )
+        drifts = {j: np.full(len(by_days.flights), size) for j, size in varies.drifts.items()}
         positions = (
-            positions
-            + _shares(by_days, np.tile(theta, (len(by_days.flights), 1)), varies.drifts)[row]
+            positions + _shares(by_days, np.tile(theta, (len(by_days.flights), 1)), drifts)[row]
         )
-    return positions + _shares(statistics, positions, varies.flights) - theta
+    sizes: dict[int, np.ndarray] = {}
+    for j, size in varies.of(statistics):
+        sizes[j] = np.hypot(sizes.get(j, 0.0), size)
+    return positions + _shares(statistics, positions, sizes) - theta
 
 
 def _shares(
-    statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, float]
+    statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, np.ndarray]
 ) -> np.ndarray:
-    """Most probable shares of each row, beside its sizes ``theta`` (F, K)."""
-    shares = np.zeros(statistics.score.shape)
-    columns = list(deviation)
+    """Return the most probable shares of each row, beside its sizes ``theta`` (F, K)."""
+    shares, columns = np.zeros(statistics.score.shape), list(deviation)
     if columns:
-        score = (
-            statistics.score
-            - np.einsum("fij,fj->fi", statistics.information, theta - statistics.theta)
-        )[:, columns]
-        block = statistics.information[:, columns][:, :, columns] + np.diag(
-            [size**-2.0 for size in deviation.values()]
+        change = theta - statistics.theta
+        score = statistics.score - np.einsum("fij,fj->fi", statistics.information, change)
+        root = np.stack([deviation[j] for j in columns], axis=1)
+        block = statistics.information[:, columns][:, :, columns] * root[:, :, None] * root[:, None]
+        scaled = np.linalg.solve(
+            np.eye(len(columns)) + block, (root * score[:, columns])[..., None]
         )
-        shares[:, columns] = np.linalg.solve(block, score[..., None])[..., 0]
+        shares[:, columns] = root * scaled[..., 0]
     return shares
-
-
-def deviations(
-    scatter: Sequence[Scatter], priors: Priors, names: Sequence[str], days: Sequence[int]
-) -> Varies:
-    """Return the random effects that were found, of effects of these names; ``days`` are the
-    flights'.
-    """
-    effect_names = list(names)
-    selected = Varies(days)
-    for s in scatter:
-        if s.found:
-            selected = selected.also(
-                [effect_names.index(name) for name in s.of if name in effect_names],
-                s.size / priors.floor,
-                s.by,
-            )
-    return selected
 
 
 def variances(scatter: Sequence[Mapping]) -> dict[str, float]:

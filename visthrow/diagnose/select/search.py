@@ -8,15 +8,26 @@ import numpy as np
 
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.evidence import VERY_STRONG, Priors, threshold
+from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG, estimate, threshold
 from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
-from visthrow.diagnose.select import held_out
-from visthrow.diagnose.select.point import ROUNDS, Point, Problem, linearise, lost, only
+from visthrow.diagnose.select import held_out, lost_commands
+from visthrow.diagnose.select.candidates import ALL, NOTHING, Names
+from visthrow.diagnose.select.point import (
+    ROUNDS,
+    Point,
+    Problem,
+    linearise,
+    moved,
+    only,
+    predicted_gain,
+    untracked_windows,
+)
 from visthrow.diagnose.select.repeated import with_repeated_laws
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
-from visthrow.diagnose.select.selector import Selector
+from visthrow.diagnose.select.scatter import Scatter
+from visthrow.diagnose.select.selection import Selector
 from visthrow.diagnose.select.verdicts import conclude, out_of_domain
 from visthrow.diagnose.throw import command_mistakes as interface
 from visthrow.diagnose.throw.command_mistakes import Mistake
@@ -113,8 +124,7 @@ def explain(
     worlds that the threshold is calibrated on; ``laws``: whether to look for laws outside the
     catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
     Raises DiagnoseError: the model gives no window, or contradicts itself."""
-    begun = time.monotonic()
-    say = progress or (lambda _: None)
+    begun, say = time.monotonic(), progress or (lambda _: None)
     keep_freed_memory()
     windows = model.windows({})
     if not windows:
@@ -125,31 +135,25 @@ def explain(
     if len(usable) < 0.5 * len(considered) or not usable:
         return out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, usable)
-    priors = problem.priors
     for c, correlation in problem.correlated.items():
         say(
             f"noise of {model.channels[c]} is correlated over {1e3 * correlation.time:.0f} ms, for"
             f" {correlation.share:.1%} of its variance"
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    for _ in range(ROUNDS):  # the worst hide others
-        if not (windows_lost := lost(nominal)):
+    begin, commands = NOTHING, None
+    for further in range(2 * ROUNDS, -1, -1):
+        if further and (untracked := untracked_windows(nominal)):  # the worst hide others
+            problem, nominal = _left_out(problem, nominal, untracked, say)
+            continue
+        needed = _threshold(problem, nominal, seed, say)
+        selection, commands = _selected(Selector(problem, nominal, needed, say, laws), begin)
+        untracked = _not_followed(selection)
+        if not further or not untracked:
             break
-        problem, nominal = _left_out(problem, nominal, windows_lost, say)
-    threshold_nats = _threshold(nominal, priors, seed, say)
-    search = Selector(problem, nominal, threshold_nats, say, laws)
-    for further in range(
-        ROUNDS - 1, -1, -1
-    ):  # where the causes are in the simulation, it may lose windows that it followed without
-        search.run(follow=not further)
-        windows_lost = lost(search.point) if further and not search.events else []
-        if not windows_lost:
-            break
-        problem, nominal = _left_out(problem, nominal, windows_lost, say)
-        threshold_nats = _threshold(nominal, priors, seed, say)
-        if not search.stands_without(windows_lost, problem, nominal, threshold_nats):
-            search = Selector(problem, nominal, threshold_nats, say, laws)
-    diagnosis = with_repeated_laws(held_out.judged(conclude(search)))
+        problem, nominal = _left_out(problem, nominal, untracked, say)
+        begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
+    diagnosis = with_repeated_laws(held_out.judged(conclude(selection, commands)))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(problem.kept)
     if left_out:
@@ -158,6 +162,40 @@ def explain(
             " follow: a cause that acts in these alone does not show",
         )
     return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
+
+
+def _not_followed(selection: Selector) -> list[int]:
+    """Return windows that the simulation does not follow with the causes, at their sizes or where
+    the derivatives would have them.
+    """
+    problem, point, columns = selection.problem, selection.best.point, selection.best.columns
+    untracked = untracked_windows(point)
+    if untracked or predicted_gain(problem, point, columns) < STRONG:
+        return untracked
+    goal = estimate(point.information, point.score, problem.priors, columns)
+    moved_point = moved(problem, point, np.where(problem.switches, point.theta, goal))
+    return [] if moved_point is None else untracked_windows(moved_point)
+
+
+def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
+    """Select, and select again as if commands had got lost, where that may say more.
+
+    Lost commands are a candidate that needs a linearisation of its own."""
+    plain = selector.run(begin)
+    (problem, nominal), needed = plain.bare(plain.nominal), plain.threshold
+    loss = lost_commands.verdict(problem, nominal, (), needed)
+    if (loss is None or not loss.found) and plain.best.columns:
+        loss = lost_commands.verdict(*plain.bare(plain.best.point), plain.names, needed)
+    if loss is None or not loss.found:
+        return plain, None
+    lossy = replace(problem, lost=loss.size)
+    start = linearise(lossy, np.zeros_like(nominal.theta), nominal.noise)
+    lossy_selection = Selector(lossy, start, needed, plain.progress, plain.laws).run(begin)
+    ahead = lossy_selection.value - needed - plain.value
+    plain.progress(f"commands got lost: {loss.size:.1%} of them, {ahead:.1f} nats ahead")
+    if ahead <= 0.0:
+        return plain, None
+    return lossy_selection, lost_commands.sized(lossy, start, loss)
 
 
 def correct_interface_mistakes(
@@ -185,7 +223,7 @@ def correct_interface_mistakes(
             alternative = built(remaining)
         except DiagnoseError:  # no flight can be replayed without it
             continue
-        nats = ahead(current[0], alternative[0])
+        nats = log_bayes_factor(current[0], alternative[0])
         if nats > VERY_STRONG + np.log(mistake.ways):
             suspected_mistakes = [
                 replace(k, nats=nats) if k is mistake else k for k in suspected_mistakes
@@ -197,7 +235,7 @@ def correct_interface_mistakes(
     return current
 
 
-def ahead(model: Model, rival: Model) -> float:
+def log_bayes_factor(model: Model, rival: Model) -> float:
     """Nats by which a model explains the windows that it shares with another better, nothing named
     in either.
     """
@@ -220,14 +258,14 @@ def ahead(model: Model, rival: Model) -> float:
     return value[0] - value[1]
 
 
-def _threshold(nominal: Point, priors: Priors, seed: int, say: Callable[[str], None]) -> float:
-    """The threshold [nats]."""
-    least = threshold(nominal.statistics, priors, np.random.default_rng(seed))
+def _threshold(problem: Problem, nominal: Point, seed: int, say: Callable[[str], None]) -> float:
+    """Return the threshold [nats]."""
+    needed = threshold(nominal.statistics, problem.priors, np.random.default_rng(seed))
     say(
         f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights; a cause needs"
-        f" {least:.1f} nats"
+        f" {needed:.1f} nats"
     )
-    return least
+    return needed
 
 
 def _left_out(

@@ -67,12 +67,12 @@ class Screen:
     cross: np.ndarray  # with the effects, shape (T, K)
 
 
-def felt(block: str) -> str:
+def level_block(block: str) -> str:
     """Latent block whose levels a term's size is measured in."""
     return "vehicle torque" if block == JOINT else block
 
 
-def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
+def typical_level(levels: Mapping[tuple[int, str], float], block: int) -> float:
     """The lower median of a block's levels; the least of a phase with few windows may
     be anything.
     """
@@ -80,7 +80,7 @@ def usual(levels: Mapping[tuple[int, str], float], block: int) -> float:
     return levels_of[(len(levels_of) - 1) // 2]
 
 
-def calmed(point: Point) -> tuple[Point, list[LatentStatistics]]:
+def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     """The point as if no phase were much rougher than is usual in its block, and the statistics of
     its windows.
 
@@ -88,7 +88,8 @@ def calmed(point: Point) -> tuple[Point, list[LatentStatistics]]:
     it would stand out."""
     levels = point.noise.latent_sd
     limits = {
-        block: UNKNOWN_RATIO * usual(levels, block) for block in {block for block, _ in levels}
+        block: UNKNOWN_RATIO * typical_level(levels, block)
+        for block in {block for block, _ in levels}
     }
     noise = replace(
         point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()}
@@ -107,8 +108,10 @@ def screen(
     terms, layout = _laid(block, shared) if "time" in shared else ((), None)
     if layout is None:
         return None
-    latent_block = LATENT_BLOCKS.index(felt(block))
-    size = BATCH if point.device == "cpu" else len(carriers)
+    latent_block, size = (
+        LATENT_BLOCKS.index(level_block(block)),
+        BATCH if point.device == "cpu" else len(carriers),
+    )
 
     ends = np.cumsum([len(quantities[w]["time"]) for w in carriers])[:-1]
     factors = zip(
@@ -296,7 +299,7 @@ def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
     return inner
 
 
-def bare(problem: Problem, point: Point) -> tuple[Problem, Point]:
+def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:
     """The problem and a point of it without its terms, whose shares are left out of the residuals
     where they are not 0.
     """
@@ -326,7 +329,7 @@ def shortlist(
     ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
     nats that a term must bring beyond its price; ``names``: that are not in the set: a term that
     one of these says as well is none."""
-    calm, parts = calmed(point)
+    calm, parts = with_capped_gusts(point)
     values = [KnotValues(window.knots) for window in point.windows]
     screens = {
         block: screened
@@ -383,11 +386,11 @@ def strongest_forces(point: Point) -> dict[str, float]:
         name = LATENT_BLOCKS[block]
         strongest[name] = max(strongest.get(name, 0.0), level)
     if set(strongest) == set(LATENT_BLOCKS):
-        strongest[JOINT] = strongest[felt(JOINT)]
+        strongest[JOINT] = strongest[level_block(JOINT)]
     return strongest if all(w.knots for w in point.windows) else {}
 
 
-def matters(problem: Problem, point: Point, j: int, size: float) -> bool:
+def exceeds_floor(problem: Problem, point: Point, j: int, size: float) -> bool:
     """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts
     in.
 

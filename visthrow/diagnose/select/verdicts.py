@@ -1,41 +1,53 @@
-"""From the end of a search to verdicts: exactly one for every effect, one overall, each with its
-reason in words.
+"""From a selection to verdicts: exactly one for every effect, one overall, each with its reason in
+words.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from scipy.stats import chi2
 
+from sim.effects.effect import RandomEffect
+from visthrow.config.effects import random_effects
+from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import (
     CALIBRATION_QUANTILE,
     INEXACT,
     NORMAL_95,
     OWN_FLOOR,
     Priors,
-    certainty,
     covariance,
-    estimate,
+    surely_there,
 )
-from visthrow.diagnose.likelihood.marginal import TAIL
+from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
 from visthrow.diagnose.models.model_interface import Effect, Model, Window
-from visthrow.diagnose.select import result
-from visthrow.diagnose.select.excess import acts_on, levels, too_strong
+from visthrow.diagnose.select import result, terms
+from visthrow.diagnose.select.candidates import ALL, EVENT, Candidate, Names, as_random, varies_of
+from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
 from visthrow.diagnose.select.held_out import sized
+from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
     Point,
+    Work,
     moved,
-    with_fitted_noise,
     with_floors_noise,
     with_varying,
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
-from visthrow.diagnose.select.scatter import CHAIN, FORM, Varies, allowed, deviations, freed
-from visthrow.diagnose.select.search_state import Work
-from visthrow.diagnose.select.selector import Selector
-from visthrow.diagnose.select.terms import bare
+from visthrow.diagnose.select.scatter import (
+    DAY,
+    REACH,
+    Scatter,
+    Varies,
+    allowed,
+    by_day,
+    freed,
+    judged,
+    relinearised_per_flight,
+)
+from visthrow.diagnose.select.selection import Selector, Trial
 
 BIT = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
@@ -43,56 +55,38 @@ less than a bit about it.
 """
 
 
-def conclude(search: Selector) -> Diagnosis:
-    """Turn a finished search into verdicts."""
-    point = search.point
-    model = search.problem.model
-    scatter = (*search.scatter(search.active), *([search.dropped] if search.dropped else []))
-    varies = deviations(
-        scatter, search.priors, [e.name for e in model.effects], search.problem.varies.days
-    )
+def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
+    """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
+    model, point = selection.problem.model, selection.best.point
+    scatter, varies = random_shares_of(selection)
     if varies or point.varies:
-        point = search.point = with_varying(point, varies)
-    latent_levels = levels(
-        search.problem,
-        search.nominal,
-        with_floors_noise(search.problem, point, search.active),
-        search.least,
+        point = with_varying(point, varies)
+        selection.best = replace(selection.best, point=point)
+    scatter = (*scatter, *([commands] if commands else []))
+    block_levels = levels(
+        selection.problem,
+        selection.nominal,
+        with_floors_noise(selection.problem, point, selection.best.columns),
+        selection.threshold,
     )
-    varied = {name for s in scatter if s.found for name in s.of}
-    search.refused = {j: nats for j, nats in search.refused.items() if search.name(j) not in varied}
-    overall, block, reasons, withdrawn = _overall(search, latent_levels)
-    mistakes = tuple(model.mistakes)
-    if overall == result.NO_EFFECT and (any(s.found for s in scatter) or mistakes):
-        besides = [m.name for m in mistakes] + [s.name for s in scatter if s.found]
-        overall = result.KNOWN
-        reasons = [f"besides {' and '.join(besides)}, {reasons[0]}"]
-    forms = [s.name for s in scatter if s.found and s.name.endswith(f"{FORM}{s.by}")]
-    if len(forms) > 1 and overall == result.KNOWN:
-        reasons = [f"flights differ in {', '.join(forms)} at once; the form is another"]
-        overall = result.UNKNOWN
-        block = next(s.block for s in scatter if s.name == forms[0])
-    explanations = (
-        search.explanations() if overall == result.UNKNOWN else []
-    )  # a term that is weaker than the names says nothing
-    search, without_terms = _without_laws(search, point), not search.terms
-    active = [j for j in search.active if j not in withdrawn]
-    point = search.point
-    model = search.problem.model
-    if not without_terms:
-        active = _sure(point, search.priors, active)
-        withdrawn = set(search.active) - set(active)
-    without_terms = without_terms and bool(active or not search.active)
-    if not active and search.active:
-        point = search.nominal
-    point = replace(
-        point,
-        plain=search.about_means(active, varies) if without_terms else freed(point.plain, varies),
-        varies=Varies(),
-    )
-    theta, spread, unlike = sized(search.problem, point, active)
+    overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
+    explanations = _explanations(selection) if overall == result.UNKNOWN else []
+    has_laws = bool(_laws_of(selection.best))
+    bare = _without_laws(selection)
+    active = [j for j in bare.best.columns if j not in withdrawn]
+    point = bare.best.point
+    if has_laws:
+        active = surely_there(point.information, point.score, bare.problem.priors, active)
+        withdrawn = set(bare.best.columns) - set(active)
+    if not active and bare.best.columns:
+        point = bare.nominal
+    statistics = point.plain if has_laws else _about_means(bare, point, active, varies)
+    reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
+    theta, spread, unlike = sized(bare.problem, reported_point, active)
+    sets = _sets_of(bare)
     findings = tuple(
-        _finding(search, point, j, active, unlike, withdrawn) for j in range(len(model.effects))
+        _finding(bare, reported_point, j, active, sets, unlike, withdrawn)
+        for j in range(len(model.effects))
     )
     return Diagnosis(
         overall,
@@ -101,75 +95,220 @@ def conclude(search: Selector) -> Diagnosis:
         findings,
         theta,
         spread,
-        search.least,
-        tuple(search.steps),
-        tuple((tuple(map(search.name, m.active)), 0.0 - m.nats) for m in search.sets),
-        latent_levels,
+        selection.threshold,
+        tuple(selection.steps),
+        tuple((tuple(sorted(c.name for c in t.chosen)), nats) for t, nats in selection.window),
+        block_levels,
         _different(explanations),
-        _events(search, point),
+        _events(selection, point),
         sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
         scatter=scatter,
-        mistakes=mistakes,
+        mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
-        flights=len(search.point.plain.flights),
+        flights=len(point.plain.flights),
         windows=len(point.windows),
         samples=int(point.statistics.samples.sum()),
         work=Work(
-            search.problem, search.nominal, search.work if active else search.nominal, tuple(active)
+            bare.problem,
+            bare.nominal,
+            bare.best.point if active else bare.nominal,
+            tuple(active),
         ),
     )
 
 
-def _sure(point: Point, priors: Priors, active: Sequence[int]) -> list[int]:
-    """Names that are surely not 0 at a point, the least certain gone first."""
-    remaining = list(active)
-    while remaining:
-        theta = estimate(point.information, point.score, priors, remaining)
-        sure = certainty(point.information, theta, priors, remaining)
-        if sure.min() > 1.0:
-            break
-        remaining.pop(int(np.argmin(sure)))
-    return remaining
+def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
+    """Return the verdicts on what differs among flights or days, of the catalogue and of what was
+    selected; and the shares that were selected.
+
+    All flights may share any size of an effect that varies; flights far from the mean are simulated
+    again at their own size."""
+    best, problem, priors = selection.best, selection.problem, selection.problem.priors
+    random = {c for c in best.chosen if c.group not in (ALL, EVENT)}
+    catalogue = {v.name: v for v in random_effects()}
+    concerned = [
+        c
+        for c in selection.candidates
+        if c in random
+        or (c.name in catalogue and c.group != DAY and not any(c.name == o.name for o in random))
+    ]
+    verdicts, shares = [], dict(best.shares)
+    for c in concerned:
+        statistics = best.point.plain
+        if c in random and len(c.columns) == 1:
+            statistics = _straight(selection, best.point, best.columns, c.columns[0])
+        fixed_shares = {o: size for o, size in best.shares.items() if o != c}
+        means = {
+            o for o in selection.candidates if o.group == ALL and set(o.columns) & set(c.columns)
+        }
+        named = best.chosen if c in random else best.chosen | means
+        linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
+        effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
+        own = share_verdict(linear, c, named, fixed_shares, effect, selection.threshold)
+        verdicts.append(replace(own, found=c in random))
+        if c in random:
+            shares[c] = max(own.size, own.floor) / effect.prior_sd
+    return tuple(verdicts), varies_of(shares, problem.days)
 
 
-def _without_laws(search: Selector, point: Point) -> Selector:
-    """The search as if the laws of its set were known: what they explain is left out of the
-    residuals.
+def share_verdict(
+    linear: Linear,
+    c: Candidate,
+    chosen: Names,
+    fixed_shares: Mapping[Candidate, float],
+    effect: RandomEffect,
+    threshold: float,
+) -> Scatter:
+    """Return the verdict on a random share by the evidence of its deviations.
+
+    Args:
+        chosen: the set that it is a part of, or is asked together with.
+        fixed_shares: other random shares, with their deviations.
+        effect: that it is a share of.
+        threshold: of evidence [nats].
     """
-    if not search.problem.terms:
-        return replace(search, work=point)
-    unlawful = (
-        moved(search.problem, point, np.where(search.term_columns, 0.0, point.theta)) or point
+    sizes, nats = linear.profile(chosen, fixed_shares, c)
+    silent = replace(c, deviations=(1e-9,) * len(c.columns))
+    none = linear.profile(chosen, fixed_shares, silent, REACH[:1])[1][0]
+    flights = by_day(linear.statistics, linear.days) if c.group == DAY else linear.statistics
+    informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
+    return judged(
+        replace(effect, name=c.name),
+        sizes * effect.prior_sd,
+        nats - none,
+        threshold + c.penalty,
+        int(informative.sum()),
+        c.group,
     )
-    problem = bare(search.problem, point)[0]
-    nominal, origin, without, work = (
-        bare(search.problem, p)[1] for p in (search.nominal, search.origin, point, unlawful)
+
+
+def _straight(selection: Selector, point: Point, active: Sequence[int], j: int) -> Statistics:
+    theta = np.zeros(len(point.theta))
+    theta[list(active)] = point.theta[list(active)]
+
+    def simulate(position: np.ndarray) -> Statistics | None:
+        moved_point = moved(selection.problem, point, position)
+        return None if moved_point is None else moved_point.plain
+
+    return relinearised_per_flight(point.plain, theta, selection.problem.priors, j, simulate)
+
+
+def _about_means(
+    selection: Selector, point: Point, active: Sequence[int], varies: Varies
+) -> Statistics:
+    """Return what the flights say of the means of effects that vary."""
+    statistics = point.plain
+    for j in sorted(set(varies.effects) & set(active)):
+        straight = _straight(selection, replace(point, plain=statistics), active, j)
+        statistics = straight
+    return statistics
+
+
+def _laws_of(trial: Trial) -> list[int]:
+    """Return the numbers of a set's terms of laws."""
+    return [c.columns[0] for c in trial.chosen if c.law]
+
+
+def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
+    """Return the effects of each possible set with the same random shares, and its nats behind."""
+    random = {c for c in selection.best.chosen if c.group != ALL}
+    return [
+        (tuple(t.columns), nats)
+        for t, nats in selection.window
+        if {c for c in t.chosen if c.group != ALL} == random
+    ]
+
+
+def _without_laws(selection: Selector) -> Selector:
+    """Return the selection as if the laws of its set were known: what they explain is left out of
+    the residuals.
+    """
+    problem, best = selection.problem, selection.best
+    if not problem.terms:
+        return selection
+    names = frozenset(c for c in best.chosen if not c.law)
+    bare = Selector(
+        terms.without_laws(problem, best.point)[0],
+        terms.without_laws(problem, selection.nominal)[1],
+        selection.threshold,
+        selection.progress,
+        laws=False,
     )
-    names = search.names
-    sets = [m for m in search.sets if max(m.active, default=0) < len(problem.priors.floor)]
-    return replace(
-        search,
-        problem=problem,
-        nominal=nominal,
-        origin=origin,
-        point=without,
-        work=with_fitted_noise(work),
-        active=names,
-        sets=sets,
+    bare.origin = terms.without_laws(problem, selection.origin)[1]
+    bare.best = Trial(names, terms.without_laws(problem, best.point)[1], best.shares, best.occam)
+    bare.window = [(t, nats) for t, nats in selection.window if not _laws_of(t)]
+    return bare
+
+
+def _explanations(selection: Selector) -> list[tuple[Law, ...]]:
+    """Return the laws of the set, then others one by one in their place, best first."""
+    best, problem = selection.best, selection.problem
+    chosen = _laws_of(best)
+    if not chosen:
+        return []
+    names = frozenset(c for c in best.chosen if not c.law)
+    linear = selection.linear(best.point)
+    alternatives = {names | {c} for c in selection.candidates if c.law} | {best.chosen}
+    value = {s: linear.value(s) - linear.value(names) for s in alternatives}
+    ranked = sorted((s for s in alternatives if s != best.chosen), key=value.get, reverse=True)
+    return [
+        terms.laws(problem, best.point, [c.columns[0] for c in s if c.group == ALL], value[s])
+        for s in (best.chosen, *ranked)
+        if s == best.chosen or value[s] > 0.0
+    ]
+
+
+def _law(selection: Selector) -> tuple[set[int], str]:
+    """Return the names that are not told beside the set's laws, and why there are laws in words.
+
+    Names that act in a law's block may be a part of its form. A name acts there by its column or by
+    what the other names cannot stand in for, as two delays that differ by a force. What is worth
+    nothing without those is not told either."""
+    effects, best, priors = selection.problem.effects, selection.best, selection.problem.priors
+    laws = _laws_of(best)
+    names = [j for j in best.columns if j not in laws]
+    blocks = {effects[j].block for j in laws}
+    joint = grammar.JOINT in blocks
+
+    def acts(columns: Sequence[int], free_effects: Sequence[int] = ()) -> list[str]:
+        return acts_on(best.point, columns, joint=joint, free_effects=free_effects)
+
+    in_block = {j for j, block in zip(names, acts(names)) if block in blocks}
+    if len(names) > 1:
+        rest = {j: [k for k in names if k != j] for j in set(names) - in_block}
+        in_block |= {j for j, free_effects in rest.items() if acts([j], free_effects)[0] in blocks}
+    remaining_columns = [j for j in best.columns if j not in in_block]
+    while in_block and set(remaining_columns) & set(names):
+        whole = best.point.evidence(priors, remaining_columns)
+        worth = {
+            j: whole - best.point.evidence(priors, [k for k in remaining_columns if k != j])
+            for j in remaining_columns
+            if j in names
+        }
+        weakest = min(worth, key=worth.get)
+        if worth[weakest] > selection.threshold:
+            break
+        remaining_columns.remove(weakest)
+    laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
+    text = " and ".join(
+        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in laws_of_set
     )
+    return set(names) - set(
+        remaining_columns
+    ), f"{text} explains what no cause of the catalogue does"
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
-    """Laws, each formula once, with the coefficient of the best."""
+    """Return laws, each formula once, with the coefficient of the best."""
     laws: dict[str, Law] = {}
     for law in (law for together in explanations for law in together):
         laws.setdefault(law.formula, law)
     return tuple(laws.values())
 
 
-def _events(search: Selector, point: Point) -> tuple[int, ...]:
-    """Flights that were left out for what happened there, and flights with a window far rougher
-    than its phase.
+def _events(selection: Selector, point: Point) -> tuple[int, ...]:
+    """Return flights in which an effect has a size of its own, and flights with a window far
+    rougher than its phase.
     """
     square = TAIL / chi2.ppf(
         (1.0 - CALIBRATION_QUANTILE) / point.noise.share.size, TAIL
@@ -179,7 +318,7 @@ def _events(search: Selector, point: Point) -> tuple[int, ...]:
         for window, share in zip(point.windows, point.noise.share)
         if share.max() ** 2 > square
     }
-    return tuple(sorted({*search.events, *rough}))
+    return tuple(sorted({*selection.events, *rough}))
 
 
 def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
@@ -215,64 +354,72 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
 
 
 def _overall(
-    search: Selector, latent_levels: Sequence[Level]
+    selection: Selector, block_levels: Sequence[Level], scatter: Sequence[Scatter]
 ) -> tuple[str, str, list[str], set[int]]:
-    """Overall verdict, block of an unknown effect, reasons, and the names that are withdrawn for
-    it.
+    """Return the overall verdict, the block of an unknown effect, reasons, and the names that are
+    withdrawn for it.
     """
-    point = search.point
-    all_names = set(search.active)
-    strong = too_strong(
-        point, INEXACT
-    )  # what no missing cause explains: the channels do not belong together
-    if strong:
+    point, active = selection.best.point, selection.best.columns
+    strong = too_strong(point, INEXACT)
+    if strong:  # what no missing cause explains: the channels do not belong together
         reason = (
             f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are"
             f" missing in the phases {', '.join(strong)}: commands and poses, units or axes do not"
             " belong together"
         )
-        return result.INCONSISTENT, "", [reason], all_names
-    if search.refused and not search.active:
-        names = ", ".join(search.name(j) for j in sorted(search.refused))
-        return (
-            result.INCONSISTENT,
-            "",
-            [f"what looks like {names} changes its sign from flight to flight"],
-            all_names,
-        )
-    excessive = [level for level in latent_levels if level.excessive]
+        return result.INCONSISTENT, "", [reason], set(active)
+    excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
-    if search.terms:
-        untold, sentence = search.law()
-        return (
-            result.UNKNOWN,
-            search.problem.effects[search.terms[0]].block,
-            [sentence, *reasons],
-            untold,
-        )
-    stuck = [j for j in search.active if _on_bound(search, j)]
+    laws = _laws_of(selection.best)
+    if laws:
+        unnamed, said = _law(selection)
+        return result.UNKNOWN, selection.problem.effects[laws[0]].block, [said, *reasons], unnamed
+    stuck = [j for j in active if _on_bound(selection, j)]
     if stuck:
-        names = ", ".join(map(search.name, stuck))
+        names = ", ".join(selection.problem.effects[j].name for j in stuck)
         reasons.append(
             f"{names} would have to lie outside what is physically possible; the form is another"
         )
-        return (
-            result.UNKNOWN,
-            acts_on(point, stuck[:1])[0] or search.problem.effects[stuck[0]].block,
-            reasons,
-            all_names,
-        )
+        block = acts_on(point, stuck[:1])[0] or selection.problem.effects[stuck[0]].block
+        return result.UNKNOWN, block, reasons, set(active)
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
-        return result.UNKNOWN, worst.block, reasons, _withdrawn(search, excessive)
-    if search.active:
-        return result.KNOWN, "", [f"{len(search.active)} named, nothing excessive is left"], set()
-    return (
-        result.NO_EFFECT,
-        "",
-        [f"no effect exceeds {search.least:.1f} nats, and nothing excessive is left"],
-        set(),
-    )
+        return result.UNKNOWN, worst.block, reasons, _withdrawn(selection, excessive)
+    for block, names in _parts_of_a_law(selection).items():
+        words = ", ".join(sorted(c.name for c in names))
+        reason = f"{words} act in the {block} and some hardly differ: another law is likelier"
+        return result.UNKNOWN, block, [*reasons, reason], {c.columns[0] for c in names}
+    catalogue = {v.name for v in random_effects()}
+    forms = [s for s in scatter if s.found and s.name not in catalogue]
+    if len(forms) > 1:
+        names = ", ".join(s.name for s in forms)
+        reason = f"flights differ in {names} at once; the form is another"
+        return result.UNKNOWN, forms[0].block, [reason], set()
+    besides = [m.name for m in selection.problem.model.mistakes]
+    besides += [s.name for s in scatter if s.found]
+    if active:
+        return result.KNOWN, "", [f"{len(active)} named, nothing excessive is left"], set()
+    nothing = f"no effect exceeds {selection.threshold:.1f} nats, and nothing excessive is left"
+    if besides:
+        return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
+    return result.NO_EFFECT, "", [nothing], set()
+
+
+def _parts_of_a_law(selection: Selector) -> dict[str, list[Candidate]]:
+    """Return the blocks that are crowded with names, of which some explain others by more than
+    half, with the names that act there.
+    """
+    if not compares_phases(selection.nominal):  # there what is left over says so
+        return {}
+    names = [c for c in selection.best.chosen if c.group == ALL]
+    parts: dict[str, list[Candidate]] = {}
+    for block, members in selection.crowded(names).items():
+        columns = [c.columns[0] for c in members]
+        information = selection.best.point.information[np.ix_(columns, columns)]
+        unlike = 1.0 / (np.diag(information) * np.diag(np.linalg.pinv(information)))
+        if unlike.min() < 0.5:
+            parts[block] = members
+    return parts
 
 
 def _excess(level: Level) -> str:
@@ -283,24 +430,25 @@ def _excess(level: Level) -> str:
     )
 
 
-def _withdrawn(search: Selector, excessive: Sequence[Level]) -> set[int]:
+def _withdrawn(selection: Selector, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one
     that left it as it was.
     """
-    blocks = dict(zip(search.active, acts_on(search.point, search.active)))
+    active = selection.best.columns
+    blocks = dict(zip(active, acts_on(selection.best.point, active)))
     in_excess = {j for j, block in blocks.items() if block in {level.block for level in excessive}}
-    if len(in_excess) > CHAIN:
+    crowd = selection.crowded(c for c in selection.best.chosen if c.columns[0] in in_excess)
+    if crowd:
         return in_excess
     eased = {level.block: level.after < 0.5 * level.before for level in excessive}
     return {j for j in in_excess if not eased.get(blocks[j], True)}
 
 
-def _on_bound(search: Selector, j: int) -> bool:
+def _on_bound(selection: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the
     threshold.
     """
-    point = search.point
-    priors = search.priors
+    point, priors = selection.best.point, selection.problem.priors
     on_bound = (
         min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
     )
@@ -308,38 +456,40 @@ def _on_bound(search: Selector, j: int) -> bool:
     return bool(
         on_bound
         and push * point.theta[j] > 0.0
-        and 0.5 * push**2 / point.information[j, j] > search.least
+        and 0.5 * push**2 / point.information[j, j] > selection.threshold
     )
 
 
 def _finding(
-    search: Selector, point: Point, j: int, active: list[int], unlike: float, withdrawn: set[int]
+    selection: Selector,
+    point: Point,
+    j: int,
+    active: list[int],
+    sets: Sequence[tuple[tuple[int, ...], float]],
+    unlike: float,
+    withdrawn: set[int],
 ) -> Finding:
-    effect = search.problem.effects[j]
-    priors = search.priors
-    blank = _blank(effect)
+    """Return the verdict on an effect.
+
+    ``sets``: effects of each possible set, and its nats behind; ``unlike``: variance among flights,
+    in what is allowed."""
+    problem, priors = selection.problem, selection.problem.priors
+    effect, blank = problem.effects[j], _blank(problem.effects[j])
     if not priors.visible[j]:
-        missing = tuple(c for c in effect.channels if c not in search.problem.model.channels)
-        return replace(
-            blank,
-            missing=missing,
-            sentence=f"{effect.name}: not to be seen without {', '.join(missing)}.",
-        )
-    partners, together = _class_of(search, j, active)
+        missing = tuple(c for c in effect.channels if c not in problem.model.channels)
+        sentence = f"{effect.name}: not to be seen without {', '.join(missing)}."
+        return replace(blank, missing=missing, sentence=sentence)
+    partners, together = _class_of(j, active, sets)
     remaining = [k for k in together if k != j]
-    sigma = covariance(
-        point.information, priors.deviation([*remaining, j])
-    )  # as if it were named beside the others
-    mean = float(sigma[j] @ point.score)
-    sd = float(np.sqrt(sigma[j, j]))
+    homes = [(members, nats) for members, nats in sets if j in members] if active else []
+    mean, sd = _averaged(point, priors, j, homes or [((*remaining, j), 0.0)])
     deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
     nats = point.evidence(priors, [*remaining, j]) - point.evidence(priors, remaining)
-    differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
-    blank = replace(
-        blank, sd=deviation, nats=nats, differs=differs if j in active or partners else 0.0
-    )
+    blank = replace(blank, sd=deviation, nats=nats)
     if j in active or partners:
-        return _named(search, point, blank, mean, sorted({j, *partners}), active)
+        differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
+        members = sorted({j, *partners})
+        return _named(selection, point, replace(blank, differs=differs), mean, members, active)
     low, high = (
         float(np.clip(mean * effect.floor + side * NORMAL_95 * deviation, *effect.bounds)) + 0.0
         for side in (-1.0, 1.0)
@@ -367,6 +517,21 @@ def _finding(
     return replace(blank, verdict=result.BOUNDED, sentence=text)
 
 
+def _averaged(
+    point: Point, priors: Priors, j: int, sets: Sequence[tuple[tuple[int, ...], float]]
+) -> tuple[float, float]:
+    """Return mean and deviation of an effect over the possible sets that hold it, all other effects
+    free below their floors, in floors.
+    """
+    estimates = []
+    for members, behind in sets:
+        sigma = covariance(point.information, priors.deviation(list(members)))
+        estimates.append((float(sigma[j] @ point.score), float(sigma[j, j]), np.exp(-behind)))
+    means, variances, weights = np.array(estimates).T
+    mean = np.average(means, weights=weights)
+    return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
+
+
 def _blank(effect: Effect) -> Finding:
     """Return the finding on an effect before any flight."""
     return Finding(
@@ -386,27 +551,25 @@ def _blank(effect: Effect) -> Finding:
 
 
 def _class_of(
-    search: Selector, j: int, active: Sequence[int]
+    j: int, active: Sequence[int], sets: Sequence[tuple[tuple[int, ...], float]]
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Partners of an effect, and the set that it belongs to: that of the search, or another that
+    """Return the partners of an effect, and the set that it belongs to: the best, or another that
     explains the flights as well.
 
     Partners are a named effect and the new ones of sets of as many that do without it.
     """
-    named = set(active)
-    alike = [set(m.active) for m in search.sets if len(m.active) == len(active)]
+    named, alike = set(active), [set(members) for members, _ in sets if len(members) == len(active)]
     for home in active:
         rivals = [members for members in alike if home not in members]
         partners = {home}.union(*rivals) - (named - {home})
         if j in partners and len(partners) > 1:
-            return tuple(sorted(partners - {j})), tuple(
-                active if j == home else next(m for m in rivals if j in m)
-            )
+            together = active if j == home else next(m for m in rivals if j in m)
+            return tuple(sorted(partners - {j})), tuple(together)
     return (), tuple(active)
 
 
 def _named(
-    search: Selector,
+    selection: Selector,
     point: Point,
     blank: Finding,
     mean: float,
@@ -423,14 +586,18 @@ def _named(
     high = min(high, size + NORMAL_95 * blank.sd) + 0.0
     text = f"{size:.3g} ± {blank.sd:.2g} {blank.unit}"
     blank = replace(blank, estimate=size, low=low, high=high)
+    if low <= 0.0 <= high:
+        sentence = f"{blank.cause}: {blank.name} = {text}, an interval that holds 0."
+        return replace(blank, verdict=result.CANDIDATE, sentence=sentence)
     if len(members) < 2:
         sentence = (
             f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
             f" {blank.nats:.0f} nats; another flight may differ by {blank.differs:.2g}."
         )
         return replace(blank, verdict=result.FOUND, sentence=sentence)
-    names = tuple(name for name in map(search.name, members) if name != blank.name)
-    joint = _joint(search, point, members, [k for k in active if k not in members])
+    effects = selection.problem.effects
+    names = tuple(effects[k].name for k in members if effects[k].name != blank.name)
+    joint = _joint(selection, point, members, [k for k in active if k not in members])
     sentence = (
         f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it"
         f" from {', '.join(names)}. Known is {joint}."
@@ -438,12 +605,11 @@ def _named(
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(search: Selector, point: Point, members: list[int], named: list[int]) -> str:
+def _joint(selection: Selector, point: Point, members: list[int], named: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior
     deviations.
     """
-    priors = search.priors
-    effects = search.problem.effects
+    priors, effects = selection.problem.priors, selection.problem.effects
     nuisances = np.setdiff1d(np.arange(len(effects)), members)
     information = point.information
     slab = priors.slab[members]

@@ -1,0 +1,163 @@
+"""Candidates of a selection: effects, other kinds of blocks, terms of laws, and shares of effects
+that flights or days have for themselves.
+
+A candidate is a group of columns of the windows with a prior and a penalty. Whatever it stands for,
+a set of candidates is worth its marginal likelihood less the penalties of its members.
+"""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim.effects.effect import Effect, RandomEffect
+from visthrow.config.effects import random_effects
+from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.grammar import TermEffect
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.scatter import DAY, EVENT, FLIGHT, Varies
+
+ALL = "all"  # group of a candidate whose size all flights share
+FEWEST_FOR_EVENT = 3  # flights: of two that differ, neither is the odd one
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A cause that may be selected."""
+
+    name: str
+    columns: tuple[int, ...]  # numbers of the effects that it concerns
+    group: str = ALL  # who has a size: ALL flights one, each FLIGHT, each DAY, or one in an EVENT
+    penalty: float = 0.0  # beyond the threshold [nats]
+    deviations: tuple[float, ...] = ()  # prior of random shares, in floors; one a column
+    floors: float = 0.0  # negligible deviation of random shares, in the prior's
+    flight: int = -1  # of an event
+    law: str = ""  # block of the law whose term it is
+
+    def __hash__(self) -> int:
+        """Hash numbers alone: with names, the order of a set would differ from run to run."""
+        return hash((self.columns, self.flight))
+
+
+Names = frozenset[Candidate]
+NOTHING: Names = frozenset()
+
+
+def shared(effects: Sequence[Effect]) -> list[Candidate]:
+    """Return every effect as a candidate whose size all flights share."""
+    return [
+        Candidate(
+            e.name,
+            (j,),
+            penalty=e.price if isinstance(e, TermEffect) else 0.0,
+            law=e.block if isinstance(e, TermEffect) else "",
+        )
+        for j, e in enumerate(effects)
+    ]
+
+
+def random_shares(
+    effects: Sequence[Effect],
+    priors: Priors,
+    statistics: Statistics,
+    days: Sequence[int],
+    every: bool = True,
+) -> list[Candidate]:
+    """Return what flights, or days, may have for themselves, where at least two of them show it.
+
+    Args:
+        effects: of the model, shape (K,).
+        statistics: of the flights.
+        days: of each flight, by its number; none where the logs do not say.
+        every: whether of every effect, not of the catalogue's random effects alone.
+    """
+    flown = statistics.information.diagonal(axis1=1, axis2=2) > 0.0
+    groups = [(FLIGHT, flown)]
+    if days:
+        day_of = np.array([days[f] for f in statistics.flights.tolist()])
+        by_day = np.array([flown[day_of == day].any(0) for day in np.unique(day_of)])
+        groups += [(DAY, by_day)] if 1 < len(by_day) < len(flown) else []
+    offered = []
+    for effect, penalty in _varying(effects):
+        columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
+        deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
+        named = effect.name not in effect.of
+        if not (named or every):
+            continue
+        offered += [
+            Candidate(
+                effect.name if named else f"{effect.name}_by_{group}",
+                tuple(columns),
+                group,
+                penalty,
+                deviations,
+                effect.floor / effect.prior_sd,
+            )
+            for group, shown in groups
+            if columns and shown[:, columns].any(1).sum() > 1
+        ]
+    return offered + _events(effects, priors, statistics.flights, flown)
+
+
+def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
+    """Yield the catalogue's random effects, then every other effect as one, with their penalties:
+    of all effects, one varies more by chance.
+    """
+    named = [v for v in random_effects() if v.of]
+    yield from ((v, 0.0) for v in named)
+    covered = {name for v in named for name in v.of}
+    for e in effects:
+        if e.name not in covered and not e.switch and not isinstance(e, TermEffect):
+            yield as_random(e), float(np.log(len(effects)))
+
+
+def as_random(effect: Effect) -> RandomEffect:
+    """Return an effect as one whose size differs from flight to flight."""
+    return RandomEffect(
+        effect.name,
+        f"{effect.cause}, now more, now less",
+        f"{effect.name} ~ N({effect.name}, theta^2) in each flight",
+        (effect.name,),
+        effect.unit,
+        effect.block,
+        effect.prior_sd,
+        effect.floor,
+        effect.source,
+        manoeuvres=tuple(effect.manoeuvres),
+    )
+
+
+def _events(
+    effects: Sequence[Effect], priors: Priors, flights: np.ndarray, flown: np.ndarray
+) -> list[Candidate]:
+    """Return each effect in each flight alone."""
+    penalty = float(np.log(max(flown.size, 1)))
+    return [
+        Candidate(
+            f"{e.name} in flight {flight}",
+            (j,),
+            EVENT,
+            penalty,
+            (float(priors.slab[j]),),
+            flight=flight,
+        )
+        for j, e in enumerate(effects)
+        if priors.visible[j] and not e.switch and not isinstance(e, TermEffect)
+        for flight in flights[flown[:, j]].tolist()
+        if flown[:, j].sum() >= FEWEST_FOR_EVENT
+    ]
+
+
+def columns_of(chosen: Iterable[Candidate]) -> list[int]:
+    """Return the numbers of the effects whose size all flights share."""
+    return sorted(j for c in chosen if c.group == ALL for j in c.columns)
+
+
+def varies_of(shares: Mapping[Candidate, float], days: Sequence[int]) -> Varies:
+    """Return the random shares of candidates; ``shares``: their deviation, in their prior's."""
+    offered = Varies(days)
+    for c, size in shares.items():
+        offered = offered.also(
+            {j: size * sd for j, sd in zip(c.columns, c.deviations)}, c.group, c.flight
+        )
+    return offered

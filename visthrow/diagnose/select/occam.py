@@ -1,0 +1,267 @@
+"""Occam's window: the sets of candidates that the statistics of some flights leave in question.
+
+A set S of candidates has the value
+
+    V(S) = log Z(S) - sum of its members' penalties
+
+with log Z as in :mod:`visthrow.diagnose.likelihood.evidence`. The deviation of random shares is
+integrated over its prior. The search opens the best set that was not opened yet, and lists its
+neighbours: one candidate more, two more, one less, one in place of another. It ends where no set
+near the best is unopened. What is left near the best is the answer: one set, or several that say
+the same.
+
+Source: Madigan and Raftery 1994 (Occam's window); Raftery 1995.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.evidence import (
+    STRONG,
+    Priors,
+    additions,
+    covariance,
+    pair_additions,
+)
+from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select.candidates import ALL, EVENT, Candidate, Names, columns_of, varies_of
+from visthrow.diagnose.select.scatter import COARSE, DAY, REACH, Varies, by_day, evidence_of, freed
+
+MOST_NAMES = 6  # a longer list of causes is a wrong form, not a finding
+
+WINDOW = 15.0
+"""Nats behind the best up to which sets are kept, for statistics of other sizes may be wrong; sets
+up to ``STRONG`` behind count as possible.
+"""
+
+PATIENCE = 8  # sets that are opened in vain before the search ends
+RANDOM_TRIED = (
+    4  # random shares whose evidence is calculated for each set, of those that may matter
+)
+
+
+class Linear:
+    """Values of sets by the statistics of one point alone."""
+
+    def __init__(
+        self,
+        statistics: Statistics,
+        priors: Priors,
+        candidates: Sequence[Candidate],
+        penalty: Callable[[Names], float],
+        days: Sequence[int] = (),
+    ) -> None:
+        """Keep what values are made of; ``penalty``: of a set [nats]."""
+        self.statistics, self.priors, self.days, self.penalty = statistics, priors, days, penalty
+        self.plain = [c for c in candidates if c.group == ALL and priors.visible[c.columns[0]]]
+        self.random = [c for c in candidates if c.group != ALL]
+        self._step = min((penalty(frozenset({c})) for c in self.plain), default=0.0)
+        self._shares: dict[Names, tuple[dict[Candidate, float], float]] = {}
+        self._values: dict[Names, float] = {}
+        self._totals: dict[frozenset, tuple[np.ndarray, np.ndarray]] = {}
+        self._added: dict[Names, dict[Names, float]] = {}
+        self._best = -np.inf
+
+    def shares(self, chosen: Names) -> tuple[dict[Candidate, float], float]:
+        """Return the deviations of a set's random shares, in their prior's, and the nats by which
+        they are worth more at their best than over their prior.
+        """
+        if chosen not in self._shares:
+            listed: dict[Candidate, float] = {}
+            occam = 0.0
+            for c in sorted((c for c in chosen if c.group != ALL), key=lambda c: c.name):
+                listed[c], more = self._deviation(chosen, listed, c)
+                occam += more
+            self._shares[chosen] = listed, occam
+        return self._shares[chosen]
+
+    def varies(self, chosen: Names) -> Varies:
+        """Return the random shares of a set."""
+        return varies_of(self.shares(chosen)[0], self.days)
+
+    def _deviation(
+        self, chosen: Names, fixed: dict[Candidate, float], c: Candidate
+    ) -> tuple[float, float]:
+        if c.group == EVENT:  # a size like any other: the slab is its prior
+            return 1.0, 0.0
+        sizes, nats = self.profile(chosen, fixed, c, REACH[::COARSE])
+        best = int(np.argmax(nats + np.log(half_normal(sizes))))
+        close = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
+        between = REACH[(close[0] < REACH) & (close[1] > REACH) & ~np.isin(REACH, sizes)]
+        if nats.max() - self.penalty(chosen) < self._best - WINDOW - STRONG:
+            between = between[:0]  # far behind, whatever its deviation
+        finer = self.profile(chosen, fixed, c, between)
+        order = np.argsort(sizes := np.append(sizes, finer[0]))
+        sizes, nats = sizes[order], np.append(nats, finer[1])[order]
+        weight = half_normal(sizes)
+        best = int(np.argmax(nats + np.log(weight)))
+        whole = nats.max() + np.log((np.exp(nats - nats.max()) * weight * np.gradient(sizes)).sum())
+        return float(sizes[best]), float(nats[best] - whole)
+
+    def profile(
+        self,
+        chosen: Names,
+        fixed: Mapping[Candidate, float],
+        c: Candidate,
+        sizes: np.ndarray = REACH,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return deviations of a random share that are not negligible, in its prior's, and log Z at
+        each.
+        """
+        sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
+        active, statistics = columns_of(chosen), self.statistics
+        flights = {other: size for other, size in fixed.items() if other.group != DAY}
+        days = {other: size for other, size in fixed.items() if other.group == DAY}
+        statistics = freed(statistics, varies_of(flights, self.days))
+        nats = []
+        for size in sizes.tolist():
+            varied = freed(statistics, varies_of({**days, c: size}, self.days))
+            nats.append(evidence_of(varied, self.priors, active))
+        return sizes, np.array(nats)
+
+    def value(self, chosen: Names) -> float:
+        """Return the value of a set."""
+        if chosen not in self._values:
+            penalty = self.penalty(chosen)
+            self._values[chosen] = -np.inf
+            if np.isfinite(penalty):
+                active, occam = columns_of(chosen), self.shares(chosen)[1]
+                whole = evidence_of(self._freed(chosen), self.priors, active)
+                self._values[chosen] = whole - occam - penalty
+                self._best = max(self._best, self._values[chosen])
+        return self._values[chosen]
+
+    def _freed(self, chosen: Names) -> Statistics:
+        return freed(self.statistics, self.varies(chosen))
+
+    def total(self, chosen: Names) -> tuple[np.ndarray, np.ndarray]:
+        """Return information and score of all flights beside a set's random shares."""
+        shares = frozenset(self.shares(chosen)[0].items())
+        if shares not in self._totals:
+            misfit = self._freed(chosen)
+            self._totals[shares] = misfit.information.sum(0), misfit.absolute.sum(0)
+        return self._totals[shares]
+
+    def added(self, subset: Names) -> dict[Names, float]:
+        """Return a set and its neighbours with one candidate more, with their values."""
+        if subset not in self._added:
+            base = self.value(subset)
+            listed = {subset: base}
+            if len(subset) < MOST_NAMES and np.isfinite(base):
+                gain = additions(*self.total(subset), self.priors, columns_of(subset))
+                varying = {j for c in subset if c.group != ALL for j in c.columns}
+                for c in self.plain:
+                    new = subset | {c}
+                    if c.columns[0] in varying:  # whose shares are others about a mean
+                        listed[new] = self.value(new)
+                    elif gain[c.columns[0]] > self._step - WINDOW:
+                        self._shares.setdefault(new, self.shares(subset))
+                        more = self.penalty(new) - self.penalty(subset)
+                        listed[new] = base + float(gain[c.columns[0]]) - more
+                listed |= {subset | {c}: self.value(subset | {c}) for c in self._may_vary(subset)}
+            self._added[subset] = listed
+        return self._added[subset]
+
+    def _may_vary(self, subset: Names) -> list[Candidate]:
+        """Return the random shares that may be worth their penalty, those that promise most: each
+        as if no other effect could stand in for it.
+        """
+        if not self.random:
+            return []
+        information, score = self.total(subset)
+        theta = covariance(information, self.priors.deviation(columns_of(subset))) @ score
+        promise = {}
+        for group, members in self._by_group.items():
+            flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
+            precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
+            misfit = (flights.absolute - flights.information @ theta) ** 2 / precision
+            sizes = np.ones(1) if group == EVENT else REACH[::COARSE]
+            deviation = np.zeros(precision.shape[1])
+            for c in members:
+                deviation[list(c.columns)] = c.deviations
+            part = precision * (sizes[:, None, None] * deviation) ** 2
+            gain = 0.5 * (misfit * part / (1.0 + part) - np.log1p(part))
+            row = {flight: f for f, flight in enumerate(flights.flights.tolist())}
+            whole = gain.sum(1)
+            for c in members:
+                j = list(c.columns)
+                nats = gain[0, row[c.flight], j] if group == EVENT else whole[:, j].sum(1)
+                promise[c] = float(nats.max()) - c.penalty
+        close = [c for c, n in promise.items() if n > self._step - STRONG and c not in subset]
+        return sorted(close, key=promise.get, reverse=True)[:RANDOM_TRIED]
+
+    @cached_property
+    def _by_group(self) -> dict[str, list[Candidate]]:
+        groups: dict[str, list[Candidate]] = {}
+        for c in self.random:
+            groups.setdefault(c.group, []).append(c)
+        return groups
+
+    def neighbours(self, chosen: Names) -> dict[Names, float]:
+        """Return sets one step away, with their values."""
+        listed = dict(self.added(chosen))
+        for c in chosen:
+            listed |= self.added(chosen - {c})
+        return listed
+
+    def pairs(self, chosen: Names) -> dict[Names, float]:
+        """Return sets with two candidates more, or in place of one or two: of two that hide each
+        other, neither shows alone.
+        """
+        listed: dict[Names, float] = {}
+        removed = [frozenset(g) for n in range(3) for g in combinations(chosen, n)]
+        for subset in (chosen - g for g in removed):
+            if len(subset) + 2 > MOST_NAMES or not np.isfinite(base := self.value(subset)):
+                continue
+            columns = np.array([c.columns[0] for c in self.plain if c not in subset and not c.law])
+            if len(columns) < 2:
+                continue
+            by_column = {c.columns[0]: c for c in self.plain}
+            active = columns_of(subset)
+            gain = pair_additions(*self.total(subset), self.priors, active)[
+                np.ix_(columns, columns)
+            ]
+            single = additions(*self.total(subset), self.priors, active)[columns]
+            price = np.array([self.penalty(subset | {by_column[j]}) for j in columns.tolist()])
+            price -= self.penalty(subset)
+            beyond = gain - np.maximum.outer(single, single) - np.minimum.outer(price, price)
+            worth = base + gain - np.add.outer(price, price)
+            close = np.argwhere(np.triu((beyond > -STRONG) & np.isfinite(gain), 1))
+            for a, b in sorted(close.tolist(), key=lambda ab: -worth[tuple(ab)])[:RANDOM_TRIED]:
+                new = subset | {by_column[int(columns[a])], by_column[int(columns[b])]}
+                self._shares.setdefault(new, self.shares(subset))
+                listed[new] = float(worth[a, b])
+        return listed
+
+
+def half_normal(sizes: np.ndarray) -> np.ndarray:
+    """Return the density of deviations, in their prior's."""
+    return np.sqrt(2.0 / np.pi) * np.exp(-0.5 * sizes**2)
+
+
+def window(linear: Linear, begin: Iterable[Names], pairs: bool = True) -> dict[Names, float]:
+    """Return the sets near the best, with their values.
+
+    ``begin``: sets that are opened first; ``pairs``: whether two candidates are tried at once."""
+    values = {chosen: linear.value(chosen) for chosen in begin}
+    opened: set[Names] = set()
+    paired: set[Names] = set()
+    in_vain = 0
+    while True:
+        best = max(values.values())
+        close = [s for s, v in values.items() if s not in opened and v > best - WINDOW]
+        if close and in_vain < PATIENCE:
+            chosen = max(close, key=values.get)
+            opened.add(chosen)
+            values |= linear.neighbours(chosen)
+        else:
+            chosen = max(values, key=values.get)
+            if chosen in paired or not pairs:
+                break
+            paired.add(chosen)
+            values |= linear.pairs(chosen)
+        in_vain = 0 if max(values.values()) > best + 1e-6 else in_vain + 1
+    return {chosen: value for chosen, value in values.items() if value > best - WINDOW}

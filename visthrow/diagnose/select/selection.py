@@ -1,0 +1,533 @@
+"""Selection of causes: Occam's window by the statistics, the simulation as judge among its best.
+
+One loop over sets of candidates of every kind: list the sets near the best by the linear statistics
+(:mod:`visthrow.diagnose.select.occam`), simulate the best of them, go over to the one that is worth
+most, linearise there, and repeat until the best set stays. Candidates that need the model's own
+latent forces, terms of laws, are offered once no other set is worth more.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+
+from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.likelihood import grammar
+from visthrow.diagnose.likelihood.evidence import (
+    OWN_FLOOR,
+    SPIKE,
+    STRONG,
+    certainty,
+    estimate,
+    surely_there,
+)
+from visthrow.diagnose.likelihood.grammar import TermEffect
+from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
+from visthrow.diagnose.select import terms
+from visthrow.diagnose.select.candidates import (
+    ALL,
+    EVENT,
+    NOTHING,
+    Candidate,
+    Names,
+    columns_of,
+    random_shares,
+    shared,
+    varies_of,
+)
+from visthrow.diagnose.select.excess import acts_on, compares_phases
+from visthrow.diagnose.select.occam import WINDOW, Linear, window
+from visthrow.diagnose.select.point import (
+    ROUNDS,
+    Point,
+    Problem,
+    candidates,
+    curvature,
+    fitted,
+    linearise,
+    predicted_gain,
+    switched,
+    with_all_effects_noise,
+    with_noise_of,
+    with_varying,
+)
+from visthrow.diagnose.select.result import SelectionStep
+from visthrow.diagnose.select.scatter import own_shares
+
+SHORTLIST = 3  # sets that are simulated at once
+MOST_TRIED = 40  # and from one point, best first
+FAR = 0.1
+"""Nats of doubt about a set's linear value for each nat that its sizes are away from where the
+derivatives were taken.
+"""
+MOST_LAWS = 2
+SHOWN = 10  # sets that a step keeps for the report
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A set of candidates where the simulation was run with it."""
+
+    chosen: Names
+    point: Point
+    shares: Mapping[Candidate, float] = field(default_factory=dict)  # deviations of random shares
+    occam: float = 0.0  # nats by which they are worth more at their best than over their prior
+    ahead: float = 0.0  # of the best set [nats]
+
+    @cached_property
+    def columns(self) -> list[int]:
+        """Return the numbers of the effects that all flights share."""
+        return columns_of(self.chosen)
+
+
+@dataclass
+class Selector:
+    """A selection under way, and its result."""
+
+    problem: Problem
+    nominal: Point
+    threshold: float  # [nats]
+    progress: Callable[[str], None] = lambda _: None
+    laws: bool = True  # whether terms of laws are offered
+    steps: list[SelectionStep] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.best = Trial(NOTHING, self.nominal)
+        self.origin = self.nominal  # where the derivatives were taken
+        self.window: list[tuple[Trial, float]] = []  # sets that are possible, with nats behind
+        self._linear: dict[int, tuple[Point, Linear]] = {}
+        self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
+        self._visited: set[Names] = set()
+        self._followed: set[Names] = set()
+        self._proposed: set[Names] = set()
+        self._linearised_at: set[Names] = set()  # for a law's sake
+        self._every = False  # whether any effect may differ among flights
+        self._offer()
+
+    def _offer(self) -> None:
+        effects, priors = self.problem.effects, self.problem.priors
+        self.candidates = shared(effects) + random_shares(
+            effects, priors, self.nominal.plain, self.problem.days, self._every
+        )
+        self._linear.clear()
+
+    @cached_property
+    def _acting(self) -> list[tuple[str, str]]:
+        """Blocks that each effect of the model acts in, without the rope's joint and with it."""
+        numbers = range(len(self.problem.model.effects))
+        return list(zip(*(acts_on(self.nominal, numbers, joint=joint) for joint in (False, True))))
+
+    def penalty(self, chosen: Names) -> float:
+        """Return the penalty of a set [nats].
+
+        What acts in the block of a law may be a part of its form and must be worth more than
+        elsewhere. Without a calm phase to compare with, a law stands in place of all names."""
+        total = sum(self.threshold + c.penalty for c in chosen)
+        forms = self._laws_of(chosen)
+        if not forms:
+            return total
+        if len(forms) > MOST_LAWS or (
+            len(forms) < len(chosen) and not compares_phases(self.nominal)
+        ):
+            return np.inf
+        blocks = {c.law for c in forms}
+        joint = int(grammar.JOINT in blocks)
+        charged = [c for c in chosen if not c.law and self._acting[c.columns[0]][joint] in blocks]
+        return total + (len(forms) + len(charged)) * terms.LAW
+
+    def crowded(self, members: Iterable[Candidate]) -> dict[str, list[Candidate]]:
+        """Return the blocks in which some candidates cost more together than a law that nobody
+        wrote down, with those that act there: its parts are likelier than so many causes.
+        """
+        by_block: dict[str, list[Candidate]] = {}
+        for c in members:
+            if not c.law:
+                by_block.setdefault(self._acting[c.columns[0]][0], []).append(c)
+        law = self.threshold + terms.LAW
+        return {
+            block: acting
+            for block, acting in by_block.items()
+            if block and sum(self.threshold + c.penalty for c in acting) > law
+        }
+
+    def linear(self, point: Point) -> Linear:
+        """Return the values of sets by the statistics of a point."""
+        if id(point) not in self._linear:
+            linear = Linear(
+                point.plain, self.problem.priors, self.candidates, self.penalty, self.problem.days
+            )
+            self._linear[id(point)] = point, linear
+        return self._linear[id(point)][1]
+
+    def run(self, begin: Names = NOTHING) -> "Selector":
+        """Select, beginning with a set."""
+        if begin:
+            (start,) = self._tried(self.nominal, [begin])
+            self._go(start)
+        while True:
+            self._visited.add(self.best.chosen)
+            if self.crowded(self.best.chosen):
+                self._propose()  # before names take ever more parts of a law
+            if not self._moved() and not self._propose() and not self._widen():
+                return self
+
+    def _widen(self) -> bool:
+        """Let any effect differ among flights, if no law is why they do; False where that was done.
+
+        A wider form is asked about where narrower ones fall short."""
+        if self._every:
+            return False
+        self._every = True
+        self._offer()
+        return True
+
+    def _moved(self) -> bool:
+        """Simulate the best sets, and go over to the one that is worth most; False where the set
+        that is there stays.
+        """
+        tried: list[Trial] = []
+        listed = self._listed()
+        while len(tried) < MOST_TRIED:
+            shortlist = self._short(listed, tried)
+            if not tried:
+                tried += self._tried(self.nominal, self._laws_instead())
+                shortlist += self._alike(shortlist[0]) if shortlist else []
+            if not shortlist and not tried:
+                break
+            tried += self._tried(self.best.point, dict.fromkeys(shortlist))
+            if not any(self._better(t) for t in tried):
+                tried += self._tried(self.best.point, self._reduced(tried))
+            better = [t for t in tried if self._better(t)]
+            if better:
+                top = max(better, key=lambda t: t.ahead)
+                if self._laws_of(top.chosen) and self._approached():
+                    return True
+                self._record(top, tried, listed)
+                self._go(top)
+                return True
+            if not shortlist:
+                break
+        if followed := self._followed_up(tried, listed):
+            self._record(followed, [*tried, followed], listed)
+            self._go(followed)
+            return True
+        rivals: dict[Names, Trial] = {}  # each where it is worth most
+        for t in sorted(tried, key=lambda t: t.ahead):
+            rivals[t.chosen] = t
+        close = [t for t in rivals.values() if -t.ahead < STRONG and self.is_admissible(t)]
+        close.sort(key=lambda t: -t.ahead)
+        self.window = [(self.best, 0.0), *((t, -t.ahead) for t in close)]
+        return False
+
+    def _listed(self) -> dict[Names, float]:
+        """Return sets near the best, with the nats by which they are ahead of the present one by
+        the statistics: of where it is, of noise levels that leave every effect its size, and of the
+        model as it stands.
+        """
+        present, ahead_of = self.best.chosen, {}
+        free = with_all_effects_noise(self.problem, self.best.point)
+        points = [self.best.point, free, *([self.nominal] if present else [])]
+        for point in points:
+            linear = self.linear(point)
+            close = window(linear, {present, NOTHING})
+            base = linear.value(present)
+            for chosen, value in close.items():
+                ahead_of[chosen] = max(ahead_of.get(chosen, -np.inf), value - base)
+        self._linear.pop(id(free))
+        ahead_of.pop(present, None)
+        return ahead_of
+
+    def _laws_instead(self) -> list[Names]:
+        """Return the sets of one law in place of all names: where the names lead, derivatives tell
+        nothing of a model that has the law in their place.
+        """
+        if not self.best.chosen or self._laws_of(self.best.chosen):
+            return []
+        laws = [frozenset({c}) for c in self.candidates if c.law]
+        return [chosen for chosen in laws if chosen not in self._visited]
+
+    @staticmethod
+    def _laws_of(chosen: Names) -> list[Candidate]:
+        return [c for c in chosen if c.law]
+
+    def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
+        """Return the members that are surely there of the sets that are ahead.
+
+        Derivatives of a delay promise far more for several lags at once than for one; where the
+        simulation was run with them, all but one may be near 0."""
+        done = {t.chosen for t in tried} | self._visited
+        reduced: dict[Names, None] = {}
+        for trial in tried:
+            if trial.ahead > ENOUGH_NATS:
+                point = trial.point
+                sure = surely_there(
+                    point.information, point.score, self.problem.priors, trial.columns
+                )
+                members = (c for c in trial.chosen if c.group != ALL or c.columns[0] in sure)
+                reduced[frozenset(members)] = None
+        return [chosen for chosen in reduced if chosen not in done]
+
+    def _alike(self, chosen: Names) -> list[Names]:
+        """Return the sets with another cause in place of a new one, that the catalogue says looks
+        like it: where a rope whips, derivatives may promise far too little.
+        """
+        visible, exchanged = self.problem.priors.visible, []
+        by_name = {c.name: c for c in self.candidates if c.group == ALL and visible[c.columns[0]]}
+        for c in chosen - self.best.chosen:
+            effect = self.problem.effects[c.columns[0]]
+            alternatives = [by_name[name] for name in effect.confused_with if name in by_name]
+            exchanged += [
+                chosen - {c} | {o} for o in alternatives if o not in chosen and c.group == ALL
+            ]
+        return exchanged
+
+    def _short(self, listed: Mapping[Names, float], tried: Sequence[Trial]) -> list[Names]:
+        """Return the next sets to be simulated: the best few, then what counts as possible.
+
+        A set is expected to fall short of what derivatives promise as its parts did."""
+        most, done = WINDOW if len(tried) < SHORTLIST else STRONG, {t.chosen for t in tried}
+        shortfalls = {t.chosen: listed[t.chosen] - t.ahead for t in tried if t.chosen in listed}
+        expected = {}
+        for chosen, promised in listed.items():
+            if chosen not in done and chosen not in self._visited:
+                parts = (nats for part, nats in shortfalls.items() if part < chosen)
+                expected[chosen] = promised - max(parts, default=0.0)
+        close = [s for s, nats in expected.items() if nats > -most]
+        ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SHORTLIST]
+        sure = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
+        return sure[:SHORTLIST]
+
+    def _doubt(self, chosen: Names) -> float:
+        """Return by how many nats the linear value of a set may be wrong."""
+        point = self.best.point
+        goal = estimate(point.information, point.score, self.problem.priors, columns_of(chosen))
+        change = goal - point.theta
+        return min(WINDOW, STRONG + FAR * 0.5 * float(change @ point.information @ change))
+
+    def _tried(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
+        """Simulate sets from a point."""
+        sets, linear = list(sets), self.linear(point)
+        shares = [linear.shares(s) for s in sets]
+        columns = [columns_of(s) for s in sets]
+        points = [
+            replace(self._with_blocks(point, active), varies=varies_of(sizes, self.problem.days))
+            for active, (sizes, _) in zip(columns, shares)
+        ]
+        trials = list(zip(sets, candidates(self.problem, points, columns), shares))
+        for s, simulated, _ in trials:
+            if isinstance(simulated, DiagnoseError):
+                self.progress(f"{names_of(s)}: not simulated, {simulated}")
+        found = [Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)]
+        return [replace(t, ahead=self._ahead(t)) for t in found]
+
+    def _with_blocks(self, point: Point, active: list[int]) -> Point:
+        """Return the point linearised with the kinds of blocks that a set asks for; once for each
+        place.
+        """
+        theta = switched(self.problem, point, active)
+        if theta is None:
+            return point
+        if theta.tobytes() not in self._turned:
+            self._turned[theta.tobytes()] = self._linearised(theta, point)
+        return self._turned[theta.tobytes()]
+
+    def _better(self, trial: Trial) -> bool:
+        new = trial.chosen not in self._visited
+        return new and trial.ahead > ENOUGH_NATS and self.is_admissible(trial)
+
+    def _ahead(self, trial: Trial) -> float:
+        """Return the nats by which a set is worth more than the best.
+
+        Where names show that something is missing, a law in their place need not show it again."""
+        nats, laws = self.ahead(trial, self.best), self._laws_of(trial.chosen)
+        if self._laws_of(self.best.chosen) or self.best.chosen <= trial.chosen:
+            return nats
+        return nats + len(laws) * terms.LAW
+
+    def ahead(self, first: Trial, second: Trial) -> float:
+        """Return the nats by which a set is worth more than another, each where it was simulated,
+        with the noise levels of whichever of both points suits it better.
+
+        The noise levels of a point were estimated without the floors; a set may do better with the
+        levels of another set."""
+        value = [
+            max(self._value(t), self._value(t, with_noise_of(t.point, other.point)))
+            for t, other in ((first, second), (second, first))
+        ]
+        return value[0] - value[1]
+
+    def _value(self, trial: Trial, point: Point | None = None) -> float:
+        """Return what a set is worth at a point [nats]: not what derivatives promise beyond what
+        the simulation gave.
+        """
+        point = point or trial.point
+        evidence = point.evidence(self.problem.priors, trial.columns)
+        promised = predicted_gain(self.problem, point, trial.columns, switches=True)
+        return evidence - promised - trial.occam - self.penalty(trial.chosen)
+
+    def is_admissible(self, trial: Trial) -> bool:
+        """Tell whether every member of a set is surely there, whatever half a floor of it is, lies
+        within its bounds in each flight, and matters.
+        """
+        point, columns, priors = trial.point, trial.columns, self.problem.priors
+        sure = certainty(point.information, point.theta, priors, columns)
+        if np.any(sure <= 1.0):
+            return False
+        sizes = point.theta + own_shares(point.plain, point.theta, point.varies)
+        if np.any((sizes < priors.low - 1.0) | (sizes > priors.high + 1.0), where=sizes != 0.0):
+            return False  # a share of a flight has the bounds of its effect, to a floor
+        laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
+        names = {*columns, *self.names} - set(laws)  # a term takes no name away that says the same
+        return all(
+            terms.exceeds_floor(self.problem, point, j, float(point.theta[j] * priors.floor[j]))
+            and all(terms.unexplained_nats(point, priors, columns, j, k) > terms.LAW for k in names)
+            for j in laws
+        )
+
+    def _followed_up(self, tried: Iterable[Trial], listed: Mapping[Names, float]) -> Trial | None:
+        """Return the set that promised most, with derivatives and initial states of its own where
+        it leads, if it is worth more there.
+
+        A rope that whips forgets its initial state within a window; what was fitted for another
+        rope explains nothing. The present set begins there as well: new states alone are no gain.
+        """
+        promising = [
+            t for t in tried if listed.get(t.chosen, 0.0) > 0.0 and t.chosen not in self._followed
+        ]
+        kinds = self.problem.switches
+        promising = [t for t in promising if not np.any(t.point.theta[kinds])]
+        if not promising:
+            return None
+        trial = max(promising, key=lambda t: listed[t.chosen])
+        self._followed.add(trial.chosen)
+        origin, point = self.origin, trial.point
+        if np.abs(point.theta[trial.columns]).max(initial=0.0) < 1.0:
+            goal = estimate(point.information, point.score, self.problem.priors, trial.columns)
+            point = fitted(self.problem, self._linearised(goal, point), trial.columns)
+        point = self._settled(point, trial.columns)
+        trial = replace(trial, point=point)
+        (unchanged,) = self._tried(point, [self.best.chosen])
+        nats = min(self.ahead(trial, self.best), self.ahead(trial, unchanged))
+        if nats > ENOUGH_NATS and self.is_admissible(trial):
+            return replace(trial, ahead=nats)
+        self.origin = origin
+        return None
+
+    def _go(self, trial: Trial) -> None:
+        """Take a set as the best, and derivatives where it is."""
+        if trial.point.about is self.nominal.about:
+            self.origin = self.nominal
+        point = self._settled(trial.point, trial.columns)
+        if point is not trial.point or trial.shares:
+            linear = Linear(
+                point.plain, self.problem.priors, self.candidates, self.penalty, self.problem.days
+            )
+            shares, occam = linear.shares(trial.chosen)
+            point = with_varying(point, varies_of(shares, self.problem.days)) if shares else point
+            trial = Trial(trial.chosen, point, shares, occam)
+        self.best = trial
+        self._linear = {id(self.nominal): (self.nominal, self.linear(self.nominal))}
+
+    def _settled(self, point: Point, active: list[int]) -> Point:
+        """Linearise where a set is, unless the last derivatives still hold, and step on where that
+        moved the optimum.
+        """
+        kinds = self.problem.switches
+        unchanged = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
+        silent = self.problem.priors.visible & (np.diag(self.origin.information) <= 0.0)
+        anew = self.problem.model.cheap and np.any(silent)
+        if unchanged and not anew and curvature(self.problem, self.origin, point) < SPIKE:
+            return point
+        for _ in range(ROUNDS):
+            try:
+                self.origin = self._linearised(point.theta, point)
+            except DiagnoseError as error:
+                self.progress(f"the last derivatives stay: {error}")
+                break
+            before, point = point, fitted(self.problem, self.origin, active)
+            close = np.abs(point.theta - before.theta).max() <= 0.5
+            if close or curvature(self.problem, self.origin, point) <= SPIKE:
+                break
+        return point
+
+    def _approached(self) -> bool:
+        """Linearise where the best set is; False where that was done. A law may explain what
+        derivatives of elsewhere lack.
+        """
+        present = self.best.point.theta
+        is_near = np.abs(self.origin.theta - present).max(initial=0.0) <= OWN_FLOOR
+        if is_near or self.best.chosen in self._linearised_at:
+            return False
+        self._linearised_at.add(self.best.chosen)
+        self.progress("derivatives are taken where the causes are, for a law may explain the rest")
+        self.origin = self._linearised(present, self.best.point)
+        point = fitted(self.problem, self.origin, self.best.columns)
+        self.best = replace(self.best, point=point)
+        return True
+
+    def _linearised(self, theta: np.ndarray, like: Point) -> Point:
+        return linearise(self.problem, theta, like.noise, varies=like.varies)
+
+    def _record(self, top: Trial, tried: Iterable[Trial], listed: Mapping[Names, float]) -> None:
+        """Say what was selected, and keep what was compared for the report."""
+        nats = {names_of(t.chosen): t.ahead for t in tried}
+        listed_best = {
+            names_of(s): n for s, n in sorted(listed.items(), key=lambda i: -i[1])[:SHOWN]
+        }
+        self.progress(f"{names_of(top.chosen)}: {top.ahead:.1f} nats ahead")
+        self.steps.append(SelectionStep(names_of(top.chosen), top.ahead, 0.0, listed_best, nats))
+
+    def _propose(self) -> bool:
+        """Offer the terms of laws that say most, beside the set and in place of its names; False
+        where none is new.
+        """
+        strongest = terms.strongest_forces(self.nominal) if self.laws else {}
+        present = self.best.chosen
+        forms = frozenset(self._laws_of(present))
+        if not strongest or present in self._proposed or len(forms) >= MOST_LAWS:
+            return False
+        self._proposed.add(present)
+        names = columns_of(present - forms)
+        sets = [(self.best.point, self.best.columns, ())]
+        if present - forms:
+            sets.append((self.nominal, columns_of(forms), names))
+        shortlist: list[TermEffect] = []
+        for point, active, gone in sets:
+            shortlist += terms.shortlist(
+                self.problem, point, active, strongest, self.threshold, gone
+            )
+        shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())
+        if not shortlist:
+            return False
+        points = {id(p): p for p in (self.nominal, self.origin, self.best.point)}
+        self.problem, wide = terms.extended(self.problem, list(points.values()), shortlist)
+        widened = dict(zip(points, wide))
+        self.best = replace(self.best, point=widened[id(self.best.point)])
+        self.nominal, self.origin = widened[id(self.nominal)], widened[id(self.origin)]
+        self._offer()
+        return True
+
+    @property
+    def value(self) -> float:
+        """Return what the best set is worth [nats]."""
+        return self._value(self.best)
+
+    @property
+    def names(self) -> list[int]:
+        """Return the numbers of the model's effects in the best set."""
+        return columns_of(c for c in self.best.chosen if not c.law)
+
+    def bare(self, point: Point) -> tuple[Problem, Point]:
+        """Return the problem and a point of it without the terms that were offered."""
+        return terms.without_laws(self.problem, point)
+
+    @property
+    def events(self) -> tuple[int, ...]:
+        """Return the flights in which something happened that the others deny."""
+        return tuple(sorted(c.flight for c in self.best.chosen if c.group == EVENT))
+
+
+def names_of(chosen: Names) -> str:
+    """Return the names of a set in words."""
+    return ", ".join(sorted(c.name for c in chosen)) or "nothing"
