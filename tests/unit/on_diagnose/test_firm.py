@@ -108,6 +108,20 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
     assert not judged(monkeypatch, truth, channels=(once,)).theta
 
 
+def test_nothing_is_named_over_an_interval_that_holds_zero():
+    """Also where the evidence for it is overwhelming."""
+    diagnosis = search.explain(
+        SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
+        laws=False,
+    )
+    findings = [replace(f, low=-f.low) if f.name == "effect_05" else f for f in diagnosis.findings]
+    wide = held_out.judged(replace(diagnosis, findings=tuple(findings)))
+    assert (wide.overall, dict(wide.theta)) == (result.UNKNOWN, {})
+    assert wide["effect_05"].verdict == result.CANDIDATE
+    assert "holds 0" in wide.reasons[0]
+    assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
+
+
 def test_names_that_do_harm_are_withdrawn(monkeypatch):
     diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=-0.1, low=-0.3, high=0.1)
     assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
