@@ -104,7 +104,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         if not len(training):
             continue
         linear = Linear(statistics.only(training), priors, candidates, penalty)
-        near = occam_window(linear, {NOTHING, selected}, pairs=False)
+        near = occam_window(linear, {NOTHING, selected}, selected, pairs=False)
         chosen = max(near, key=near.get)
         if near[chosen] < linear.value(selected) + STRONG:
             chosen = selected  # the training cannot tell it from others, and does not deny it

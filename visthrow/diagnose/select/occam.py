@@ -27,7 +27,15 @@ from visthrow.diagnose.likelihood.evidence import (
     pair_additions,
 )
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select.candidates import ALL, EVENT, Candidate, Names, columns_of, varies_of
+from visthrow.diagnose.select.candidates import (
+    ALL,
+    EVENT,
+    NOTHING,
+    Candidate,
+    Names,
+    columns_of,
+    varies_of,
+)
 from visthrow.diagnose.select.scatter import COARSE, DAY, REACH, Varies, by_day, evidence_of, freed
 
 MOST_NAMES = 6  # a longer list of causes is a wrong form, not a finding
@@ -37,6 +45,7 @@ WINDOW = 15.0
 up to ``STRONG`` behind count as possible.
 """
 
+MOST_NEW = 2  # candidates in one move: of where many lead together, derivatives tell too little
 PATIENCE = 8  # sets that are opened in vain before the search ends
 RANDOM_TRIED = (
     4  # random shares whose evidence is calculated for each set, of those that may matter
@@ -200,11 +209,14 @@ class Linear:
             groups.setdefault(c.group, []).append(c)
         return groups
 
-    def neighbours(self, chosen: Names) -> dict[Names, float]:
-        """Return sets one step away, with their values."""
-        listed = dict(self.added(chosen))
-        for c in chosen:
-            listed |= self.added(chosen - {c})
+    def neighbours(self, chosen: Names, near: Names) -> dict[Names, float]:
+        """Return sets one step away, with their values, and no more than ``MOST_NEW`` candidates
+        that a set does not have.
+        """
+        listed = {}
+        for subset in (chosen, *(chosen - {c} for c in chosen)):
+            full = len(subset - near) >= MOST_NEW
+            listed |= {subset: self.value(subset)} if full else self.added(subset)
         return listed
 
     def pairs(self, chosen: Names) -> dict[Names, float]:
@@ -242,10 +254,16 @@ def half_normal(sizes: np.ndarray) -> np.ndarray:
     return np.sqrt(2.0 / np.pi) * np.exp(-0.5 * sizes**2)
 
 
-def window(linear: Linear, begin: Iterable[Names], pairs: bool = True) -> dict[Names, float]:
+def window(
+    linear: Linear, begin: Iterable[Names], near: Names = NOTHING, pairs: bool = True
+) -> dict[Names, float]:
     """Return the sets near the best, with their values.
 
-    ``begin``: sets that are opened first; ``pairs``: whether two candidates are tried at once."""
+    Args:
+        begin: sets that are opened first.
+        near: set that the derivatives belong to: others have at most ``MOST_NEW`` candidates more.
+        pairs: whether two candidates are tried at once.
+    """
     values = {chosen: linear.value(chosen) for chosen in begin}
     opened: set[Names] = set()
     paired: set[Names] = set()
@@ -256,12 +274,13 @@ def window(linear: Linear, begin: Iterable[Names], pairs: bool = True) -> dict[N
         if close and in_vain < PATIENCE:
             chosen = max(close, key=values.get)
             opened.add(chosen)
-            values |= linear.neighbours(chosen)
+            listed = linear.neighbours(chosen, near)
         else:
             chosen = max(values, key=values.get)
             if chosen in paired or not pairs:
                 break
             paired.add(chosen)
-            values |= linear.pairs(chosen)
+            listed = linear.pairs(chosen)
+        values |= {s: v for s, v in listed.items() if len(s - near) <= MOST_NEW}
         in_vain = 0 if max(values.values()) > best + 1e-6 else in_vain + 1
     return {chosen: value for chosen, value in values.items() if value > best - WINDOW}

@@ -55,8 +55,7 @@ from visthrow.diagnose.select.point import (
 from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
 
-SHORTLIST = 3  # sets that are simulated at once
-MOST_TRIED = 40  # and from one point, best first
+SIDE_BY_SIDE = 4  # sets that are simulated at once on a GPU
 FAR = 0.1
 """Nats of doubt about a set's linear value for each nat that its sizes are away from where the
 derivatives were taken.
@@ -99,6 +98,7 @@ class Selector:
         self._linear: dict[int, tuple[Point, Linear]] = {}
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
         self._visited: set[Names] = set()
+        self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._followed: set[Names] = set()
         self._proposed: set[Names] = set()
         self._linearised_at: set[Names] = set()  # for a law's sake
@@ -186,28 +186,28 @@ class Selector:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
         that is there stays.
         """
-        tried: list[Trial] = []
         listed = self._listed()
-        while len(tried) < MOST_TRIED:
-            shortlist = self._short(listed, tried)
-            if not tried:
-                tried += self._tried(self.nominal, self._laws_instead())
-                shortlist += self._alike(shortlist[0]) if shortlist else []
-            if not shortlist and not tried:
-                break
-            tried += self._tried(self.best.point, dict.fromkeys(shortlist))
-            if not any(self._better(t) for t in tried):
-                tried += self._tried(self.best.point, self._reduced(tried))
+        tried = self._tried(self.nominal, self._laws_instead())
+        alike_tried = False
+        while True:
             better = [t for t in tried if self._better(t)]
-            if better:
-                top = max(better, key=lambda t: t.ahead)
-                if self._laws_of(top.chosen) and self._approached():
-                    return True
-                self._record(top, tried, listed)
-                self._go(top)
-                return True
+            least = max((t.ahead for t in better), default=-np.inf)
+            shortlist = self._short(listed, tried, least)
             if not shortlist:
                 break
+            shortlist += [] if alike_tried else self._alike(shortlist[0])
+            alike_tried = True
+            new = self._tried(self.best.point, dict.fromkeys(shortlist))
+            if not any(self._better(t) for t in new):
+                new += self._tried(self.best.point, self._reduced(new))
+            tried += new
+        if better:
+            top = max(better, key=lambda t: t.ahead)
+            if self._laws_of(top.chosen) and self._approached():
+                return True
+            self._record(top, tried, listed)
+            self._go(top)
+            return True
         if followed := self._followed_up(tried, listed):
             self._record(followed, [*tried, followed], listed)
             self._go(followed)
@@ -222,15 +222,16 @@ class Selector:
 
     def _listed(self) -> dict[Names, float]:
         """Return sets near the best, with the nats by which they are ahead of the present one by
-        the statistics: of where it is, of noise levels that leave every effect its size, and of the
-        model as it stands.
+        the statistics: of where it is, of noise levels that leave every effect its size, and sets
+        of few causes by those of the model as it stands.
         """
         present, ahead_of = self.best.chosen, {}
         free = with_all_effects_noise(self.problem, self.best.point)
-        points = [self.best.point, free, *([self.nominal] if present else [])]
-        for point in points:
+        places = [(self.best.point, present), (free, present)]
+        places += [(self.nominal, NOTHING)] if present else []
+        for point, near in places:
             linear = self.linear(point)
-            close = window(linear, {present, NOTHING})
+            close = window(linear, {near, NOTHING}, near)
             base = linear.value(present)
             for chosen, value in close.items():
                 ahead_of[chosen] = max(ahead_of.get(chosen, -np.inf), value - base)
@@ -245,7 +246,8 @@ class Selector:
         if not self.best.chosen or self._laws_of(self.best.chosen):
             return []
         laws = [frozenset({c}) for c in self.candidates if c.law]
-        return [chosen for chosen in laws if chosen not in self._visited]
+        done = {s for s, nats in self._simulated.items() if nats < -WINDOW} | self._visited
+        return [chosen for chosen in laws if chosen not in done]
 
     @staticmethod
     def _laws_of(chosen: Names) -> list[Candidate]:
@@ -282,21 +284,29 @@ class Selector:
             ]
         return exchanged
 
-    def _short(self, listed: Mapping[Names, float], tried: Sequence[Trial]) -> list[Names]:
-        """Return the next sets to be simulated: the best few, then what counts as possible.
+    def _short(
+        self, listed: Mapping[Names, float], tried: Sequence[Trial], least: float
+    ) -> list[Names]:
+        """Return the next sets to be simulated, best first: what promises more than ``least``
+        [nats], and may be possible.
 
         A set is expected to fall short of what derivatives promise as its parts did."""
-        most, done = WINDOW if len(tried) < SHORTLIST else STRONG, {t.chosen for t in tried}
-        shortfalls = {t.chosen: listed[t.chosen] - t.ahead for t in tried if t.chosen in listed}
+        done = {t.chosen for t in tried} | self._visited
+        done |= {s for s, nats in self._simulated.items() if nats < -WINDOW}
+        present = self.best.chosen
+        shortfalls = [
+            (s, s ^ present, listed[s] - n) for s, n in self._simulated.items() if s in listed
+        ]
         expected = {}
         for chosen, promised in listed.items():
-            if chosen not in done and chosen not in self._visited:
-                parts = (nats for part, nats in shortfalls.items() if part < chosen)
+            if chosen not in done:
+                move = chosen ^ present
+                parts = (n for s, part, n in shortfalls if s < chosen or part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
-        close = [s for s, nats in expected.items() if nats > -most]
-        ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SHORTLIST]
-        sure = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
-        return sure[:SHORTLIST]
+        close = [s for s, nats in expected.items() if nats > max(least, -WINDOW)]
+        ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
+        close = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
+        return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
     def _doubt(self, chosen: Names) -> float:
         """Return by how many nats the linear value of a set may be wrong."""
@@ -319,7 +329,10 @@ class Selector:
             if isinstance(simulated, DiagnoseError):
                 self.progress(f"{names_of(s)}: not simulated, {simulated}")
         found = [Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)]
-        return [replace(t, ahead=self._ahead(t)) for t in found]
+        found = [replace(t, ahead=self._ahead(t)) for t in found]
+        for t in found:
+            self._simulated[t.chosen] = max(t.ahead, self._simulated.get(t.chosen, -np.inf))
+        return found
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point linearised with the kinds of blocks that a set asks for; once for each
@@ -416,6 +429,7 @@ class Selector:
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
+        self._simulated = {s: nats - trial.ahead for s, nats in self._simulated.items()}
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
         point = self._settled(trial.point, trial.columns)
