@@ -303,7 +303,8 @@ class Selector:
                 move = chosen ^ present
                 parts = (n for s, part, n in shortfalls if s < chosen or part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
-        close = [s for s, nats in expected.items() if nats > max(least, -WINDOW)]
+        behind = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
+        close = [s for s, nats in expected.items() if nats > max(least, -behind)]
         ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
         close = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
