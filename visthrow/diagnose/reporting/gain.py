@@ -16,8 +16,14 @@ from visthrow.diagnose.likelihood.marginal import finite, grams_of
 from visthrow.diagnose.likelihood.noise_levels import without_outliers
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.reporting.blackbox import table_of, train
-from visthrow.diagnose.select.held_out import Crossed, channel_gains, crossed, regrouped
-from visthrow.diagnose.select.point import Point, Work
+from visthrow.diagnose.select.held_out import (
+    Crossed,
+    Work,
+    channel_gains,
+    crossed,
+    regrouped,
+)
+from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.diagnose.throw.landing import PredictedLandings
 

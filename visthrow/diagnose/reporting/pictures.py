@@ -16,7 +16,7 @@ from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.point import Work
+from visthrow.diagnose.select.held_out import Work
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.view.parts import png_of
 

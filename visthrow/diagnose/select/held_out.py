@@ -35,7 +35,7 @@ from visthrow.diagnose.select.candidates import NOTHING, Names, columns_of, shar
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, Work
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
 from visthrow.diagnose.select.scatter import allowed, between_flights, freed
 
@@ -65,6 +65,19 @@ class Crossed:
     named: Mapping[str, float]  # effect -> share of the folds that named it
 
 
+@dataclass(frozen=True)
+class Work:
+    """What a diagnosis leaves behind for gain, report, plan and blind: its problem, the model as it
+    stands, and the model with what was selected.
+    """
+
+    problem: Problem
+    before: Point
+    after: Point
+    active: tuple[int, ...]
+    crossed: Crossed | None = None  # searches without some of the flights
+
+
 def groups_of(point: Point, windows: Sequence[int]) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
@@ -83,11 +96,15 @@ def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
 
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
-    """Repeat a selection without each of the flights, by statistics; random shares are integrated
-    out.
+    """Repeat a selection without each of the flights, by statistics, unless that was done; random
+    shares are integrated out.
     """
-    work, priors = diagnosis.work, diagnosis.work.problem.priors
-    point, effects = work.after, work.problem.effects
+    work = diagnosis.work
+    if work.crossed is not None:
+        return work.crossed
+    priors = work.problem.priors
+    point = work.after
+    effects = work.problem.effects
     groups, left_out = groups_of(point, work.problem.kept)
     statistics = freed(regrouped(point, groups), point.varies.by_flight)
     count = len(statistics.flights)
@@ -254,6 +271,8 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             return _unconfirmed(diagnosis, None, spanning, reason)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
+    work = replace(diagnosis.work, crossed=crossed(diagnosis))
+    diagnosis = replace(diagnosis, work=work)
     measured = measure(diagnosis)
     uncompared = not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
@@ -400,9 +419,9 @@ def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str)
     active = [effect_names.index(name) for name in remaining]
     theta, spread, _ = sized(work.problem, work.after, active)
     work = (
-        replace(work, active=tuple(active))
+        replace(work, active=tuple(active), crossed=None)
         if active
-        else replace(work, after=work.before, active=())
+        else replace(work, after=work.before, active=(), crossed=None)
     )
     return replace(diagnosis, findings=findings, theta=theta, covariance=spread, work=work)
 

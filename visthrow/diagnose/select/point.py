@@ -541,15 +541,3 @@ def switched(problem: Problem, point: Point, active: Sequence[int]) -> np.ndarra
     theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
     theta[off] = 1.0 / problem.priors.floor[off]
     return theta
-
-
-@dataclass(frozen=True)
-class Work:
-    """What a diagnosis leaves behind for gain, report, plan and blind: its problem, the model as it
-    stands, and the model with what was selected.
-    """
-
-    problem: Problem
-    before: Point
-    after: Point
-    active: tuple[int, ...]

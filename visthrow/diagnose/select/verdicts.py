@@ -25,12 +25,11 @@ from visthrow.diagnose.models.model_interface import Effect, Model, Window
 from visthrow.diagnose.select import result, terms
 from visthrow.diagnose.select.candidates import ALL, EVENT, Candidate, Names, as_random, varies_of
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
-from visthrow.diagnose.select.held_out import sized
+from visthrow.diagnose.select.held_out import Work, sized
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
     Point,
-    Work,
     moved,
     with_floors_noise,
     with_varying,
