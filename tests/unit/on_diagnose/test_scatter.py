@@ -14,7 +14,7 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
-from visthrow.diagnose.select.scatter import DAY, Varies, freed, own_shares
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -77,10 +77,9 @@ def test_what_is_drawn_anew_each_day_drifts():
 def test_a_mean_is_as_sure_as_there_are_days():
     """Three flights of a day tell no more of what all days share than one does."""
     statistics, days = campaign(default_rng(10), 5, 0.012, 0.0)
-    size = {0: 6.0}  # floors
     by_flight, by_day = (
-        freed(statistics, Varies(days, flights=size)),
-        freed(statistics, Varies(days, drifts=size)),
+        freed(statistics, Varies(days, {(0, FLIGHT): 6.0})),
+        freed(statistics, Varies(days, {(0, DAY): 6.0})),
     )
     assert len(by_day.flights) == 5
     sd = [1.0 / np.sqrt(s.information.sum(0)[0, 0]) for s in (by_flight, by_day)]
@@ -91,7 +90,9 @@ def test_shares_of_days_come_before_those_of_flights():
     statistics, days = campaign(default_rng(11), 5, 0.0, 0.0)
     moved = np.repeat([4.0, -4.0, 2.0, -2.0, 0.0], 3) + np.tile([1.0, 0.0, -1.0], 5)
     statistics = replace(statistics, score=moved[:, None] * statistics.information[:, :, 0])
-    shares = own_shares(statistics, np.zeros(len(NAMES)), Varies(days, {0: 1.0}, {0: 10.0}))
+    shares = own_shares(
+        statistics, np.zeros(len(NAMES)), Varies(days, {(0, FLIGHT): 1.0, (0, DAY): 10.0})
+    )
     assert_allclose(shares[:, 0], moved, atol=0.5)
     assert np.all(shares[:, 1:] == 0.0)
 

@@ -12,7 +12,7 @@ from pytest import mark
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from tests.unit.on_diagnose.test_scatter import NAMES, PRIORS, chosen_of, flights
 from visthrow.diagnose.select import result, search
-from visthrow.diagnose.select.scatter import Varies, freed
+from visthrow.diagnose.select.scatter import FLIGHT, Varies, freed
 
 EFFECTS = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(catalogue(12)))
 FLOOR = EFFECTS[4].floor
@@ -63,7 +63,11 @@ def test_a_deviation_is_about_the_mean():
 
 def test_what_flights_have_of_their_own_is_integrated_out():
     found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
-    left, own, score = freed(found, Varies(flights={j: size})), found.information[0], found.score[0]
+    left, own, score = (
+        freed(found, Varies((), {(j, FLIGHT): size})),
+        found.information[0],
+        found.score[0],
+    )
     theta = default_rng(4).normal(size=K)
 
     def misfit(x):

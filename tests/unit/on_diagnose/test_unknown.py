@@ -21,7 +21,7 @@ from visthrow.diagnose.select import result, search, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
-from visthrow.diagnose.select.scatter import Varies
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies
 from visthrow.diagnose.select.selection import Selector, Trial
 
 EFFECTS = catalogue(12)
@@ -353,7 +353,7 @@ def test_terms_are_screened_beside_what_varies(days):
     """
     model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
     problem = Problem.of(model, model.windows({}), range(14))
-    varies = Varies(days, {0: 5.0}, {4: 2.0} if days else {})
+    varies = Varies(days, {(0, FLIGHT): 5.0} | ({(4, DAY): 2.0} if days else {}))
     calm, parts = terms.with_capped_gusts(replace(linearise(problem, np.zeros(12)), varies=varies))
     screen = terms.screen(
         calm, parts, "payload force", [laws.KnotValues(w.knots) for w in calm.windows]

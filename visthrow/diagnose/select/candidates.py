@@ -155,9 +155,8 @@ def columns_of(chosen: Iterable[Candidate]) -> list[int]:
 
 def varies_of(shares: Mapping[Candidate, float], days: Sequence[int]) -> Varies:
     """Return the random shares of candidates; ``shares``: their deviation, in their prior's."""
-    offered = Varies(days)
+    sizes = {}
     for c, size in shares.items():
-        offered = offered.also(
-            {j: size * sd for j, sd in zip(c.columns, c.deviations)}, c.group, c.flight
-        )
-    return offered
+        who = c.flight if c.group == EVENT else c.group
+        sizes |= {(j, who): size * sd for j, sd in zip(c.columns, c.deviations)}
+    return Varies(days, sizes)

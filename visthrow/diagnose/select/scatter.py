@@ -60,43 +60,31 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Varies:
-    """Effects that have random shares: by the effect's number, the deviation of the shares in its
-    floor.
-    """
+    """Effects that have random shares, with the shares' deviation in the effect's floors."""
 
     days: Sequence[int] = ()  # of each flight, by its number; none where the logs do not say
-    flights: Mapping[int, float] = field(default_factory=dict)  # shares of flights
-    drifts: Mapping[int, float] = field(default_factory=dict)  # shares of days
-    events: Mapping[tuple[int, int], float] = field(default_factory=dict)  # (effect, flight)
+    # (effect's number, who has shares: FLIGHT, DAY or one flight's number)
+    shares: Mapping[tuple[int, str | int], float] = field(default_factory=dict)
 
     def __bool__(self) -> bool:
-        return bool(self.flights or self.drifts or self.events)
+        return bool(self.shares)
 
     @property
-    def effects(self) -> dict[int, float]:
-        """Return the deviations of all effects with shares in every flight or day."""
-        return {**self.flights, **self.drifts}
+    def drifts(self) -> dict[int, float]:
+        """Return the effects with shares of days."""
+        return {j: size for (j, who), size in self.shares.items() if who == DAY}
 
     @property
     def by_flight(self) -> "Varies":
         """Return the same as if every flight were a day."""
-        return Varies((), self.effects, events=self.events)
-
-    def also(self, sizes: Mapping[int, float], group: str = FLIGHT, flight: int = -1) -> "Varies":
-        """Return the same with shares of more effects."""
-        if group == EVENT:
-            return replace(
-                self, events={**self.events, **{(j, flight): s for j, s in sizes.items()}}
-            )
-        name = "drifts" if group == DAY else "flights"
-        return replace(self, **{name: {**getattr(self, name), **sizes}})
+        shares = self.shares.items()
+        return Varies((), {(j, FLIGHT if who == DAY else who): size for (j, who), size in shares})
 
     def of(self, statistics: Statistics) -> Iterator[tuple[int, np.ndarray]]:
         """Yield effects with the deviation of each flight's share, shape (F,)."""
-        for j, size in self.flights.items():
-            yield j, np.full(len(statistics.flights), size)
-        for (j, flight), size in self.events.items():
-            yield j, size * (statistics.flights == flight)
+        for (j, who), size in self.shares.items():
+            if who != DAY:
+                yield j, size * ((who == FLIGHT) | (statistics.flights == who))
 
 
 def relinearised_per_flight(
@@ -228,7 +216,8 @@ def between_flights(
         0
     )  # 1 / F of F that say as much
     freed_flights = [
-        freed(statistics, Varies(flights={j: u * allowed(theta[j]) for j in active})) for u in REACH
+        freed(statistics, Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in active}))
+        for u in REACH
     ]
     value = np.array([evidence_of(flights, priors, active) for flights in freed_flights])
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u

@@ -15,6 +15,7 @@ import numpy as np
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import (
+    INEXACT,
     OWN_FLOOR,
     SPIKE,
     STRONG,
@@ -56,10 +57,6 @@ from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
 
 SIDE_BY_SIDE = 4  # sets that are simulated at once on a GPU
-FAR = 0.1
-"""Nats of doubt about a set's linear value for each nat that its sizes are away from where the
-derivatives were taken.
-"""
 MOST_LAWS = 2
 SHOWN = 10  # sets that a step keeps for the report
 
@@ -113,10 +110,10 @@ class Selector:
         self._linear.clear()
 
     @cached_property
-    def _acting(self) -> list[tuple[str, str]]:
-        """Blocks that each effect of the model acts in, without the rope's joint and with it."""
+    def _acting(self) -> list[list[str]]:
+        """Block that each effect of the model acts in, without the rope's joint and with it."""
         numbers = range(len(self.problem.model.effects))
-        return list(zip(*(acts_on(self.nominal, numbers, joint=joint) for joint in (False, True))))
+        return [acts_on(self.nominal, numbers, joint=joint) for joint in (False, True)]
 
     def penalty(self, chosen: Names) -> float:
         """Return the penalty of a set [nats].
@@ -132,9 +129,15 @@ class Selector:
         ):
             return np.inf
         blocks = {c.law for c in forms}
-        joint = int(grammar.JOINT in blocks)
-        charged = [c for c in chosen if not c.law and self._acting[c.columns[0]][joint] in blocks]
+        joint = grammar.JOINT in blocks
+        charged = [c for c in chosen if not c.law and self.block_of(c.columns[0], joint) in blocks]
         return total + (len(forms) + len(charged)) * terms.LAW
+
+    def block_of(self, j: int, joint: bool = False) -> str:
+        """Return the block that an effect of the model acts in; ``joint``: of the rope's joint as
+        well.
+        """
+        return self._acting[joint][j]
 
     def crowded(self, members: Iterable[Candidate]) -> dict[str, list[Candidate]]:
         """Return the blocks in which some candidates cost more together than a law that nobody
@@ -143,7 +146,7 @@ class Selector:
         by_block: dict[str, list[Candidate]] = {}
         for c in members:
             if not c.law:
-                by_block.setdefault(self._acting[c.columns[0]][0], []).append(c)
+                by_block.setdefault(self.block_of(c.columns[0]), []).append(c)
         law = self.threshold + terms.LAW
         return {
             block: acting
@@ -290,18 +293,17 @@ class Selector:
         """Return the next sets to be simulated, best first: what promises more than ``least``
         [nats], and may be possible.
 
-        A set is expected to fall short of what derivatives promise as its parts did."""
+        A move is expected to fall short of what derivatives promise as its parts did."""
         done = {t.chosen for t in tried} | self._visited
         done |= {s for s, nats in self._simulated.items() if nats < -WINDOW}
         present = self.best.chosen
         shortfalls = [
-            (s, s ^ present, listed[s] - n) for s, n in self._simulated.items() if s in listed
+            (s ^ present, listed[s] - n) for s, n in self._simulated.items() if s in listed
         ]
         expected = {}
         for chosen, promised in listed.items():
             if chosen not in done:
-                move = chosen ^ present
-                parts = (n for s, part, n in shortfalls if s < chosen or part < move)
+                parts = (nats for part, nats in shortfalls if part < chosen ^ present)
                 expected[chosen] = promised - max(parts, default=0.0)
         behind = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         close = [s for s, nats in expected.items() if nats > max(least, -behind)]
@@ -310,11 +312,14 @@ class Selector:
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
     def _doubt(self, chosen: Names) -> float:
-        """Return by how many nats the linear value of a set may be wrong."""
+        """Return by how many nats the linear value of a set may be wrong: strongly, and by a part
+        of what its sizes are worth that are elsewhere.
+        """
         point = self.best.point
         goal = estimate(point.information, point.score, self.problem.priors, columns_of(chosen))
         change = goal - point.theta
-        return min(WINDOW, STRONG + FAR * 0.5 * float(change @ point.information @ change))
+        nats = 0.5 * float(change @ point.information @ change)
+        return min(WINDOW, STRONG + INEXACT * nats)
 
     def _tried(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
         """Simulate sets from a point."""

@@ -288,15 +288,13 @@ def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
     latents, shape (L, T).
     """
     part = _latents(gram)
-    size = gram.inner.shape[1]
-    count = columns.shape[1]
     products = gram.inner[:, :, part] @ columns
-    inner = np.empty((len(products), size + count, size + count))
-    inner[:, :size, :size] = gram.inner
-    inner[:, :size, size:] = products
-    inner[:, size:, :size] = products.transpose(0, 2, 1)
-    inner[:, size:, size:] = columns.T @ products[:, part]
-    return inner
+    return np.block(
+        [
+            [gram.inner, products],
+            [products.transpose(0, 2, 1), columns.T @ products[:, part]],
+        ]
+    )
 
 
 def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:

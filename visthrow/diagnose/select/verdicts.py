@@ -37,6 +37,7 @@ from visthrow.diagnose.select.point import (
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import (
     DAY,
+    FLIGHT,
     REACH,
     Scatter,
     Varies,
@@ -197,7 +198,7 @@ def _about_means(
 ) -> Statistics:
     """Return what the flights say of the means of effects that vary."""
     statistics = point.plain
-    for j in sorted(set(varies.effects) & set(active)):
+    for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
         straight = _straight(selection, replace(point, plain=statistics), active, j)
         statistics = straight
     return statistics
@@ -268,14 +269,12 @@ def _law(selection: Selector) -> tuple[set[int], str]:
     names = [j for j in best.columns if j not in laws]
     blocks = {effects[j].block for j in laws}
     joint = grammar.JOINT in blocks
-
-    def acts(columns: Sequence[int], free_effects: Sequence[int] = ()) -> list[str]:
-        return acts_on(best.point, columns, joint=joint, free_effects=free_effects)
-
-    in_block = {j for j, block in zip(names, acts(names)) if block in blocks}
-    if len(names) > 1:
-        rest = {j: [k for k in names if k != j] for j in set(names) - in_block}
-        in_block |= {j for j, free_effects in rest.items() if acts([j], free_effects)[0] in blocks}
+    in_block = set()
+    for j in names:
+        rest = [k for k in names if k != j]
+        alone = acts_on(best.point, [j], joint=joint, free_effects=rest)[0]
+        if {selection.block_of(j, joint), alone} & blocks:
+            in_block.add(j)
     remaining_columns = [j for j in best.columns if j not in in_block]
     while in_block and set(remaining_columns) & set(names):
         whole = best.point.evidence(priors, remaining_columns)
@@ -379,7 +378,7 @@ def _overall(
         reasons.append(
             f"{names} would have to lie outside what is physically possible; the form is another"
         )
-        block = acts_on(point, stuck[:1])[0] or selection.problem.effects[stuck[0]].block
+        block = selection.block_of(stuck[0]) or selection.problem.effects[stuck[0]].block
         return result.UNKNOWN, block, reasons, set(active)
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
@@ -433,8 +432,7 @@ def _withdrawn(selection: Selector, excessive: Sequence[Level]) -> set[int]:
     """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one
     that left it as it was.
     """
-    active = selection.best.columns
-    blocks = dict(zip(active, acts_on(selection.best.point, active)))
+    blocks = {j: selection.block_of(j) for j in selection.best.columns}
     in_excess = {j for j, block in blocks.items() if block in {level.block for level in excessive}}
     crowd = selection.crowded(c for c in selection.best.chosen if c.columns[0] in in_excess)
     if crowd:
@@ -609,15 +607,11 @@ def _joint(selection: Selector, point: Point, members: list[int], named: list[in
     deviations.
     """
     priors, effects = selection.problem.priors, selection.problem.effects
-    nuisances = np.setdiff1d(np.arange(len(effects)), members)
-    information = point.information
     slab = priors.slab[members]
-    nuisance = information[np.ix_(nuisances, nuisances)] + np.diag(
-        priors.deviation(named)[nuisances] ** -2.0
-    )
-    cross = information[np.ix_(members, nuisances)]
-    schur = information[np.ix_(members, members)] - cross @ np.linalg.solve(nuisance, cross.T)
-    score = point.score[members] - cross @ np.linalg.solve(nuisance, point.score[nuisances])
+    sigma = covariance(point.information, priors.deviation([*members, *named]))
+    precision = np.linalg.inv(sigma[np.ix_(members, members)])
+    schur = precision - np.diag(slab**-2.0)
+    score = precision @ (sigma[members] @ point.score)
     values, vectors = np.linalg.eigh(schur * np.outer(slab, slab))
     vector = vectors[:, -1] / slab
     value = values[-1]  # per floor
