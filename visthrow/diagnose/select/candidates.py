@@ -153,6 +153,11 @@ def columns_of(chosen: Iterable[Candidate]) -> list[int]:
     return sorted(j for c in chosen if c.group == ALL for j in c.columns)
 
 
+def laws_of(chosen: Iterable[Candidate]) -> list[Candidate]:
+    """Return the terms of laws."""
+    return [c for c in chosen if c.law]
+
+
 def varies_of(shares: Mapping[Candidate, float], days: Sequence[int]) -> Varies:
     """Return the random shares of candidates; ``shares``: their deviation, in their prior's."""
     sizes = {}

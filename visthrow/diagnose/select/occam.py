@@ -36,7 +36,16 @@ from visthrow.diagnose.select.candidates import (
     columns_of,
     varies_of,
 )
-from visthrow.diagnose.select.scatter import COARSE, DAY, REACH, Varies, by_day, evidence_of, freed
+from visthrow.diagnose.select.scatter import (
+    COARSE,
+    DAY,
+    REACH,
+    Varies,
+    by_day,
+    evidence_of,
+    freed,
+    over_deviations,
+)
 
 MOST_NAMES = 6  # a longer list of causes is a wrong form, not a finding
 
@@ -72,7 +81,6 @@ class Linear:
         self._values: dict[Names, float] = {}
         self._totals: dict[frozenset, tuple[np.ndarray, np.ndarray]] = {}
         self._added: dict[Names, dict[Names, float]] = {}
-        self._best = -np.inf
 
     def shares(self, chosen: Names) -> tuple[dict[Candidate, float], float]:
         """Return the deviations of a set's random shares, in their prior's, and the nats by which
@@ -97,18 +105,9 @@ class Linear:
         if c.group == EVENT:  # a size like any other: the slab is its prior
             return 1.0, 0.0
         sizes, nats = self.profile(chosen, fixed, c, REACH[::COARSE])
-        best = int(np.argmax(nats + np.log(half_normal(sizes))))
-        close = sizes[max(best - 1, 0)], sizes[min(best + 1, len(sizes) - 1)]
-        between = REACH[(close[0] < REACH) & (close[1] > REACH) & ~np.isin(REACH, sizes)]
-        if nats.max() - self.penalty(chosen) < self._best - WINDOW - STRONG:
-            between = between[:0]  # far behind, whatever its deviation
-        finer = self.profile(chosen, fixed, c, between)
-        order = np.argsort(sizes := np.append(sizes, finer[0]))
-        sizes, nats = sizes[order], np.append(nats, finer[1])[order]
-        weight = half_normal(sizes)
-        best = int(np.argmax(nats + np.log(weight)))
-        whole = nats.max() + np.log((np.exp(nats - nats.max()) * weight * np.gradient(sizes)).sum())
-        return float(sizes[best]), float(nats[best] - whole)
+        mode, _, evidence = over_deviations(sizes, nats)
+        at_mode = self.profile(chosen, fixed, c, np.array([mode]))[1]
+        return mode, float(at_mode[0]) - evidence
 
     def profile(
         self,
@@ -140,7 +139,6 @@ class Linear:
                 active, occam = columns_of(chosen), self.shares(chosen)[1]
                 whole = evidence_of(self._freed(chosen), self.priors, active)
                 self._values[chosen] = whole - occam - penalty
-                self._best = max(self._best, self._values[chosen])
         return self._values[chosen]
 
     def _freed(self, chosen: Names) -> Statistics:
@@ -247,11 +245,6 @@ class Linear:
                 self._shares.setdefault(new, self.shares(subset))
                 listed[new] = float(worth[a, b])
         return listed
-
-
-def half_normal(sizes: np.ndarray) -> np.ndarray:
-    """Return the density of deviations, in their prior's."""
-    return np.sqrt(2.0 / np.pi) * np.exp(-0.5 * sizes**2)
 
 
 def window(

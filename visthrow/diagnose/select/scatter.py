@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+from scipy.interpolate import CubicSpline, PchipInterpolator
 
 from sim.effects.effect import RandomEffect
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, log_evidence
@@ -140,6 +140,30 @@ def relinearised_per_flight(
     return replace(statistics, score=scores)
 
 
+def over_deviations(
+    sizes: np.ndarray, nats: np.ndarray, none: float | None = None
+) -> tuple[float, tuple[float, float], float]:
+    """Return the most probable deviation, its 95 % interval, and the evidence of all, which are
+    half normal before.
+
+    Args:
+        sizes: deviations that were tried, from small to large, above 0, in their prior's.
+        nats: of evidence of each.
+        none: nats of no deviation, if that is one of them.
+    """
+    size = np.geomspace(sizes[0], sizes[-1], FINE)
+    value = PchipInterpolator(np.log(sizes), nats)(np.log(size))
+    if none is not None:
+        size = np.append(0.0, size)
+        value = np.append(none, value)
+    best = value.max()
+    density = np.exp(value - best - 0.5 * size**2) * np.sqrt(2.0 / np.pi)
+    mass = density * np.gradient(size)
+    share = np.cumsum(mass) / mass.sum()
+    low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
+    return float(size[np.argmax(density)]), (low, high), float(np.log(mass.sum()) + best)
+
+
 def judged(
     v: RandomEffect,
     reach: np.ndarray,
@@ -157,21 +181,8 @@ def judged(
         flights: or days or commands, that say something of it.
         group: what has shares.
     """
-    size = np.append(0.0, np.geomspace(reach[0], reach[-1], FINE))
-    spline = CubicSpline(np.log(reach), nats)
-    value = np.append(0.0, spline(np.log(size[1:])))
-    weight = (
-        np.gradient(size)
-        * np.sqrt(2.0 / np.pi)
-        / v.prior_sd
-        * np.exp(-0.5 * (size / v.prior_sd) ** 2)
-    )
-    best = value.max()
-    density = np.exp(value - best) * weight
-    share = np.cumsum(density) / density.sum()
-    low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    nats = float(np.log(density.sum()) + best)
-    mode = float(size[np.argmax(density / np.gradient(size))])
+    mode, (low, high), evidence = over_deviations(reach / v.prior_sd, nats, none=0.0)
+    mode, low, high = (v.prior_sd * size for size in (mode, low, high))
     return Scatter(
         v.name,
         v.cause,
@@ -179,12 +190,12 @@ def judged(
         v.block,
         v.unit,
         tuple(v.of),
-        nats > threshold and mode > v.floor,
+        evidence > threshold and mode > v.floor,
         mode,
         low,
         high,
         v.floor,
-        nats,
+        evidence,
         flights,
         v.manoeuvres,
         group,

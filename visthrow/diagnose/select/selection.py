@@ -33,6 +33,7 @@ from visthrow.diagnose.select.candidates import (
     Candidate,
     Names,
     columns_of,
+    laws_of,
     random_shares,
     shared,
     varies_of,
@@ -121,7 +122,7 @@ class Selector:
         What acts in the block of a law may be a part of its form and must be worth more than
         elsewhere. Without a calm phase to compare with, a law stands in place of all names."""
         total = sum(self.threshold + c.penalty for c in chosen)
-        forms = self._laws_of(chosen)
+        forms = laws_of(chosen)
         if not forms:
             return total
         if len(forms) > MOST_LAWS or (
@@ -206,7 +207,7 @@ class Selector:
             tried += new
         if better:
             top = max(better, key=lambda t: t.ahead)
-            if self._laws_of(top.chosen) and self._approached():
+            if laws_of(top.chosen) and self._approached():
                 return True
             self._record(top, tried, listed)
             self._go(top)
@@ -246,15 +247,11 @@ class Selector:
         """Return the sets of one law in place of all names: where the names lead, derivatives tell
         nothing of a model that has the law in their place.
         """
-        if not self.best.chosen or self._laws_of(self.best.chosen):
+        if not self.best.chosen or laws_of(self.best.chosen):
             return []
         laws = [frozenset({c}) for c in self.candidates if c.law]
         done = {s for s, nats in self._simulated.items() if nats < -WINDOW} | self._visited
         return [chosen for chosen in laws if chosen not in done]
-
-    @staticmethod
-    def _laws_of(chosen: Names) -> list[Candidate]:
-        return [c for c in chosen if c.law]
 
     def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
         """Return the members that are surely there of the sets that are ahead.
@@ -359,8 +356,8 @@ class Selector:
         """Return the nats by which a set is worth more than the best.
 
         Where names show that something is missing, a law in their place need not show it again."""
-        nats, laws = self.ahead(trial, self.best), self._laws_of(trial.chosen)
-        if self._laws_of(self.best.chosen) or self.best.chosen <= trial.chosen:
+        nats, laws = self.ahead(trial, self.best), laws_of(trial.chosen)
+        if laws_of(self.best.chosen) or self.best.chosen <= trial.chosen:
             return nats
         return nats + len(laws) * terms.LAW
 
@@ -504,7 +501,7 @@ class Selector:
         """
         strongest = terms.strongest_forces(self.nominal) if self.laws else {}
         present = self.best.chosen
-        forms = frozenset(self._laws_of(present))
+        forms = frozenset(laws_of(present))
         if not strongest or present in self._proposed or len(forms) >= MOST_LAWS:
             return False
         self._proposed.add(present)

@@ -230,14 +230,13 @@ def _conditional(
 
 
 def _unsaid(
-    point: Point, priors: Priors, active: Sequence[int], screened: Screen, name: int
+    point: Point, priors: Priors, deviation: np.ndarray, screened: Screen, name: int
 ) -> np.ndarray:
-    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,); see
-    :func:`unexplained_nats`.
-    """
-    deviation = priors.deviation(list(active))
-    deviation[name] = priors.slab[name] / NARROW
-    information, score = _conditional(point, deviation, screened)
+    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,).
+
+    ``deviation``: prior deviations of the effects beside it, shape (K,)."""
+    free = np.where(np.arange(len(deviation)) == name, priors.slab / NARROW, deviation)
+    information, score = _conditional(point, free, screened)
     return 0.5 * score**2 / np.maximum(information, 1e-300)
 
 
@@ -342,7 +341,8 @@ def shortlist(
             calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
         )
         gain -= [price[term.depth] for term in screened.terms]
-        explained = [_unsaid(calm, problem.priors, active, screened, name) < LAW for name in names]
+        beside = problem.priors.deviation(list(active))
+        explained = [_unsaid(calm, problem.priors, beside, screened, n) < LAW for n in names]
         gain[np.any(explained, axis=0)] = -np.inf
         ranked += [
             (float(gain[i]), screened.terms[i], float(prior[i]))
@@ -443,11 +443,8 @@ def unexplained_nats(
 
     A term has neither bounds nor a usual size. It must not take the place of a name that says the
     same only because the name lies at its bound, or is larger than was expected."""
-    deviation = priors.deviation([k for k in active if k != term])
-    deviation[[name, term]] = priors.slab[name] / NARROW, 0.0
-    information = point.information
-    score = point.score
-    solved = covariance(information, deviation) @ np.column_stack((information[:, term], score))
-    precision = information[term, term] - information[term] @ solved[:, 0]
-    remaining = score[term] - information[term] @ solved[:, 1]
-    return float(0.5 * remaining**2 / max(precision, 1e-300))
+    beside = priors.deviation([k for k in active if k != term])
+    beside[term] = 0.0
+    row = point.information[[term]]
+    alone = Screen((), np.ones(1), row[:, term], point.score[[term]], row)
+    return float(_unsaid(point, priors, beside, alone, name)[0])

@@ -23,7 +23,15 @@ from visthrow.diagnose.likelihood.evidence import (
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
 from visthrow.diagnose.models.model_interface import Effect, Model, Window
 from visthrow.diagnose.select import result, terms
-from visthrow.diagnose.select.candidates import ALL, EVENT, Candidate, Names, as_random, varies_of
+from visthrow.diagnose.select.candidates import (
+    ALL,
+    EVENT,
+    Candidate,
+    Names,
+    as_random,
+    laws_of,
+    varies_of,
+)
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
 from visthrow.diagnose.select.held_out import Work, sized
 from visthrow.diagnose.select.occam import Linear
@@ -71,7 +79,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     )
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
     explanations = _explanations(selection) if overall == result.UNKNOWN else []
-    has_laws = bool(_laws_of(selection.best))
+    has_laws = bool(laws_of(selection.best.chosen))
     bare = _without_laws(selection)
     active = [j for j in bare.best.columns if j not in withdrawn]
     point = bare.best.point
@@ -204,11 +212,6 @@ def _about_means(
     return statistics
 
 
-def _laws_of(trial: Trial) -> list[int]:
-    """Return the numbers of a set's terms of laws."""
-    return [c.columns[0] for c in trial.chosen if c.law]
-
-
 def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
     """Return the effects of each possible set with the same random shares, and its nats behind."""
     random = {c for c in selection.best.chosen if c.group != ALL}
@@ -236,15 +239,14 @@ def _without_laws(selection: Selector) -> Selector:
     )
     bare.origin = terms.without_laws(problem, selection.origin)[1]
     bare.best = Trial(names, terms.without_laws(problem, best.point)[1], best.shares, best.occam)
-    bare.window = [(t, nats) for t, nats in selection.window if not _laws_of(t)]
+    bare.window = [(t, nats) for t, nats in selection.window if not laws_of(t.chosen)]
     return bare
 
 
 def _explanations(selection: Selector) -> list[tuple[Law, ...]]:
     """Return the laws of the set, then others one by one in their place, best first."""
     best, problem = selection.best, selection.problem
-    chosen = _laws_of(best)
-    if not chosen:
+    if not laws_of(best.chosen):
         return []
     names = frozenset(c for c in best.chosen if not c.law)
     linear = selection.linear(best.point)
@@ -264,10 +266,10 @@ def _law(selection: Selector) -> tuple[set[int], str]:
     Names that act in a law's block may be a part of its form. A name acts there by its column or by
     what the other names cannot stand in for, as two delays that differ by a force. What is worth
     nothing without those is not told either."""
-    effects, best, priors = selection.problem.effects, selection.best, selection.problem.priors
-    laws = _laws_of(best)
-    names = [j for j in best.columns if j not in laws]
-    blocks = {effects[j].block for j in laws}
+    best = selection.best
+    priors = selection.problem.priors
+    names = selection.names
+    blocks = {c.law for c in laws_of(best.chosen)}
     joint = grammar.JOINT in blocks
     in_block = set()
     for j in names:
@@ -368,10 +370,10 @@ def _overall(
         return result.INCONSISTENT, "", [reason], set(active)
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
-    laws = _laws_of(selection.best)
+    laws = laws_of(selection.best.chosen)
     if laws:
         unnamed, said = _law(selection)
-        return result.UNKNOWN, selection.problem.effects[laws[0]].block, [said, *reasons], unnamed
+        return result.UNKNOWN, laws[0].law, [said, *reasons], unnamed
     stuck = [j for j in active if _on_bound(selection, j)]
     if stuck:
         names = ", ".join(selection.problem.effects[j].name for j in stuck)
