@@ -33,6 +33,7 @@ class Candidate:
     floors: float = 0.0  # negligible deviation of random shares, in the prior's
     flight: int = -1  # of an event
     law: str = ""  # block of the law whose term it is
+    claims: int = 1  # thresholds that it must beat: that an effect is there, that it differs
 
     def __hash__(self) -> int:
         """Hash numbers alone: with names, the order of a set would differ from run to run."""
@@ -92,6 +93,7 @@ def random_shares(
                 penalty,
                 deviations,
                 effect.floor / effect.prior_sd,
+                claims=1 if named else 2,
             )
             for group, shown in groups
             if columns and shown[:, columns].any(1).sum() > 1
@@ -146,6 +148,12 @@ def _events(
         for flight in flights[flown[:, j]].tolist()
         if flown[:, j].sum() >= FEWEST_FOR_EVENT
     ]
+
+
+def without_means(chosen: Iterable[Candidate]) -> list[Candidate]:
+    """Return candidates without the means of those whose being there is one of their claims."""
+    varying = {c.columns for c in chosen if c.claims > 1}
+    return [c for c in chosen if c.claims > 1 or c.columns not in varying]
 
 
 def columns_of(chosen: Iterable[Candidate]) -> list[int]:

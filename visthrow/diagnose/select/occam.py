@@ -250,7 +250,7 @@ class Linear:
 def window(
     linear: Linear, begin: Iterable[Names], near: Names = NOTHING, pairs: bool = True
 ) -> dict[Names, float]:
-    """Return the sets near the best, with their values.
+    """Return the sets near the best and their neighbours, with their values.
 
     Args:
         begin: sets that are opened first.
@@ -276,4 +276,4 @@ def window(
             listed = linear.pairs(chosen)
         values |= {s: v for s, v in listed.items() if len(s - near) <= MOST_NEW}
         in_vain = 0 if max(values.values()) > best + 1e-6 else in_vain + 1
-    return {chosen: value for chosen, value in values.items() if value > best - WINDOW}
+    return values

@@ -21,7 +21,6 @@ from visthrow.diagnose.likelihood.evidence import (
     STRONG,
     certainty,
     estimate,
-    surely_there,
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
@@ -37,6 +36,7 @@ from visthrow.diagnose.select.candidates import (
     random_shares,
     shared,
     varies_of,
+    without_means,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases
 from visthrow.diagnose.select.occam import WINDOW, Linear, window
@@ -119,9 +119,11 @@ class Selector:
     def penalty(self, chosen: Names) -> float:
         """Return the penalty of a set [nats].
 
-        What acts in the block of a law may be a part of its form and must be worth more than
+        That an effect differs among flights is a second claim beside its being there. What acts in
+        the block of a law may be a part of its form and must be worth more than
         elsewhere. Without a calm phase to compare with, a law stands in place of all names."""
-        total = sum(self.threshold + c.penalty for c in chosen)
+        counted = without_means(chosen)
+        total = sum(c.claims * self.threshold + c.penalty for c in counted)
         forms = laws_of(chosen)
         if not forms:
             return total
@@ -195,16 +197,15 @@ class Selector:
         alike_tried = False
         while True:
             better = [t for t in tried if self._better(t)]
-            least = max((t.ahead for t in better), default=-np.inf)
+            least = -np.inf
+            if better:
+                least = max(*(t.ahead for t in better), max(listed.values()) - WINDOW)
             shortlist = self._short(listed, tried, least)
             if not shortlist:
                 break
             shortlist += [] if alike_tried else self._alike(shortlist[0])
             alike_tried = True
-            new = self._tried(self.best.point, dict.fromkeys(shortlist))
-            if not any(self._better(t) for t in new):
-                new += self._tried(self.best.point, self._reduced(new))
-            tried += new
+            tried += self._tried(self.best.point, dict.fromkeys(shortlist))
         if better:
             top = max(better, key=lambda t: t.ahead)
             if laws_of(top.chosen) and self._approached():
@@ -252,23 +253,6 @@ class Selector:
         laws = [frozenset({c}) for c in self.candidates if c.law]
         done = {s for s, nats in self._simulated.items() if nats < -WINDOW} | self._visited
         return [chosen for chosen in laws if chosen not in done]
-
-    def _reduced(self, tried: Iterable[Trial]) -> list[Names]:
-        """Return the members that are surely there of the sets that are ahead.
-
-        Derivatives of a delay promise far more for several lags at once than for one; where the
-        simulation was run with them, all but one may be near 0."""
-        done = {t.chosen for t in tried} | self._visited
-        reduced: dict[Names, None] = {}
-        for trial in tried:
-            if trial.ahead > ENOUGH_NATS:
-                point = trial.point
-                sure = surely_there(
-                    point.information, point.score, self.problem.priors, trial.columns
-                )
-                members = (c for c in trial.chosen if c.group != ALL or c.columns[0] in sure)
-                reduced[frozenset(members)] = None
-        return [chosen for chosen in reduced if chosen not in done]
 
     def _alike(self, chosen: Names) -> list[Names]:
         """Return the sets with another cause in place of a new one, that the catalogue says looks
@@ -333,8 +317,9 @@ class Selector:
                 self.progress(f"{names_of(s)}: not simulated, {simulated}")
         found = [Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)]
         found = [replace(t, ahead=self._ahead(t)) for t in found]
-        for t in found:
-            self._simulated[t.chosen] = max(t.ahead, self._simulated.get(t.chosen, -np.inf))
+        for t in found:  # what may not be named gains nothing
+            nats = t.ahead if self.is_admissible(t) else min(t.ahead, 0.0)
+            self._simulated[t.chosen] = max(nats, self._simulated.get(t.chosen, -np.inf))
         return found
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
