@@ -4,6 +4,7 @@
         --banks bench/diagnose/bank-window.txt --foreign bench/diagnose/bank-foreign-window.txt
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
+With one tree it is answered alone, as the new one.
 Each world is flown once, by this checkout, and its logs are handed to both tools in processes of
 their own, on the same core one after the other. Worlds come in an order that the seeds fix,
 so that whatever was answered before the time is over is a balanced part of the banks.
@@ -86,8 +87,8 @@ def answer_of(tree: str, arguments: list[str], folder: Path, until: float) -> di
 
 
 def in_turn(trees: list[str], number: int) -> list[tuple[str, str]]:
-    """Return both sides with their trees; every second world asks the new one first."""
-    sides = list(zip(SIDES, trees))
+    """Return the sides with their trees; every second world asks the new one first."""
+    sides = list(zip(SIDES[-len(trees) :], trees))
     return sides if number % 2 else sides[::-1]
 
 
@@ -298,10 +299,12 @@ def compare(args: argparse.Namespace) -> None:
     lines = [json.loads(line) for line in text.splitlines()]
     failed = [line for line in lines if "failed" in line]
     lines = [line for line in lines if "failed" not in line]
-    late = [line for line in lines if any(line[s]["error"] == sealed.NOT_WAITED for s in SIDES)]
+    sides = [side for side in SIDES if all(side in line for line in lines)]
+    late = [line for line in lines if any(line[s]["error"] == sealed.NOT_WAITED for s in sides)]
     lines = [line for line in lines if line not in late]
-    print(f"{len(lines)} worlds answered by both; {len(failed)} not flown, {len(late)} cut off")
-    for side in SIDES:
+    print(f"{len(lines)} worlds answered by {' and '.join(sides)}")
+    print(f"{len(failed)} not flown, {len(late)} cut off")
+    for side in sides:
         errors = [line[side]["error"] for line in lines if line[side]["error"]]
         print(f"{side}: {len(errors)} answers are errors, which count as wrong: {errors[:1]}")
     tests = (
@@ -322,29 +325,30 @@ def compare(args: argparse.Namespace) -> None:
         part = [line for line in lines if belongs(line)]
         if not part:
             continue
-        for side in SIDES:
+        for side in sides:
             print(f"{name:30} {side} {interval(sum(test(p, side) for p in part), len(part))}")
-        print(f"{'':30} {paired(part, test)}")
+        if len(sides) > 1:
+            print(f"{'':30} {paired(part, test)}")
     for kind in sorted({line["kind"] for line in lines if is_null(line)}):
         part = [line for line in lines if line["kind"] == kind]
-        names = [sum(bool(line[side]["named"]) for line in part) for side in SIDES]
-        print(f"{kind:30} false names: old {names[0]}, new {names[1]} of {len(part)}")
-    for side in SIDES:
+        names = [f"{side} {sum(bool(line[side]['named']) for line in part)}" for side in sides]
+        print(f"{kind:30} false names: {', '.join(names)} of {len(part)}")
+    for side in sides:
         inside = covered(lines, side)
         print(f"{'95 % intervals hold the truth':30} {side} {interval(sum(inside), len(inside))}")
         gain = gains(lines, side)
         quarters = np.percentile(gain, [10, 25, 50, 75]) if len(gain) else []
         print(f"{'gain on throws held back':30} {side} n {len(gain)}, 10-25-50-75 %: {quarters}")
     for bank in ("sealed", "foreign"):
-        seconds = np.array([[p[s]["seconds"] for s in SIDES] for p in lines if p["bank"] == bank])
+        seconds = np.array([[p[s]["seconds"] for s in sides] for p in lines if p["bank"] == bank])
         if len(seconds):
-            ratio = np.exp(np.mean(np.log(seconds[:, 1] / seconds[:, 0])))
+            ratio = np.exp(np.mean(np.log(seconds[:, -1] / seconds[:, 0])))
             print(
                 f"CPU seconds, {bank}: median {np.median(seconds, axis=0)}, mean"
                 f" {seconds.mean(0)}, geometric mean of the ratio {ratio:.2f}"
             )
     if args.list:
-        differing(lines, tests)
+        differing(lines, tests, sides)
 
 
 def is_varying(line: dict) -> bool:
@@ -365,17 +369,17 @@ def without_wrong(line: dict, side: str) -> bool:
     return not line[side]["wrong"]
 
 
-def differing(lines: list[dict], tests: tuple) -> None:
+def differing(lines: list[dict], tests: tuple, sides: list[str]) -> None:
     """Print each world that a side has wrong."""
     for name, belongs, test in tests:
         for line in lines:
-            if name.startswith(" ") or not belongs(line) or all(test(line, s) for s in SIDES):
+            if name.startswith(" ") or not belongs(line) or all(test(line, s) for s in sides):
                 continue
             hidden = line.get("recipe", {}).get("effects", line.get("seed"))
             answers = [
                 f"{side} {'ok' if test(line, side) else 'NO'} {line[side]['overall']}"
                 f" {line[side]['named']} {line[side].get('varies', '')} {line[side]['error'][:60]}"
-                for side in SIDES
+                for side in sides
             ]
             print(f"{name}: {line['kind']} {hidden}\n    " + "\n    ".join(answers))
 
@@ -385,7 +389,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     actions = parser.add_subparsers(dest="action", required=True)
     ask = actions.add_parser("answer", help=answer.__doc__)
-    ask.add_argument("--trees", nargs=2, required=True, help="checkouts: old, new")
+    ask.add_argument("--trees", nargs="+", required=True, help="checkouts: old, new; or new alone")
     ask.add_argument("--banks", nargs="*", default=[], help="files of arguments of sealed")
     ask.add_argument("--foreign", nargs="*", default=[], help="lists of seeds of foreign")
     ask.add_argument("--skip", nargs="*", type=int, default=[], help="seeds seen in development")
