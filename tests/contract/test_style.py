@@ -20,7 +20,7 @@ MOST = 13
 """Entries of a folder that holds modules, beside :data:`ASIDE`."""
 ASIDE = {"__init__.py", "__pycache__", "README.md", "py.typed"}
 
-KNOWN = {}
+KNOWN: set[str] = set()
 """What is still to be mended.
 
 The list may only become shorter: an entry that is no longer needed fails too.
