@@ -103,20 +103,20 @@ class InitialFit:
         )
         self._shortened = flights.ended(ends)
 
-    def fit(
-        self, starts: Sequence[States], slopes: Mapping[int, np.ndarray] | None = None
-    ) -> States:
+    def fit(self, states: States, slopes: Mapping[int, np.ndarray] | None = None) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
-        ``starts``: states to begin with, each window with the best of its own, and how far they
-        were moved before; those that do not count keep the last; ``slopes``: of windows' samples by
-        their states, as :attr:`slopes` of another fit has them."""
+        ``states``: to begin with; ``slopes``: of windows' samples by their states, as
+        :attr:`slopes` of another fit has them."""
         count = len(self.flights.cuts)
         damping = np.full(count, DAMPING)
         remaining = self.retained
         self.slopes |= slopes or {}
         aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
-        states, residuals, cost = self._best(starts)
+        flown = self._residuals(rows_of(states, remaining), remaining)
+        residuals = dict(zip(remaining, flown))
+        cost = np.full(count, np.inf)
+        cost[remaining] = [self._cost(w, residual) for w, residual in residuals.items()]
         stale = ~aged
         for _ in range(ROUNDS):
             self.slopes |= self._slopes(states, remaining[stale[remaining]])
@@ -150,40 +150,6 @@ class InitialFit:
             if not len(remaining):
                 break
         return states
-
-    def _best(self, starts: Sequence[States]) -> tuple[States, dict[int, np.ndarray], np.ndarray]:
-        """The best of each window's states, what they leave, and its cost, shape (W,); all are
-        flown at once.
-        """
-        retained = self.retained
-        count = len(self.retained)
-        residuals = self._residuals(
-            stacked([rows_of(states, retained) for states in starts]),
-            np.tile(retained, len(starts)),
-        )
-        tried = np.reshape(
-            [
-                self._cost(w, residual)
-                for w, residual in zip(np.tile(retained, len(starts)), residuals)
-            ],
-            (len(starts), count),
-        )
-        which = tried.argmin(axis=0)
-        cost = np.full(len(self.flights.cuts), np.inf)
-        cost[retained] = tried.min(axis=0)
-        best = {name: value.copy() for name, value in starts[-1].items()}
-        for name, value in best.items():
-            value[retained] = np.stack([states[name][retained] for states in starts])[
-                which, np.arange(count)
-            ]
-        return (
-            best,
-            {
-                w: residuals[start * count + row]
-                for row, (w, start) in enumerate(zip(retained, which))
-            },
-            cost,
-        )
 
     def _tried(
         self,

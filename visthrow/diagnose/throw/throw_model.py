@@ -377,9 +377,8 @@ class ThrowModel(Model):
             if states is None and (among := self._among_more(cuts)) is not None:
                 return among
             fitter = self._initial_fit(self.setting)
-            fitted = fitter.fit(
-                [self._settled_throughout(self.setting)[0] if states is None else states]
-            )
+            start = self._settled_throughout(self.setting)[0] if states is None else states
+            fitted = fitter.fit(start)
             self._fits[cuts] = fitted, fitter.slopes
         return self._fits[cuts]
 
@@ -397,26 +396,17 @@ class ThrowModel(Model):
         return None
 
     def _settled(self, setting: Setting) -> States:
-        """States fitted in a setting, from the better of those fitted at theta = 0 and those that
-        the setting begins with.
-        """
+        """States fitted in a setting, from those that the setting begins with."""
         states, slopes = self._fitted()
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting)
-        ways = [
-            [(x.field, x.axis, x.part) for x in directions_of]
-            for directions_of in (fitter.directions, directions(self.setting.plant))
+        kinds = [
+            [(x.field, x.axis, x.part) for x in members]
+            for members in (fitter.directions, directions(self.setting.plant))
         ]
-        start = dict(resampled(states, setting.plant.rope.segments))
-        if ways[0] != ways[1]:
-            moved = dict(zip(ways[1], states[MOVED].T))
-            start[MOVED] = np.stack(
-                [moved.get(way, np.zeros(len(states[MOVED]))) for way in ways[0]], axis=1
-            )
-        return fitter.fit(
-            [start, self._settled_throughout(setting)[0]], slopes if ways[0] == ways[1] else None
-        )
+        start, _ = self._settled_throughout(setting)
+        return fitter.fit(start, slopes if kinds[0] == kinds[1] else None)
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
