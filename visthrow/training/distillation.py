@@ -24,7 +24,7 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import DistillationParams, Experiment, contract_of
 from visthrow.training.env import ThrowEnv
-from visthrow.training.ppo.network import averaged, cosine_rate, normalizer_state
+from visthrow.training.ppo.network import MuonAdam, averaged, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
 
 SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
@@ -77,6 +77,12 @@ class EstimatorNetwork(nn.Module):
         parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
         inner = tuple((layer.weight.detach(), layer.bias.detach()) for layer in self.inner)
         return Estimator(*(part.detach() for part in parts), inner)
+
+    @property
+    def matrices(self) -> list[Tensor]:
+        """Weights of all layers but the last."""
+        layers = (self.encoder, *self.inner, self.gru)
+        return [w for layer in layers for w in layer.parameters() if w.dim() == 2]
 
     def forward(self, obs: Tensor) -> Tensor:
         """Estimates, shape (T, E, S), along throws, shape (T, E, D)."""
@@ -142,8 +148,9 @@ class Distillation:
         self._flying = self.network.frozen()
         self.average = averaged(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
-        self.optimizer = torch.optim.Adam(
-            self.network.parameters(), lr=self.p.learning_rate, fused=on_gpu
+        weights = self.network.parameters()
+        self.optimizer = MuonAdam(
+            weights, self.network.matrices, lr=self.p.learning_rate, fused=on_gpu
         )
         self.rollout = ReplayedGraph(self._fly) if on_gpu else self._fly
 

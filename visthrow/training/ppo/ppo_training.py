@@ -12,9 +12,11 @@ from visthrow.common.errors import ConfigError
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.env import ThrowEnv
-from visthrow.training.ppo.network import CapturableGaussian, Network
+from visthrow.training.ppo.network import CapturableGaussian, Network, averaged
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
+
+AVERAGED = 10  # iterations that the exported weights are a mean of, at most
 
 WARM_UP_RATE = 2e-3  # learning rate of a critic that learns alone; nothing that it moves is flown
 
@@ -45,6 +47,8 @@ def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
         "max_grad_norm": p.max_grad_norm,
         "use_clipped_value_loss": True,
     }
+    if p.muon:
+        algorithm["muon"] = True
     return {
         "num_steps_per_env": p.steps,
         "algorithm": algorithm,
@@ -81,6 +85,7 @@ class PPOTraining:
             )
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
+        self.average = averaged(self.alg.actor, AVERAGED)
         self._obs = self.env.get_observations()
         # a solver whose work cannot be captured is launched
         capturable = device.startswith("cuda") and self.env.sim.capturable
@@ -108,6 +113,7 @@ class PPOTraining:
         self.alg.desired_kl = (1.0 - settled) * p.desired_kl + settled * p.final_kl
         self._warm_up(round(done * p.iterations))
         figures = self.alg.update()
+        self.average.update_parameters(self.alg.actor)
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
 
     def _warm_up(self, iteration: int) -> None:
@@ -121,21 +127,24 @@ class PPOTraining:
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         return Policy.from_actor_state(
-            self.alg.actor.state_dict(), self.experiment.ppo.activation, contract, made_by
+            self.average.module.state_dict(), self.experiment.ppo.activation, contract, made_by
         )
 
     def take_up(self, policy: Policy) -> None:
-        self.alg.actor.take_up(policy)
+        for actor in (self.alg.actor, self.average.module):
+            actor.take_up(policy)
 
     def state_dict(self) -> dict:
         return {
             "networks": self.alg.save(),
+            "average": self.average.state_dict(),
             "env": self.env.state_dict(),
             "obs": {k: v.clone() for k, v in self._obs.items()},
         }
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         self.alg.load(saved["networks"], None, True)
+        self.average.load_state_dict(saved["average"])
         if own_throws:
             self.env.load_state_dict(saved["env"])
             for key, value in saved["obs"].items():

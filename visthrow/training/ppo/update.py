@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from sim.torch_bridge import ReplayedGraph
-from visthrow.training.ppo.network import Network
+from visthrow.training.ppo.network import MuonAdam, Network
 
 # range of the adaptive learning rate
 SLOWEST = 1e-5
@@ -17,7 +17,8 @@ FASTEST = 1e-2
 class CapturedPPO(PPO):
     """rsl_rl's PPO of networks without memory, whose learning rate lives on the device."""
 
-    def __init__(self, actor: Network, critic: Network, storage, **settings):
+    def __init__(self, actor: Network, critic: Network, storage, muon: bool = False, **settings):
+        """Take rsl_rl's settings; ``muon``: see :class:`PPOParams`."""
         super().__init__(actor, critic, storage, **settings)
         make = {"device": self.device, "dtype": torch.float32}
         self._cuda = torch.device(self.device).type == "cuda"
@@ -26,9 +27,12 @@ class CapturedPPO(PPO):
         self.target_kl = torch.tensor([self.desired_kl], **make)
         # 0 holds the actor still, to the bit, while the critic learns
         self.actor_learns = torch.ones(1, **make)
-        self.optimizer = torch.optim.Adam(
-            self._parameters, lr=self.rate, fused=True, capturable=self._cuda
-        )
+        options = {"lr": self.rate, "fused": True, "capturable": self._cuda}
+        if muon:
+            matrices = actor.matrices + critic.matrices
+            self.optimizer = MuonAdam(self._parameters, matrices, **options)
+        else:
+            self.optimizer = torch.optim.Adam(self._parameters, **options)
         self._totals = torch.zeros(3, **make)
         self._capture()
 
