@@ -310,9 +310,8 @@ def test_the_disk_is_full(tmp_path, full_at):
             pass
 
     def fill(now, runner, fake):
-        for writer in recorder._writers.values():
-            if now >= full_at and not isinstance(writer._file, Full):
-                writer._file = Full()
+        if now >= full_at:
+            recorder._writer._file = Full()
         # The recorder writes in a thread of its own; lock step does not wait for it.
         patience = time.monotonic() + 10.0
         while now >= full_at + 0.2 and not recorder.failed and time.monotonic() < patience:

@@ -4,6 +4,7 @@ catalogue.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 
 import numpy as np
 
@@ -71,7 +72,7 @@ def parsed(items: Sequence[str]) -> dict[str, float]:
 
     Raises DiagnoseError: something else."""
     out = {}
-    for item in ",".join(items).split(","):
+    for item in chain.from_iterable(entry.split(",") for entry in items):
         name, _, sd = item.partition("=")
         try:
             out[name.strip()] = float(sd)

@@ -262,10 +262,11 @@ def _log(table: Table, mapping: TableMap, rows: np.ndarray, label: str, source: 
     meta: dict[str, Any] = {"source": source, "part": label, "rows": len(rows), "ingest": {}}
     meta["left_out"] = list(getattr(table, "left_out", ()))
     channels = {}
+    taken = slice(None) if mapping.split is None else rows  # one for all clocks
     for entry in mapping.channels:
         clock = mapping.clocks[entry.clock] if entry.clock and mapping.clocks else mapping.time
-        time = _stamps(table, clock, source)[rows]
-        columns = [_numbers(table, name, source)[rows] for name in entry.columns]
+        time = _stamps(table, clock, source)[taken]
+        columns = [_numbers(table, name, source)[taken] for name in entry.columns]
         if {len(column) for column in columns} != {len(time)}:
             raise LogError(
                 f"{source}: channel '{entry.name}': {len(time)} stamps, columns of"
