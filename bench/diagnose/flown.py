@@ -38,6 +38,7 @@ def fly(
     swirl=0.0,
     beat=0.0,
     downwash=0.0,
+    mount=(0.0, 0.0, 0.0),
 ) -> FlightLog:
     """A vehicle with an attitude of closed form and motors that hold it up; equations and
     integrator of the test's own.
@@ -60,6 +61,10 @@ def fly(
     volts = 4.1 - 0.05 * half
     level = gain * (1.0 + volts_slope * (volts - 3.8)) * (1.0 + fade * half)
 
+    near = [attitude(half + begin + shift).apply(mount) for shift in (-1e-3, 0.0, 1e-3)]
+    arm_rate = (near[2] - near[0]) / 2e-3
+    arm_acc = (near[2] - 2.0 * near[1] + near[0]) / 1e-6
+
     # another vehicle, which passes above
     above = np.column_stack([3.0 * np.sin(0.9 * half + phases[0]), np.cos(half), 6.0 + 0.0 * half])
 
@@ -80,19 +85,20 @@ def fly(
         if cable is None:
             return np.concatenate([v, force / mass, lag])
         vp = state[10:13]
-        along = (state[7:10] - p) / np.sqrt(np.sum((state[7:10] - p) ** 2))
+        gap = state[7:10] - p - near[1][i]
+        rate = vp - v - arm_rate[i]
+        along = gap / np.sqrt(gap @ gap)
         weight = -payload_drag * np.sqrt(vp @ vp) * vp - [0, 0, payload * G]
-        pull = (along @ (weight / payload - force / mass) + (vp - v) @ (vp - v) / cable) / (
-            1 / mass + 1 / payload
-        )
+        apart = weight / payload - force / mass - arm_acc[i]
+        pull = (along @ apart + rate @ rate / cable) / (1 / mass + 1 / payload)
         return np.concatenate(
             [v, (force + pull * along) / mass, lag, vp, (weight - pull * along) / payload]
         )
 
-    state = np.array(
-        [0, 0, 5.0, 0, 0, 0, told[0]]
-        + ([0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99), 0, 0, 0] if cable else [])
-    )
+    state = np.array([0, 0, 5.0, 0, 0, 0, told[0]])
+    if cable:
+        hung = near[1][0] + [0.1 * cable, 0, 5.0 - cable * np.sqrt(0.99)]
+        state = np.concatenate([state, hung, arm_rate[0]])
     path = [state]
     for i in range(0, len(half) - 2, 2):
         k1 = slope(i, state)

@@ -23,7 +23,7 @@ from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import FlyerParams, TorqueParams
+from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
@@ -252,6 +252,18 @@ class TestFlyer:
         assert (
             np.abs(np.concatenate(FlyerModel([log], params).residuals({}))).max() < 1e-4
         )  # motion capture has more noise
+
+    def test_a_cable_is_attached_where_its_setup_says(self):
+        mount = (0.01, 0.0, -0.03)
+        log = fly(4.0, cable=0.5, mount=mount, noise=1e-6)
+        params = replace(FLYER, command_delay=LATE, drag_xy=0.0)
+        worst = []
+        for point in (mount, (0.0, 0.0, 0.0)):
+            cable = CableParams(0.5, 0.008, point)
+            model = FlyerModel([log], replace(params, cable=cable))
+            worst.append(np.abs(np.concatenate(model.residuals({}))).max())
+        assert worst[0] < 1e-4
+        assert worst[1] > 3e-3
 
     def test_a_law_is_looked_for(self):
         logs = [fly(6.0, swirl=0.008, seed=i) for i in range(3)]

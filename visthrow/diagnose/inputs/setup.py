@@ -108,7 +108,7 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
         return KnownVehicle(0.0, imu.mass, imu.input, imu.thrust_map, unread)
     flyer = setup.flyer if setup is not None else None
     if flyer is not None:
-        length = flyer.cable.length if flyer.cable is not None else 0.0
+        length = flyer.cable.length - flyer.cable.mount[2] if flyer.cable is not None else 0.0
         return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map, VELOCITIES)
     if plant is None:
         return KnownVehicle(unread=VELOCITIES)

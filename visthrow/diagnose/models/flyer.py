@@ -155,7 +155,10 @@ class FlyerModel(NumericModel):
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
         thrust = self._thrusts(lanes)
         step = np.full((len(lanes.owner), 1), self.params.step)
-        path = integrate(self._slope(lanes, thrust), self._begin(lanes), self.steps, step)
+        rot = self._rotations(lanes)
+        mount = self._mount(rot)
+        slope = self._slope(lanes, thrust, rot, mount)
+        path = integrate(slope, self._begin(lanes, mount), self.steps, step)
         return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
     def _rise(self, thrust: np.ndarray) -> np.ndarray:
@@ -187,7 +190,7 @@ class FlyerModel(NumericModel):
             stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
             pose[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
         if p.cable is not None:
-            gap = path[:, 6:9]
+            gap = path[:, 6:9] - stretch.data["rot"][halves[::2]] @ np.array(p.cable.mount)
             vel = path[:, 3:6] + path[:, 9:12]
             direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
@@ -247,7 +250,20 @@ class FlyerModel(NumericModel):
             out[:, rows] = pos.reshape(len(path), -1)
         return out
 
-    def _begin(self, lanes: Lanes) -> np.ndarray:
+    def _mount(self, rot: np.ndarray) -> np.ndarray:
+        """Return where the cable is attached, from the centre of mass, the velocity and the
+        acceleration of that point at the half steps, world frame, shape (3, half steps, B or 1, 3).
+        """
+        cable = self.params.cable
+        if cable is None or not any(cable.mount):
+            return np.zeros((3, len(rot), 1, 3))
+        arm = rot @ np.array(cable.mount)
+        rate = np.gradient(arm, 0.5 * self.params.step, axis=0, edge_order=2)
+        return np.array(
+            [arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)]
+        )
+
+    def _begin(self, lanes: Lanes, mount: np.ndarray) -> np.ndarray:
         """States from the unknowns at the window's start."""
         unknown = lanes.nuisance
         if self.params.cable is None:
@@ -260,21 +276,21 @@ class FlyerModel(NumericModel):
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         swing = np.pad(unknown[:, 8:10], level)
         swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
-        parts = unknown[:, :6], length * direction, length * swing, unknown[:, 10:]
-        return np.concatenate(parts, 1)
+        gap = length * direction + mount[0, 0]
+        rate = length * swing + mount[1, 0]
+        return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
 
-    def _slope(self, lanes: Lanes, thrust: np.ndarray) -> Slope:
+    def _slope(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: np.ndarray) -> Slope:
         """Return the derivative of the states under thrusts [N], shape (half steps, B, motors)."""
         p = self.params
         mass = (p.mass + self.size_of(lanes, "mass_quad"))[:, None]
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
         gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
         wind = self.stack(lanes, "wind_x", "wind_y", "")
-        rot = self._rotations(lanes)
         latent = latent_force(lanes.latent, self.steps, len(self._blocks))
         force_of = self._force(lanes, thrust, rot)
         exerted_of = self._exerted(lanes, thrust, rot)
-        pulled = self._pulled(lanes, mass, gravity) if p.cable is not None else None
+        pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
 
         def slope(half: int, state: np.ndarray) -> np.ndarray:
@@ -282,12 +298,12 @@ class FlyerModel(NumericModel):
             loads = dict(zip(self._blocks, latent[half]))
             loads["vehicle force"] = loads["vehicle force"] + force_of(half, vel - wind)
             if self.laws:
-                hung = pulled and pulled(state, vel - wind, loads)
+                hung = pulled and pulled(half, state, vel - wind, loads)
                 for block, load in exerted_of(half, state, hung).items():
                     loads[block] = loads.get(block, 0.0) + load
             parts = [vel, loads["vehicle force"] / mass + gravity]
             if pulled is not None:
-                acc, acc_payload, *_ = pulled(state, vel - wind, loads)
+                acc, acc_payload, *_ = pulled(half, state, vel - wind, loads)
                 parts = [vel, acc, state[:, 9:12], acc_payload - acc]
             if turning is not None:
                 parts.append(turning(half, state[:, self._rates], loads["vehicle torque"]))
@@ -329,24 +345,28 @@ class FlyerModel(NumericModel):
 
         return force
 
-    def _pulled(self, lanes: Lanes, mass: np.ndarray, gravity: np.ndarray) -> Callable:
+    def _pulled(
+        self, lanes: Lanes, mass: np.ndarray, gravity: np.ndarray, mount: np.ndarray
+    ) -> Callable:
         """Return what gives accelerations of vehicle and payload, the cable's direction, and what
-        it pulls with [N], by states, velocity in the air and loads; it never pushes.
+        it pulls with [N], by the half step, states, velocity in the air and loads; it never pushes.
         """
         payload = (self.params.cable.mass + self.size_of(lanes, "mass_payload"))[:, None]
         payload_drag = self.size_of(lanes, "payload_drag")[:, None]
         reduced = 1.0 / (1.0 / payload + 1.0 / mass)
 
-        def pulled(state: np.ndarray, air: np.ndarray, loads: Mapping) -> tuple[np.ndarray, ...]:
-            gap = state[:, 6:9]
-            gap_rate = state[:, 9:12]
-            vel = air + gap_rate
+        def pulled(
+            half: int, state: np.ndarray, air: np.ndarray, loads: Mapping
+        ) -> tuple[np.ndarray, ...]:
+            gap = state[:, 6:9] - mount[0, half]
+            gap_rate = state[:, 9:12] - mount[1, half]
+            vel = air + state[:, 9:12]
             drag = -payload_drag * np.sqrt(_products(vel, vel)) * vel
             free = loads["vehicle force"] / mass + gravity
             free_payload = (drag + loads["payload force"]) / payload + gravity
             length = np.sqrt(_products(gap, gap))
             direction = gap / length
-            separation = _products(direction, free_payload - free)
+            separation = _products(direction, free_payload - free - mount[2, half])
             relative = separation + _products(gap_rate, gap_rate) / length
             pull = np.maximum(relative * reduced, 0.0)
             pull_w = pull * direction

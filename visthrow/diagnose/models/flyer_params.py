@@ -16,10 +16,12 @@ MOTORS = ("fl", "fr", "rl", "rr")
 
 @dataclass(frozen=True)
 class CableParams(Bounded):
-    """Payload on a massless cable at the vehicle's centre of mass."""
+    """Payload on a massless cable."""
 
     length: Positive  # to the payload's centre [m]
     mass: Positive  # of the payload [kg]
+    # where the cable is attached, from the vehicle's centre of mass [m], body frame
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,8 @@ class TorqueParams(Bounded):
 class FlyerParams(Bounded):
     """The vehicle that is assumed first.
 
-    Raises ConfigError where torque has no motors' commands, or the map does not rise.
+    Raises ConfigError where torque has no motors' commands or a mounted cable, or where the
+    map does not rise.
     """
 
     input: Literal[
@@ -86,6 +89,11 @@ class FlyerParams(Bounded):
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
             raise ConfigError(
                 f"torque needs commands of single motors; the input is '{self.input}'"
+            )
+        if self.torque is not None and self.cable is not None and any(self.cable.mount):
+            raise ConfigError(
+                f"cable.mount {self.cable.mount} beside torque: the model has no torque of a cable;"
+                " expected one of them alone"
             )
         if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
             raise ConfigError(f"thrust_map {self.thrust_map} does not rise")

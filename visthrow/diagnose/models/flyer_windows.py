@@ -98,7 +98,8 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         if "battery_voltage" in log
         else 0.0
     )
-    guess, spread, direction = _guess(rows, channels, params)
+    rot = _attitudes(log[params.attitude], halves)
+    guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
     blocks = [
         0,
         *([2] if params.cable is not None else []),
@@ -110,7 +111,7 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
         [(time, values, sigma[name]) for name, (time, values) in zip(channels, rows)],
         {
             "start": start,
-            "rot": _attitudes(log[params.attitude], halves),
+            "rot": rot,
             "input": inputs,
             "volts": float(volts),
             "direction": direction,
@@ -201,8 +202,13 @@ def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarra
     return value, slope
 
 
-def _guess(rows, channels, params: FlyerParams) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Unknowns at the start, their spread, and the cable's direction there."""
+def _guess(
+    rows, channels, params: FlyerParams, rot: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unknowns at the start, their spread, and the cable's direction there.
+
+    ``rot``: attitudes at the start and half a step later, shape (2, 3, 3).
+    """
     start = float(rows[0][0][0])
     pos, vel = _line(*rows[0], start)
     guess = [*pos, *vel]
@@ -212,8 +218,11 @@ def _guess(rows, channels, params: FlyerParams) -> tuple[np.ndarray, np.ndarray,
         first_row = rows[channels.index("payload_pos_w")]
         if len(first_row[0]) >= 4:
             pos_p, vel_p = _line(*first_row, start)
-            direction = (pos_p - pos) / np.linalg.norm(pos_p - pos)
-            rate = (vel_p - vel) / params.cable.length
+            mount = rot @ np.array(params.cable.mount)
+            gap = pos_p - pos - mount[0]
+            direction = gap / np.linalg.norm(gap)
+            mount_rate = (mount[1] - mount[0]) / (0.5 * params.step)
+            rate = (vel_p - vel - mount_rate) / params.cable.length
             swing = (rate - direction * np.dot(direction, rate))[:2]
         else:
             swing = np.zeros(2)

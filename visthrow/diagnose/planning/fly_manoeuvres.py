@@ -170,7 +170,7 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
             rope,
             length=params.cable.length - rope.payload_offset,
             payload_mass=params.cable.mass,
-            mount=(0.0, 0.0, 0.0),
+            mount=params.cable.mount,
             rope_mass=THREAD * params.cable.mass,
         )
     return replace(plant, vehicle=changed(v, values), rope=rope)
