@@ -36,7 +36,6 @@ from visthrow.diagnose.throw.initial_states import (
     directions,
     moved_along,
     resampled,
-    rows_of,
 )
 from visthrow.diagnose.throw.landing import PredictedLandings, landings
 from visthrow.diagnose.throw.linearising import Linearisation
@@ -119,10 +118,13 @@ class ThrowModel(Model):
             expect_known(only, concerned, "no effect '{}' for these flights", DiagnoseError)
             concerned = {name: concerned[name] for name in only}
         self._choose(concerned)
-        self._fits: dict[tuple[Cut, ...], tuple[States, dict[int, np.ndarray]]] = {}
+        fitter = self._initial_fit(self.setting)
+        begun = fitter.fit(states)
+        # states at theta = 0, and the samples' derivatives by them; None: of other windows
+        self._nominal: tuple[States, dict[int, np.ndarray]] | None = begun, fitter.slopes
         # by kinds of blocks: the latest states, and what their fit took from windows' residuals
         self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
-        self._latest[frozenset()] = self._fitted(states)[0], self._none
+        self._latest[frozenset()] = begun, self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
 
@@ -248,7 +250,7 @@ class ThrowModel(Model):
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
-        states, fitted = self._latest.get(self._switches(theta), (self._fitted()[0], self._none))
+        states, fitted = self._latest.get(self._switches(theta), (self._nominal[0], self._none))
         moves = {}
         if linearised is not None:
             states, moves = self._following(setting, theta, linearised)
@@ -272,7 +274,7 @@ class ThrowModel(Model):
     ) -> list[np.ndarray]:
         """See the base class; the command before stays."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._settled_at.get(_key(theta), self._fitted()[0])
+        states = self._settled_at.get(_key(theta), self._nominal[0])
         slopes = self.setting.plant.vehicle.queue.delay
         return without_each_command(
             self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
@@ -323,7 +325,7 @@ class ThrowModel(Model):
         """See the base class; the step is so many times finer."""
         fine = dataclasses.replace(self.setting, step_square=1.0 / finer**2)
         worst = np.zeros(len(self.channels))
-        states = self._fitted()[0]
+        states = self._nominal[0]
         for w, plain, halved in zip(
             self._retained, self._flown(self.setting, states), self._flown(fine, states)
         ):
@@ -340,6 +342,7 @@ class ThrowModel(Model):
         """Return the model of other windows of its flights."""
         model = copy.copy(self)
         model._settled_at = {}
+        model._nominal = None
         model._secants = {}  # of other windows
         model.flights = self._cut(self.flights.flights, cuts)
         model._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
@@ -368,45 +371,22 @@ class ThrowModel(Model):
             self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag
         )
 
-    def _fitted(self, states: States | None = None) -> tuple[States, dict[int, np.ndarray]]:
-        """States fitted at theta = 0, to begin with ``states``, and the samples' derivatives by
-        them; of the same windows, once.
-        """
-        cuts = tuple(self.flights.cuts)
-        if cuts not in self._fits:
-            if states is None and (among := self._among_more(cuts)) is not None:
-                return among
-            fitter = self._initial_fit(self.setting)
-            start = self._settled_throughout(self.setting)[0] if states is None else states
-            fitted = fitter.fit(start)
-            self._fits[cuts] = fitted, fitter.slopes
-        return self._fits[cuts]
-
-    def _among_more(self, cuts: tuple[Cut, ...]) -> tuple[States, dict[int, np.ndarray]] | None:
-        """Return what was fitted to all windows of some flights among those of others, as each
-        flight is fitted by itself.
-        """
-        flights = {c.flight for c in cuts}
-        for cuts_more, (states, slopes) in self._fits.items():
-            rows = [row for row, c in enumerate(cuts_more) if c.flight in flights]
-            if cuts == tuple(cuts_more[row] for row in rows):
-                return rows_of(states, np.array(rows)), {
-                    w: slopes[row] for w, row in enumerate(rows) if row in slopes
-                }
-        return None
-
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
-        states, slopes = self._fitted()
-        if setting == self.setting:
-            return states
         fitter = self._initial_fit(setting)
-        kinds = [
-            [(x.field, x.axis, x.part) for x in members]
-            for members in (fitter.directions, directions(self.setting.plant))
-        ]
+        slopes = None
+        if self._nominal is not None:
+            states, slopes = self._nominal
+            if setting == self.setting:
+                return states
+            kinds = [
+                [(x.field, x.axis, x.part) for x in members]
+                for members in (fitter.directions, directions(self.setting.plant))
+            ]
+            if kinds[0] != kinds[1]:
+                slopes = None
         start, _ = self._settled_throughout(setting)
-        return fitter.fit(start, slopes if kinds[0] == kinds[1] else None)
+        return fitter.fit(start, slopes)
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
