@@ -5,7 +5,7 @@ commands.
 import copy
 import dataclasses
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -114,10 +114,7 @@ class ThrowModel(Model):
         self.channels = [*_measured(flights, carries), *(kind.channel for kind in self._direct)]
         thrown = any(f.latch != NEVER for f in flights)
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
-        if only is not None:
-            expect_known(only, concerned, "no effect '{}' for these flights", DiagnoseError)
-            concerned = {name: concerned[name] for name in only}
-        self._choose(concerned)
+        self._choose(concerned, concerned if only is None else only)
         fitter = self._initial_fit(self.setting)
         begun = fitter.fit(states)
         # states at theta = 0, and the samples' derivatives by them; None: of other windows
@@ -145,13 +142,17 @@ class ThrowModel(Model):
             states, _ = self._settled_throughout(self.setting)
         return states
 
-    def _choose(self, effects: Mapping[str, SettingEffect]) -> None:
-        """Take these effects: first those that are simulated by degrees, then switches, then what
-        only cameras see.
+    def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
+        """Take effects by their names: first those that are simulated by degrees, then switches,
+        then what only cameras see.
+
+        Raises DiagnoseError: one does not concern these flights.
         """
-        self._sighted = [e for e in effects.values() if needs_no_flight(e)]
-        self._graded = [e for e in effects.values() if not e.switch and e not in self._sighted]
-        self._switched = [e for e in effects.values() if e.switch]
+        expect_known(names, concerned, "no effect '{}' for these flights", DiagnoseError)
+        effects = [concerned[name] for name in names]
+        self._sighted = [e for e in effects if needs_no_flight(e)]
+        self._graded = [e for e in effects if not e.switch and e not in self._sighted]
+        self._switched = [e for e in effects if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
         self._secants: dict[
