@@ -1,9 +1,10 @@
 """Selection of causes: Occam's window by the statistics, the simulation as judge among its best.
 
 One loop over sets of candidates of every kind: list the sets near the best by the linear statistics
-(:mod:`visthrow.diagnose.select.occam`), simulate the best of them, go over to the one that is worth
-most, linearise there, and repeat until the best set stays. Candidates that need the model's own
-latent forces, terms of laws, are offered once no other set is worth more.
+(:mod:`visthrow.diagnose.select.occam`), simulate the most promising until what one gains exceeds
+what the next promises, go over to the best, linearise there, and repeat until the best set stays.
+What was simulated is remembered: it tells how far short of its promise a move falls. Candidates
+that need the model's own latent forces, terms of laws, are offered once no other set is worth more.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -120,8 +121,8 @@ class Selector:
         """Return the penalty of a set [nats].
 
         That an effect differs among flights is a second claim beside its being there. What acts in
-        the block of a law may be a part of its form and must be worth more than
-        elsewhere. Without a calm phase to compare with, a law stands in place of all names."""
+        the block of a law may be a part of its form and must be worth more than elsewhere. Without
+        a calm phase to compare with, a law stands in place of all names."""
         counted = without_means(chosen)
         total = sum(c.claims * self.threshold + c.penalty for c in counted)
         forms = laws_of(chosen)
