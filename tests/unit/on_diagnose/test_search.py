@@ -16,6 +16,7 @@ from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import held_out, result, search
 from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
+from visthrow.diagnose.select.point import Problem, linearise
 from visthrow.diagnose.select.selection import Selector
 
 EFFECTS = catalogue(12)
@@ -407,6 +408,21 @@ def test_a_set_that_is_not_admissible_does_not_end_the_search(monkeypatch):
     )
     assert "effect_07" in diagnosis.theta
     assert "effect_03" not in diagnosis.theta
+
+
+def test_a_set_that_was_the_best_before_stays_possible():
+    model = world(truth={"effect_06": 15.0}, seed=4)
+    for w in model._windows:  # hardly to be told from it
+        w.effects[:, 8] = w.effects[:, 6] + 0.03 * w.effects[:, 3]
+    problem = Problem.of(model, model.windows({}), range(14))
+    selector = Selector(problem, linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
+    twin = frozenset(c for c in selector.candidates if c.name == "effect_08")
+    selector.run(twin)
+    assert [step.named for step in selector.steps] == ["effect_06"]
+    assert {c.name for trial, _ in selector.window for c in trial.chosen} == {
+        "effect_06",
+        "effect_08",
+    }
 
 
 def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):

@@ -222,6 +222,11 @@ class Selector:
         for t in sorted(tried, key=lambda t: t.ahead):
             rivals[t.chosen] = t
         close = [t for t in rivals.values() if -t.ahead < STRONG and self.is_admissible(t)]
+        close += [  # sets that were the best before
+            Trial(s, self.best.point, ahead=nats)
+            for s, nats in self._simulated.items()
+            if s in self._visited - {self.best.chosen} and nats > -STRONG
+        ]
         close.sort(key=lambda t: -t.ahead)
         self.window = [(self.best, 0.0), *((t, -t.ahead) for t in close)]
         return False
