@@ -40,7 +40,6 @@ from visthrow.diagnose.select.scatter import (
     COARSE,
     DAY,
     REACH,
-    Varies,
     by_day,
     evidence_of,
     freed,
@@ -95,10 +94,6 @@ class Linear:
             self._shares[chosen] = listed, occam
         return self._shares[chosen]
 
-    def varies(self, chosen: Names) -> Varies:
-        """Return the random shares of a set."""
-        return varies_of(self.shares(chosen)[0], self.days)
-
     def _deviation(
         self, chosen: Names, fixed: dict[Candidate, float], c: Candidate
     ) -> tuple[float, float]:
@@ -142,7 +137,7 @@ class Linear:
         return self._values[chosen]
 
     def _freed(self, chosen: Names) -> Statistics:
-        return freed(self.statistics, self.varies(chosen))
+        return freed(self.statistics, varies_of(self.shares(chosen)[0], self.days))
 
     def total(self, chosen: Names) -> tuple[np.ndarray, np.ndarray]:
         """Return information and score of all flights beside a set's random shares."""
