@@ -1,10 +1,9 @@
 """The log of a training: what stands in the file, what is left, what is printed."""
 
 import csv
-import math
 
 import numpy as np
-from pytest import approx, fixture, mark
+from pytest import approx, fixture
 
 from visthrow.task.measurement import Throws
 from visthrow.training import progress
@@ -41,13 +40,6 @@ def test_the_lines_show_errors_landings_and_the_time_left(tmp_path, clock, capsy
     assert "0.0500 m, 1.000 s, landed 66.7 %" in line
     assert float(rows_of(tmp_path / "p.csv")[-1]["error_2m"]) == approx(0.05)
     assert float(rows_of(tmp_path / "p.csv")[-1]["landed_2m"]) == approx(2 / 3)
-
-
-@mark.parametrize(
-    ("seconds", "text"), [(0, "0:00"), (65.2, "1:05"), (3661, "1:01:01"), (math.inf, "-")]
-)
-def test_clock(seconds, text):
-    assert progress.clock(seconds) == text
 
 
 def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, clock, capsys):
