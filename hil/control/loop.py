@@ -128,8 +128,7 @@ class Loop:
         )
         early = source.poll(clock.now())
         runner.take_poses(early)
-        if ticker.due() - clock.now() > 0.5 * LEAD:
-            runner.warm()
+        runner.warm(ticker.due() - clock.now())
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed
