@@ -171,16 +171,9 @@ class Linearisation:
             resume = first_knot + knots + max(knot - 1, 0)
             force = axis, knot, LATENT_SIZES[axis]
             lanes.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
-        # lanes that ride along follow the nominal one
-        order = [*np.argsort(~alike, kind="stable"), *range(len(alike), len(lanes))]
         nominal = Lane(w, 0, w, keep=first_knot, shared=int(alike.sum()))
         rough = Lane(w, 0, w, keep=first_knot + knots, rough=True)
-        numbers = [-1, *(i for i in order if not lanes[i].rough)]
-        split = len(numbers)
-        numbers += [-1, *(i for i in order if lanes[i].rough)]
-        flown = [nominal, *(lanes[i] for i in numbers[1:split])]
-        flown += [rough, *(lanes[i] for i in numbers[split + 1 :])]
-        places = np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
+        flown, split, places = _in_order(lanes, alike, nominal, rough)
         return Plan(w, first, first_knot, split, places, nuisances, latents), flown
 
     def _slopes(self, measured: torch.Tensor, plan: Plan) -> list[torch.Tensor]:
@@ -241,6 +234,23 @@ class Linearisation:
             c.after_slack,
         )
         return without_calm_speeds(window, self._blocks, self._setting.plant.air.wind_w)
+
+
+def _in_order(
+    lanes: Sequence[Lane], alike: np.ndarray, nominal: Lane, rough: Lane
+) -> tuple[list[Lane], int, np.ndarray]:
+    """Put lanes of nominal steps behind the nominal lane, first those that ride along, and the
+    others behind the rough one.
+
+    Returns all lanes, the place of the rough one, and of each given lane the place.
+    """
+    order = [*np.argsort(~alike, kind="stable"), *range(len(alike), len(lanes))]
+    numbers = [-1, *(i for i in order if not lanes[i].rough)]
+    split = len(numbers)
+    numbers += [-1, *(i for i in order if lanes[i].rough)]
+    flown = [nominal, *(lanes[i] for i in numbers[1:split])]
+    flown += [rough, *(lanes[i] for i in numbers[split + 1 :])]
+    return flown, split, np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
 
 
 def at_knots(

@@ -162,16 +162,7 @@ class ReplayedFlights:
             name: fields[name].astype(int if kind[0] == "int" else float)
             for name, kind in WINDOW_FIELDS.items()
         }
-        vehicle, attitude, payload, gyro = zip(*self.samples)
-        data = {
-            "command_time": np.concatenate([f.command_time for f in self.flights]),
-            "command": np.concatenate([f.command for f in self.flights]),
-            "vehicle_time": np.concatenate([part.time for part in vehicle]),
-            "vehicle_quat": np.concatenate([part.values for part in attitude]),
-            "payload_time": np.concatenate([part.time for part in payload]),
-            "gyro_time": np.concatenate([part.time for part in gyro]),
-        }
-        self.recording = Recording(self.windows, data)
+        self.recording = Recording(self.windows, self._recorded())
         self.rows = self.recording.rows
         self._groups = [_groups_of(*samples) for samples in self.samples]
         self.sigma = [
@@ -186,6 +177,18 @@ class ReplayedFlights:
             measured = np.zeros((len(groups), 3))  # attitudes are measured against themselves
             measured[groups != 1] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
+
+    def _recorded(self) -> dict[str, np.ndarray]:
+        """Return commands and stamps of all windows, as the kernel reads them."""
+        vehicle, attitude, payload, gyro = zip(*self.samples)
+        return {
+            "command_time": np.concatenate([f.command_time for f in self.flights]),
+            "command": np.concatenate([f.command for f in self.flights]),
+            "vehicle_time": np.concatenate([part.time for part in vehicle]),
+            "vehicle_quat": np.concatenate([part.values for part in attitude]),
+            "payload_time": np.concatenate([part.time for part in payload]),
+            "gyro_time": np.concatenate([part.time for part in gyro]),
+        }
 
     def _samples_in(self, c: Cut, delays: tuple[float, float, float]) -> list[ChannelSamples]:
         """Return the window's samples of vehicle, attitude, payload and gyro."""

@@ -187,22 +187,29 @@ class ThrowModel(Model):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
         fitted = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)]
         self._latest[self._switches(theta)] = states, fitted
+        listed = self._with_switches(theta, listed)
+        return [
+            with_direct(w, number, self._direct, self.channels, settings, steps)
+            for number, w in zip(self._retained, listed)
+        ]
+
+    def _with_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
+        """Return windows with columns of other kinds of blocks, and empty ones of what cameras
+        alone show.
+        """
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, listed)
         blank = [np.zeros(len(w.residual)) for w in listed]  # of effects that a camera alone shows
         columns = [*(self._secants[e.name] for e in self._switched), *[blank] * len(self._sighted)]
         if columns:
-            listed = [
+            return [
                 dataclasses.replace(
                     w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1)))
                 )
                 for i, w in enumerate(listed)
             ]
-        return [
-            with_direct(w, number, self._direct, self.channels, settings, steps)
-            for number, w in zip(self._retained, listed)
-        ]
+        return listed
 
     def _secant(
         self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
