@@ -20,12 +20,11 @@ from hil.links.team_link import TeamLink
 from hil.poses.sources.images import Eyes
 from hil.poses.sources.pose_source import Source
 
-LEAD = 4e-3
-LEAD_SPREAD = 4e-3
-"""Before a tick the poses that have come are taken in [s], so that the tick finds the last ones
-alone, and the policy's weights are brought into the caches; earlier by a share of the second number
-that goes round from tick to tick, so that the link is looked at, and peers are asked for their
-time, at any point of their periods.
+LEAD = 1e-3
+LEAD_SPREAD = 5e-3
+"""Before a tick the poses that have come are taken in [s], so that the tick finds the last one or
+two alone; earlier by a share of the second number that goes round from tick to tick, so that the
+link is looked at, and peers are asked for their time, at any point of their periods.
 """
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -128,7 +127,6 @@ class Loop:
         )
         early = source.poll(clock.now())
         runner.take_poses(early)
-        runner.warm(ticker.due() - clock.now())
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed

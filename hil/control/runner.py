@@ -70,14 +70,6 @@ class Runner:
         except Exception as error:  # as in tick
             self._early_error = error
 
-    def warm(self, left: float) -> None:
-        """Have the policy ready in the caches where it ran in the last tick, and where twice the
-        time that it took then is left before the next one [s].
-        """
-        spent = self.parts.spent
-        if "policy" in spent and left > 2.0 * (spent["observation"] + spent["policy"]):
-            self.pilot.warm()
-
     def tick(
         self,
         time: float,

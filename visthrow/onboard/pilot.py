@@ -160,7 +160,6 @@ class Pilot:
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
-        self._inputs: tuple[np.ndarray, ...] = ()  # keypoints that a detector saw in the last step
         self._previous = self._first.repeat(self.count, 0)
         shape = (self.count, 1 + self.layout.history, self.layout.payload)
         self._history = np.zeros(shape, dtype=np.float32)
@@ -212,7 +211,6 @@ class Pilot:
         attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
         inputs = () if keypoints is None else tuple(map(np.asarray, keypoints))
-        self._inputs = inputs
         observation, *state = self._seen(views, inputs)
         if now is not None and self._bridged(now, state):
             observation, *state = self._seen(views, inputs)
@@ -230,13 +228,6 @@ class Pilot:
         points, valid = frame if frame else (None, None)
         self.spent = (decided - begin, time.perf_counter() - decided)
         return PilotOutput(action, command, release, observation, points, valid)
-
-    @torch.inference_mode()
-    def warm(self) -> None:
-        """Compute the last step again and forget it, so that programs and weights are in the caches
-        when the next step comes.
-        """
-        self._decide(self._seen(self._views, self._inputs)[0], self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of

@@ -596,17 +596,3 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
 
     pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
     assert pilot.tracks["payload"].gate.refused["cable"] > 10
-
-
-def test_caches_are_warmed_where_the_policy_ran_and_time_is_left(monkeypatch):
-    warmed = []
-    pilot = runner()
-    monkeypatch.setattr(pilot.pilot, "warm", lambda: warmed.append(pilot.parts.spent))
-    for spent, left in (
-        ({"estimate": 1e-4}, 0.01),
-        ({"observation": 1e-3, "policy": 3e-3}, 0.007),
-        ({"observation": 1e-3, "policy": 3e-3}, 0.009),
-    ):
-        pilot.parts.spent = spent
-        pilot.warm(left)
-    assert warmed == [{"observation": 1e-3, "policy": 3e-3}], "twice the time that it took"

@@ -7,12 +7,10 @@ import torch
 from numpy.testing import assert_allclose
 from pytest import approx, mark
 
-from hil.params import HilParams
 from tests.hil_flight import simple_policy
-from visthrow import config
 from visthrow.onboard.observations import RESPONSE, resampled
 from visthrow.onboard.pilot import Pilot
-from visthrow.onboard.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy
 
 PERIOD = 0.02
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -90,14 +88,3 @@ def test_a_release_that_was_not_done_is_not_told():
     seen(pilot, PERIOD, PERIOD)
     pilot.not_released()
     assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"
-
-
-def test_a_warmed_pilot_decides_the_same_bits():
-    policy = Policy.load(find_policy("vision"))
-    camera = config.load(HilParams, config.find("hil", "dry_run")).camera
-    cold, warmed = Pilot(policy, camera), Pilot(policy, camera)
-    for step in range(6):
-        expected = seen(cold, PERIOD * step, PERIOD * step)
-        assert (seen(warmed, PERIOD * step, PERIOD * step) == expected).all()
-        warmed.warm()
-        assert (warmed.previous_action == cold.previous_action).all()
