@@ -12,7 +12,6 @@ import signal
 import subprocess
 import sys
 import time
-import tomllib
 from types import SimpleNamespace
 
 import torch
@@ -25,6 +24,7 @@ from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.common import storage
 from visthrow.common.errors import TrainError
+from visthrow.common.toml_text import tables_beside
 from visthrow.onboard import observations
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.paper import measurements
@@ -325,7 +325,7 @@ def test_another_solver_keeps_its_rope_and_steps(name):
 def test_the_recorded_seeds_are_those_of_the_record():
     record = measurements.load(measurements.FOLDER / "train-state-fast-seeds-h100.json")
     errors = [run["error"]["2.0"] for run in record["figures"]["runs"]]
-    recorded = tomllib.loads(session.RECORDED.read_text(encoding="utf-8"))
+    recorded = tables_beside(session.__file__, "recorded.toml")
     assert recorded == {"state_fast": approx(errors, abs=5.1e-5)}  # four digits are kept
 
 
