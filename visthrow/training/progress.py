@@ -103,7 +103,9 @@ class TrainLog:
     def _remaining(self, iteration: int, elapsed: float) -> float:
         """Time to the last iteration or the end of the minutes at the speed so far [s]."""
         remaining = (self.last - iteration) * elapsed / max(iteration - self.done, 1)
-        return remaining if self.minutes is None else min(remaining, 60.0 * self.minutes - elapsed)
+        if self.minutes is None:
+            return remaining
+        return max(min(remaining, 60.0 * self.minutes - elapsed), 0.0)
 
 
 def evaluated(throws: Throws) -> dict[str, float]:

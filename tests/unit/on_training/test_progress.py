@@ -50,12 +50,17 @@ def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, cl
     with progress.TrainLog(tmp_path / "p.csv", 1000, 10, done=2, minutes=1.0) as log:
         clock[0] += 10.0
         log.row(FIGURES | {"iteration": 3}, throws())
+        clock[0] += 60.0
+        log.row(FIGURES | {"iteration": 4}, throws())
     assert [(int(r["iteration"]), float(r["wall_s"])) for r in rows_of(tmp_path / "p.csv")] == [
         (1, 10.0),
         (2, 20.0),
         (3, 30.0),
+        (4, 90.0),
     ]
-    assert "0:50 left" in capsys.readouterr().out  # the minute ends before the seven iterations
+    before, after = capsys.readouterr().out.splitlines()
+    assert "0:50 left" in before  # the minute ends before the seven iterations
+    assert ", 0:00:00 left" in after
 
 
 def test_what_no_throw_reaches_is_no_error():
