@@ -315,6 +315,19 @@ def test_ppo_trains_in_a_coarser_simulator_and_its_policy_is_for_the_plant():
     assert run.experiment == experiment
 
 
+def test_the_policy_of_ppo_has_the_mean_of_the_last_iterations_weights():
+    experiment = config.load(Experiment, config.find("train", "laptop"), SMALL)
+    run = Trainer(experiment, "cpu", 1)
+    mean = torch.zeros(())
+    for iteration in range(3):
+        run.step()
+        last = run.algorithm.alg.actor.mlp[0].weight.detach().clone()
+        mean = mean + (last - mean) * 4.0 / (iteration + 4.0)
+    exported = run.algorithm.export(contract_of(experiment), {}).weights[0]
+    torch.testing.assert_close(exported, mean)
+    assert (exported - last).abs().max() > 1e-5
+
+
 @mark.parametrize("name", ["state_box", "state_two_cables", "state_rod_gripper"])
 def test_another_solver_keeps_its_rope_and_steps(name):
     experiment = load_experiment(name)

@@ -221,8 +221,8 @@ class PPOParams(Bounded):
     segments: Annotated[int, Bound(0)] = 0
     # shortest step that training simulates, with the solver chain; 0 for the plant's [s]
     substep: NotNegative = 0.0
-    # whether weight matrices step along their orthogonalised momentum; see
-    # visthrow.training.ppo.network.MuonAdam
+    # whether PPO's weight matrices step along their orthogonalised momentum, as those of first
+    # order and distillation always do; see visthrow.training.ppo.network.MuonAdam
     muon: bool = False
     critic: Counts = ()  # hidden layers of the critic; empty for the actor's
     # iterations at the beginning in which the critic alone learns
