@@ -128,7 +128,7 @@ class CflibPort:
         packet = self._link.receive_packet(0)
         return None if packet is None else bytes([packet.header]) + bytes(packet.data)
 
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+    def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         packet = self._packet(data[0])
         packet.data = data[1:]
         self._link.send_packet(packet)

@@ -82,7 +82,7 @@ class Port(Protocol):
     def read(self) -> bytes | None:
         """Return the next chunk; None where there is none."""
 
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+    def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         """Return whether the bytes were taken; on UDP for an address, where the device does not
         name it.
         """
@@ -125,7 +125,7 @@ class _Opened:
         self._open.close()
 
 
-def refused(port: str, number: int, error: OSError, other: str = "") -> LinkError:
+def refused(port: str, number: int, error: OSError, option: str = "") -> LinkError:
     """Return the error that says why a port of this machine cannot be listened on and, where
     another program has it, what to do.
 
@@ -133,7 +133,7 @@ def refused(port: str, number: int, error: OSError, other: str = "") -> LinkErro
         port: Its name, as ``udp:127.0.0.1:14560``.
         number: Its number.
         error: What the system said.
-        other: Option that names another port.
+        option: Option that names another port.
     """
     if error.errno == errno.EADDRNOTAVAIL:
         return LinkError(
@@ -145,7 +145,7 @@ def refused(port: str, number: int, error: OSError, other: str = "") -> LinkErro
     return LinkError(
         f"cannot listen on {port}: another program has it, perhaps a second `visthrow hil`, a"
         f" ground station or a simulator; `ss -{port[0]}lnp 'sport = :{number}'` shows which. End"
-        f" it, or take another port{other and ': ' + other}"
+        f" it, or take another port{option and ': ' + option}"
     )
 
 
@@ -154,10 +154,10 @@ class UdpPort(_Opened):
 
     whole = True
 
-    def __init__(self, device: Device, other: str = "") -> None:
+    def __init__(self, device: Device, option: str = "") -> None:
         """Open it; raises `LinkError` where the address is taken or not this machine's.
 
-        ``other``: as of `refused`.
+        ``option``: as of `refused`.
         """
         family = socket.AF_INET6 if ":" in device.host else socket.AF_INET
         self._open = socket.socket(family, socket.SOCK_DGRAM)
@@ -170,7 +170,7 @@ class UdpPort(_Opened):
         except OSError as error:
             self._open.close()
             raise refused(
-                f"{device.kind}:{device.host}:{device.port}", device.port, error, other
+                f"{device.kind}:{device.host}:{device.port}", device.port, error, option
             ) from error
 
     def read(self) -> bytes | None:
@@ -181,10 +181,10 @@ class UdpPort(_Opened):
         self.sender = sender[:2]
         return data
 
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
-        to = self.peer or to
+    def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
+        address = self.peer or address
         try:
-            return to is not None and self._open.sendto(data, to) == len(data)
+            return address is not None and self._open.sendto(data, address) == len(data)
         except OSError:
             return False
 
@@ -204,7 +204,7 @@ class _Stream(_Opened):
         except OSError:
             return None
 
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+    def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         try:
             return self._put(data) == len(data)
         except OSError:
@@ -254,11 +254,11 @@ class SerialPort(_Stream):
         self._put = self._open.write
 
 
-def open_port(device: Device, other: str = "") -> Port:
+def open_port(device: Device, option: str = "") -> Port:
     """Open the port of a checked device string; raises `LinkError` where it cannot be opened.
 
-    ``other``: the option that names another device; it stands in the message of a port that is
+    ``option``: the option that names another device; it stands in the message of a port that is
     taken."""
     if device.kind in ("udp", "udpout"):
-        return UdpPort(device, other)
+        return UdpPort(device, option)
     return TcpPort(device) if device.kind == "tcp" else SerialPort(device)

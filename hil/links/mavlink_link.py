@@ -14,7 +14,7 @@ from typing import Any
 from hil.links.clock import TimeSync
 from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
 from hil.links.pymav import Parser, Signed, mav
-from hil.links.roster import Address, Roster, Seen, shown
+from hil.links.roster import Address, Roster, Traffic, address_text
 from hil.links.writer import TlogWriter
 from hil.poses.pose import Pose, Quaternion, Vector
 from visthrow.common.rotations import quat_of_euler, rotate_one
@@ -127,10 +127,10 @@ class Link:
             count += 1
         for forged in self.parser.forged:
             ids = forged[IDS[forged[0]]]
-            self.roster.refuse(Seen(self.sender, *ids, "message", "no valid signature"))
+            self.roster.refuse(Traffic(self.sender, *ids, "message", "no valid signature"))
         return count
 
-    def send(self, message: Any, to: Address = None) -> bool:
+    def send(self, message: Any, address: Address = None) -> bool:
         """Send a message, to one address or to the autopilot's where it names a target, else to all
         parties'; whether the port took it.
         """
@@ -142,7 +142,7 @@ class Link:
             self.dropped += 1
             return False
         self._mav.seq = (self._mav.seq + 1) % 256
-        addresses = (to,) if to is not None else self.roster.addresses(message) or (None,)
+        addresses = (address,) if address is not None else self.roster.addresses(message) or (None,)
         taken = all([self.port.write(data, address) for address in addresses])
         if taken and self._tlog is not None:
             self._tlog.write(message)
@@ -298,7 +298,7 @@ class LinkSync:
         """Return offsets and round trips [s] by system and address."""
         return {
             "peers": {
-                f"{system} at {shown(address)}": {
+                f"{system} at {address_text(address)}": {
                     "offset": peer.offset,
                     "round_trip": peer.round_trip,
                     "steps": peer.steps,

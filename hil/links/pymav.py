@@ -53,15 +53,15 @@ class Parser:
         """
         self.forged = []
         try:
-            found = self._mav.parse_buffer(data) or []
+            parsed = self._mav.parse_buffer(data) or []
         except Exception:  # pymavlink's state is not to be trusted afterwards
             self.errors += 1
             self._fresh()
             return []
-        messages = [message for message in found if message.get_msgId() >= 0]
-        self.errors += len(found) - len(messages)
-        if len(found) > len(messages):
-            bad = (message for message in found if message.get_msgId() < 0)
+        messages = [message for message in parsed if message.get_msgId() >= 0]
+        self.errors += len(parsed) - len(messages)
+        if len(parsed) > len(messages):
+            bad = (message for message in parsed if message.get_msgId() < 0)
             self.forged = [
                 bytes(message.data) for message in bad if getattr(message, "reason", "") == FORGED
             ]
@@ -78,7 +78,7 @@ KEY_BYTES = 32
 TICKS = 100_000  # of a signature's time a second
 EPOCH = 1_420_070_400.0  # 2015-01-01, where time stamps of signatures begin [s since 1970]
 # that the first message of a stream may be behind our clock: a minute, in units of 10 us
-BEHIND = 6_000_000
+LAG_LIMIT = 6_000_000
 MOST_STREAMS = 256  # streams of valid signatures; more than 255 link ids of one sender are none
 LEAST_WORD = 8  # characters of a pass phrase
 
@@ -152,7 +152,7 @@ class Signed(mav.MAVLink):
         stream = (link, srcSystem, srcComponent)
         last = self.signing.stream_timestamps
         stamp = int.from_bytes(units, "little")
-        if stamp <= last.get(stream, stamp_now() - BEHIND) or (
+        if stamp <= last.get(stream, stamp_now() - LAG_LIMIT) or (
             stream not in last and len(last) >= MOST_STREAMS
         ):
             return False

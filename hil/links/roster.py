@@ -53,8 +53,8 @@ class Party:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """The count of messages from one sender."""
+class Traffic:
+    """Messages of one kind from one sender."""
 
     address: Address
     system: int | None
@@ -65,15 +65,15 @@ class Seen:
     def text(self) -> str:
         """Return it in words."""
         ids = "" if self.system is None else f" of system {self.system}, component {self.component}"
-        return f"{self.kind}{ids} from {shown(self.address)}" + (
+        return f"{self.kind}{ids} from {address_text(self.address)}" + (
             f": {self.why}" if self.why else ""
         )
 
 
-OTHERS = Seen(None, None, None, "others")
+OTHER_TRAFFIC = Traffic(None, None, None, "others")
 
 
-def shown(address: Address) -> str:
+def address_text(address: Address) -> str:
     """Return an address in words."""
     if address is None:
         return "the link's peer"
@@ -139,7 +139,7 @@ class Roster:
         self.at: dict[str, Address] = {}
         self.heard: dict[str, float] = {}
         self.flying = self.simulated = False
-        self.seen: dict[Seen, int] = {}
+        self.seen: dict[Traffic, int] = {}
         self.refused = 0
         self.only: Address = None
         self.moved: list[Callable[[Party], None]] = []
@@ -151,7 +151,7 @@ class Roster:
         """
         why = None
         if address is not None and self.only not in (None, address):
-            why = f"the link's device is {shown(self.only)}"
+            why = f"the link's device is {address_text(self.only)}"
         elif (
             address is not None
             and self._allow
@@ -163,21 +163,21 @@ class Roster:
         ):
             why = "another sender while it flies"
         if why is not None:
-            self.refuse(Seen(address, None, None, "datagram", why))
+            self.refuse(Traffic(address, None, None, "datagram", why))
         return why is not None
 
-    def refuse(self, seen: Seen, count: int = 1) -> None:
+    def refuse(self, traffic: Traffic, count: int = 1) -> None:
         """Count what is not taken, and say who sent it."""
         self.refused += count
-        self._count(seen, count)
-        who = (seen.address, seen.system, seen.component, seen.why)
+        self._count(traffic, count)
+        who = (traffic.address, traffic.system, traffic.component, traffic.why)
         if self.tell is not None and who not in self._said and len(self._said) < MOST_SAID:
             self._said.add(who)
-            self.tell(f"refused: {seen.text()}")
+            self.tell(f"refused: {traffic.text()}")
 
-    def _count(self, seen: Seen, count: int = 1) -> None:
-        seen = seen if seen in self.seen or len(self.seen) < MOST_KEPT else OTHERS
-        self.seen[seen] = self.seen.get(seen, 0) + count
+    def _count(self, traffic: Traffic, count: int = 1) -> None:
+        traffic = traffic if traffic in self.seen or len(self.seen) < MOST_KEPT else OTHER_TRAFFIC
+        self.seen[traffic] = self.seen.get(traffic, 0) + count
 
     def admit(self, message: Any, address: Address, host_time: float) -> bool:
         """Return whether a message is one of a party's; binds the party to its sender's address at
@@ -190,18 +190,19 @@ class Roster:
         if party is None and any(
             p.has(system, component) and self.at.get(p.name, ...) == address for p in self.parties
         ):
-            self._count(Seen(address, system, component, kind))  # a party's, that nobody asked for
+            # a party's, that nobody asked for
+            self._count(Traffic(address, system, component, kind))
             return False
         if self.parties:
             why = self._objection(party, message, kind, address, host_time)
         else:
             why = None if self.at.setdefault("peer", address) == address else "a second sender"
-        seen = Seen(address, system, component, kind, why or "")
+        traffic = Traffic(address, system, component, kind, why or "")
         # a message before a party's first is no stranger's
         if why is not None and not why.startswith(NOT_YET):
-            self.refuse(seen)
+            self.refuse(traffic)
         else:
-            self._count(seen)
+            self._count(traffic)
         if why is not None or party is None:
             return why is None
         self.heard[party.name] = host_time
@@ -211,7 +212,7 @@ class Roster:
         self.at[party.name] = address
         if before != address:
             if self.tell is not None:
-                self.tell(f"the {party.name} speaks from {shown(address)} now")
+                self.tell(f"the {party.name} speaks from {address_text(address)} now")
             for call in self.moved:
                 call(party)
         return True
@@ -254,13 +255,13 @@ class Roster:
 
     def _taken(self, name: str, address: Address, host_time: float) -> str | None:
         """Return why an address may not speak for a name that another one speaks for, or None."""
-        at = self.at.get(name, address)
-        if at == address:
+        bound = self.at.get(name, address)
+        if bound == address:
             return None
         if self.flying:
-            return f"another sender while it flies; the {name} speaks from {shown(at)}"
+            return f"another sender while it flies; the {name} speaks from {address_text(bound)}"
         if host_time - self.heard[name] < SILENT:
-            return f"a second sender; the {name} speaks from {shown(at)}"
+            return f"a second sender; the {name} speaks from {address_text(bound)}"
         return None
 
     def claim(self, name: str, address: Address, host_time: float) -> bool:
@@ -269,7 +270,7 @@ class Roster:
         """
         why = self._taken(name, address, host_time)
         if why is not None:
-            self.refuse(Seen(address, None, None, name, why))
+            self.refuse(Traffic(address, None, None, name, why))
             return False
         self.at[name] = address
         self.heard[name] = host_time
@@ -277,7 +278,7 @@ class Roster:
 
     def drop(self, address: Address, kind: str, why: str, count: int = 1) -> None:
         """Count what a source could not take from a sender, and say it once."""
-        self.refuse(Seen(address, None, None, kind, why), count)
+        self.refuse(Traffic(address, None, None, kind, why), count)
 
     def expected(self) -> str:
         """Return the parties in words."""
@@ -299,12 +300,18 @@ class Roster:
     def summary(self) -> dict[str, Any]:
         """Return who was heard from where, and what was refused, most first."""
         refused = sorted(
-            ((n, seen) for seen, n in self.seen.items() if seen.why or seen is OTHERS),
+            (
+                (n, traffic)
+                for traffic, n in self.seen.items()
+                if traffic.why or traffic is OTHER_TRAFFIC
+            ),
             key=lambda row: -row[0],
         )
         return {
-            "at": {name: shown(address) for name, address in self.at.items()},
+            "at": {name: address_text(address) for name, address in self.at.items()},
             "simulated": self.simulated,
             "refused": self.refused,
-            "refused_most": [{"count": n, "what": seen.text()} for n, seen in refused[:MOST_SAID]],
+            "refused_most": [
+                {"count": n, "what": traffic.text()} for n, traffic in refused[:MOST_SAID]
+            ],
         }

@@ -121,7 +121,7 @@ class LoggedPort:
             self._note(b">", data)
         return data
 
-    def write(self, data: bytes, to: tuple[str, int] | None = None) -> bool:
+    def write(self, data: bytes, address: tuple[str, int] | None = None) -> bool:
         taken = self._port.write(data)
         if taken:
             self._note(b"<", data)

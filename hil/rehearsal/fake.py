@@ -167,7 +167,7 @@ class Witness:
             self._note(time, f"command {command} is not finite")
             return
         self.worst = [max(w, abs(c)) for w, c in zip(self.worst, command)]
-        if command[0] < 0.0 or any(abs(c) > ROOM * most for c, most in zip(command, self.limits)):
+        if command[0] < 0.0 or any(abs(c) > ROOM * limit for c, limit in zip(command, self.limits)):
             self._note(time, f"command {command} beyond {self.limits}")
 
     def release(self, time: float, armed: bool, payload_w: np.ndarray) -> None:
@@ -499,8 +499,8 @@ class Bridge(Fake):
         params: Any,
         autopilot: Any = None,
     ) -> None:
-        """Connect to an autopilot; ``params`` of its back-end, ``autopilot``: what it is reached by
-        where that is made before.
+        """Connect to an autopilot; ``params`` of its back-end; ``autopilot``: its link or pipe,
+        where that is open already.
         """
         super().__init__(plant, link, mocap, seed, options)
         self.params = params

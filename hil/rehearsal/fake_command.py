@@ -75,8 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="KEY=VALUE",
         help=option,
     )
-    own = "where a fake listens that has a port of its own"
-    add("--msp-port", type=PORT, default=14561, help=own)
+    msp = "where a fake listens that has a port of its own"
+    add("--msp-port", type=PORT, default=14561, help=msp)
     program = "of --kind betaflight-sitl: Betaflight's for a PC, to fly the plant's motors"
     add("--firmware", metavar="PROGRAM", help=program)
     folder = "of the firmware's settings and blackbox"
@@ -142,17 +142,19 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
             )
         firmware = Firmware(args.firmware, args.folder)
         ends.callback(firmware.stop)
-        kept = firmware.set_up(needed(params.betaflight))
+        settings = firmware.set_up(needed(params.betaflight))
         firmware.start()
         print(
-            "".join(f"{name:28} {value}\n" for name, value in kept.items()), end="", file=sys.stderr
+            "".join(f"{name:28} {value}\n" for name, value in settings.items()),
+            end="",
+            file=sys.stderr,
         )
         flown = BetaflightSitl(*vehicle, params.betaflight, firmware.stands)
         flown.sensors.start()
-        said = "the firmware has its settings; it flies"
+        status = "the firmware has its settings; it flies"
     elif args.kind == "ardupilot-sitl":
         flown = ArduPilotSitl(*vehicle, params.ardupilot)
-        said = "waiting for ArduPilot: --model json:127.0.0.1"
+        status = "waiting for ArduPilot: --model json:127.0.0.1"
     else:
         flown = Px4Sih(
             *vehicle,
@@ -162,8 +164,8 @@ def _bridge(args: argparse.Namespace, vehicle: tuple[Any, ...], ends: ExitStack)
                 *BRIDGE_ID,
             ),
         )
-        said = f"waiting for PX4 on {args.autopilot}"
-    print(said, file=sys.stderr, flush=True)
+        status = f"waiting for PX4 on {args.autopilot}"
+    print(status, file=sys.stderr, flush=True)
     return flown
 
 
@@ -173,11 +175,11 @@ def make_ball(policy: str, seed: int) -> HangingBall:
     """
     contract = Policy.load(find_policy(policy)).contract
     rope = contract["rope"]
-    alone = contract["vehicle"]["body"]["mass"]
+    vehicle = contract["vehicle"]["body"]["mass"]
     return HangingBall(
         np.array(rope["mount"]),
         rope["length"] + rope["payload_offset"],
         BALL_LAG,
-        (alone + rope["rope_mass"] + rope["payload_mass"], alone),
+        (vehicle + rope["rope_mass"] + rope["payload_mass"], vehicle),
         contract["action"]["max_thrust"],
     )

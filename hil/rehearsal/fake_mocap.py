@@ -57,9 +57,9 @@ class Mocap:
             {name: truth[name][None].astype(float) for name in names}, noise, rng
         ).values()
         lost = rng.random(2) < p.loss
-        seen = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
+        bodies = ((VEHICLE, vehicle, quat[0].tolist()), (PAYLOAD, payload, (0.0, 0.0, 0.0, 1.0)))
         poses = [
             Pose(time, time + p.latency, body, tuple(pos[0].tolist()), tuple(attitude))
-            for body, pos, attitude in seen
+            for body, pos, attitude in bodies
         ]
-        return [pose for pose, gone in zip(poses, lost) if not gone]
+        return [pose for pose, is_lost in zip(poses, lost) if not is_lost]

@@ -29,14 +29,14 @@ def load_plant(target: str, policy: str, seed: int, changes: Sequence[str] = ())
     """
     try:
         make = resolve_name(target)
-        given = (policy, seed, *([changes] if changes else []))
-        inspect.signature(make).bind(*given)
+        arguments = (policy, seed, *([changes] if changes else []))
+        inspect.signature(make).bind(*arguments)
     except (ImportError, AttributeError, ValueError, TypeError) as error:
         raise RunError(
             f"plant '{target}': {error}; expected module:function, as"
             " visthrow.throws.wire_plant:make, called with policy and seed"
         ) from error
-    return make(*given)
+    return make(*arguments)
 
 
 def load_fake(kind: str) -> type[Fake]:
@@ -49,15 +49,15 @@ def load_fake(kind: str) -> type[Fake]:
         raise RunError(f"fake of kind '{kind}'; {suggest(kind, FAKES)}, or module:class")
     try:
         return resolve_name(target)
-    except (ImportError, AttributeError) as error:
+    except (ImportError, AttributeError, ValueError) as error:
         raise RunError(f"fake of kind '{kind}': {error}; expected module:class") from error
 
 
 def serve(
-    fake: Fake, clock: Clock, most: float, out: Path | None = None, after: float = AFTER_LANDING
+    fake: Fake, clock: Clock, limit: float, out: Path | None = None, after: float = AFTER_LANDING
 ) -> dict[str, Any]:
     """Fly in real time, or on a firmware's clock, until ``after`` seconds after the landing, for
-    ``most`` seconds, or until Ctrl-C; returns the report.
+    ``limit`` seconds, or until Ctrl-C; returns the report.
     """
     plant = fake.plant
     begun = fake.plant.time
@@ -67,10 +67,10 @@ def serve(
     heard: list[tuple[float, float]] = []  # first and last period on a firmware's clock
     fake.wall = lambda: plant.time + min(max(clock.now() - start - plant.time, 0.0), plant.period)
     fake.question_lag = 0.0
-    asked = StopRequest((signal.SIGINT,))
+    interrupt = StopRequest((signal.SIGINT,))
     # a collection of all takes a tenth of a second
-    with contextlib.suppress(KeyboardInterrupt), asked as stop, collected():
-        while plant.time - begun < most and not stop.asked:
+    with contextlib.suppress(KeyboardInterrupt), interrupt as stop, collected():
+        while plant.time - begun < limit and not stop.asked:
             time = plant.time + plant.period
             due = start + time
             if fake.paced:

@@ -27,7 +27,7 @@ CHOICES = {
     "hil/links/backends/audit.py": "ASK_AGAIN GIVE_UP GIVE_UP_OPTIONAL",
     "hil/links/backends/autopilot.py": "ASK_AGAIN CONFIRMATION_TIME STREAM SERVO_NEAR",
     "hil/links/backends/base.py": "REPEAT",
-    "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX NEAR KEEP_ALIVE OPEN_TIME"
+    "hil/links/backends/betaflight.py": "EXPIRES FEWEST_AUX ARRIVED KEEP_ALIVE OPEN_TIME"
     " ARM_LOW POLLS READ_BACK RATES_PERIOD RATES_TIME",
     "hil/links/backends/crazyflie.py": "ASK ARM_PERIOD HOLDS DESCENT SHORTEST",
     "tests/fakes/fake_crazyflie.py": "GYRO_NOISE",
@@ -37,15 +37,15 @@ CHOICES = {
     "hil/links/device.py": "MOST_CHUNKS MOST_SHUT_OUT",
     "hil/links/mavlink_link.py": "OUR_SYSTEM OUR_COMPONENT COMMAND_VALUES IDS MOST_PENDING"
     " ASK_EVERY EARLY LATE",
-    "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH BEHIND LEAST_WORD",
+    "hil/links/pymav.py": "KEY_BYTES TICKS EPOCH LAG_LIMIT LEAST_WORD",
     "hil/links/roster.py": "SILENT MOST_SAID",
     "hil/links/team_link.py": "WINDOW",
     "hil/links/writer.py": "MOST_WAITING WRITE_EVERY",
-    "hil/rehearsal/bridges/ardupilot_bridge.py": "LOW HIGH NEAR",
+    "hil/rehearsal/bridges/ardupilot_bridge.py": "LOW HIGH ARRIVED",
     "hil/rehearsal/bridges/betaflight_bridge.py": "ASK SAMPLE",
     "hil/rehearsal/bridges/betaflight_firmware.py": "LAST_WORDS LOOK_AGAIN START ANSWER END FREED",
-    "hil/rehearsal/bridges/packets.py": "TIME MOTORS LARGEST_ANSWER SEA_LEVEL STILL CALIBRATION",
-    "hil/rehearsal/bridges/px4_bridge.py": "STREAMS NEAR HALVING MOST_DAMPING SETTLING",
+    "hil/rehearsal/bridges/packets.py": "TIME MOTORS LARGEST_ANSWER SEA_LEVEL STEP CALIBRATION",
+    "hil/rehearsal/bridges/px4_bridge.py": "STREAMS ARRIVED HALVING MOST_DAMPING SETTLING",
     "hil/rehearsal/fake.py": "MOST_EVENTS ROOM DESCENT LOWEST TOUCH GOES_ON COVARIANCES THRUST",
     "hil/rehearsal/fake_command.py": "BRIDGE_ID BALL_LAG",
     "hil/rehearsal/fake_mavlink.py": "OUTPUTS FLIES SERVO",
@@ -178,7 +178,7 @@ def unfounded(line: str, firmware: str) -> list[str]:
 
 
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
-OURS = {row["most"] for name in ("ardupilot", "px4") for row in RULES[name] if "most" in row}
+OURS = {row["maximum"] for name in ("ardupilot", "px4") for row in RULES[name] if "maximum" in row}
 """Limits that the audit sets."""
 
 

@@ -135,7 +135,9 @@ class FakeBetaflight(PortFake):
             self._sticks_came(list(frame.words()))
         elif frame.command == msp.SET_RC_TUNING and not self.armed:
             told = {
-                name: told.at for name, told in SETTINGS.items() if told.command == msp.RC_TUNING
+                name: told.offset
+                for name, told in SETTINGS.items()
+                if told.command == msp.RC_TUNING
             }
             self.parameters.update(
                 {name: frame.payload[at] for name, at in told.items() if at < len(frame.payload)}
@@ -165,7 +167,7 @@ class FakeBetaflight(PortFake):
         for name, told in SETTINGS.items():
             if told.command == command:
                 struct.pack_into(
-                    told.code, out, told.at, round(self.parameters.get(name, 0) / told.scale)
+                    told.code, out, told.offset, round(self.parameters.get(name, 0) / told.scale)
                 )
         return bytes(out)
 

@@ -239,7 +239,7 @@ def log_of(played: PlayedRun, first: int, last: int, throw: int | None = None) -
     thrown = [tick for tick in ticks if tick.line["time"] >= start]
     landing: Landing | None = None
     if throw is not None:
-        same = (each for each in runner.latch.landings if abs(each.start - start) < 1e-9)
+        same = (entry for entry in runner.latch.landings if abs(entry.start - start) < 1e-9)
         landing = next(same, None)
     latch = next((tick.line["time"] for tick in thrown if tick.decision.release), None)
     separation = np.inf

@@ -145,8 +145,8 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     counted = {name: stage for name, stage in stages.stages.items() if stage.counts.any()}
     for name, stage in counted.items():
         longer = 1.0 - np.cumsum(stage.counts) / stage.counts.sum()
-        drawn = (longer > 0.0) & (longer < 1.0)
-        axis.step(edges[drawn], longer[drawn], label=f"{name}: {STAGES[name]}")
+        partial = (longer > 0.0) & (longer < 1.0)
+        axis.step(edges[partial], longer[partial], label=f"{name}: {STAGES[name]}")
     axis.set(xscale="log", yscale="log", xlabel="time [ms]", ylabel="share that took longer")
     axis.set_title(title, loc="left", fontsize=11.5)
     if counted:

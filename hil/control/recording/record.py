@@ -188,14 +188,18 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
     """
     folder = Path(folder)
     require_run(folder)
+    setup = load_setup(folder)
     ticks = list(lines(folder / TICKS))
     try:
         if (folder / FORMER_POSES).is_file():
             poses: dict[int, list] = {}
             for number, *row in lines(folder / FORMER_POSES):
                 poses.setdefault(number, []).append(row)
+            # killed: the two files may end at different ticks, with half of its poses
+            if not (folder / SUMMARY).is_file():
+                ticks = [line for line in ticks if line["n"] < max(poses, default=0)]
             ticks = [line | {"poses": poses.get(line["n"], [])} for line in ticks]
-        return *load_setup(folder), [with_poses(line) for line in ticks]
+        return *setup, [with_poses(line) for line in ticks]
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{folder / TICKS}: not a list of ticks with poses: {error!r}") from error
 

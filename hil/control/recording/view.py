@@ -22,6 +22,7 @@ from hil.control.recording.flightlogs import TickLogger, events, read
 from hil.control.recording.playback import Playback, Tick
 from hil.control.recording.record import (
     CONFIG,
+    FORMER_POSES,
     POLICY,
     PROVENANCE,
     SUMMARY,
@@ -109,6 +110,8 @@ def follow(folder: str | Path, stream: Any, going: Callable[[], bool] = lambda: 
     """
     folder = Path(folder)
     require_run(folder, (CONFIG, POLICY, PROVENANCE))
+    if (folder / FORMER_POSES).is_file():
+        raise RunError(f"{folder} holds its poses apart, as only former runs do; leave out --live")
     playback = Playback(*load_setup(folder))
     provenance = json.loads((folder / PROVENANCE).read_text(encoding="utf-8"))
     lines = tail(folder / TICKS)

@@ -94,14 +94,14 @@ def require_reach(params: Any, contract: dict[str, Any]) -> None:
             f" weight that the policy was trained with, {mass * GRAVITY:.3f} N; expected it within"
             f" {vehicle.thrust.tolerance:g}: train a policy for this vehicle"
         )
-    available = vehicle.thrust.most
+    available = vehicle.thrust.full_thrust
     trained = float(action["max_thrust"])
     if available < THRUST_SHORT * trained:
         raise RunError(
             f"{params.backend}.thrust gives {available:.2f} N at most, the policy was trained with"
             f" {trained:g} N; check weight, hover and slope, or train a policy for this vehicle"
         )
-    ends = Sticks(vehicle.rates).most if params.backend == "betaflight" else action["max_rate"]
+    ends = Sticks(vehicle.rates).limits if params.backend == "betaflight" else action["max_rate"]
     if any(end < THRUST_SHORT * rate for end, rate in zip(ends, action["max_rate"])):
         raise RunError(
             f"betaflight.rates reach {', '.join(f'{r:.1f}' for r in ends)} rad/s on roll, pitch,"

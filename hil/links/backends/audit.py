@@ -30,35 +30,35 @@ class Rule:
     name: str
     why: str
     values: tuple[float, ...] = ()  # one of these
-    near: float = 0.0  # tolerance of them; 0: rounding
+    tolerance: float = 0.0  # of them; 0: rounding
     mask: int = 0  # bits that must be set
     above: float = -math.inf
     below: float = math.inf
-    least: float = -math.inf
-    most: float = math.inf
+    minimum: float = -math.inf
+    maximum: float = math.inf
     expected: str = ""  # in words; "": the value, or the bits
-    # write the bits, the first of the values, or the most, where the operator asked for it
+    # write the bits, the first of the values, or the maximum, where the operator asked for it
     write: bool = False
     optional: bool = False  # firmware without it is right as well
     warns: bool = False  # a mismatch is told, and flown with
     text: Callable[[float], str] = "{:g}".format  # a value in words
 
-    def good(self, found: float) -> bool:
+    def good(self, value: float) -> bool:
         """Return whether a value is as required."""
-        known = not self.values or any(
-            abs(found - x) <= (self.near or ROUNDING * max(1.0, abs(x))) for x in self.values
+        equal = not self.values or any(
+            abs(value - x) <= (self.tolerance or ROUNDING * max(1.0, abs(x))) for x in self.values
         )
-        inside = self.above < found < self.below
-        inside &= self.least - ROUNDING <= found <= self.most + ROUNDING
-        return known and inside and (not self.mask or int(found) & self.mask == self.mask)
+        in_range = self.above < value < self.below
+        in_range &= self.minimum - ROUNDING <= value <= self.maximum + ROUNDING
+        return equal and in_range and (not self.mask or int(value) & self.mask == self.mask)
 
-    def corrected(self, found: float) -> float:
+    def corrected(self, value: float) -> float:
         """Return what is written in place of a value."""
-        return int(found) | self.mask if self.mask else (*self.values, self.most)[0]
+        return int(value) | self.mask if self.mask else (*self.values, self.maximum)[0]
 
     @property
     def words(self) -> str:
-        """What is expected."""
+        """The expected value in words."""
         exact = f"{self.values[0]:g}" if self.values else f"with the bits of {self.mask} set"
         return self.expected or exact
 
@@ -67,23 +67,23 @@ def rules_of(firmware: str, params: Any, **further: Any) -> list[Rule]:
     """Return the rules of ``rules.toml`` for a firmware by its facts, the vehicle's configuration
     and further values.
     """
-    known = values(firmware) | vars(params) | further
+    terms = values(firmware) | vars(params) | further
     rules = []
     for row in RULES[firmware]:
         conditions = row.get("when", {})
-        if all(wanted in (known[k], bool(known[k])) for k, wanted in conditions.items()):
-            fields = {key: _filled(key, entry, known) for key, entry in row.items()}
+        if all(required in (terms[k], bool(terms[k])) for k, required in conditions.items()):
+            fields = {key: _filled(key, entry, terms) for key, entry in row.items()}
             fields.pop("when", None)
             rules.append(Rule(**fields))
     return rules
 
 
-def _filled(key: str, entry: Any, known: dict[str, Any]) -> Any:
-    """Return an entry of a row with the known values in it."""
+def _filled(key: str, entry: Any, terms: dict[str, Any]) -> Any:
+    """Return an entry of a row with the terms that it names."""
     if isinstance(entry, list):
-        return tuple(_filled(key, value, known) for value in entry)
+        return tuple(_filled(key, value, terms) for value in entry)
     if isinstance(entry, str):
-        return entry.format(**known) if key in ("name", "why", "expected") else known[entry]
+        return entry.format(**terms) if key in ("name", "why", "expected") else terms[entry]
     return entry
 
 
@@ -159,10 +159,10 @@ class Audit:
         ]
         if not missing or waited > GIVE_UP:
             self.done = True
-            told = {name: f": {why}" for name, why in self.refused.items()}
-            told |= {name: f" is {self.rules[name].text(x)}" for name, x in self.found.items()}
+            answers = {name: f": {why}" for name, why in self.refused.items()}
+            answers |= {name: f" is {self.rules[name].text(x)}" for name, x in self.found.items()}
             self.problems = [
-                f"{r.name}{told.get(r.name, ' was not told')}; expected {r.words}"
+                f"{r.name}{answers.get(r.name, ' was not told')}; expected {r.words}"
                 for r in self._wrong()
                 if not r.warns
             ]
@@ -175,11 +175,10 @@ class Audit:
                 self._ask(name)
 
     def _wrong(self) -> list[Rule]:
-        found = self.found
         return [
             r
             for r in self.rules.values()
-            if not (r.good(found[r.name]) if r.name in found else r.optional)
+            if not (r.good(self.found[r.name]) if r.name in self.found else r.optional)
         ]
 
     def fault(self) -> str | None:
@@ -197,14 +196,14 @@ class Audit:
         rows = [("", "parameter", "found", "expected", "why")]
         wrong = self._wrong()
         for name, rule in self.rules.items():
-            shown = (
+            text = (
                 rule.text(self.found[name])
                 if name in self.found
                 else self.refused.get(name, "no answer")
             )
-            shown += " (written)" if name in self.written else ""
+            text += " (written)" if name in self.written else ""
             judged = ("WARN" if rule.warns else "WRONG") if rule in wrong else "ok"
-            rows.append((judged, name, shown, rule.words, rule.why))
+            rows.append((judged, name, text, rule.words, rule.why))
         widths = [max(len(row[i]) for row in rows) for i in range(4)]
         lines = [
             "  ".join([*(cell.ljust(w) for cell, w in zip(row, widths)), row[4]]).rstrip()

@@ -7,7 +7,7 @@ from typing import Any
 
 from hil.links.backends.audit import Audit
 from hil.links.device import Port
-from hil.links.roster import Address, Announce, Roster, shown
+from hil.links.roster import Address, Announce, Roster, address_text
 
 # how far a release has come
 IDLE = "idle"
@@ -310,14 +310,14 @@ class OnPort(Autopilot):
     def _note(self, host_time: float) -> tuple[str, str]:
         silence = host_time - self._heard
         if silence <= self._silence:
-            return self._known()
+            return self._judge()
         return (
             f"no answer by {self.protocol}"
             + (f" for {silence:.1f} s" if self._heard >= 0.0 else ""),
             WAIT,
         )
 
-    def _known(self) -> tuple[str, str]:
+    def _judge(self) -> tuple[str, str]:
         """Return the same as `_note`, of one that is heard."""
         raise NotImplementedError
 
@@ -329,7 +329,7 @@ class OnPort(Autopilot):
 
     def _stranger(self, sender: Address) -> None:
         """Count a datagram of another sender than the one that the device names."""
-        self.roster.drop(sender, "datagram", f"the device is {shown(self._port.peer)}")
+        self.roster.drop(sender, "datagram", f"the device is {address_text(self._port.peer)}")
 
     def _put(self, data: bytes) -> bool:
         taken = self._port.write(data)

@@ -58,7 +58,7 @@ EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
 
 FEWEST_AUX = 4  # channels of a frame beside the sticks
 IMU = struct.Struct(f"<{FACTS['imu_rates']}x3h")  # body rates of MSP_RAW_IMU
-NEAR = 50  # a channel or output this near to its target has arrived [us]
+ARRIVED = 50  # a channel or output this near to its target has arrived [us]
 # between two frames while nothing is commanded yet: a receiver that is silent cannot be armed [s]
 KEEP_ALIVE = 0.02
 # after which the mechanism closes again, so that the next payload can be hung on [s]
@@ -178,18 +178,18 @@ class Betaflight(OnPort):
     def _flies_itself(self) -> bool:
         return not self._taken and self._box(BOX_ARM) and not self._box(BOX_OVERRIDE)
 
-    def _known(self) -> tuple[str, str]:
+    def _judge(self) -> tuple[str, str]:
         if not (self.audit.done and self._boxes and self._order):
             return "settings are being read", WAIT
-        own = self.params.arm_channel > 0  # all channels are ours
+        has_all = self.params.arm_channel > 0  # all channels are ours
         armed = self._box(BOX_ARM)
-        ours = own or self._box(BOX_OVERRIDE)
+        ours = has_all or self._box(BOX_OVERRIDE)
         if armed and ours and self._taken:
             self._raised = True
             return "", FOLLOW
         if self._taken and self._raised:
             return "MSP OVERRIDE is off: the pilot has it" if armed else "disarmed", WAIT
-        if own:
+        if has_all:
             blocks = self._blocks and not self._taken
             return f"arming disabled: {blocked(self._blocks)}" if blocks else "", WAIT
         if not armed:
@@ -347,7 +347,9 @@ class Betaflight(OnPort):
         p = self.params
         outputs = frame.words()
         if 1 <= p.servo_output <= len(outputs):
-            self.release_record.output(abs(outputs[p.servo_output - 1] - p.servo_open_us) <= NEAR)
+            self.release_record.output(
+                abs(outputs[p.servo_output - 1] - p.servo_open_us) <= ARRIVED
+            )
 
     def _hear_boxes(self, frame: msp.Frame) -> None:
         self._boxes = tuple(frame.payload)
@@ -382,7 +384,7 @@ class Betaflight(OnPort):
             self._pilots_us = channels[3]
         self.share = min(max((channels[3] - p.minimum_us) / (HIGH - p.minimum_us), 0.0), 1.0)
         index = STICKS + p.release_channel - 1
-        if index < len(channels) and abs(channels[index] - HIGH) <= NEAR:
+        if index < len(channels) and abs(channels[index] - HIGH) <= ARRIVED:
             self.release_record.answer(True)
 
     def _write_setting(self, name: str, value: float) -> None:
@@ -390,12 +392,12 @@ class Betaflight(OnPort):
         setting = SETTINGS[name]
         if (
             setting.command != msp.RC_TUNING
-            or len(self._tuning) <= setting.at
+            or len(self._tuning) <= setting.offset
             or self._box(BOX_ARM)
         ):
             return
         changed = bytearray(self._tuning)
-        changed[setting.at] = int(value)
+        changed[setting.offset] = int(value)
         self._tuning = bytes(changed)
         self._write(msp.SET_RC_TUNING, self._tuning)
         self._write(msp.EEPROM_WRITE)
@@ -418,7 +420,7 @@ class AnswerField:
     """The place of a setting in an answer."""
 
     command: int
-    at: int  # of the payload
+    offset: int  # in the payload
     code: str = "B"  # as of `struct`
     scale: float = 1.0
 
@@ -446,7 +448,7 @@ def expiry() -> Rule:
         "fc_version",
         f"there the pilot's sticks count {FACTS['override_window']:g} s after the runner dies;"
         " before, its last sticks count until the pilot switches MSP OVERRIDE off",
-        least=EXPIRES,
+        minimum=EXPIRES,
         expected=f"{version_text(EXPIRES)} or newer",
         warns=True,
         text=version_text,
@@ -465,10 +467,10 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     values = {
         name: float(setting.scale * n)
         for name, setting in mine.items()
-        if (n := frame.number(setting.code, setting.at)) is not None
+        if (n := frame.number(setting.code, setting.offset)) is not None
     }
     for name in {"api_version", "fc_version"} & values.keys():
-        minor = frame.number("B", SETTINGS[name].at + 1)
+        minor = frame.number("B", SETTINGS[name].offset + 1)
         values = {} if minor is None else {name: values[name] + 0.01 * minor}
     if "channel_forwarding" in values:
         values["channel_forwarding"] = float(bool(int(values["channel_forwarding"]) & FORWARDING))

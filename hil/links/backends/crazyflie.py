@@ -101,7 +101,7 @@ class Crazyflie(OnPort):
             " tells no state"
         )
         return [
-            Rule("protocol", old, least=oldest, expected=f"{oldest} or newer"),
+            Rule("protocol", old, minimum=oldest, expected=f"{oldest} or newer"),
             *(Rule(name, why[name], (FACTS[name],)) for name in MODES),
             Rule(self.params.release_parameter, "the mechanism, closed", (0.0,)),
         ]
@@ -116,7 +116,7 @@ class Crazyflie(OnPort):
     def _hint(self) -> str:
         return "it is being armed" if self._taken and not self._raised else ""
 
-    def _known(self) -> tuple[str, str]:
+    def _judge(self) -> tuple[str, str]:
         if not self.audit.done:
             flies = self._state & FACTS["flying"]
             return "it flies: land it first" if flies else "its settings are being set", WAIT

@@ -75,7 +75,7 @@ class Sticks:
         ]
 
     @property
-    def most(self) -> tuple[float, float, float]:
+    def limits(self) -> tuple[float, float, float]:
         """Rates at the ends of the sticks [rad/s]."""
         return tuple(table[-1] for table in self._tables)
 

@@ -21,7 +21,7 @@ from typing import Annotated
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 from visthrow.onboard.hover import GRAVITY
 
-Inside = Annotated[float, Bound(0.0, 1.0, "()")]
+Share = Annotated[float, Bound(0.0, 1.0, "()")]
 
 LEAST_SHARES = 50  # values that a mean share of hover is taken over: 5 s at 10 Hz
 VOLTAGE_RANGE = (
@@ -37,10 +37,10 @@ class HoverThrustParams(Bounded):
     """The calibration of one vehicle."""
 
     weight: Positive  # thrust of the hover that was measured [N]
-    hover: Inside  # share of full thrust in that hover, 0 to 1
+    hover: Share  # share of full thrust in that hover, 0 to 1
     # of the thrust over the share around hover, relative to weight / hover
     slope: Annotated[float, Bound(0.3, 2.0)]
-    tolerance: Inside  # of a measured share of hover, relative; beyond it the runner does not fly
+    tolerance: Share  # of a measured share of hover, relative; beyond it the runner does not fly
     voltage: NotNegative  # of the battery in that hover [V]; 0: no correction for its voltage
     # of thrust over the motors' command, where the autopilot does not straighten it
     exponent: Annotated[float, Bound(1.0, 3.0)] = 1.0
@@ -76,7 +76,7 @@ class HoverThrustParams(Bounded):
         return self.idle + (1.0 - self.idle) * share
 
     @property
-    def most(self) -> float:
+    def full_thrust(self) -> float:
         """Thrust at full share [N]."""
         return self.thrust(1.0)
 

@@ -15,7 +15,7 @@ from hil.links.mavlink_link import (
     quaternion_from_euler,
 )
 from hil.links.pymav import mav
-from hil.links.roster import Address, MavlinkId, Seen
+from hil.links.roster import Address, MavlinkId, Traffic
 from hil.poses.pose import Body, Pose
 from hil.poses.sources.pose_source import Source
 from visthrow.config.bounds import Bound, Bounded
@@ -116,14 +116,14 @@ FORMER_FRAMES = dict(enumerate(["MOCAP_NED", "MOCAP_ENU", "VISION_NED", "VISION_
 def frame_name(number: int) -> str:
     """Return the name of a MAV_FRAME."""
     entry = mav.enums["MAV_FRAME"].get(number)
-    known = str(number) if entry is None else entry.name.removeprefix("MAV_FRAME_")
-    return FORMER_FRAMES.get(number, known)
+    name = str(number) if entry is None else entry.name.removeprefix("MAV_FRAME_")
+    return FORMER_FRAMES.get(number, name)
 
 
-def seen_of(message: Any, address: Address, why: str) -> Seen:
+def traffic_of(message: Any, address: Address, why: str) -> Traffic:
     """Return how a message that is not taken is counted."""
     ids = message.get_srcSystem(), message.get_srcComponent()
-    return Seen(address, *ids, message.get_type(), why)
+    return Traffic(address, *ids, message.get_type(), why)
 
 
 class MavlinkSource(Source):
@@ -155,7 +155,7 @@ class MavlinkSource(Source):
             )
 
     def _drop(self, message: Any, why: str) -> None:
-        self._link.roster.refuse(seen_of(message, self._link.sender, why))
+        self._link.roster.refuse(traffic_of(message, self._link.sender, why))
 
     def poll(self, time: float) -> list[Pose]:
         self.pump()

@@ -17,7 +17,7 @@ import numpy as np
 from hil.errors import SourceError
 from hil.links.roster import Roster
 from hil.poses.pose import BODIES, GOAL, PAYLOAD, VEHICLE, Body, Pose
-from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder, seen_of
+from hil.poses.sources.mavlink import PAIR_AGE, BodyIds, MavlinkDecoder, traffic_of
 from visthrow.common.errors import LogError, suggest
 from visthrow.config.bounds import Bound, Bounded
 from visthrow.logs import read
@@ -120,7 +120,7 @@ def read_tlog(
     Raises `SourceError` where nothing in it is a message.
     """
     roster = roster or Roster()
-    decoder = MavlinkDecoder(bodies, lambda m, why: roster.refuse(seen_of(m, None, why)))
+    decoder = MavlinkDecoder(bodies, lambda m, why: roster.refuse(traffic_of(m, None, why)))
     poses = []
     first = None
     for arrival, message in messages.telemetry(path):
@@ -137,17 +137,17 @@ def read_autopilot(path: str | Path, bodies: tuple[LogBody, ...], kind: str) -> 
     raises `SourceError` for no such file, a missing package, or a message that carries no pose or
     is not in the log.
     """
-    known = pose_messages(kind)
+    messages = pose_messages(kind)
     if not bodies:
         raise SourceError(
-            f"source.logs is empty; expected a body and one of the messages {', '.join(known)}"
+            f"source.logs is empty; expected a body and one of the messages {', '.join(messages)}"
         )
     poses: list[Pose] = []
     for body in bodies:
-        if body.message not in known:
+        if body.message not in messages:
             raise SourceError(
                 f"message '{body.message}' of the {body.body} carries no pose;"
-                f" {suggest(body.message, known)}"
+                f" {suggest(body.message, messages)}"
             )
         file = body.file or path
         log = log_of_poses(file, kind, body.message, body.instance)

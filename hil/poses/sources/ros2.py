@@ -70,20 +70,20 @@ def message_types() -> dict[str, Any]:
     """
     idl = load_extra("cyclonedds.idl", "ros2", "ROS 2 topics", SourceError)
     types = load_extra("cyclonedds.idl.types", "ros2", "ROS 2 topics", SourceError)
-    known: dict[str, Any] = {"string": str, "float64[36]": types.array[types.float64, 36]}
-    known |= {name: getattr(types, name) for name in ("float64", "int32", "uint32")}
+    primitives: dict[str, Any] = {"string": str, "float64[36]": types.array[types.float64, 36]}
+    primitives |= {name: getattr(types, name) for name in ("float64", "int32", "uint32")}
     messages = {}
     for line in STRUCTURES.split("\n")[1:-1]:
         full_name, *fields = line.split()
         package, name = full_name.split("/")
         kinds = dict(field.split(":") for field in fields)
-        notes = {"__annotations__": {field: known[kind] for field, kind in kinds.items()}}
+        notes = {"__annotations__": {field: primitives[kind] for field, kind in kinds.items()}}
         typename = f"{package}::msg::dds_::{name}_"
         meta = type(idl.IdlStruct)(
             name, (idl.IdlStruct,), {**notes, "__module__": __name__}, typename=typename
         )
-        known[name] = messages[full_name] = dataclasses.dataclass(meta)
-        known[f"{name}[]"] = types.sequence[known[name]]
+        primitives[name] = messages[full_name] = dataclasses.dataclass(meta)
+        primitives[f"{name}[]"] = types.sequence[primitives[name]]
     return messages
 
 

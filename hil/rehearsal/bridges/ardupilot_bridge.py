@@ -38,7 +38,7 @@ OURS = FACTS["motor_order"]
 
 LOW = 1000.0  # MOT_PWM_MIN [us]
 HIGH = 2000.0  # MOT_PWM_MAX [us]
-NEAR = 50.0  # an output this near to its target has arrived [us]
+ARRIVED = 50.0  # an output this near to its target has arrived [us]
 # for the next frame of an ArduPilot that was heard [s]; then the plant goes on without it
 PATIENCE = 1.0
 
@@ -62,7 +62,7 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
     """The state of a vehicle as ArduPilot takes it, a line of JSON between two line feeds."""
     now = plant.state
     x, y, z, w = plant.quat_wb.tolist()
-    told = {
+    state = {
         "timestamp": time,
         "imu": {
             "gyro": (FLIP * plant.rate_b).tolist(),
@@ -73,7 +73,7 @@ def state_line(time: float, plant: MotorPlant) -> bytes:
         "quaternion": [w, x, -y, -z],
         "battery": {"voltage": plant.voltage, "current": 0.0},
     }
-    return b"\n" + json.dumps(told).encode() + b"\n"
+    return b"\n" + json.dumps(state).encode() + b"\n"
 
 
 class ArduPilotSitl(Bridge):
@@ -108,7 +108,7 @@ class ArduPilotSitl(Bridge):
         """Fly a period by the next frame's outputs, and the state after it in answer; without a
         frame, a period as it was.
         """
-        frame, to = self._frame()
+        frame, address = self._frame()
         self.paced = frame is not None
         if frame is None:
             super().fly()
@@ -121,11 +121,13 @@ class ArduPilotSitl(Bridge):
             self._number = number
             self.frames += 1
             self.motors = np.clip((servos[OURS] - LOW) / (HIGH - LOW), 0.0, 1.0)
-            at = self.params.servo_output - 1
+            index = self.params.servo_output - 1
             opens = self.params.servo_open_us
-            self.output(0 <= at < len(servos) and abs(servos[at] - opens) <= NEAR, self.plant.time)
+            self.output(
+                0 <= index < len(servos) and abs(servos[index] - opens) <= ARRIVED, self.plant.time
+            )
             super().fly()
-        self._socket.sendto(state_line(self.plant.time, self.plant), to)
+        self._socket.sendto(state_line(self.plant.time, self.plant), address)
 
     def _frame(self) -> tuple[tuple[int, np.ndarray] | None, Any]:
         while select.select([self._socket], [], [], PATIENCE if self.paced else 0.0)[0]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from hil.links import msp
-from hil.links.backends.betaflight import BOX_ARM, FACTS, HIGH, NEAR, STICKS, BetaflightParams
+from hil.links.backends.betaflight import ARRIVED, BOX_ARM, FACTS, HIGH, STICKS, BetaflightParams
 from hil.links.device import Device, TcpPort, chunks
 from hil.rehearsal.bridges.betaflight_firmware import PORTS
 from hil.rehearsal.bridges.packets import Sensors
@@ -101,7 +101,7 @@ class BetaflightSitl(Bridge):
         elif frame.command == msp.RC:
             channels = frame.words()
             at = STICKS + self.params.release_channel - 1
-            self.output(at < len(channels) and abs(channels[at] - HIGH) <= NEAR, self.heard)
+            self.output(at < len(channels) and abs(channels[at] - HIGH) <= ARRIVED, self.heard)
 
     def _hear_status(self, frame: msp.Frame) -> None:
         flags = frame.number("<I", FACTS["status_flags"]) or 0

@@ -124,13 +124,13 @@ class Firmware:
                 f"something listens on port {PORTS[0]} already; expected no other firmware beside"
                 " this one"
             ) from None
-        self.stands, said = os.pipe()
+        self.stands, report = os.pipe()
         # by its place in the folder that it runs in: a path may hold no space
         library = compiled(self.folder).name
-        environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(said)}
+        environment = {**os.environ, "LD_PRELOAD": f"./{library}", "VISTHROW_STANDS": str(report)}
         # its errors; of what it prints, most are the words of its memory
-        told = self.folder / "firmware.txt"
-        with open(told, "wb") as errors:
+        log = self.folder / "firmware.txt"
+        with open(log, "wb") as errors:
             self._process = subprocess.Popen(
                 [self.program],
                 cwd=self.folder,
@@ -139,11 +139,11 @@ class Firmware:
                 stderr=errors,
                 preexec_fn=_end_with_parent,
                 env=environment,
-                pass_fds=[said],
+                pass_fds=[report],
             )
-        os.close(said)
+        os.close(report)
         end = time.monotonic() + START
-        while f"bind port {PORTS[0]} for UART1" not in (words := told.read_text(errors="replace")):
+        while f"bind port {PORTS[0]} for UART1" not in (words := log.read_text(errors="replace")):
             if not self.runs or time.monotonic() > end:
                 self.stop()
                 raise RunError(
@@ -226,10 +226,10 @@ def compiled(folder: Path) -> Path:
         try:
             subprocess.run(command, check=True, capture_output=True, text=True)
         except (OSError, subprocess.CalledProcessError) as error:
-            told = getattr(error, "stderr", "") or error
+            reason = getattr(error, "stderr", "") or error
             raise RunError(
-                f"cannot compile {LOCKSTEP.name}: {told}; expected a C compiler, as the firmware's"
-                " own build has one"
+                f"cannot compile {LOCKSTEP.name}: {reason}; expected a C compiler, as the"
+                " firmware's own build has one"
             ) from error
     return library
 

@@ -35,7 +35,7 @@ LARGEST_ANSWER = 4096  # bytes of all
 OURS = FACTS["motor_order"]
 SEA_LEVEL = 101325.0  # [Pa]
 
-STILL = 0.002
+STEP = 0.002
 CALIBRATION = 3.0
 """Between two packets at rest, and the time that the firmware's gyro takes to be calibrated and its
 receiver to begin [s].
@@ -50,15 +50,15 @@ def sample(
 ) -> bytes:
     """Packet of body rates [rad/s], specific force [m/s^2], body frame, and attitude xyzw."""
     x, y, z, w = quat_wb
-    back, right, up = force_b
+    x_force, y_force, z_force = force_b
     return FDM.pack(
         stamp,
         rate_b[0],
         -rate_b[1],
         -rate_b[2],
-        -back,
-        -right,
-        -up,
+        -x_force,
+        -y_force,
+        -z_force,
         w,
         x,
         y,
@@ -69,11 +69,11 @@ def sample(
     )
 
 
-def stood(stands: int, most: float) -> bytes:
+def stood(stands: int, timeout: float) -> bytes:
     """Read what a firmware in lock step writes to its pipe once it stands still; nothing where it
     does not within a time [s].
     """
-    return os.read(stands, LARGEST_ANSWER) if select.select([stands], [], [], most)[0] else b""
+    return os.read(stands, LARGEST_ANSWER) if select.select([stands], [], [], timeout)[0] else b""
 
 
 class Sensors:
@@ -136,8 +136,8 @@ class Sensors:
 
         Raises `RunError`: see `send`.
         """
-        for _ in range(round(CALIBRATION / STILL)):
-            self.rest(STILL)
+        for _ in range(round(CALIBRATION / STEP)):
+            self.rest(STEP)
 
     def close(self) -> None:
         """Give the socket back."""
@@ -155,8 +155,8 @@ def at_rest(stands: int) -> Iterator[None]:
     def feed() -> None:
         # the firmware ends where it is told to keep its settings
         with suppress(RunError):
-            while not done.wait(STILL / 10.0):
-                sensors.rest(STILL)
+            while not done.wait(STEP / 10.0):
+                sensors.rest(STEP)
 
     thread = threading.Thread(target=feed, daemon=True)
     thread.start()

@@ -38,7 +38,7 @@ STREAMS = {
 ORIGIN = ("SIH_LOC_LAT0", "SIH_LOC_LON0", "SIH_LOC_H0")  # of SIH's world [deg, deg, m]
 ASK_AGAIN = 1.0  # between two requests for a stream or a parameter [s]: an answer may be lost
 PATIENCE = 1.0  # for the next state of a PX4 that was heard [s]; then the ball goes on without it
-NEAR = 50.0  # an output this near to its target has arrived [us]
+ARRIVED = 50.0  # an output this near to its target has arrived [us]
 FLIP = np.array([1.0, -1.0, -1.0])  # north, east, down and forward, right, down to ours
 
 HALVING = 1.4  # a slow swing halves in this time, as below the simulator's hovering vehicle [s]
@@ -101,8 +101,8 @@ class HangingBall:
         if not self.length > 0.0:
             raise ValueError(f"rope of {self.length} m; expected a length above 0")
         self.time = 0.0
-        still = Motion(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
-        self._now = still
+        start = Motion(0.0, np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3))
+        self._now = start
         self._motions = deque[Motion]()
         self._hangs = False
         self._ball = np.array([0.0, 0.0, -self.length])
@@ -278,8 +278,8 @@ class Px4Sih(Bridge):
                 self._place = Place(*(self._origin[name] for name in ORIGIN))
         elif kind == "SERVO_OUTPUT_RAW":
             self.last_output = getattr(message, f"servo{self.params.servo_output}_raw", 0)
-            near = abs(self.last_output - self.params.servo_open_us) <= NEAR
-            self.output(bool(self.params.servo_output) and near, arrival)
+            is_open = abs(self.last_output - self.params.servo_open_us) <= ARRIVED
+            self.output(bool(self.params.servo_output) and is_open, arrival)
 
     def _hear_state(self, message: Any) -> None:
         if self._place is None:
@@ -300,15 +300,15 @@ class Px4Sih(Bridge):
 
     def fly(self) -> None:
         """Fly a period once PX4 has flown it; without PX4, a period as it was."""
-        wanted = self.plant.time + self.plant.period - SLACK
+        target = self.plant.time + self.plant.period - SLACK
         end = monotonic() + PATIENCE
         waits = self.paced
-        while waits and self.plant.until < wanted and monotonic() < end:
+        while waits and self.plant.until < target and monotonic() < end:
             select.select([self.port], [], [], max(end - monotonic(), 0.0))
             self.hear()
         super().fly()
         if waits:
-            self.paced = self.plant.until >= wanted
+            self.paced = self.plant.until >= target
 
     def deliver(self, time: float) -> None:
         """Count the poses' latency on PX4's clock, which is ahead of the ball's."""

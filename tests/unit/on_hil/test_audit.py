@@ -15,7 +15,12 @@ RULES = (
     Rule("GUID_OPTIONS", "thrust", mask=8, write=True),
     Rule("ATC_ANGLE_BOOST", "tilt", (0.0,), write=True),
     Rule(
-        "GUID_TIMEOUT", "silence", above=0.0, most=0.5, expected="above 0, at most 0.5", write=True
+        "GUID_TIMEOUT",
+        "silence",
+        above=0.0,
+        maximum=0.5,
+        expected="above 0, at most 0.5",
+        write=True,
     ),
     Rule("FIXED", "cannot be written", (7.0,)),
 )

@@ -99,3 +99,5 @@ def test_options_of_a_fake():
         read_options(["servo_delay=-0.1"])
     with raises(RunError, match="did you mean 'ardupilot'"):
         load_fake("ardupilo")
+    with raises(RunError, match="expected module:class"):
+        load_fake("my-fakes:Fake")

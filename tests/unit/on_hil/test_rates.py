@@ -40,7 +40,7 @@ def test_the_inverse_is_as_near_as_microseconds_allow(params):
     sticks = Sticks(params)
     for axis in range(3):
         for i in range(-40, 41):
-            wanted = i / 40 * sticks.most[axis]
+            wanted = i / 40 * sticks.limits[axis]
             us = sticks.position(axis, wanted)
             assert 1000 <= us <= 2000
             off = abs(sticks.rate(axis, us) - wanted)

@@ -9,6 +9,7 @@ from pytest import fixture, mark, raises
 
 from bench.processes import free_port
 from hil.control.recording.record import RunRecorder, lines, load_run
+from hil.control.recording.view import follow
 from hil.control.runner import Runner
 from hil.errors import RunError
 from tests.commands import run_command
@@ -105,6 +106,13 @@ def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_pa
         text = "".join(json.dumps(row) + "\n" for row in rows)
         (tmp_path / "before" / f"{name}.jsonl").write_text(text)
     assert run_command(f"hil replay {tmp_path}/before") == 0
+    assert "all bit for bit the same" in capsys.readouterr().out
+    with raises(RunError, match="leave out --live"):
+        follow(tmp_path / "before", None)
+    # killed while its poses were behind its ticks
+    (tmp_path / "before" / "summary.json").unlink()
+    (tmp_path / "before" / "poses.jsonl").write_text(text[: len(text) // 2])
+    assert run_command(f"hil replay {tmp_path}/before") == 1
     assert "all bit for bit the same" in capsys.readouterr().out
 
 

@@ -390,8 +390,8 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     slope = added[..., :2] - lean * added[..., 2:]
     power = np.maximum(np.sum(slope**2, axis=(1, 2)), 1e-12)
     share = np.clip(-np.sum(off * slope, axis=(1, 2)) / power, 0.0, _HEAVIEST)
-    left = np.sum((off + share[:, None, None] * slope) ** 2, axis=(1, 2))
-    return acc + share[np.argmin(left)] * relative
+    residual = np.sum((off + share[:, None, None] * slope) ** 2, axis=(1, 2))
+    return acc + share[np.argmin(residual)] * relative
 
 
 def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> list[Row]:
@@ -607,12 +607,12 @@ def _early(
     later = relations.relate(time + _RESPONSE, set_points, *rates, reach=_RESPONSE)
     if later is None:
         return []
-    before, behind = (min(r.axes_correlation, 0.999) for r in (relation, later))
+    before, after = (min(r.axes_correlation, 0.999) for r in (relation, later))
     independent = float(np.ptp(time)) / relations.INDEPENDENT
-    nats = 0.5 * independent * np.log((1.0 - behind**2) / (1.0 - before**2))
+    nats = 0.5 * independent * np.log((1.0 - after**2) / (1.0 - before**2))
     early = -1e3 * relation.axes_delay
     text = f"the rates go {early:.0f} ms or more before their commands, correlation {before:.2f}"
-    text += f" (behind them {behind:.2f}, {nats:.0f} nats): the commands' clock is late"
+    text += f" (behind them {after:.2f}, {nats:.0f} nats): the commands' clock is late"
     figures = {"delay_s": relation.axes_delay, "nats": float(nats)}
     return [Row("delay", channels, "bad" if nats > _NATS else "warn", text, figures)]
 
@@ -636,12 +636,14 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
                 figures | {"axes": relation.axes, "nats": relation.nats},
             )
         ]
-    known = relation.delay_sd < _UNTOLD
-    late = known and relation.delay < -0.005
+    is_measured = relation.delay_sd < _UNTOLD
+    late = is_measured and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
     weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
-    when = f"{1e3 * relation.delay:.1f} ms later" if known else "at a delay that cannot be told"
+    when = (
+        f"{1e3 * relation.delay:.1f} ms later" if is_measured else "at a delay that cannot be told"
+    )
     text = (
         f"the rates follow {when}, correlation {relation.correlation:.2f}, gain"
         f" {relation.scale:.2f}"
@@ -714,10 +716,10 @@ def _left_early(log: FlightLog, time: np.ndarray, length: np.ndarray) -> list[Ro
         return []
     pressed = log["release_command"]
     commanded = pressed.time[pressed.values.ravel() > 0.0]
-    near = np.flatnonzero(length < (1.0 + _TAUT) * np.percentile(length, 25))
-    if not len(commanded) or near[-1] == len(time) - 1:
+    taut = np.flatnonzero(length < (1.0 + _TAUT) * np.percentile(length, 25))
+    if not len(commanded) or taut[-1] == len(time) - 1:
         return []
-    early = float(commanded[0] - time[near[-1] + 1])
+    early = float(commanded[0] - time[taut[-1] + 1])
     if early < _DELAY_BAD:
         return []
     text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "

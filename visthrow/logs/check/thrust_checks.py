@@ -124,8 +124,8 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     mass = mass_of(log, vehicle)
     rows = [_weight(mass, vehicle, f"{name}, acc_b")] if mass is not None else []
     if sparse(time):
-        every = 1e3 * float(np.median(np.diff(time)))
-        text = f"comes every {every:.0f} ms: too seldom to be held against the force"
+        period = 1e3 * float(np.median(np.diff(time)))
+        text = f"comes every {period:.0f} ms: too seldom to be held against the force"
         return [*rows, Row("thrust", name, "warn", text)]
     correlations = [
         (felt, *c)

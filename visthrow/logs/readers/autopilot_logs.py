@@ -305,10 +305,10 @@ def valid_rows(fields: Fields, flags: str) -> np.ndarray:
     return good
 
 
-def in_range(values: np.ndarray, least: float, largest: float) -> np.ndarray:
+def in_range(values: np.ndarray, smallest: float, largest: float) -> np.ndarray:
     """Tell the values within bounds, bool, shape (T,)."""
     numbers = np.asarray(values, float)
-    return (numbers >= least) & (numbers <= largest)
+    return (numbers >= smallest) & (numbers <= largest)
 
 
 def _moving(

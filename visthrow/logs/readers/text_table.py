@@ -129,8 +129,8 @@ def _section(rows: Rows) -> tuple[Rows, list[str]]:
         return rows, []
     chosen = next(iter(starts))
     end = min((start for start in starts.values() if start > starts[chosen]), default=len(rows))
-    others = [f"the table {title}: {chosen} is read" for title in starts if title != chosen]
-    return rows[starts[chosen] : end], others
+    omitted = [f"the table {title}: {chosen} is read" for title in starts if title != chosen]
+    return rows[starts[chosen] : end], omitted
 
 
 def _separator(lines: list[str]) -> str:
