@@ -154,9 +154,29 @@ class EffectTables:
 def apply(
     effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]
 ) -> Setting:
-    """Return the setting with effects of these sizes. Raises KeyError: no effect of that name."""
-    for name, size in theta.items():
-        effect = effects[name]
-        if size != 0.0:
+    """Return the setting with effects of these sizes, applied in the order of ``effects``.
+
+    Raises KeyError: no effect of that name."""
+    if unknown := theta.keys() - effects.keys():
+        raise KeyError(*unknown)
+    for name, effect in effects.items():
+        if size := theta.get(name, 0.0):
             setting = effect.apply(setting, size)
     return setting
+
+
+def possible_together(
+    effects: Mapping[str, SettingEffect], setting: Setting, theta: Mapping[str, float]
+) -> dict[str, float]:
+    """Return the sizes that can be applied together: none takes more of a number than the effects
+    before it leave.
+
+    Bounds hold for an effect alone. Two that lower one number, each within its bounds, could make
+    it negative. ``theta``: sizes within the bounds, of effects that :func:`apply` is to apply.
+    """
+    sizes = {}
+    for name, effect in effects.items():
+        if size := theta.get(name, 0.0):
+            sizes[name] = max(size, effect.bounded(setting).bounds[0])
+            setting = effect.apply(setting, sizes[name])
+    return sizes

@@ -38,7 +38,10 @@ def random_effects() -> tuple[Any, ...]:
 
 
 def chosen(names: Iterable[str]) -> dict[str, Any]:
-    """Return the effects of these names; ConfigError for one that the catalogue does not hold."""
+    """Return the effects of these names in the order of the catalogue; ConfigError for one that it
+    does not hold.
+    """
+    names = list(names)
     effects = catalogue()
     expect_known(names, effects, "no effect '{}'", ConfigError)
-    return {name: effects[name] for name in names}
+    return {name: effect for name, effect in effects.items() if name in names}

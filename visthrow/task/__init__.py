@@ -497,15 +497,15 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
     """Return ``diagnosed.plants`` plants about the experiment's; that one itself where it is 1 or
     nothing is uncertain.
 
-    A draw that an effect's physical bounds forbid is put on the bound. ConfigError for a covariance
-    that is none."""
+    A draw that the effects' physical bounds forbid is put on the bound. ConfigError for a
+    covariance that is none."""
     diagnosed = experiment.diagnosed
     plant = plant_of(experiment)
     if diagnosed.plants == 1 or not diagnosed.effects:
         return [plant]
     import numpy as np
 
-    from sim.effects.effect import apply
+    from sim.effects.effect import apply, possible_together
     from sim.effects.setting import Setting, generalised, specialised
     from visthrow.config.effects import chosen
 
@@ -525,5 +525,6 @@ def drawn_plants(experiment: Experiment, seed: int) -> list[PlantParams]:
             name: float(np.clip(x, *effects[name].bounds))
             for name, x in zip(diagnosed.effects, draw)
         }
+        theta = possible_together(effects, base, theta)
         plants.append(specialised(apply(effects, base, theta).plant, plant))
     return plants

@@ -3,6 +3,7 @@ read.
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -176,8 +177,6 @@ def test_draws_keep_what_is_pinned_together():
     loose = DiagnosedParams(
         ("thrust_gain", "mass_quad"), tuple(map(tuple, COVARIANCE[:2, :2])), 400
     )
-    from dataclasses import replace
-
     plants = drawn_plants(replace(before, diagnosed=loose), 1)
     gain = np.array([p.vehicle.thrust.gain[0] for p in plants]) - 1.0
     mass = np.array([p.vehicle.body.mass for p in plants]) - before.vehicle.body.mass
@@ -185,6 +184,18 @@ def test_draws_keep_what_is_pinned_together():
     assert np.corrcoef(gain, mass)[0, 1] > 0.97
     assert drawn_plants(before, 1) == [plant_of(before)]
     assert drawn_plants(replace(before, diagnosed=loose), 1) == plants
+
+
+def test_draws_that_share_a_number_keep_to_its_bounds_together():
+    before = shipped()
+    spread = before.vehicle.aero.drag_z
+    loose = DiagnosedParams(
+        ("rotor_drag_z", "rotor_drag"), ((spread**2, 0.0), (0.0, 4.0 * spread**2)), 50
+    )
+    plants = drawn_plants(replace(before, diagnosed=loose), 1)
+    drags = [plant.vehicle.aero.drag_z for plant in plants]
+    assert min(drags) == approx(0.0, abs=1e-15)
+    assert max(drags) > spread
 
 
 @mark.parametrize(
@@ -318,8 +329,6 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys)
 def test_a_broken_covariance_is_refused():
     with raises(ConfigError, match="one row and one column"):
         DiagnosedParams(("rope_length",), ((1.0, 2.0),), 2)
-    from dataclasses import replace
-
     bad = DiagnosedParams(("rope_length", "mass_quad"), ((1e-6, 1e-5), (1e-5, 1e-6)), 4)
     with raises(ConfigError, match="no covariance"):
         drawn_plants(replace(shipped(), diagnosed=bad), 0)

@@ -152,6 +152,19 @@ def test_initial_states_follow_the_effects(planted):
         assert_allclose(again.residual, w.residual, atol=1e-9)
 
 
+def test_a_search_goes_no_further_than_effects_can_go_together(planted):
+    """Each of two effects that share a coefficient may take all of it, but not both."""
+    model = ThrowModel(planted[0], paper_plant(), only=["rotor_drag", "rotor_drag_z"])
+    windows = model.windows({})
+    problem = Problem(model, tuple(range(len(windows))))
+    nominal = linearise(problem, np.zeros(2), windows=windows)
+    priors = problem.priors
+    both = moved(problem, nominal, priors.low)
+    assert_allclose(both.theta, [priors.low[0], 0.0], atol=1e-9)
+    one = moved(problem, nominal, np.array([priors.low[0], 0.0]))
+    assert_allclose(both.windows[0].residual, one.windows[0].residual, atol=1e-12)
+
+
 def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
     setting = setting_with({})
     vehicle = setting.plant.vehicle

@@ -1,11 +1,12 @@
 """Effects on a plant's numbers, by numbers worked by hand."""
 
 from dataclasses import replace
+from itertools import combinations
 
-from pytest import approx, mark
+from pytest import approx, mark, raises
 
-from sim.effects.effect import Lowest
-from sim.effects.setting import Setting
+from sim.effects.effect import Lowest, apply, possible_together
+from sim.effects.setting import Setting, generalised
 from tests.plants import paper_plant
 from visthrow.config.effects import catalogue
 
@@ -22,3 +23,29 @@ def test_the_lower_bound_leaves_what_the_limit_says(share, factor, least):
     low, high = effect.bounded(setting).bounds
     assert high == 9.0
     assert mass + factor * low == approx((1.0 - share) * mass + factor * least)
+
+
+def test_two_effects_together_keep_every_number_of_the_plant_within_its_bounds():
+    setting = generalised(Setting(paper_plant()))
+    effects = {
+        name: effect.bounded(setting)
+        for name, effect in catalogue().items()
+        if effect.changes and not effect.simpler and effect.applies(setting)
+    }
+    lowest = {name: effect.bounds[0] for name, effect in effects.items()}
+    for pair in combinations(effects, 2):
+        apply(effects, setting, possible_together(effects, setting, {n: lowest[n] for n in pair}))
+
+
+def test_an_effect_takes_what_others_leave_of_a_number():
+    setting = generalised(Setting(paper_plant()))
+    names = "rotor_drag", "rotor_drag_z"
+    effects = {name: catalogue()[name].bounded(setting) for name in names}
+    drag = setting.plant.vehicle.aero.drag_z
+    asked = {"rotor_drag_z": -0.75 * drag, "rotor_drag": -drag}
+    with raises(ValueError, match="drag_z is -"):
+        apply(effects, setting, asked)
+    sizes = possible_together(effects, setting, asked)
+    assert sizes == {"rotor_drag": -drag, "rotor_drag_z": approx(-0.5 * drag)}
+    assert apply(effects, setting, sizes).plant.vehicle.aero.drag_z == approx(0.0, abs=1e-15)
+    assert possible_together(effects, setting, {"rotor_drag_z": -drag}) == {"rotor_drag_z": -drag}

@@ -120,6 +120,10 @@ class Model(Protocol):
         """
         ...
 
+    def possible(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the sizes, each within its bounds, cut to what the effects can have together."""
+        return theta
+
     def plain(self) -> "Model":
         """Return the model without its extensions."""
         return self

@@ -114,11 +114,21 @@ class Problem:
         """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
         floors.
         """
+        return dict(self.model.possible(self._within_bounds(theta)))
+
+    def _within_bounds(self, theta: np.ndarray) -> dict[str, float]:
         return {
             e.name: float(np.clip(t * e.floor, *e.bounds))
             for e, t in zip(self.model.effects, theta)
             if t != 0.0
         }
+
+    def possible(self, theta: np.ndarray) -> np.ndarray:
+        """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
+        alone = self._within_bounds(theta)
+        together = self.model.possible(alone)
+        cut = [together.get(e.name, 0.0) - alone.get(e.name, 0.0) for e in self.model.effects]
+        return theta + np.pad(cut, (0, len(self.terms))) / self.priors.floor
 
 
 @dataclass(frozen=True)
@@ -211,6 +221,7 @@ def linearise(
 
     ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
     model gave there, if it was asked already; ``varies``: effects that differ among flights."""
+    theta = problem.possible(theta)
     sizes, channels = problem.sizes(theta), len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
@@ -313,6 +324,7 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the
     simulation fails there.
     """
+    theta = problem.possible(theta)
     kinds = problem.switches
     linearised = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
     count = len(

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from camera.params import CameraParams
-from sim.effects.effect import SettingEffect, apply
+from sim.effects.effect import SettingEffect, apply, possible_together
 from sim.effects.setting import Setting, generalised
 from sim.kernels.replay.kernel import ATTACHED
 from sim.params import PlantParams, SensingParams
@@ -276,6 +276,10 @@ class ThrowModel(Model):
                 residual = residual + linearised.windows[i].nuisance @ moves[i]
             residuals.append(residual)
         return residuals
+
+    def possible(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """See the base class."""
+        return possible_together(self.entries, self.setting, theta)
 
     def without_commands(
         self, theta: Mapping[str, float], windows: Sequence[int]
