@@ -237,14 +237,14 @@ def test_an_estimate_stays_within_its_physical_bounds():
 def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     model = world(truth={"effect_03": -5.0}, seed=2)
     model.effects = tuple(
-        replace(e, bounds=(-0.0, 1.0)) if e.name == "effect_03" else e for e in EFFECTS
+        replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS
     )
     found = search.explain(model, laws=False)["effect_03"]
     assert found.verdict == result.BOUNDED
     assert (found.low, found.high) == (0.0, 0.0)
     assert (
         found.sentence
-        == "effect_03: on its bound of 0 N; these flights ask for less than is possible."
+        == "effect_03: on its bound of 0; these flights ask for less than is possible."
     )
 
 

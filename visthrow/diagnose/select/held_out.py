@@ -121,9 +121,9 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         if not len(training):
             continue
         linear = Linear(statistics.only(training), priors, candidates, penalty)
-        near = occam_window(linear, {NOTHING, selected}, selected, pairs=False)
-        chosen = max(near, key=near.get)
-        if near[chosen] < linear.value(selected) + STRONG:
+        window_sets = occam_window(linear, {NOTHING, selected}, selected, pairs=False)
+        chosen = max(window_sets, key=window_sets.get)
+        if window_sets[chosen] < linear.value(selected) + STRONG:
             chosen = selected  # the training cannot tell it from others, and does not deny it
         active = columns_of(chosen)
         trained[fold] = estimate(*linear.total(chosen), priors, active)

@@ -27,7 +27,7 @@ from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, judged
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
 
-FEW = 5  # every which deviation is tried in a few windows, before all are asked
+STRIDE = 5  # every which deviation is tried in a few windows, before all are asked
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely.
@@ -96,7 +96,7 @@ class CommandStatistics:
             longest,
         )
 
-    def ahead(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
+    def gain(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
         """Nats of these shares of dropped commands against none, beside a set of effects."""
         return np.array(
             [self._evidence(float(p), priors, active) for p in shares]
@@ -141,15 +141,15 @@ def verdict(
     sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
     sets = active, np.flatnonzero(priors.visible & ~problem.switches).tolist()
-    every = range(len(problem.kept))
-    for rows, shares in ((few_of(every), reach[::FEW]), (every, reach)):
+    numbers = range(len(problem.kept))
+    for rows, shares in ((few_of(numbers), reach[::STRIDE]), (numbers, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         if not columns:
             return None
         statistics = CommandStatistics.of(
             problem, point, [point.windows[w] for w in rows], columns, rows
         )
-        nats = np.minimum(*(statistics.ahead(shares, priors, named) for named in sets))
+        nats = np.minimum(*(statistics.gain(shares, priors, named) for named in sets))
         if nats.max() <= 0.0:
             return None
     return judged(

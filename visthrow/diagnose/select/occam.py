@@ -89,8 +89,8 @@ class Linear:
             listed: dict[Candidate, float] = {}
             occam = 0.0
             for c in sorted((c for c in chosen if c.group != ALL), key=lambda c: c.name):
-                listed[c], more = self._deviation(chosen, listed, c)
-                occam += more
+                listed[c], bonus = self._deviation(chosen, listed, c)
+                occam += bonus
             self._shares[chosen] = listed, occam
         return self._shares[chosen]
 
@@ -116,8 +116,8 @@ class Linear:
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active, statistics = columns_of(chosen), self.statistics
-        flights = {other: size for other, size in fixed.items() if other.group != DAY}
-        days = {other: size for other, size in fixed.items() if other.group == DAY}
+        flights = {share: size for share, size in fixed.items() if share.group != DAY}
+        days = {share: size for share, size in fixed.items() if share.group == DAY}
         statistics = freed(statistics, varies_of(flights, self.days))
         nats = []
         for size in sizes.tolist():
@@ -161,8 +161,8 @@ class Linear:
                         listed[new] = self.value(new)
                     elif gain[c.columns[0]] > self._step - WINDOW:
                         self._shares.setdefault(new, self.shares(subset))
-                        more = self.penalty(new) - self.penalty(subset)
-                        listed[new] = base + float(gain[c.columns[0]]) - more
+                        cost = self.penalty(new) - self.penalty(subset)
+                        listed[new] = base + float(gain[c.columns[0]]) - cost
                 listed |= {subset | {c}: self.value(subset | {c}) for c in self._may_vary(subset)}
             self._added[subset] = listed
         return self._added[subset]
@@ -202,13 +202,13 @@ class Linear:
             groups.setdefault(c.group, []).append(c)
         return groups
 
-    def neighbours(self, chosen: Names, near: Names) -> dict[Names, float]:
+    def neighbours(self, chosen: Names, centre: Names) -> dict[Names, float]:
         """Return sets one step away, with their values, and no more than ``MOST_NEW`` candidates
         that a set does not have.
         """
         listed = {}
         for subset in (chosen, *(chosen - {c} for c in chosen)):
-            full = len(subset - near) >= MOST_NEW
+            full = len(subset - centre) >= MOST_NEW
             listed |= {subset: self.value(subset)} if full else self.added(subset)
         return listed
 
@@ -232,9 +232,9 @@ class Linear:
             single = additions(*self.total(subset), self.priors, active)[columns]
             price = np.array([self.penalty(subset | {by_column[j]}) for j in columns.tolist()])
             price -= self.penalty(subset)
-            beyond = gain - np.maximum.outer(single, single) - np.minimum.outer(price, price)
+            synergy = gain - np.maximum.outer(single, single) - np.minimum.outer(price, price)
             worth = base + gain - np.add.outer(price, price)
-            close = np.argwhere(np.triu((beyond > -STRONG) & np.isfinite(gain), 1))
+            close = np.argwhere(np.triu((synergy > -STRONG) & np.isfinite(gain), 1))
             for a, b in sorted(close.tolist(), key=lambda ab: -worth[tuple(ab)])[:RANDOM_TRIED]:
                 new = subset | {by_column[int(columns[a])], by_column[int(columns[b])]}
                 self._shares.setdefault(new, self.shares(subset))
@@ -243,13 +243,14 @@ class Linear:
 
 
 def window(
-    linear: Linear, begin: Iterable[Names], near: Names = NOTHING, pairs: bool = True
+    linear: Linear, begin: Iterable[Names], centre: Names = NOTHING, pairs: bool = True
 ) -> dict[Names, float]:
     """Return the sets near the best and their neighbours, with their values.
 
     Args:
         begin: sets that are opened first.
-        near: set that the derivatives belong to: others have at most ``MOST_NEW`` candidates more.
+        centre: set that the derivatives belong to: others have at most ``MOST_NEW`` candidates
+            more.
         pairs: whether two candidates are tried at once.
     """
     values = {chosen: linear.value(chosen) for chosen in begin}
@@ -262,13 +263,13 @@ def window(
         if close and in_vain < PATIENCE:
             chosen = max(close, key=values.get)
             opened.add(chosen)
-            listed = linear.neighbours(chosen, near)
+            listed = linear.neighbours(chosen, centre)
         else:
             chosen = max(values, key=values.get)
             if chosen in paired or not pairs:
                 break
             paired.add(chosen)
             listed = linear.pairs(chosen)
-        values |= {s: v for s, v in listed.items() if len(s - near) <= MOST_NEW}
+        values |= {s: v for s, v in listed.items() if len(s - centre) <= MOST_NEW}
         in_vain = 0 if max(values.values()) > best + 1e-6 else in_vain + 1
     return values

@@ -413,10 +413,10 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
     return _with_noise_at(point, theta)
 
 
-def with_noise_of(point: Point, other: Point) -> Point:
+def with_noise_of(point: Point, source: Point) -> Point:
     """Return the point with its residuals under the noise levels of another."""
-    alike = point.grams[0].inner is other.grams[0].inner  # the same derivatives
-    return regathered(point, other.integrals if alike else None, noise=other.noise)
+    alike = point.grams[0].inner is source.grams[0].inner  # the same derivatives
+    return regathered(point, source.integrals if alike else None, noise=source.noise)
 
 
 def with_varying(point: Point, varies: Varies) -> Point:
@@ -530,17 +530,17 @@ def candidates(
     """Return :func:`candidate` of several sets, or why there is none: side by side where they wait
     for a GPU.
     """
-    asked = list(zip(points, sets))
+    pairs = list(zip(points, sets))
 
     def simulated(i: int) -> Point | DiagnoseError:
         try:
-            return candidate(problem, *asked[i])
+            return candidate(problem, *pairs[i])
         except DiagnoseError as error:
             return error
 
-    if not asked or points[0].device == "cpu":
-        return [simulated(i) for i in range(len(asked))]
-    return run_concurrently(simulated, range(len(asked)))
+    if not pairs or points[0].device == "cpu":
+        return [simulated(i) for i in range(len(pairs))]
+    return run_concurrently(simulated, range(len(pairs)))
 
 
 def switched(problem: Problem, point: Point, active: Sequence[int]) -> np.ndarray | None:

@@ -44,11 +44,11 @@ def with_repeated_laws(diagnosis: Diagnosis) -> Diagnosis:
     statistics = regrouped(point, groups)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
     shares = [_share(statistics, wide.priors, names, chosen) for chosen in sets]
-    kept = [e for e, (_, low, _) in zip(diagnosis.explanations, shares) if low > 0.0]
-    kept = kept if shares[0][1] > 0.0 else []  # none in place of a better one
-    formulas = {law.formula for together in kept for law in together}
+    repeated = [e for e, (_, low, _) in zip(diagnosis.explanations, shares) if low > 0.0]
+    repeated = repeated if shares[0][1] > 0.0 else []  # none in place of a better one
+    formulas = {law.formula for together in repeated for law in together}
     reasons = list(diagnosis.reasons)
-    if not kept:
+    if not repeated:
         share, low, high = (100.0 * value for value in shares[0])
         best = [law.formula for law in diagnosis.explanations[0]]
         reasons = [r for r in reasons if not any(formula in r for formula in best)]
@@ -59,7 +59,7 @@ def with_repeated_laws(diagnosis: Diagnosis) -> Diagnosis:
     return replace(
         diagnosis,
         reasons=tuple(reasons),
-        explanations=tuple(kept),
+        explanations=tuple(repeated),
         laws=tuple(law for law in diagnosis.laws if law.formula in formulas),
     )
 
@@ -74,7 +74,7 @@ def _share(
     score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
     prior = np.diag(priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
-    others = total - information, score.sum(0) - score
-    trained = np.linalg.solve(others[0], others[1][..., None])[..., 0]
+    training = total - information, score.sum(0) - score
+    trained = np.linalg.solve(training[0], training[1][..., None])[..., 0]
     part = replace(statistics, information=information, score=score, theta=np.zeros(len(laws)))
     return borne_out(part, trained, np.linalg.solve(total, score.sum(0)))

@@ -22,10 +22,15 @@ EVENT = "event"  # one flight alone has one
 REACH = np.geomspace(0.02, 6.0, 25)
 """Deviations that are tried, in their prior's."""
 COARSE = 3  # every which of them suffices to compare candidates
-FAR = 3.0  # floors of a flight's own estimate from which its derivative is not relied upon
+FAR_FLOORS = 3.0  # floors of a flight's own estimate from which its derivative is not relied upon
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at
+
+
+def unit_suffix(unit: str) -> str:
+    """Return a unit as it stands after a number: nothing where it is dimensionless."""
+    return "" if unit == "1" else f" {unit}"
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,8 @@ class Scatter:
     def sentence(self) -> str:
         """For people."""
         size = (
-            f"{self.name} = {self.size:.3g} {self.unit} (95 %: {self.low:.3g} to {self.high:.3g})"
+            f"{self.name} = {self.size:.3g}{unit_suffix(self.unit)}"
+            f" (95 %: {self.low:.3g} to {self.high:.3g})"
         )
         drifts = "drifts, a value for each day. " if self.by == DAY else ""
         return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
@@ -97,8 +103,8 @@ def relinearised_per_flight(
     """Statistics whose scores are those about the size of one effect at which each flight fits best
     by itself.
 
-    ``theta``: estimated sizes, in floors; ``again``: the flights simulated at other sizes, in
-    floors; None where that fails.
+    ``theta``: estimated sizes, in floors; ``simulate``: simulates the flights at other sizes, in
+    floors, or returns None where that fails.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
     diagonal = statistics.information[:, j, j]
@@ -106,7 +112,7 @@ def relinearised_per_flight(
     reach = np.abs(
         np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
     ).max(initial=0.0)
-    if reach < FAR:
+    if reach < FAR_FLOORS:
         return statistics
     sizes = []
     simulated = []
@@ -247,10 +253,10 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
 
     ``varies``: effects that have such shares. Where days have some, what is returned is of days.
     """
-    left = integrated(statistics, varies.of(statistics))
+    of_flights = integrated(statistics, varies.of(statistics))
     if not varies.drifts:
-        return left
-    return integrated(by_day(left, varies.days), varies.drifts.items())
+        return of_flights
+    return integrated(by_day(of_flights, varies.days), varies.drifts.items())
 
 
 def freed_beside(

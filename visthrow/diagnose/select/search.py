@@ -191,9 +191,9 @@ def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | Non
     lossy = replace(problem, lost=loss.size)
     start = linearise(lossy, np.zeros_like(nominal.theta), nominal.noise)
     lossy_selection = Selector(lossy, start, needed, plain.progress, plain.laws).run(begin)
-    ahead = lossy_selection.value - needed - plain.value
-    plain.progress(f"commands got lost: {loss.size:.1%} of them, {ahead:.1f} nats ahead")
-    if ahead <= 0.0:
+    gain = lossy_selection.value - needed - plain.value
+    plain.progress(f"commands got lost: {loss.size:.1%} of them, {gain:.1f} nats ahead")
+    if gain <= 0.0:
         return plain, None
     return lossy_selection, lost_commands.sized(lossy, start, loss)
 

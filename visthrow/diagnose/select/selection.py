@@ -60,7 +60,7 @@ from visthrow.diagnose.select.scatter import own_shares
 
 SIDE_BY_SIDE = 4  # sets that are simulated at once on a GPU
 MOST_LAWS = 2
-SHOWN = 10  # sets that a step keeps for the report
+REPORTED_SETS = 10  # sets that a step keeps for the report
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class Trial:
     point: Point
     shares: Mapping[Candidate, float] = field(default_factory=dict)  # deviations of random shares
     occam: float = 0.0  # nats by which they are worth more at their best than over their prior
-    ahead: float = 0.0  # of the best set [nats]
+    lead: float = 0.0  # of the best set [nats]
 
     @cached_property
     def columns(self) -> list[int]:
@@ -198,17 +198,17 @@ class Selector:
         alike_tried = False
         while True:
             better = [t for t in tried if self._better(t)]
-            least = -np.inf
+            minimum = -np.inf
             if better:
-                least = max(*(t.ahead for t in better), max(listed.values()) - WINDOW)
-            shortlist = self._short(listed, tried, least)
+                minimum = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
+            shortlist = self._short(listed, tried, minimum)
             if not shortlist:
                 break
             shortlist += [] if alike_tried else self._alike(shortlist[0])
             alike_tried = True
             tried += self._tried(self.best.point, dict.fromkeys(shortlist))
         if better:
-            top = max(better, key=lambda t: t.ahead)
+            top = max(better, key=lambda t: t.lead)
             if laws_of(top.chosen) and self._approached():
                 return True
             self._record(top, tried, listed)
@@ -219,16 +219,16 @@ class Selector:
             self._go(followed)
             return True
         rivals: dict[Names, Trial] = {}  # each where it is worth most
-        for t in sorted(tried, key=lambda t: t.ahead):
+        for t in sorted(tried, key=lambda t: t.lead):
             rivals[t.chosen] = t
-        close = [t for t in rivals.values() if -t.ahead < STRONG and self.is_admissible(t)]
+        close = [t for t in rivals.values() if -t.lead < STRONG and self.is_admissible(t)]
         close += [  # sets that were the best before
-            Trial(s, self.best.point, ahead=nats)
+            Trial(s, self.best.point, lead=nats)
             for s, nats in self._simulated.items()
             if s in self._visited - {self.best.chosen} and nats > -STRONG
         ]
-        close.sort(key=lambda t: -t.ahead)
-        self.window = [(self.best, 0.0), *((t, -t.ahead) for t in close)]
+        close.sort(key=lambda t: -t.lead)
+        self.window = [(self.best, 0.0), *((t, -t.lead) for t in close)]
         return False
 
     def _listed(self) -> dict[Names, float]:
@@ -240,9 +240,9 @@ class Selector:
         free = with_all_effects_noise(self.problem, self.best.point)
         places = [(self.best.point, present), (free, present)]
         places += [(self.nominal, NOTHING)] if present else []
-        for point, near in places:
+        for point, centre in places:
             linear = self.linear(point)
-            close = window(linear, {near, NOTHING}, near)
+            close = window(linear, {centre, NOTHING}, centre)
             base = linear.value(present)
             for chosen, value in close.items():
                 ahead_of[chosen] = max(ahead_of.get(chosen, -np.inf), value - base)
@@ -275,9 +275,9 @@ class Selector:
         return exchanged
 
     def _short(
-        self, listed: Mapping[Names, float], tried: Sequence[Trial], least: float
+        self, listed: Mapping[Names, float], tried: Sequence[Trial], minimum: float
     ) -> list[Names]:
-        """Return the next sets to be simulated, best first: what promises more than ``least``
+        """Return the next sets to be simulated, best first: what promises more than ``minimum``
         [nats], and may be possible.
 
         A move is expected to fall short of what derivatives promise as its parts did."""
@@ -292,8 +292,8 @@ class Selector:
             if chosen not in done:
                 parts = (nats for part, nats in shortfalls if part < chosen ^ present)
                 expected[chosen] = promised - max(parts, default=0.0)
-        behind = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
-        close = [s for s, nats in expected.items() if nats > max(least, -behind)]
+        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
+        close = [s for s, nats in expected.items() if nats > max(minimum, -margin)]
         ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
         close = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
@@ -321,12 +321,14 @@ class Selector:
         for s, simulated, _ in trials:
             if isinstance(simulated, DiagnoseError):
                 self.progress(f"{names_of(s)}: not simulated, {simulated}")
-        found = [Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)]
-        found = [replace(t, ahead=self._ahead(t)) for t in found]
-        for t in found:  # what may not be named gains nothing
-            nats = t.ahead if self.is_admissible(t) else min(t.ahead, 0.0)
+        simulated_trials = [
+            Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)
+        ]
+        simulated_trials = [replace(t, lead=self._lead(t)) for t in simulated_trials]
+        for t in simulated_trials:  # what may not be named gains nothing
+            nats = t.lead if self.is_admissible(t) else min(t.lead, 0.0)
             self._simulated[t.chosen] = max(nats, self._simulated.get(t.chosen, -np.inf))
-        return found
+        return simulated_trials
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point linearised with the kinds of blocks that a set asks for; once for each
@@ -341,26 +343,26 @@ class Selector:
 
     def _better(self, trial: Trial) -> bool:
         new = trial.chosen not in self._visited
-        return new and trial.ahead > ENOUGH_NATS and self.is_admissible(trial)
+        return new and trial.lead > ENOUGH_NATS and self.is_admissible(trial)
 
-    def _ahead(self, trial: Trial) -> float:
+    def _lead(self, trial: Trial) -> float:
         """Return the nats by which a set is worth more than the best.
 
         Where names show that something is missing, a law in their place need not show it again."""
-        nats, laws = self.ahead(trial, self.best), laws_of(trial.chosen)
+        nats, laws = self.lead(trial, self.best), laws_of(trial.chosen)
         if laws_of(self.best.chosen) or self.best.chosen <= trial.chosen:
             return nats
         return nats + len(laws) * terms.LAW
 
-    def ahead(self, first: Trial, second: Trial) -> float:
+    def lead(self, first: Trial, second: Trial) -> float:
         """Return the nats by which a set is worth more than another, each where it was simulated,
         with the noise levels of whichever of both points suits it better.
 
         The noise levels of a point were estimated without the floors; a set may do better with the
         levels of another set."""
         value = [
-            max(self._value(t), self._value(t, with_noise_of(t.point, other.point)))
-            for t, other in ((first, second), (second, first))
+            max(self._value(t), self._value(t, with_noise_of(t.point, rival.point)))
+            for t, rival in ((first, second), (second, first))
         ]
         return value[0] - value[1]
 
@@ -415,15 +417,15 @@ class Selector:
         point = self._settled(point, trial.columns)
         trial = replace(trial, point=point)
         (unchanged,) = self._tried(point, [self.best.chosen])
-        nats = min(self.ahead(trial, self.best), self.ahead(trial, unchanged))
+        nats = min(self.lead(trial, self.best), self.lead(trial, unchanged))
         if nats > ENOUGH_NATS and self.is_admissible(trial):
-            return replace(trial, ahead=nats)
+            return replace(trial, lead=nats)
         self.origin = origin
         return None
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
-        self._simulated = {s: nats - trial.ahead for s, nats in self._simulated.items()}
+        self._simulated = {s: nats - trial.lead for s, nats in self._simulated.items()}
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
         point = self._settled(trial.point, trial.columns)
@@ -479,12 +481,12 @@ class Selector:
 
     def _record(self, top: Trial, tried: Iterable[Trial], listed: Mapping[Names, float]) -> None:
         """Say what was selected, and keep what was compared for the report."""
-        nats = {names_of(t.chosen): t.ahead for t in tried}
+        nats = {names_of(t.chosen): t.lead for t in tried}
         listed_best = {
-            names_of(s): n for s, n in sorted(listed.items(), key=lambda i: -i[1])[:SHOWN]
+            names_of(s): n for s, n in sorted(listed.items(), key=lambda i: -i[1])[:REPORTED_SETS]
         }
-        self.progress(f"{names_of(top.chosen)}: {top.ahead:.1f} nats ahead")
-        self.steps.append(SelectionStep(names_of(top.chosen), top.ahead, 0.0, listed_best, nats))
+        self.progress(f"{names_of(top.chosen)}: {top.lead:.1f} nats ahead")
+        self.steps.append(SelectionStep(names_of(top.chosen), top.lead, 0.0, listed_best, nats))
 
     def _propose(self) -> bool:
         """Offer the terms of laws that say most, beside the set and in place of its names; False
@@ -501,9 +503,9 @@ class Selector:
         if present - forms:
             sets.append((self.nominal, columns_of(forms), names))
         shortlist: list[TermEffect] = []
-        for point, active, gone in sets:
+        for point, active, replaced in sets:
             shortlist += terms.shortlist(
-                self.problem, point, active, strongest, self.threshold, gone
+                self.problem, point, active, strongest, self.threshold, replaced
             )
         shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())
         if not shortlist:

@@ -62,7 +62,7 @@ class Screen:
 
     terms: tuple[Term, ...]
     size: np.ndarray  # root mean square over the knots, shape (T,)
-    own: np.ndarray  # shape (T,)
+    information: np.ndarray  # shape (T,)
     score: np.ndarray
     cross: np.ndarray  # with the effects, shape (T, K)
 
@@ -222,7 +222,7 @@ def _conditional(
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
     information = np.maximum(
-        screened.own
+        screened.information
         - np.einsum("tk,kl,tl->t", screened.cross, sigma, screened.cross, optimize=True),
         0.0,
     )
@@ -341,8 +341,8 @@ def shortlist(
             calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
         )
         gain -= [price[term.depth] for term in screened.terms]
-        beside = problem.priors.deviation(list(active))
-        explained = [_unsaid(calm, problem.priors, beside, screened, n) < LAW for n in names]
+        deviation = problem.priors.deviation(list(active))
+        explained = [_unsaid(calm, problem.priors, deviation, screened, n) < LAW for n in names]
         gain[np.any(explained, axis=0)] = -np.inf
         ranked += [
             (float(gain[i]), screened.terms[i], float(prior[i]))
@@ -443,8 +443,8 @@ def unexplained_nats(
 
     A term has neither bounds nor a usual size. It must not take the place of a name that says the
     same only because the name lies at its bound, or is larger than was expected."""
-    beside = priors.deviation([k for k in active if k != term])
-    beside[term] = 0.0
+    deviation = priors.deviation([k for k in active if k != term])
+    deviation[term] = 0.0
     row = point.information[[term]]
-    alone = Screen((), np.ones(1), row[:, term], point.score[[term]], row)
-    return float(_unsaid(point, priors, beside, alone, name)[0])
+    single = Screen((), np.ones(1), row[:, term], point.score[[term]], row)
+    return float(_unsaid(point, priors, deviation, single, name)[0])

@@ -54,6 +54,7 @@ from visthrow.diagnose.select.scatter import (
     freed,
     judged,
     relinearised_per_flight,
+    unit_suffix,
 )
 from visthrow.diagnose.select.selection import Selector, Trial
 
@@ -152,10 +153,10 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
         named = best.chosen if c in random else best.chosen | means
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
-        own = share_verdict(linear, c, named, fixed_shares, effect, selection.threshold)
-        verdicts.append(replace(own, found=c in random))
+        verdict = share_verdict(linear, c, named, fixed_shares, effect, selection.threshold)
+        verdicts.append(replace(verdict, found=c in random))
         if c in random:
-            shares[c] = max(own.size, own.floor) / effect.prior_sd
+            shares[c] = max(verdict.size, verdict.floor) / effect.prior_sd
     return tuple(verdicts), varies_of(shares, problem.days)
 
 
@@ -207,8 +208,7 @@ def _about_means(
     """Return what the flights say of the means of effects that vary."""
     statistics = point.plain
     for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
-        straight = _straight(selection, replace(point, plain=statistics), active, j)
-        statistics = straight
+        statistics = _straight(selection, replace(point, plain=statistics), active, j)
     return statistics
 
 
@@ -273,9 +273,9 @@ def _law(selection: Selector) -> tuple[set[int], str]:
     joint = grammar.JOINT in blocks
     in_block = set()
     for j in names:
-        rest = [k for k in names if k != j]
-        alone = acts_on(best.point, [j], joint=joint, free_effects=rest)[0]
-        if {selection.block_of(j, joint), alone} & blocks:
+        remaining = [k for k in names if k != j]
+        residual_block = acts_on(best.point, [j], joint=joint, free_effects=remaining)[0]
+        if {selection.block_of(j, joint), residual_block} & blocks:
             in_block.add(j)
     remaining_columns = [j for j in best.columns if j not in in_block]
     while in_block and set(remaining_columns) & set(names):
@@ -291,7 +291,8 @@ def _law(selection: Selector) -> tuple[set[int], str]:
         remaining_columns.remove(weakest)
     laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
     text = " and ".join(
-        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}" for law in laws_of_set
+        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
+        for law in laws_of_set
     )
     return set(names) - set(
         remaining_columns
@@ -372,8 +373,8 @@ def _overall(
     reasons = [_excess(level) for level in excessive]
     laws = laws_of(selection.best.chosen)
     if laws:
-        unnamed, said = _law(selection)
-        return result.UNKNOWN, laws[0].law, [said, *reasons], unnamed
+        unnamed, law_text = _law(selection)
+        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed
     stuck = [j for j in active if _on_bound(selection, j)]
     if stuck:
         names = ", ".join(selection.problem.effects[j].name for j in stuck)
@@ -398,8 +399,8 @@ def _overall(
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
     if active:
-        return result.KNOWN, "", [f"{len(active)} named, nothing excessive is left"], set()
-    nothing = f"no effect exceeds {selection.threshold:.1f} nats, and nothing excessive is left"
+        return result.KNOWN, "", [f"{len(active)} named, no residual above the noise"], set()
+    nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
     return result.NO_EFFECT, "", [nothing], set()
@@ -503,14 +504,15 @@ def _finding(
     if sd > BIT * priors.slab[j]:
         text = (
             f"{effect.name}: these flights say hardly more than was known ({deviation:.2g} of"
-            f" {effect.prior_sd:.2g} {effect.unit})."
+            f" {effect.prior_sd:.2g}{unit_suffix(effect.unit)})."
         )
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    text = f"{effect.name}: between {low:.3g} and {high:.3g} {effect.unit}, if there at all."
+    unit = unit_suffix(effect.unit)
+    text = f"{effect.name}: between {low:.3g} and {high:.3g}{unit}, if there at all."
     if low == high:
         comparison = "less" if mean * effect.floor < low else "more"
         text = (
-            f"{effect.name}: on its bound of {low:.3g} {effect.unit}; these flights ask for"
+            f"{effect.name}: on its bound of {low:.3g}{unit}; these flights ask for"
             f" {comparison} than is possible."
         )
     return replace(blank, verdict=result.BOUNDED, sentence=text)
@@ -523,9 +525,9 @@ def _averaged(
     free below their floors, in floors.
     """
     estimates = []
-    for members, behind in sets:
+    for members, distance in sets:
         sigma = covariance(point.information, priors.deviation(list(members)))
-        estimates.append((float(sigma[j] @ point.score), float(sigma[j, j]), np.exp(-behind)))
+        estimates.append((float(sigma[j] @ point.score), float(sigma[j, j]), np.exp(-distance)))
     means, variances, weights = np.array(estimates).T
     mean = np.average(means, weights=weights)
     return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
@@ -583,7 +585,7 @@ def _named(
     size = float(np.clip(mean * blank.floor, low, high)) + 0.0  # no -0
     low = max(low, size - NORMAL_95 * blank.sd) + 0.0
     high = min(high, size + NORMAL_95 * blank.sd) + 0.0
-    text = f"{size:.3g} ± {blank.sd:.2g} {blank.unit}"
+    text = f"{size:.3g} ± {blank.sd:.2g}{unit_suffix(blank.unit)}"
     blank = replace(blank, estimate=size, low=low, high=high)
     if low <= 0.0 <= high:
         sentence = f"{blank.cause}: {blank.name} = {text}, an interval that holds 0."
@@ -599,7 +601,7 @@ def _named(
     joint = _joint(selection, point, members, [k for k in active if k not in members])
     sentence = (
         f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it"
-        f" from {', '.join(names)}. Known is {joint}."
+        f" from {', '.join(names)}. Only this combination is determined: {joint}."
     )
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
@@ -632,4 +634,4 @@ def _joint(selection: Selector, point: Point, members: list[int], named: list[in
             f" {effect.name}"
         )
     sd = 1.0 / np.sqrt(max(value, 1e-300)) / abs(scale)
-    return f"{' '.join(parts)} = {mean / scale:.4g} ± {sd:.2g} {unit}"
+    return f"{' '.join(parts)} = {mean / scale:.4g} ± {sd:.2g}{unit_suffix(unit)}"
