@@ -252,9 +252,9 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
             at.problem, [at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
         )
         scale = problem.priors.floor[-1]
-        assert point.information[-1, -1] == approx(scale**2 * of.own[i], rel=1e-6)
+        assert point.information[-1, -1] == approx(scale**2 * of.information[i], rel=1e-6)
         assert point.score[-1] == approx(
-            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.own[i])
+            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.information[i])
         )
         cross, most = scale * of.cross, scale * np.abs(of.cross).max()
         assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
@@ -361,7 +361,7 @@ def test_terms_are_screened_beside_what_varies(days):
     for i in (0, 1, 40):
         own = terms.as_effect(screen.terms[i], 0.1, 0.0)
         _, (wide,) = terms.extended(problem, [calm], [own])
-        assert_allclose(screen.own[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
+        assert_allclose(screen.information[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
         assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
         cross = wide.information[-1, :-1] / own.floor
         assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())
