@@ -286,7 +286,9 @@ class ThrowModel(Model):
     ) -> list[np.ndarray]:
         """See the base class; the command before stays."""
         setting = apply(self.entries, self.setting, theta)
-        states = self._settled_at.get(_key(theta), self._nominal[0])
+        states = self._settled_at.get(_key(theta))
+        if states is None:  # nominal ones may have another number of segments
+            states, _ = self._latest[self._switches(theta)]
         slopes = self.setting.plant.vehicle.queue.delay
         return without_each_command(
             self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
