@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -384,8 +384,8 @@ def differing(lines: list[dict], tests: tuple, sides: list[str]) -> None:
             print(f"{name}: {line['kind']} {hidden}\n    " + "\n    ".join(answers))
 
 
-def main() -> None:
-    """Answer banks, or compare the answers of a ledger."""
+def main(argv: Sequence[str] | None = None) -> None:
+    """Answer banks, or compare the answers of a ledger; ``argv``: in place of the program's."""
     parser = argparse.ArgumentParser(description=__doc__)
     actions = parser.add_subparsers(dest="action", required=True)
     ask = actions.add_parser("answer", help=answer.__doc__)
@@ -401,7 +401,7 @@ def main() -> None:
     judge = actions.add_parser("compare", help=compare.__doc__)
     judge.add_argument("ledgers", type=Path, nargs="+")
     judge.add_argument("--list", action="store_true", help="print worlds that a side has wrong")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     {"answer": answer, "compare": compare}[args.action](args)
 
 

@@ -382,9 +382,7 @@ def build_replay(
                 until = wp.min(until, wp.max(knot_time, m.time + tiny))
             count = wp.max(int(wp.ceil((until - m.time) / lanes.substep[lane] - real(1.0e-3))), 1)
             h = (until - m.time) / real(float(count))
-            acting = command
-            if command == lanes.skip[lane]:
-                acting = command - 1
+            acting = wp.where(command == lanes.skip[lane], command - 1, command)
             active = data.command[acting]
             peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
             for j in range(count):

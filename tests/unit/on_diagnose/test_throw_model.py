@@ -326,3 +326,17 @@ def test_a_path_comes_down_between_two_points():
     path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
     assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
     assert np.isnan(landing._crossing(path, 0.7)).all()
+
+
+def test_lost_commands_are_asked_for_from_states_of_the_setting_s_own_rope():
+    rigid = paper_plant()
+    rigid = replace(rigid, rope=replace(rigid.rope, segments=1))
+    logs = fly(setting_with({}), free=1, throws=0, seconds=1.0)
+    model = ThrowModel(logs, rigid, only=["rope_flexible", "mass_payload"])
+    windows = model.windows({"rope_flexible": 1.0})
+    model.windows({})
+    elsewhere = {"rope_flexible": 1.0, "mass_payload": 1e-6}  # where no states were fitted
+    columns = model.without_commands(elsewhere, range(len(windows)))
+    at_fit = model.without_commands({"rope_flexible": 1.0}, range(len(windows)))
+    for near, exact in zip(columns, at_fit):
+        assert_allclose(near, exact, atol=1e-3 * np.abs(exact).max())

@@ -67,8 +67,8 @@ class Crossed:
 
 @dataclass(frozen=True)
 class Work:
-    """What a diagnosis leaves behind for gain, report, plan and blind: its problem, the model as it
-    stands, and the model with what was selected.
+    """A diagnosis' problem, the model as it stands, and the model with what was selected: for gain,
+    report, plan and blind limits.
     """
 
     problem: Problem
