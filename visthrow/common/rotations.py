@@ -172,9 +172,10 @@ def rotation_vector(quat: Quaternion) -> Vector:
 
 
 def tilt_and_heading(quat: Quaternion) -> tuple[float, float]:
-    """Angle of body z from the vertical, and of body x's heading from world x [rad]."""
+    """Angle of body z from the vertical, and of body x's heading from world x [rad]; NaN of NaN."""
     x, y, z, w = quat
-    tilt = math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * (x * x + y * y))))
+    # in this order min and max pass a NaN on
+    tilt = math.acos(max(min(1.0 - 2.0 * (x * x + y * y), 1.0), -1.0))
     return tilt, math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 

@@ -116,7 +116,7 @@ class MavlinkAutopilot(Autopilot, ABC):
 
     def _begin_audit(self) -> None:
         p = self.params
-        rules = rules_of(self.name, p, **self._rule_values())
+        rules = rules_of(self.name, p, servo_near=SERVO_NEAR, **self._rule_values())
         for name, value in p.parameters.items():
             rules.append(Rule(name, "by the config", (value,), write=True))
         self.audit = Audit(

@@ -154,7 +154,8 @@ def test_a_payload_that_is_seen_again_in_its_fall_is_farther_off_than_its_cable(
 
 
 @mark.parametrize(
-    ("speed", "tilt_deg", "able"), [(0.9, 19.0, True), (1.1, 0.0, False), (0.0, 21.0, False)]
+    ("speed", "tilt_deg", "able"),
+    [(0.9, 19.0, True), (1.1, 0.0, False), (0.0, 21.0, False), (0.0, math.nan, False)],
 )
 def test_a_vehicle_that_is_slow_and_level_is_handed_over(speed, tilt_deg, able):
     half = 0.5 * math.radians(tilt_deg)
