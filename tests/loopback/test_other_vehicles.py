@@ -100,7 +100,7 @@ def test_the_policys_vehicle_throws_even_with_a_slow_yaw(kind):
 
 
 @mark.parametrize("kind", KINDS)
-@mark.parametrize("times", [0.5, 2.0])
+@mark.parametrize("times", [0.5, 2.0, 4.0])
 def test_a_weight_that_the_configuration_names_is_refused_at_the_start(kind, times):
     weight = 2.668 * times
     over = [f"{kind}.thrust.weight={weight}", f"{kind}.thrust.hover={min(0.1906 * times, 0.9)}"]
@@ -113,6 +113,7 @@ THRUST = ("times the weight", "thrust: the vehicle")
 OTHERS = {
     "half the weight": ({"times": 0.5}, THRUST),
     "twice the weight": ({"times": 2.0}, THRUST),
+    "four times the weight": ({"times": 4.0}, THRUST),
     "less thrust": ({"spoil": bend(0.8)}, THRUST),
     "more thrust": ({"spoil": bend(1.2)}, THRUST),
     "no yaw": ({"yaw_lag": 1e6}, ("handed back: yaw: the vehicle does not turn as commanded",)),
