@@ -1,5 +1,5 @@
 """The house keeps its order: no import circle, no import upward, no long function, no crowded
-folder.
+folder, no mutation of a text that is gone.
 
 An import counts wherever it stands: at the top, under TYPE_CHECKING, or in a function that is meant
 to save start-up time. The rooms and their order are read from CONVENTIONS.md."""
@@ -11,6 +11,8 @@ from functools import cache
 from pathlib import Path
 
 from pytest import fixture, mark
+
+from bench.mutations.__main__ import load
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
@@ -239,6 +241,14 @@ def test_a_circle_of_three_is_caught_and_a_diamond_is_none():
         ["a", "b"],
         ["c", "d"],
     ]
+
+
+def test_each_mutation_fits_the_code():
+    """Each old text stands once in its file, or ``load`` raises; the tests that it names exist."""
+    mutations = load([])
+    assert mutations
+    tests = {name for m in mutations for name in (*m.tests, *m.room_tests)}
+    assert [name for name in sorted(tests) if not (ROOT / name).exists()] == []
 
 
 def test_the_rooms_are_read_in_their_order():
