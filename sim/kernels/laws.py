@@ -11,7 +11,6 @@ A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the p
 does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its
 opposite at the mount. Momentum is conserved."""
 
-from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -223,15 +222,14 @@ QUANTITIES = {
 """Quantities of ``law_factors.toml`` at a state."""
 
 
-@cache
 def quantity(name: str):
     """Return the function of a quantity of the table, of a vector's size, or of a cross product."""
-    first, crossed, second = name.partition(" x ")
     if name in QUANTITIES:
         return QUANTITIES[name]
-    return (
-        _crossed(quantity(first), quantity(second)) if crossed else _size(quantity(name.strip("|")))
-    )
+    first, crossed, second = name.partition(" x ")
+    if crossed:
+        return _crossed(QUANTITIES[first], QUANTITIES[second])
+    return _size(QUANTITIES[name.strip("|")])
 
 
 def _functions(rows):
