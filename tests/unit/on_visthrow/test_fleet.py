@@ -119,9 +119,8 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
     env.carry(torch.ones(12, 5))
     queued = env.views.command[:, 0]
     for e in range(12):
-        assert float(queued[e]) == approx(
-            drawn[e % 6 // 2].max_thrust, rel=0.15
-        )  # five deviations of the commands' noise
+        most = drawn[e % 6 // 2].max_thrust
+        assert float(queued[e]) == approx(most, rel=0.15), "five deviations of the commands' noise"
 
 
 def quiet(base: Experiment) -> Experiment:
