@@ -251,6 +251,12 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
             "not a readable checkpoint",
         ),
         (lambda f: (f / CHECKPOINT).unlink(), "no checkpoint.pt to resume from"),
+        (
+            lambda f: (f / "config.toml").write_text(
+                (f / "config.toml").read_text().replace("clip = 0.2", "clip = 0.3")
+            ),
+            "lines that differ: clip = 0.2; clip = 0.3",
+        ),
     ],
 )
 def test_broken_checkpoints_are_refused(tmp_path, capsys, change, words):

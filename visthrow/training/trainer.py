@@ -277,10 +277,13 @@ class Trainer:
             ) from None
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
-        if saved["config"] != config.dumps(self.experiment) or saved["seed"] != self.seed:
+        there = saved["config"] + f"seed = {saved['seed']}\n"
+        here = config.dumps(self.experiment) + f"seed = {self.seed}\n"
+        if there != here:
+            differ = sorted(set(there.splitlines()) ^ set(here.splitlines()))
             raise CheckpointError(
-                f"{path}: written by a run of another configuration or seed; resume with the same"
-                " ones"
+                f"{path}: written by a run of another configuration or seed, or by another version"
+                f" of visthrow; lines that differ: {'; '.join(differ)}"
             )
         self.iteration = saved["iteration"]
         rank = self.ranks.rank
