@@ -18,15 +18,13 @@ from torch.optim.swa_utils import AveragedModel
 
 from visthrow.onboard.policy import RSL_RL_EPS, Policy
 
-OBSERVED = (
-    10**8
-    # observations that a policy's normaliser counts for when it is taken up: about those of its
-    # training, which no file tells
-)
+# observations that the normaliser of a policy counts for when it is taken up: about as many as in
+# its training, which its file does not state
+OBSERVED = 10**8
 
 
 def normalizer_state(mean: Tensor, std: Tensor) -> dict[str, Tensor]:
-    """State of rsl_rl's normaliser that has seen :data:`SEEN` observations of this mean and spread,
+    """State of rsl_rl's normaliser after :data:`OBSERVED` observations of this mean and spread,
     shape (D,).
     """
     state = {"_mean": mean, "_std": std, "_var": std.square()}
@@ -104,13 +102,15 @@ class Network(MLPModel):
 
 
 class MuonAdam(torch.optim.Adam):
-    """Adam whose weight matrices step along their orthogonalised momentum, all at one learning
-    rate. First order comes to an error in half the gradients by it.
+    """Adam whose weight matrices step along their orthogonalised momentum, at the same learning
+    rate.
 
     Source: K. Jordan et al., Muon, 2024; the steps' size: Liu et al., arXiv:2502.16982."""
 
     def __init__(self, parameters: Iterable[Tensor], matrices: Iterable[Tensor], **options: Any):
-        """Take ``matrices`` among the parameters by Muon; ``options`` of Adam."""
+        """Step the ``matrices`` among the parameters by Muon and the others by Adam, with these
+        ``options``.
+        """
         self._matrices = list(matrices)
         taken = set(map(id, self._matrices))
         super().__init__([p for p in parameters if id(p) not in taken], **options)
@@ -128,7 +128,8 @@ class MuonAdam(torch.optim.Adam):
         super().step()
         before = [matrix.clone() for matrix in self._matrices]
         self._muon.step()
-        for matrix, old in zip(self._matrices, before):  # a rate on the device, in a graph
+        # Muon's rate cannot live on the device, as graphs need it: scale steps of rate 1
+        for matrix, old in zip(self._matrices, before):
             matrix.copy_(torch.lerp(old, matrix, self.param_groups[0]["lr"]))
 
     def state_dict(self) -> dict:

@@ -72,8 +72,8 @@ class CapturedPPO(PPO):
     def _descend(self, batch: RolloutStorage.Batch) -> None:
         """Take one gradient step on a minibatch."""
         distribution = self.actor.distribution
-        distribution.update(self.actor.output(self.actor.get_latent(batch.observations)))
-        value = self.critic.output(self.critic.get_latent(batch.observations))
+        distribution.update(self.actor(batch.observations))
+        value = self.critic(batch.observations)
         ratio = (distribution.log_prob(batch.actions)[:, None] - batch.old_actions_log_prob).exp()
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-batch.advantages * ratio, -batch.advantages * clipped).mean()
