@@ -328,11 +328,14 @@ def test_a_path_comes_down_between_two_points():
     assert np.isnan(landing._crossing(path, 0.7)).all()
 
 
-def test_lost_commands_are_asked_for_from_states_of_the_setting_s_own_rope():
+def test_residuals_and_lost_commands_are_those_of_states_of_the_setting_s_own_rope():
     rigid = paper_plant()
     rigid = replace(rigid, rope=replace(rigid.rope, segments=1))
     logs = fly(setting_with({}), free=1, throws=0, seconds=1.0)
     model = ThrowModel(logs, rigid, only=["rope_flexible", "mass_payload"])
+    unasked = model.residuals({"rope_flexible": 1.0})
+    for residual, expected in zip(unasked, model._flown(*model.begun({"rope_flexible": 1.0}))):
+        assert_allclose(residual, expected)
     windows = model.windows({"rope_flexible": 1.0})
     model.windows({})
     elsewhere = {"rope_flexible": 1.0, "mass_payload": 1e-6}  # where no states were fitted

@@ -70,14 +70,12 @@ class _Trial:
 class InitialFit:
     """Fits the states of the windows that count in one setting."""
 
-    def __init__(
-        self, flights: ReplayedFlights, retained: np.ndarray, simulation: Simulation, lag: float
-    ):
+    def __init__(self, flights: ReplayedFlights, simulation: Simulation, lag: float):
         """Make ready; ``simulation``: of the setting; ``lag``: of the release, as far
         as known [s].
         """
         self.flights = flights
-        self.retained = retained
+        self.retained = np.array([w for w, c in enumerate(flights.cuts) if c.retained])
         self.simulation = simulation
         self.directions = directions(simulation.settings[0].plant)
         self.slopes: dict[

@@ -170,22 +170,6 @@ def stacked(parts: list[States]) -> States:
     return {name: np.concatenate([p[name] for p in parts]) for name in parts[0]}
 
 
-def resampled(states: States, segments: int) -> States:
-    """The states with ropes of another number of segments, of the same shape."""
-    n = states["cable_dir_w"]
-    if n.shape[1] == segments:
-        return states
-    positions = (np.arange(segments) + 0.5) / segments * n.shape[1]
-    rows = np.minimum(positions.astype(int), n.shape[1] - 1)
-    if segments == 1:
-        chord = np.mean(n, axis=1, keepdims=True)
-        out = {"cable_dir_w": chord / np.linalg.norm(chord, axis=-1, keepdims=True)}
-        out["cable_vel_w"] = np.mean(states["cable_vel_w"], axis=1, keepdims=True)
-    else:
-        out = {name: states[name][:, rows] for name in ("cable_dir_w", "cable_vel_w")}
-    return states | out | {"stiffness": states["stiffness"][:, rows]}
-
-
 def smoothed(
     samples: ChannelSamples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
 ) -> tuple[np.ndarray, np.ndarray] | None:

@@ -151,7 +151,7 @@ def _fly(
     shape (F, 3).
     """
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
-    setting, states = model.with_cuts(cuts).begun(theta)
+    setting, states = model.begun(theta, cuts)
     release = setting.plant.release
     x = model.setting.sensing
     retained = [w for w, c in enumerate(cuts) if c.retained]

@@ -2,7 +2,6 @@
 commands.
 """
 
-import copy
 import dataclasses
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -35,7 +34,6 @@ from visthrow.diagnose.throw.initial_states import (
     concerns,
     directions,
     moved_along,
-    resampled,
 )
 from visthrow.diagnose.throw.landing import PredictedLandings, landings
 from visthrow.diagnose.throw.linearising import Linearisation
@@ -115,10 +113,10 @@ class ThrowModel(Model):
         thrown = any(f.latch != NEVER for f in flights)
         concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
         self._choose(concerned, concerned if only is None else only)
-        fitter = self._initial_fit(self.setting)
+        fitter = self._initial_fit(self.setting, self.flights)
         begun = fitter.fit(states)
-        # states at theta = 0, and the samples' derivatives by them; None: of other windows
-        self._nominal: tuple[States, dict[int, np.ndarray]] | None = begun, fitter.slopes
+        # states at theta = 0, and the samples' derivatives by them
+        self._nominal: tuple[States, dict[int, np.ndarray]] = begun, fitter.slopes
         # by kinds of blocks: the latest states, and what their fit took from windows' residuals
         self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
         self._latest[frozenset()] = begun, self._none
@@ -135,11 +133,11 @@ class ThrowModel(Model):
     ) -> States:
         """Take the windows without the time in which ropes were slack; returns initial states."""
         self.flights = self._cut(flights, cuts)
-        states, ends = self._settled_throughout(self.setting)
+        states, ends = self._settled_throughout(self.setting, self.flights)
         without_slack = self._without_slack(ends)
         if without_slack != cuts:
             self.flights = self._cut(flights, without_slack)
-            states, _ = self._settled_throughout(self.setting)
+            states, _ = self._settled_throughout(self.setting, self.flights)
         return states
 
     def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
@@ -258,12 +256,13 @@ class ThrowModel(Model):
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""
         setting = apply(self.entries, self.setting, theta)
-        states, fitted = self._latest.get(self._switches(theta), (self._nominal[0], self._none))
-        moves = {}
-        if linearised is not None:
+        if linearised is None:
+            states, fitted = self._latest_states(theta, setting)
+            moves = {}
+        else:
             states, moves = self._following(setting, theta, linearised)
             fitted = self._none
-        flown = self._flown(setting, resampled(states, setting.plant.rope.segments))
+        flown = self._flown(setting, states)
         residuals = []
         for i, (w, residual, offset) in enumerate(zip(self._retained, flown, fitted)):
             direct = [
@@ -287,12 +286,24 @@ class ThrowModel(Model):
         """See the base class; the command before stays."""
         setting = apply(self.entries, self.setting, theta)
         states = self._settled_at.get(_key(theta))
-        if states is None:  # nominal ones may have another number of segments
-            states, _ = self._latest[self._switches(theta)]
+        if states is None:
+            states, _ = self._latest_states(theta, setting)
         slopes = self.setting.plant.vehicle.queue.delay
         return without_each_command(
             self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
         )
+
+    def _latest_states(
+        self, theta: Mapping[str, float], setting: Setting
+    ) -> tuple[States, Sequence]:
+        """Return the states settled last with the same kinds of blocks, in ``setting`` where there
+        are none, and what their fit took from windows' residuals.
+        """
+        kinds = self._switches(theta)
+        with self._lock:
+            if kinds not in self._latest:
+                self._latest[kinds] = self._settled(setting), self._none
+            return self._latest[kinds]
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
@@ -352,20 +363,18 @@ class ThrowModel(Model):
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
-    def with_cuts(self, cuts: Sequence[Cut]) -> "ThrowModel":
-        """Return the model of other windows of its flights."""
-        model = copy.copy(self)
-        model._settled_at = {}
-        model._nominal = None
-        model._secants = {}  # of other windows
-        model.flights = self._cut(self.flights.flights, cuts)
-        model._retained = np.array([w for w, c in enumerate(cuts) if c.retained])
-        return model
+    def begun(
+        self, theta: Mapping[str, float], cuts: Sequence[Cut] | None = None
+    ) -> tuple[Setting, States]:
+        """The setting with effects at ``theta``, and initial states fitted in it.
 
-    def begun(self, theta: Mapping[str, float]) -> tuple[Setting, States]:
-        """The setting with effects at ``theta``, and initial states fitted in it."""
+        ``cuts``: windows of the model's flights; default the model's."""
         setting = apply(self.entries, self.setting, theta)
-        return setting, self._settled(setting)
+        if cuts is None:
+            return setting, self._settled(setting)
+        flights = self._cut(self.flights.flights, cuts)
+        start, _ = self._settled_throughout(setting, flights)
+        return setting, self._initial_fit(setting, flights).fit(start)
 
     def simulation(
         self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded
@@ -373,34 +382,30 @@ class ThrowModel(Model):
         """Settings ready to be flown in, with this model's steps."""
         return Simulation(settings, self.substep, self.device, download)
 
-    def _settled_throughout(self, setting: Setting) -> tuple[States, States]:
+    def _settled_throughout(
+        self, setting: Setting, flights: ReplayedFlights
+    ) -> tuple[States, States]:
         """See :func:`visthrow.diagnose.throw.replay.carried`."""
-        states, ends = carried(self.flights, self.simulation(setting))
-        states[MOVED] = np.zeros((len(self.flights.cuts), len(directions(setting.plant))))
+        states, ends = carried(flights, self.simulation(setting))
+        states[MOVED] = np.zeros((len(flights.cuts), len(directions(setting.plant))))
         return states, ends
 
-    def _initial_fit(self, setting: Setting) -> InitialFit:
+    def _initial_fit(self, setting: Setting, flights: ReplayedFlights) -> InitialFit:
         """Return the fit of initial states in a setting."""
-        return InitialFit(
-            self.flights, self._retained, self.simulation(setting), self.setting.plant.release.lag
-        )
+        return InitialFit(flights, self.simulation(setting), self.setting.plant.release.lag)
 
     def _settled(self, setting: Setting) -> States:
         """States fitted in a setting, from those that the setting begins with."""
-        fitter = self._initial_fit(setting)
-        slopes = None
-        if self._nominal is not None:
-            states, slopes = self._nominal
-            if setting == self.setting:
-                return states
-            kinds = [
-                [(x.field, x.axis, x.part) for x in members]
-                for members in (fitter.directions, directions(self.setting.plant))
-            ]
-            if kinds[0] != kinds[1]:
-                slopes = None
-        start, _ = self._settled_throughout(setting)
-        return fitter.fit(start, slopes)
+        states, slopes = self._nominal
+        if setting == self.setting:
+            return states
+        fitter = self._initial_fit(setting, self.flights)
+        kinds = [
+            [(x.field, x.axis, x.part) for x in members]
+            for members in (fitter.directions, directions(self.setting.plant))
+        ]
+        start, _ = self._settled_throughout(setting, self.flights)
+        return fitter.fit(start, slopes if kinds[0] == kinds[1] else None)
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
