@@ -26,8 +26,8 @@ from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.models.catalogue import effects_of
-from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 

@@ -37,13 +37,14 @@ FOREIGN = """
 import json, sys
 from pathlib import Path
 from bench.diagnose import foreign
-from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.inputs.setup import MODELS
 from visthrow.diagnose.reporting.diagnosis_report import to_json
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import FlightLog
 vehicle, seed = sys.argv[1:]
 logs = [FlightLog.load(path) for path in sorted(Path().glob("flight_*.npz"))]
-answer = search.explain(FlyerModel(logs, foreign.known(vehicle)), seed=int(seed))
+model = MODELS["flyer"](logs, foreign.known(vehicle))
+answer = search.explain(model, seed=int(seed))
 Path("verdict.json").write_text(json.dumps(to_json(answer)))
 """
 TIMEOUT = 300.0  # [s]

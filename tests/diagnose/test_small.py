@@ -21,10 +21,10 @@ from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.models.ball import BallModel
-from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import TorqueParams
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import TorqueParams
 from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import Channel, FlightLog
 

@@ -11,7 +11,7 @@ from tests.configs import load_experiment
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.ball import BallModel
-from visthrow.diagnose.models.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
 from visthrow.diagnose.select import search

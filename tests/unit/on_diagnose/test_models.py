@@ -22,11 +22,11 @@ from visthrow.diagnose.inputs import fit as fitting
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
-from visthrow.diagnose.models.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
+from visthrow.diagnose.models.quadrotor.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.reporting.gain import on_others
@@ -37,25 +37,30 @@ from visthrow.logs.flightlog import Channel, FlightLog
 BALL = BallParams(G, 0.0, 0.02, 0.3, 1)
 SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
 STAND = StandParams(1.5e-6, 2e-8, 0.0, 0.1, 11.0, 0.02, 0.01, 0.05, 0.02, 100.0)
+QUADROTOR = {
+    "input": "motor_command",
+    "mass": 0.03,
+    "gravity": G,
+    "thrust_map": (0.0, 0.06, 0.1),
+    "motor_time_constant": 0.03,
+    "command_delay": 0.0,
+    "reference_voltage": 3.8,
+    "voltage_coefficient": 0.0,
+    "window": 1.0,
+    "every": 1,
+    "most_windows": 40,
+}
 FLYER = FlyerParams(
-    "motor_command",
-    "pos_w",
-    "quat_wb",
-    0.03,
-    G,
-    (0.0, 0.06, 0.1),
-    0.03,
-    0.0,
-    3.8,
-    0.0,
-    0.0,
-    0.0,
-    -10.0,
-    1.0,
-    0.02,
-    1,
-    40,
+    **QUADROTOR,
+    step=0.02,
+    position="pos_w",
+    attitude="quat_wb",
+    drag_xy=0.0,
+    drag_z=0.0,
+    lowest=-10.0,
 )
+TORQUE = TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
+IMU = ImuParams(**QUADROTOR, step=0.01, torque=TORQUE)
 
 
 def swing_log(
@@ -210,10 +215,11 @@ class TestStand:
 
 
 class TestFlyer:
+    @mark.parametrize("params", [FLYER, IMU], ids=["flyer", "imu"])
     @mark.parametrize("thrust_map", [(0.0, 0.0, 0.0), (1.0, -1.0, 0.0)])
-    def test_a_map_without_thrust_is_refused(self, thrust_map):
+    def test_a_map_without_thrust_is_refused(self, params, thrust_map):
         with raises(ConfigError, match="thrust_map"):
-            replace(FLYER, thrust_map=thrust_map)
+            replace(params, thrust_map=thrust_map)
 
     @mark.parametrize("phase", [0.0, 0.003, 0.0085])
     def test_held_commands_pass_the_motors_lag_exactly(self, phase):
@@ -262,6 +268,7 @@ class TestFlyer:
             cable = CableParams(0.5, 0.008, point)
             model = FlyerModel([log], replace(params, cable=cable))
             worst.append(np.abs(np.concatenate(model.residuals({}))).max())
+            assert np.all(model.windows({})[0].knots["mount_b"] == point)
         assert worst[0] < 1e-4
         assert worst[1] > 3e-3
 
@@ -380,27 +387,11 @@ TRIM = TrimParams(
 class TestImu:
     """Motors' commands, accelerometer and gyro, and nothing else."""
 
-    PARAMS = ImuParams(
-        "motor_command",
-        0.03,
-        G,
-        (0.0, 0.06, 0.1),
-        0.03,
-        0.0,
-        3.8,
-        0.0,
-        1.0,
-        0.01,
-        1,
-        40,
-        TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0)),
-    )
-
     def log(self, tau: float, curve: float, inertia: tuple[float, float], seed: int) -> FlightLog:
         """A vehicle that turns to and fro about all axes while its thrust swings; Euler steps of
         0.5 ms of the test's own, an accelerometer off by 0.2 m/s^2.
         """
-        p, rng, step = self.PARAMS, default_rng(seed), 5e-4
+        p, rng, step = IMU, default_rng(seed), 5e-4
         time = np.arange(0.0, 8.0, step)
         arm = p.torque.arm_x
         mixer = np.array(
@@ -437,7 +428,7 @@ class TestImu:
     def test_lag_curve_and_inertia_without_a_position(self):
         truth = {"motor_tau": 0.02, "thrust_curve": 0.2, "inertia_xy": 0.3, "inertia_z": -0.2}
         logs = [self.log(0.05, 0.2, (0.3, -0.2), seed) for seed in range(2)]
-        model = ImuModel(logs, self.PARAMS)
+        model = ImuModel(logs, IMU)
         fitted = fitting.fit(model, [*fitting.DEFAULT_FREE["imu"]])
         found = dict(zip(fitted.names, fitted.theta))
         sd = dict(zip(fitted.names, np.sqrt(np.diag(fitted.covariance))))
@@ -447,7 +438,7 @@ class TestImu:
 
     def test_a_lag_is_named_with_its_interval(self):
         logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(3)]
-        diagnosis = search.explain(ImuModel(logs, self.PARAMS))
+        diagnosis = search.explain(ImuModel(logs, IMU))
         assert diagnosis.named == ("motor_tau",)
         finding = diagnosis["motor_tau"]
         assert finding.estimate == approx(0.02, abs=5e-4)

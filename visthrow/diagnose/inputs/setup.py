@@ -10,12 +10,12 @@ from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.flyer import FlyerModel, FlyerParams
 from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
-from visthrow.diagnose.models.imu import UNREAD, ImuModel, ImuParams
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, FlyerParams
+from visthrow.diagnose.models.quadrotor.imu import UNREAD, ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.logs import read_all, takes_mapping

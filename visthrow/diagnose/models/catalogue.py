@@ -17,12 +17,10 @@ class ModelEffect(Effect):
     names, as ``{position}``.
     """
 
-    times: dict[str, str] = field(
-        default_factory=dict
-    )  # bounds, prior_sd, floor -> parameters they are told in, "mass * arm"
-    lowest: str = (
-        ""  # parameter of which theta takes no more than there is, in place of the lower bound
-    )
+    # bounds, prior_sd, floor -> parameters that they are multiples of, as "mass * arm"
+    times: dict[str, str] = field(default_factory=dict)
+    # parameter of which theta takes no more than there is, in place of the lower bound
+    lowest: str = ""
     needs: str = ""  # parameter that a setup may lack, and the effect with it
 
     def for_params(self, params: Any) -> "ModelEffect":

@@ -16,9 +16,9 @@ from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
-from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import FlyerParams
 from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
 from visthrow.diagnose.models.trim import command_of
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select.result import Diagnosis

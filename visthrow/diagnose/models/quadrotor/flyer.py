@@ -14,15 +14,6 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import ModelEffect
-from visthrow.diagnose.models.flyer_params import MOTORS, FlyerParams
-from visthrow.diagnose.models.flyer_windows import (
-    FINE,
-    KNOTS,
-    NEIGHBOUR,
-    expect_thrust,
-    spare,
-    windows_of,
-)
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -32,6 +23,15 @@ from visthrow.diagnose.models.numeric import (
     integrate,
     latent_force,
     triangles,
+)
+from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, FlyerParams
+from visthrow.diagnose.models.quadrotor.flyer_windows import (
+    FINE,
+    KNOTS,
+    NEIGHBOUR,
+    expect_thrust,
+    spare,
+    windows_of,
 )
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
@@ -196,8 +196,7 @@ class FlyerModel(NumericModel):
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
             tension = np.maximum(-np.sum(direction * force, 1, keepdims=True), 0.0)
             hung = triangles(time, grid) @ direction, triangles(time, grid) @ tension
-        quantities = _quantities(values, rate, thrust, hung)
-        return pose | quantities
+        return pose | self._quantities(values, rate, thrust, hung)
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
@@ -391,13 +390,28 @@ class FlyerModel(NumericModel):
                 "time": np.zeros(len(state)),
                 "slope": rise[half],
                 **{f"axis_{a}": rot[half, :, :, i] for i, a in enumerate("xyz")},
-                **_quantities(state, rate, total[half], hung and hung[2:]),
+                **self._quantities(state, rate, total[half], hung and hung[2:]),
             }
             if NEIGHBOUR in self.inputs:
                 values[NEIGHBOUR] = self._neighbour[lanes.owner, row]
             return exerted(self.laws, values)
 
         return loads
+
+    def _quantities(
+        self, state: np.ndarray, rate: np.ndarray, thrust: np.ndarray, hung: tuple | None
+    ) -> dict[str, np.ndarray]:
+        """Return quantities of laws at states; ``hung``: direction and pull [N] of the cable."""
+        values = {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "rate_b": rate, "thrust": thrust}
+        if hung is None:
+            return values
+        return values | {
+            "payload_pos_w": state[:, :3] + state[:, 6:9],
+            "payload_vel_w": state[:, 3:6] + state[:, 9:12],
+            "cable_dir_w": hung[0],
+            "tension": hung[1][:, 0],
+            "mount_b": np.tile(self.params.cable.mount, (len(state), 1)),
+        }
 
     def _turning(self, lanes: Lanes, thrust: np.ndarray) -> Callable:
         """Return what gives the angular acceleration from the motors' thrusts and the offset of the
@@ -424,22 +438,6 @@ class FlyerModel(NumericModel):
             return (torque - cross(rate, inertia * rate) + push) / inertia
 
         return turning
-
-
-def _quantities(
-    state: np.ndarray, rate: np.ndarray, thrust: np.ndarray, hung: tuple | None
-) -> dict[str, np.ndarray]:
-    """Return quantities of laws at states; ``hung``: the cable's direction, and its pull [N]."""
-    values = {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "rate_b": rate, "thrust": thrust}
-    if hung is None:
-        return values
-    return values | {
-        "payload_pos_w": state[:, :3] + state[:, 6:9],
-        "payload_vel_w": state[:, 3:6] + state[:, 9:12],
-        "cable_dir_w": hung[0],
-        "tension": hung[1][:, 0],
-        "mount_b": np.zeros((len(state), 3)),
-    }
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -1,5 +1,5 @@
-"""Parameters of a quadrotor that is driven by its logged commands and its measured attitude: the
-table ``flyer`` of a setup.
+"""Parameters of a quadrotor that its logged commands drive, and of one whose attitude is measured:
+the table ``flyer`` of a setup.
 """
 
 from dataclasses import dataclass
@@ -37,18 +37,13 @@ class TorqueParams(Bounded):
 
 
 @dataclass(frozen=True)
-class FlyerParams(Bounded):
+class QuadrotorParams(Bounded):
     """The vehicle that is assumed first.
 
-    Raises ConfigError where torque has no motors' commands or a mounted cable, or where the
-    map does not rise.
+    Raises ConfigError where the map does not rise.
     """
 
-    input: Literal[
-        "motor_command", "motor_speed", "thrust_command", "command"
-    ]  # channel of the commands
-    position: str  # channel of the measured position
-    attitude: str  # channel of the measured attitude
+    input: str  # channel of the commands
     mass: Positive  # of the vehicle alone [kg]
     gravity: Positive  # [m/s^2]
     # thrust of a motor (of all, for a thrust command) by powers 0, 1, 2 of its input [N]
@@ -57,16 +52,42 @@ class FlyerParams(Bounded):
     command_delay: float  # below 0 where the log stamps its inputs late [s]
     reference_voltage: Positive  # at which the map holds [V]
     voltage_coefficient: float  # thrust changes by this share a volt [1/V]
+    window: Positive  # [s]
+    step: Positive  # of the integration [s]
+    every: int  # the measured samples taken: every n-th
+    most_windows: int  # spread evenly over all logs
+
+    @property
+    def total_mass(self) -> float:
+        """Return the mass of all that flies [kg]."""
+        return self.mass
+
+    def thrust(self, inputs: np.ndarray) -> np.ndarray:
+        """Return the thrust that the map gives for inputs [N]."""
+        return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
+            raise ConfigError(f"thrust_map {self.thrust_map} does not rise")
+
+
+@dataclass(frozen=True)
+class FlyerParams(QuadrotorParams):
+    """A vehicle whose position and attitude are measured.
+
+    Raises ConfigError where torque has no motors' commands or a mounted cable, or where the
+    map does not rise.
+    """
+
+    input: Literal["motor_command", "motor_speed", "thrust_command", "command"]
+    position: str  # channel of the measured position
+    attitude: str  # channel of the measured attitude
     drag_xy: NotNegative  # rotor drag [kg/s]
     drag_z: NotNegative  # [kg/s]
     lowest: float  # windows keep above this height [m]
-    window: Positive  # [s]
-    step: Positive  # of the integration [s]
-    every: int  # the position samples taken: every n-th
-    most_windows: int  # spread evenly over all logs
-    estimator_rate: Positive = (
-        1.0  # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
-    )
+    # at which an estimate of the attitude takes other forces than thrust for tilt [1/s]
+    estimator_rate: Positive = 1.0
     torque: TorqueParams | None = None  # None: rates are not simulated
     cable: CableParams | None = None  # None: no payload
 
@@ -80,10 +101,6 @@ class FlyerParams(Bounded):
         """Return the vehicle's mass in 0.21 kg, the mass that the catalogue's forces refer to."""
         return self.mass / 0.21
 
-    def thrust(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the thrust that the map gives for inputs [N]."""
-        return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
-
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.torque is not None and self.input not in ("motor_command", "motor_speed"):
@@ -95,5 +112,3 @@ class FlyerParams(Bounded):
                 f"cable.mount {self.cable.mount} beside torque: the model has no torque of a cable;"
                 " expected one of them alone"
             )
-        if self.thrust_map[1] <= 0.0 and self.thrust_map[2] <= 0.0:
-            raise ConfigError(f"thrust_map {self.thrust_map} does not rise")

@@ -10,10 +10,6 @@ from typing import Literal
 
 import numpy as np
 
-from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.flyer import FlyerModel
-from visthrow.diagnose.models.flyer_params import TorqueParams
-from visthrow.diagnose.models.flyer_windows import KNOTS, covered, flies, held_inputs
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -23,6 +19,9 @@ from visthrow.diagnose.models.numeric import (
     latent_layout,
     sigma_of,
 )
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
+from visthrow.diagnose.models.quadrotor.flyer_windows import KNOTS, covered, flies, held_inputs
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
@@ -33,31 +32,14 @@ QUIETEST = (1e-2, 2e-3)  # noise of accelerometer and gyro below which none is b
 
 
 @dataclass(frozen=True)
-class ImuParams(Bounded):
-    """The vehicle that is assumed first."""
+class ImuParams(QuadrotorParams):
+    """A vehicle whose position nobody measures.
 
-    input: Literal["motor_command", "motor_speed"]  # channel of the commands
-    mass: Positive  # of all that flies [kg]
-    gravity: Positive  # [m/s^2]
-    thrust_map: tuple[float, float, float]  # of a motor by powers 0, 1, 2 of its input [N]
-    motor_time_constant: NotNegative  # [s]
-    command_delay: float  # below 0 where the log stamps its inputs late [s]
-    reference_voltage: Positive  # at which the map holds [V]
-    voltage_coefficient: float  # thrust changes by this share a volt [1/V]
-    window: Positive  # [s]
-    step: Positive  # of the integration [s]
-    every: int  # the samples taken: each so-manieth
-    most_windows: int  # spread evenly over all logs
+    Raises ConfigError where the map does not rise.
+    """
+
+    input: Literal["motor_command", "motor_speed"]
     torque: TorqueParams
-
-    @property
-    def total_mass(self) -> float:
-        """Return the mass of all that flies [kg]."""
-        return self.mass
-
-    def thrust(self, inputs: np.ndarray) -> np.ndarray:
-        """Return the thrust that the map gives for inputs [N]."""
-        return np.polynomial.polynomial.polyval(inputs, self.thrust_map)
 
 
 class ImuModel(FlyerModel):
@@ -89,8 +71,10 @@ class ImuModel(FlyerModel):
         stretches = []
         for start in np.arange(first + p.window, last - p.window, p.window):
             end = start + p.window
+            if not all(covered(c, start, end) for c in driven):
+                continue
             inputs = held_inputs(log[p.input], p, start)
-            if not (all(covered(c, start, end) for c in driven) and flies(inputs, p)):
+            if not flies(inputs, p):
                 continue
             acc, rate = (
                 log[name].only((log[name].time >= start) & (log[name].time < end)).samples()

@@ -3,7 +3,6 @@ state.
 """
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -11,8 +10,8 @@ from scipy.signal import lfilter
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
-from visthrow.diagnose.models.flyer_params import MOST_LATE, FlyerParams
 from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
+from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -28,7 +27,7 @@ _MOST_THRUST = 5.0
 _IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
-def expect_thrust(stretches: Sequence[Stretch], params: FlyerParams) -> None:
+def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None:
     """Refuse commands of another unit: they carry neither the vehicle nor anything like it.
 
     Raises LogError: they are.
@@ -125,7 +124,7 @@ def _window(log, number: int, params: FlyerParams, channels, sigma, start: float
     )
 
 
-def flies(inputs: np.ndarray, params: Any) -> bool:
+def flies(inputs: np.ndarray, params: QuadrotorParams) -> bool:
     """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
     thrust = params.thrust(inputs).sum(axis=1)
     return np.min(thrust[len(thrust) // 2 :]) >= _IDLE * params.mass * params.gravity
@@ -136,7 +135,7 @@ def spare(step: float) -> int:
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
-def held_inputs(channel: Channel, params: Any, start: float) -> np.ndarray:
+def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.ndarray:
     """Means of the held commands over fine steps, from one window before the start to its end,
     shape (fine steps, motors).
     """
