@@ -201,7 +201,7 @@ def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]
             ticks = [line | {"poses": poses.get(line["n"], [])} for line in ticks]
         return *setup, [with_poses(line) for line in ticks]
     except (KeyError, TypeError, ValueError) as error:
-        raise RunError(f"{folder / TICKS}: not a list of ticks with poses: {error!r}") from error
+        raise RunError(f"{folder}: ticks or poses are damaged: {error!r}") from error
 
 
 def load_setup(folder: Path) -> tuple[HilParams, Policy]:

@@ -6,6 +6,7 @@ from pytest import approx, mark
 
 from hil.links.backends.audit import (
     GIVE_UP,
+    GIVE_UP_OPTIONAL,
     Audit,
     Rule,
 )
@@ -99,6 +100,13 @@ def test_a_value_that_the_vehicle_does_not_take_is_written_once():
     for i in range(400):
         stubborn.service(0.02 * i)
     assert (sent, stubborn.problems) == ([0.0], ["ATC_ANGLE_BOOST is 1; expected 0"])
+
+
+def test_an_optional_parameter_that_nobody_answers_is_soon_given_up():
+    audited = Audit((Rule("OLD", "", (1.0,), optional=True),))
+    audited.service(0.0)
+    audited.service(GIVE_UP_OPTIONAL + 0.1)
+    assert (audited.done, audited.problems) == (True, [])
 
 
 def sends(release, until, start=0.0):

@@ -93,7 +93,7 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     with raises(RunError, match="line 1 is damaged"):
         load_run(tmp_path)
     (tmp_path / "ticks.jsonl").write_text('{"n": 0}\n')
-    with raises(RunError, match="not a list of ticks with poses: KeyError"):
+    with raises(RunError, match="ticks or poses are damaged: KeyError"):
         load_run(tmp_path)
 
 
@@ -114,6 +114,9 @@ def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_pa
     (tmp_path / "before" / "poses.jsonl").write_text(text[: len(text) // 2])
     assert run_command(f"hil replay {tmp_path}/before") == 1
     assert "all bit for bit the same" in capsys.readouterr().out
+    (tmp_path / "before" / "poses.jsonl").write_text("7\n")
+    with raises(RunError, match="ticks or poses are damaged: TypeError"):
+        load_run(tmp_path / "before")
 
 
 @mark.parametrize(
