@@ -247,16 +247,12 @@ def _find(node: Node, names: str) -> Any:
     for name in names.split():
         value: Any = node
         for part in [name] if name in node else name.split("."):
-            if isinstance(value, list) and part.isdigit():
-                if int(part) < len(value):
-                    value = value[int(part)]
-                else:
-                    value = None
+            if isinstance(value, list) and part.isdigit() and int(part) < len(value):
+                value = value[int(part)]
+            elif isinstance(value, dict):
+                value = value.get(part)
             else:
-                if isinstance(value, dict):
-                    value = value.get(part)
-                else:
-                    value = None
+                value = None
         if value is not None:
             return value
     return None
@@ -289,9 +285,7 @@ def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
             raise ValueError
     except (TypeError, ValueError):
         text = repr(value)
-        if len(text) <= 80:
-            text = text
-        else:
+        if len(text) > 80:
             text = text[:77] + "..."
         raise ValueError(f"{name} is {text}; expected {count or 'some'} numbers") from None
     return numbers
@@ -379,10 +373,9 @@ def _camera(box: str, node: Node) -> Camera:
         word = str(_find(node, tool["kind"]) or tool.get("default", ""))
         kind = word.lower()
         models = tool["models"]
-        if kind not in models and "otherwise" not in tool:
+        if kind not in models:
             name = next((name for name in tool["kind"].split() if name in node), tool["kind"])
             raise ValueError(f"{name} is {word!r}; expected one of {list(models)}")
-        kind = kind if kind in models else tool["otherwise"]
         tool = {"model": kind} | tool | models[kind]
     for key, reason in tool.get("refuses", {}).items():
         if key in node:
@@ -396,7 +389,7 @@ def _camera(box: str, node: Node) -> Camera:
     values = _values(section, [*tool["numbers"], tool.get("more", "")])
     core = tool.get("model", "pinhole")
     places = tool.get("coefficients", "")
-    if not places or (tool.get("optional") and _find(node, places) is None):
+    if not places or ("optional" in tool and not _has(node, tool["optional"])):
         return core, values
     if tool.get("terms"):
         coefficients = [_number(node, place) for place in places.split()]

@@ -491,6 +491,8 @@ SIZELESS = basalt("kb4", **LENS).replace(f"[[{W}, {H}]]", "5")
             "no name of their model; say it with --model",
         ),
         (svo("pinhole", WIDE[:3], "none", []), "intrinsics is .*; expected 4 numbers"),
+        (svo("pinhole", WIDE, "none", []).replace("parameters:", "k:"), "'distortion.parameters'"),
+        ("Camera: {model: equirectangular, fx: 1.0}", "'equirectangular'; expected one of"),
         ("model: kannala_brandt\npinhole: {fx: 1.0}\n", "model is 'kannala_brandt'"),
         ("resolution: [2, 2]\nintrinsics: []\ndistortion_model: omni\nomni_affine: [0]", "Kimera"),
         (SIZELESS, "image size is 5; expected 2 numbers"),
