@@ -38,17 +38,6 @@ gives four rows: one in the controller's own model, an idealised bound, and thre
 compensate no, most or all known delays.
 """
 
-PLANTS = {
-    "hybrid": "the training simulator with all its noise and randomisation",
-    "reference": (
-        "the reference plant (MuJoCo) without extras: measurements late but exact, still air"
-    ),
-    "reference-realistic": (
-        "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise"
-    ),
-}
-"""Name -> what titles of tables call it."""
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -282,10 +271,11 @@ def throw_hybrid(
 
 def on_plant(plant: str, seed: int, entries: Sequence[Entry], notes: str = "") -> Comparison:
     """Return throws on a plant with what they are called; ``notes`` end the title."""
-    from visthrow.throws import plants
+    from visthrow.throws.plants import PLANTS
 
-    title = f"Throws from hover on {PLANTS[plant]} (`{plant}`, seed {seed}){notes}"
-    subtitle = f"{len(entries[0].throws[0].success)} throws each, {plants.PLANTS[plant]}"
+    short, long = PLANTS[plant]
+    title = f"Throws from hover on {long} (`{plant}`, seed {seed}){notes}"
+    subtitle = f"{len(entries[0].throws[0].success)} throws each, {short}"
     return Comparison(plant, title, subtitle, entries)
 
 

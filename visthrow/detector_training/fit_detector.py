@@ -356,9 +356,8 @@ class Fit:
         else:
             error = off.unflatten(1, (4, 2)).norm(dim=-1).mean(1)
         spread = outputs[:, 1].clamp(-8.0, 3.0)
-        accuracy = (error.detach() / spread.exp()).clamp(
-            max=50.0
-        ) + spread  # of a Laplace distribution
+        # of a Laplace distribution
+        accuracy = (error.detach() / spread.exp()).clamp(max=50.0) + spread
         present = present.float()
         return loss + ((8.0 * where + 0.2 * accuracy) * present).sum() / present.sum().clamp(min=1)
 

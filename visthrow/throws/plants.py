@@ -21,11 +21,20 @@ from visthrow.task import Experiment, NoiseParams, plant_of
 from visthrow.throws.loose_rope import LooseRope
 
 PLANTS = {
-    "hybrid": "the training simulator",
-    "reference": "the reference plant without extras",
-    "reference-realistic": "the realistic reference plant",
+    "hybrid": (
+        "the training simulator",
+        "the training simulator with all its noise and randomisation",
+    ),
+    "reference": (
+        "the reference plant without extras",
+        "the reference plant (MuJoCo) without extras: measurements late but exact, still air",
+    ),
+    "reference-realistic": (
+        "the realistic reference plant",
+        "the reference plant (MuJoCo) with pinned wind, drag, build errors and mocap noise",
+    ),
 }
-"""Name -> what pictures call it."""
+"""Name -> what pictures call it, and what titles of tables call it."""
 
 
 def known_plant(name: str) -> str:

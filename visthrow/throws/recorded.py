@@ -200,7 +200,7 @@ def _meta(loaded: Loaded, plant_name: str, goal_w: ndarray, seed: int) -> dict[s
         "policy": loaded.name,
         "layout": loaded.policy.contract["observation"]["layout"],
         "plant": plant_name,
-        "plant_meaning": PLANTS[plant_name],
+        "plant_meaning": PLANTS[plant_name][0],
         "goal_w": [float(x) for x in goal_w],
         "seed": seed,
         "config": config.to_dict(loaded.experiment),

@@ -31,7 +31,7 @@ Rates are in rad/s; a signal's unit and frame are its channel's metadata.
 """
 
 Message = tuple[float, str, str, dict[str, Any]]
-"""Time [s], topic, schema, content, to which a message of Foxglove's is given its time."""
+"""Time [s], topic, schema, content; `write` adds the time to a content of Foxglove's."""
 
 
 def write(path: str | Path, log: FlightLog, experiment: Any) -> None:

@@ -11,7 +11,7 @@ from bench import baseline as baseline_record
 from tests.commands import run_command
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, gap, result_set, throws, trade
+from visthrow.paper.report import ablations, beyond, gap, result_set, throws, trade
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page
@@ -43,6 +43,13 @@ def texts(section, kind: str) -> str:
 
 def only(*found) -> result_set.ResultSet:
     return result_set.ResultSet(tuple(found))
+
+
+def test_changes_of_one_name_in_two_tables_are_both_shown():
+    changes = {"rope.length": 0.3, "task.start.length": 0.2}
+    one = made_up.policy(default_rng(0), "far", "state", "hybrid", 2.0, departures=changes)
+    section = beyond.section(only(Result({**one.unit, "variant": "far"}, one.columns, made_up.MADE)))
+    assert "length 0.3, length 0.2" in grids(section)[0].rows[0]
 
 
 def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):

@@ -72,7 +72,8 @@ def _changes(departures: dict) -> str:
     """Return the changes in words, or as keys without their tables."""
     values = {key.split(".")[-1]: value for key, value in departures.items()}
     if "payload_spread" not in values:
-        return ", ".join(f"{key} {json.dumps(value)}" for key, value in values.items()) or "its own"
+        words = [f"{key.split('.')[-1]} {json.dumps(value)}" for key, value in departures.items()]
+        return ", ".join(words) or "its own"
     if not values["payload_spread"] > 0.0:
         return "one payload, no drag"
     drag = ", drag varied" if values.get("drag_spread", 0.0) > 0.0 else ""
