@@ -17,11 +17,19 @@ from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # width of a picture over the whole page [inch]
 
-LOOKS = tables_beside(__file__, "data/looks.toml")
+
+def _looks() -> dict[str, dict[str, Any]]:
+    looks = tables_beside(__file__, "data/looks.toml")
+    for look in looks.values():
+        for key in look.keys() & {"color", "mec"}:
+            look[key] = getattr(style, look[key], look[key])
+        if isinstance(look.get("ls"), list):
+            look["ls"] = (0, tuple(look["ls"]))
+    return looks
+
+
+LOOKS = _looks()
 """Part of a picture -> matplotlib's keywords."""
-for _look_of_part in LOOKS.values():
-    if isinstance(_look_of_part.get("ls"), list):
-        _look_of_part["ls"] = (0, tuple(_look_of_part["ls"]))
 
 CIRCLES = (0.1, 0.2, 0.4)  # about the target, in scatter panels [m]
 
