@@ -259,6 +259,19 @@ def test_out_of_view_tells_nothing_but_that():
     assert (shown[~told] == 0.0).all()
 
 
+def test_batch_of_many_equals_batch_of_one_bit_for_bit():
+    camera = KeypointCamera(PARAMS)
+    arguments = scene(1003)
+    extrinsics = camera.extrinsics(0.02 * torch.ones(1003, 3), 0.001 * torch.ones(1003, 3))
+    points, valid = keypoints(camera, *arguments, extrinsics)
+    for i in range(0, 1003, 13):
+        row = slice(i, i + 1)
+        turned = tuple(part[row] for part in extrinsics)
+        one, visible = keypoints(camera, *(part[row] for part in arguments), turned)
+        assert torch.equal(one, points[row])
+        assert torch.equal(visible, valid[row])
+
+
 @mark.parametrize(
     ("field", "value"),
     [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))],

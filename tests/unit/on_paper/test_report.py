@@ -48,7 +48,9 @@ def only(*found) -> result_set.ResultSet:
 def test_changes_of_one_name_in_two_tables_are_both_shown():
     changes = {"rope.length": 0.3, "task.start.length": 0.2}
     one = made_up.policy(default_rng(0), "far", "state", "hybrid", 2.0, departures=changes)
-    section = beyond.section(only(Result({**one.unit, "variant": "far"}, one.columns, made_up.MADE)))
+    section = beyond.section(
+        only(Result({**one.unit, "variant": "far"}, one.columns, made_up.MADE))
+    )
     assert "length 0.3, length 0.2" in grids(section)[0].rows[0]
 
 
