@@ -24,7 +24,6 @@ from visthrow.diagnose.select.point import (
     predicted_gain,
     untracked_windows,
 )
-from visthrow.diagnose.select.repeated import with_repeated_laws
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
 from visthrow.diagnose.select.scatter import Scatter
 from visthrow.diagnose.select.selection import Selector
@@ -153,7 +152,7 @@ def explain(
             break
         problem, nominal = _left_out(problem, nominal, untracked, say)
         begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
-    diagnosis = with_repeated_laws(held_out.judged(conclude(selection, commands)))
+    diagnosis = held_out.with_repeated_laws(held_out.judged(conclude(selection, commands)))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(problem.kept)
     if left_out:

@@ -28,7 +28,6 @@ from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.candidates import (
     ALL,
-    EVENT,
     NOTHING,
     Candidate,
     Names,
@@ -531,11 +530,6 @@ class Selector:
     def bare(self, point: Point) -> tuple[Problem, Point]:
         """Return the problem and a point of it without the terms that were offered."""
         return terms.without_laws(self.problem, point)
-
-    @property
-    def events(self) -> tuple[int, ...]:
-        """Return the flights in which something happened that the others deny."""
-        return tuple(sorted(c.flight for c in self.best.chosen if c.group == EVENT))
 
 
 def names_of(chosen: Names) -> str:

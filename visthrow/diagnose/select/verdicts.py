@@ -319,7 +319,8 @@ def _events(selection: Selector, point: Point) -> tuple[int, ...]:
         for window, share in zip(point.windows, point.noise.share)
         if share.max() ** 2 > square
     }
-    return tuple(sorted({*selection.events, *rough}))
+    events = {c.flight for c in selection.best.chosen if c.group == EVENT}
+    return tuple(sorted(events | rough))
 
 
 def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
