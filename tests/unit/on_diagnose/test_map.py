@@ -207,6 +207,18 @@ def test_a_column_is_found_under_another_laboratorys_name(thrust, load, angles, 
     assert "does a load hang below?" in question
 
 
+def test_a_thrust_goes_before_a_temperature_and_a_vehicle_before_its_ball():
+    columns = flight(20.0)
+    time = columns["time"]
+    gone = np.outer(np.clip(time - 8.0, 0.0, 1.0), [1.5, 0.0, 1.2])
+    table = {"time": time, "T": 31.0 + 0.5 * np.sin(0.1 * time)}
+    table |= {f"ball_{a}": c for a, c in zip("xyz", (columns["pos_w"] - [0, 0, 0.5] - gone).T)}
+    table |= dict(zip("xyz", columns["pos_w"].T)) | {"thrust": columns["command"][:, 0]}
+    made = {c.name: c.columns for c in propose(table, "a.csv").mapping.channels}
+    assert made["thrust_command"] == ("thrust",)
+    assert made["pos_w"] == ("x", "y", "z")
+
+
 @pytest.mark.parametrize(("reach", "unit"), [(40.0, "deg"), (0.6, "rad")])
 def test_an_angle_is_in_the_unit_of_its_reach(reach, unit):
     time = 0.01 * np.arange(500)

@@ -308,6 +308,32 @@ def test_commands_that_come_after_the_rates_are_caught_however_late():
     assert "the commands' clock is late" in faults(log_of(columns, command=late))
 
 
+def test_commands_that_oppose_a_swing_are_not_late():
+    """Angles that a disturbance swings, and a controller that commands rates against them: as good
+    as behind the commands is a mirror image that goes before them.
+    """
+    rng = default_rng(13)
+    time = np.arange(0.0, 30.0, 0.01)
+    periods = rng.uniform(0.5, 1.5, 3)
+    gain, lag, width = rng.uniform([2.0, 0.02, 0.02], [6.0, 0.1, 0.3])
+    push = []
+    for period in periods:
+        wander = np.interp(time, np.arange(31.0), rng.normal(size=31))
+        turns = 0.01 * np.cumsum(1.0 + width * wander) / period
+        push.append(20.0 * np.sin(2.0 * np.pi * turns + rng.uniform(0.0, 6.0)))
+    angle = rate = np.zeros(3)
+    rows = []
+    for pushed in np.transpose(push) * [1.0, 1.0, 0.3]:
+        asked = -gain * angle
+        rate = rate + 0.01 * ((asked - rate) / lag + pushed)
+        angle = angle + 0.01 * rate
+        rows.append((2.0, *asked, *rate))
+    columns = np.array(rows)
+    rates = columns[:, 4:] + rng.normal(0.0, 0.01, (len(time), 3))
+    log = log_of({"time": time, "command": columns[:, :4], "rate_b": rates})
+    assert "clock is late" not in faults(log)
+
+
 @mark.parametrize(("late", "told"), [(-0.03, False), (0.02, False), (0.3, True)])
 def test_a_payload_that_leaves_before_its_command_is_told(late, told):
     columns = carrying()
@@ -315,6 +341,27 @@ def test_a_payload_that_leaves_before_its_command_is_told(late, told):
     gone = np.maximum(time - 6.0, 0.0)
     columns["payload_pos_w"] = columns["payload_pos_w"] - np.outer(4.0 * gone, [0.6, 0.0, 0.8])
     pressed = Channel(time, (time > 6.0 + late).astype(float), "1")
+    said = faults(log_of(columns, release_command=pressed))
+    assert ("before its release is commanded" in said) == told
+
+
+def test_a_payload_that_waits_on_the_floor_does_not_leave_before_its_command():
+    columns = carrying()
+    time = columns["time"]
+    floor = time < 6.0
+    columns["payload_pos_w"][floor] = columns["pos_w"][floor] + [0.15, 0.0, 0.0]
+    columns["payload_pos_w"] -= np.outer(np.maximum(time - 8.0, 0.0), [2.4, 0.0, 3.2])
+    pressed = Channel(time, (time > 8.0).astype(float), "1")
+    assert "before its release" not in faults(log_of(columns, release_command=pressed))
+
+
+@mark.parametrize(("late", "told"), [(0.0, False), (0.3, True)])
+def test_a_payload_leaves_before_a_command_that_is_logged_seldom(late, told):
+    columns = carrying()
+    time = columns["time"]
+    columns["payload_pos_w"] -= np.outer(np.maximum(time - 6.0, 0.0), [2.4, 0.0, 3.2])
+    seldom = np.arange(0.19, 10.0, 0.2)
+    pressed = Channel(seldom, (seldom > 6.0 + late).astype(float), "1")
     said = faults(log_of(columns, release_command=pressed))
     assert ("before its release is commanded" in said) == told
 

@@ -40,6 +40,7 @@ def _pattern(name: str) -> re.Pattern[str]:
 _TIME = _pattern("time")
 _TARGET = _pattern("target")
 _NOT_VEHICLE = _pattern("not_vehicle")
+_LOAD = _pattern("load")
 _THRUST = _pattern("thrust")
 _ESTIMATE = _pattern("estimate")
 _CAPTURE = _pattern("capture")
@@ -534,6 +535,7 @@ class _Chooser:
         paths = [(g, units[g.columns]) for g in groups if units.get(g.columns)]
         pay = self._payload(paths, others)
         vehicles = [(g, u) for g, u in paths if pay is None or g is not pay[1]]
+        vehicles.sort(key=lambda path: bool(_LOAD.search(path[0].stem)))
         if pay is not None and not _ESTIMATE.search(getattr(pay[0], "stem", "")):
             vehicles.sort(key=lambda path: path[0] is not pay[0])  # the payload hangs below it
         for group, unit in vehicles:
@@ -959,7 +961,8 @@ class _Chooser:
         """Take the collective thrust, a command before what else bears its name."""
         groups = [g for g in self._open(1, targets=True) if _THRUST.search(_split_unit(g.stem)[0])]
         groups = [g for g in groups if not _rises(g.values[:, 0])]  # f of frames, t of times
-        for group in sorted(groups, key=lambda g: not _TARGET.search(g.stem)):
+        groups.sort(key=lambda g: (len(g.stem) == 1, not _TARGET.search(g.stem)))
+        for group in groups:  # a word before a letter, which may be of a temperature
             middle = float(np.nanmedian(group.values))
             if middle > _LARGEST_THRUST or "thrust_command" in self.made:
                 continue

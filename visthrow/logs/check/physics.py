@@ -587,10 +587,8 @@ def _commands(log: FlightLog) -> list[Row]:
         ):
             channels = f"{name}, {turning}"
             spread = float(np.max(np.std(rates[1], axis=0)))
-            if relation.axes_delay < -_DELAY_BAD and relation.axes_correlation > FIRMLY:
-                rows += _early(relation, time, set_points, rates, channels)
-            else:
-                rows += _followed(relation, channels, spread)
+            early = _early(relation, time, set_points, rates, channels)
+            rows += early or _followed(relation, channels, spread)
     return rows
 
 
@@ -602,19 +600,24 @@ def _early(
     channels: str,
 ) -> list[Row]:
     """Report rates that go before their commands: if no delay that a controller has fits them as
-    well, the clock of the commands is late.
+    well, the clock of the commands is late. A swing that a controller opposes fits both.
     """
+    if relation.axes_delay > -_DELAY_BAD or relation.axes_correlation < FIRMLY:
+        return []
     later = relations.relate(time + _RESPONSE, set_points, *rates, reach=_RESPONSE)
     if later is None:
         return []
-    before, after = (min(r.axes_correlation, 0.999) for r in (relation, later))
+    before = min(relation.axes_correlation, 0.999)
+    after = min(max(later.axes_correlation, relation.correlation * (relation.delay > 0.0)), 0.999)
     independent = float(np.ptp(time)) / relations.INDEPENDENT
     nats = 0.5 * independent * np.log((1.0 - after**2) / (1.0 - before**2))
+    if nats < _NATS or before < after + CLEARLY:
+        return []
     early = -1e3 * relation.axes_delay
     text = f"the rates go {early:.0f} ms or more before their commands, correlation {before:.2f}"
     text += f" (behind them {after:.2f}, {nats:.0f} nats): the commands' clock is late"
     figures = {"delay_s": relation.axes_delay, "nats": float(nats)}
-    return [Row("delay", channels, "bad" if nats > _NATS else "warn", text, figures)]
+    return [Row("delay", channels, "bad", text, figures)]
 
 
 def _followed(relation: relations.Relation, channels: str, spread: float) -> list[Row]:
@@ -706,20 +709,29 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
         ]
     rows = [Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)]
     rows += _length(middle, vehicle.cable_length, channels) if vehicle.cable_length else []
-    rows += _left_early(log, time_p, length)
+    rows += _left_early(log, time_p, gap)
     return rows + _payload_late(time_q, q, time_p, p, channels)
 
 
-def _left_early(log: FlightLog, time: np.ndarray, length: np.ndarray) -> list[Row]:
+def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> list[Row]:
     """Report a payload that leaves its cable before its release is commanded."""
     if "release_command" not in log:
         return []
-    pressed = log["release_command"]
-    commanded = pressed.time[pressed.values.ravel() > 0.0]
-    taut = np.flatnonzero(length < (1.0 + _TAUT) * np.percentile(length, 25))
-    if not len(commanded) or taut[-1] == len(time) - 1:
+    stamps, pressed = log["release_command"].samples()
+    commanded = np.flatnonzero(pressed.ravel() > 0.0)
+    if not len(commanded):
         return []
-    early = float(commanded[0] - time[taut[-1] + 1])
+    length = np.linalg.norm(gap, axis=1)
+    hangs = (gap[:, 2] < -0.5 * length) & (
+        time < stamps[commanded[0]]
+    )  # not beside it on the floor
+    if not np.any(hangs):
+        return []
+    taut = np.flatnonzero(length < (1.0 + _TAUT) * np.median(length[hangs]))
+    if taut[-1] == len(time) - 1:
+        return []
+    since = stamps[max(commanded[0] - 1, 0)]  # the command came after this sample
+    early = float(since - time[taut[-1] + 1])
     if early < _DELAY_BAD:
         return []
     text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "
