@@ -140,9 +140,8 @@ class MotionCapture:
                 self._process = None
                 self._heard = math.inf
 
-        bodies = tuple(RigidBody(body, name) for body, name in NUMBERS.items())
         params = MocapParams("mock", HOST[0])
-        self.source = Unconnected(params, bodies, clock, tell=lambda text: None)
+        self.source = Unconnected(params, _bodies(), clock, tell=lambda text: None)
         self._system = Silent()
 
     def _flush(self) -> None:
