@@ -59,9 +59,8 @@ class Priors:
 
     floor: np.ndarray  # in the effects' units
     slab: np.ndarray  # deviation of a named effect
-    low: (
-        np.ndarray
-    )  # of a named effect; another kind of block is there as a whole, but for its form
+    # of a named effect; another kind of block is there as a whole, but for its form
+    low: np.ndarray
     high: np.ndarray
     visible: np.ndarray  # bool: all its channels are there
 

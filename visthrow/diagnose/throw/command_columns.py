@@ -29,9 +29,9 @@ def without_each_command(
 ) -> list[np.ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
-    ``windows``: their numbers; ``delay``: of the commands by which those that act in a window
-    are told [s]: their number is the same in all settings; ``simulation``: of one setting. Returns
-    for each of these windows, shape (N, T), with the T commands that differ from the one before.
+    ``windows``: their numbers; ``delay``: of the commands [s], the same in all settings: it says
+    which of them act in a window; ``simulation``: of one setting. Returns for each of these
+    windows, shape (N, T), with the T commands that differ from the one before.
     """
     commands = {w: _acting(flights, w, delay) for w in windows}
     lanes = [1 + len(numbers) for numbers in commands.values()]

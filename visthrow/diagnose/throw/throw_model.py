@@ -288,9 +288,9 @@ class ThrowModel(Model):
         states = self._settled_at.get(_key(theta))
         if states is None:
             states, _ = self._latest_states(theta, setting)
-        slopes = self.setting.plant.vehicle.queue.delay
+        delay = self.setting.plant.vehicle.queue.delay
         return without_each_command(
-            self.flights, self._retained[list(windows)], slopes, self.simulation(setting), states
+            self.flights, self._retained[list(windows)], delay, self.simulation(setting), states
         )
 
     def _latest_states(

@@ -80,6 +80,7 @@ class FlyerParams(QuadrotorParams):
     map does not rise.
     """
 
+    # channel of the commands
     input: Literal["motor_command", "motor_speed", "thrust_command", "command"]
     position: str  # channel of the measured position
     attitude: str  # channel of the measured attitude

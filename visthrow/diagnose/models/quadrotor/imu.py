@@ -38,8 +38,8 @@ class ImuParams(QuadrotorParams):
     Raises ConfigError where the map does not rise.
     """
 
-    input: Literal["motor_command", "motor_speed"]
-    torque: TorqueParams
+    input: Literal["motor_command", "motor_speed"]  # channel of the commands
+    torque: TorqueParams  # how thrusts turn the vehicle
 
 
 class ImuModel(FlyerModel):
