@@ -245,6 +245,7 @@ BAD = {
     "truncated": Bad(as_they_are, cut_to=0.6),
     "empty_files": Bad(as_they_are, cut_to=0.0),
     "standing": Bad(standing, flown=False),
-    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping"})),
+    # its blades do not flap, and its rates follow the commands at once
+    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping", "rate_gain"})),
     "two_hours_still": Bad(hours_still, flown=False),
 }

@@ -65,14 +65,19 @@ def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
     assert opening.throw_model(args, [])[0].sensing.frame_tilt == (0.01, 0.0, 0.0)
 
 
-def test_of_hours_of_flight_all_throws_are_looked_at():
+def test_of_hours_of_flight_all_throws_and_the_liveliest_windows_are_looked_at():
     hover = [Cut(0, "hover", float(i), i + 1.0, ATTACHED) for i in range(7200)]
     throws = [Cut(1, "throw", float(i), i + 1.0, ATTACHED) for i in range(30)]
-    kept = thinned([*hover, *throws])
-    assert len(kept) == 400
+    time = np.arange(0.0, 7200.0, 0.1)
+    lively = (time % 60.0 >= 30.0) & (time % 60.0 < 31.0)  # a second of each minute
+    command = np.outer(np.sin(7.0 * time) * (0.01 + lively), np.ones(4))
+    flight = argparse.Namespace(command_time=time, command=command)
+    kept = thinned([*hover, *throws], [flight, flight])
+    assert len(kept) == 100
     assert [c for c in kept if c.flight == 1] == throws
-    assert max(b.start - a.start for a, b in pairwise(kept[:370])) < 25.0
-    assert thinned(throws) == throws
+    assert max(b.start - a.start for a, b in pairwise(kept[:70])) < 250.0
+    assert all(c.start % 60.0 == 30.0 for c in kept[:70])
+    assert thinned(throws, [flight, flight]) == throws
 
 
 def run_cases(kinds: list[str], count: int = 1) -> list[dict]:

@@ -436,6 +436,19 @@ class TestImu:
             assert abs(found[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
             assert sd[name] < 0.15 * abs(size), name
 
+    def test_torques_are_left_out_where_the_air_turns_the_vehicle(self):
+        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(2)]
+        for log in logs:
+            rate = log["rate_b"]
+            rate.values[:] += 40.0 * np.sin(4.0 * rate.time)[:, None] * [1.0, -1.0, 0.5]
+        model = ImuModel(logs, IMU)
+        assert model.channels == ("acc_b",)
+        assert "with a correlation of 0." in model.notes[0]
+        diagnosis = search.diagnose(logs, model, laws=False)
+        assert diagnosis.named == ("motor_tau",)
+        assert diagnosis["inertia_xy"].missing == ("rate_b",)
+        assert any("no torque or inertia" in reason for reason in diagnosis.reasons)
+
     def test_a_lag_is_named_with_its_interval(self):
         logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(3)]
         diagnosis = search.explain(ImuModel(logs, IMU))

@@ -73,8 +73,9 @@ def diagnose(
     say(f"{len(flights)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
     copied = {i: original for i, original in copies(checked).items() if i not in refused}
     reasons += [f"{checked[i].name}: a copy of another log, which counts once" for i in copied]
-    for reason in reasons:
-        say(f"  left out: {reason}")
+    notes = [*model.notes, *(f"left out: {reason}" for reason in reasons)]
+    for note in notes:
+        say(f"  {note}")
     diagnosis = explain(
         model,
         seed=seed,
@@ -82,7 +83,6 @@ def diagnose(
         laws=laws,
         progress=lambda line: say(f"  {line}"),
     )
-    notes = [f"left out: {reason}" for reason in reasons]
     missing = len(flights) - len({*without, *refused, *copied}) - diagnosis.flights
     if missing > 0:
         notes.insert(0, f"{missing} of {len(flights)} flights have no window in this answer")

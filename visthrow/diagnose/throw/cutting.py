@@ -1,5 +1,6 @@
 """Flights cut into windows of about a second at changes of phase."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -21,7 +22,8 @@ LEAST_TAUT = 0.05  # before the separation, without which the release cannot be 
 # that a rope may whip after it came taut [s]: it bends more than what fitted states of calm windows
 # may
 RINGING = 1.5
-WINDOW_LIMIT = 400  # windows; of longer flights these are spread evenly over all
+WINDOW_LIMIT = 100  # windows that are diagnosed in minutes; longer flights are thinned to these
+TINY = 1e-12  # variance of a command that never changes
 POSES_LEAST = 8  # measured poses without which a window says nothing
 
 
@@ -99,16 +101,25 @@ def cut(
     ]
 
 
-def thinned(cuts: list[Cut], count: int = WINDOW_LIMIT) -> list[Cut]:
-    """Thin hours of flight out to all throws and what follows them, and so many of the other
-    windows that ``count`` are left.
+def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
+    """Thin long flights out to all throws and what follows them, and so many of the other windows
+    that :data:`WINDOW_LIMIT` are left: of each stretch that whose commands vary most.
     """
     plain = [i for i, c in enumerate(cuts) if c.phase not in ("throw", "ballistic")]
-    room = max(count - len(cuts) + len(plain), count // 4)
+    room = max(WINDOW_LIMIT - len(cuts) + len(plain), WINDOW_LIMIT // 4)
     if len(plain) <= room:
         return cuts
-    dropped = set(plain) - {plain[i] for i in np.linspace(0, len(plain) - 1, room).astype(int)}
+    variation = {i: _variation(flights[cuts[i].flight], cuts[i]) for i in plain}
+    chosen = {max(part, key=variation.__getitem__) for part in np.array_split(plain, room)}
+    dropped = set(plain) - chosen
     return [c for i, c in enumerate(cuts) if i not in dropped]
+
+
+def _variation(flight: RecordedFlight, c: Cut) -> float:
+    """Variance of a window's commands, against that of the flight's."""
+    acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
+    variance = np.var(flight.command[acts], axis=0)
+    return float(np.sum(variance / np.maximum(np.var(flight.command, axis=0), TINY)))
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:

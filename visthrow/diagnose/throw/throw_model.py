@@ -100,7 +100,10 @@ class ThrowModel(Model):
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries = any(hangs)
         release = (plant.release.lag, plant.release.landing_height)
-        cuts = thinned([c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])])
+        all_cuts = [c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])]
+        cuts = thinned(all_cuts, flights)
+        if len(cuts) < len(all_cuts):
+            self.notes = (f"long flights: {len(cuts)} of {len(all_cuts)} windows are looked at",)
         if not cuts:
             raise DiagnoseError(
                 f"{len(flights)} flights hold no stretch of poses and commands long enough to"

@@ -97,6 +97,7 @@ class FlyerModel(NumericModel):
             expect_thrust(stretches, self.params)
         if len(stretches) <= limit:
             return stretches
+        self.notes = (*self.notes, f"long flights: {limit} windows are looked at, spread over all")
         chosen = np.linspace(0, len(stretches) - 1, limit).round().astype(int)
         return [stretches[i] for i in chosen]
 
@@ -422,20 +423,11 @@ class FlyerModel(NumericModel):
         inertia = np.array(p.inertia) * scale
         com_x, com_y = self.stack(lanes, "com_x", "com_y").T
         total = thrust.sum(2)
+        lever = np.stack([-com_y * total, com_x * total, 0.0 * total], -1)
+        torque = p.of(thrust) + lever
 
         def turning(half: int, rate: np.ndarray, push: np.ndarray) -> np.ndarray:
-            front_left, front_right, rear_left, rear_right = thrust[half].T
-            right_up = front_left + rear_left - front_right - rear_right
-            nose_down = rear_left + rear_right - front_left - front_right
-            torque = np.stack(
-                [
-                    p.arm_y * right_up - com_y * total[half],
-                    p.arm_x * nose_down + com_x * total[half],
-                    p.torque_ratio * thrust[half] @ np.array(p.spin),
-                ],
-                1,
-            )
-            return (torque - cross(rate, inertia * rate) + push) / inertia
+            return (torque[half] - cross(rate, inertia * rate) + push) / inertia
 
         return turning
 

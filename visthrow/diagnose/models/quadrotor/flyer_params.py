@@ -35,6 +35,16 @@ class TorqueParams(Bounded):
     # +1 turns clockwise seen from above; order of the rotors as everywhere
     spin: tuple[float, float, float, float]
 
+    def of(self, thrusts: np.ndarray) -> np.ndarray:
+        """Return the torque of four rotors' thrusts, shape (..., 4), about the middle of them
+        [N m], shape (..., 3).
+        """
+        front_left, front_right, rear_left, rear_right = np.moveaxis(thrusts, -1, 0)
+        right_up = front_left + rear_left - front_right - rear_right
+        nose_down = rear_left + rear_right - front_left - front_right
+        turn = self.torque_ratio * (thrusts @ np.array(self.spin))
+        return np.stack([self.arm_y * right_up, self.arm_x * nose_down, turn], -1)
+
 
 @dataclass(frozen=True)
 class QuadrotorParams(Bounded):

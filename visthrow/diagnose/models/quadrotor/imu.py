@@ -22,13 +22,17 @@ from visthrow.diagnose.models.numeric import (
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import KNOTS, covered, flies, held_inputs
-from visthrow.logs.check.relations import on_grid
+from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
 from visthrow.logs.flightlog import FlightLog
 
 CHANNELS = ("acc_b", "rate_b")
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
 OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
 QUIETEST = (1e-2, 2e-3)  # noise of accelerometer and gyro below which none is believed
+# correlation of angular acceleration with the commands' torques, below which inertia cannot be told:
+# in simulated flights it is 0.99, in fast flights of a Crazyflie, which the air turns as well, 0.5
+FOLLOWS = 0.8
+SMOOTHING = 0.05  # of the gyro for its slope [s]
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,10 @@ class ImuModel(FlyerModel):
     def __init__(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
         """See the base class."""
         self.needed = (params.input, *CHANNELS)
+        turned = [r for log in logs if (r := _turned(log, params)) is not None]
+        if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
+            self.channels = CHANNELS[:1]
+            self.notes = (_why_not(turned, params.input),)
         self.has_voltage = all("battery_voltage" in log for log in logs)
         self.inputs = (params.input, *["battery_voltage"] * self.has_voltage)
         NumericModel.__init__(self, logs, params)
@@ -89,6 +97,7 @@ class ImuModel(FlyerModel):
             data["since"] = start - float(log[p.input].time[0])
             layout = latent_layout(start, end, KNOTS, (0, 1))
             guess = [*samples[1][1][0], 0.0]
+            samples = samples[: len(self.channels)]
             spread = [1.0, 1.0, 1.0, OFFSET]
             stretches.append(
                 Stretch.laid_out(number, "flight", samples, data, layout, guess, spread)
@@ -116,7 +125,7 @@ class ImuModel(FlyerModel):
         """See the base class."""
         grid = stretch.data["start"] + self.params.step * np.arange(path.shape[1])
         out = np.empty((len(path), len(stretch.time)))
-        for channel, part in enumerate((slice(3, 4), slice(3))):
+        for channel, part in enumerate((slice(3, 4), slice(3))[: len(self.channels)]):
             rows = stretch.channel == channel
             width = part.stop - (part.start or 0)
             time = stretch.time[rows][::width]
@@ -127,3 +136,27 @@ class ImuModel(FlyerModel):
     def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
         """See the base class."""
         return {}
+
+
+def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
+    """Relate the angular acceleration to what the commands' torques would give; None where a
+    channel lacks or nothing turns.
+    """
+    if params.input not in log or "rate_b" not in log:
+        return None
+    time, inputs = log[params.input].samples()
+    sent = params.torque.of(params.thrust(inputs)) / np.array(params.torque.inertia)
+    return relate(time, sent, *derivative(*log["rate_b"].samples(), SMOOTHING))
+
+
+def _why_not(turned: Sequence[Relation], source: str) -> str:
+    """Return why a model leaves the rates out."""
+    worst = min(turned, key=lambda r: r.correlation)
+    reason = (
+        f"the rates follow the torques of {source} with a correlation of {worst.correlation:.2f}"
+        f" only (expected {FOLLOWS} or more): the air turns this vehicle as well, or hardly"
+        " anything does"
+    )
+    if worst.nats > 0.0:
+        reason += f"; as ({worst.axes}) it is {worst.axes_correlation:.2f}: motors in another order"
+    return f"{reason}; acc_b alone is looked at, and no torque or inertia is told"
