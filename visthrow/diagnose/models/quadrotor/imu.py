@@ -29,7 +29,7 @@ CHANNELS = ("acc_b", "rate_b")
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
 OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
 QUIETEST = (1e-2, 2e-3)  # noise of accelerometer and gyro below which none is believed
-# correlation of angular acceleration with the commands' torques, from which inertia can be told: 0.99
+# correlation of angular acceleration with the commands' torques, from which inertia is told: 0.99
 # in simulated flights, 0.2 to 0.5 in fast flights of a Crazyflie, which the air turns as well
 FOLLOWS = 0.8
 SMOOTHING = 0.05  # of the gyro for its slope [s]
