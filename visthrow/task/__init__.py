@@ -7,7 +7,7 @@ the learning parameters; :func:`plant_of` gives what the simulator needs of it."
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
@@ -39,8 +39,9 @@ SOUND = 343.0  # speed of sound in it [m/s]
 class ActionParams(Bounded):
     """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
-    max_thrust: Positive  # collective thrust at +1 [N]
     max_rate: tuple[Positive, Positive, Positive]  # body rates at +-1 [rad/s]
+    # collective thrust at +1 [N]; 0 stands for that of the experiment's vehicle, which then replaces it
+    max_thrust: NotNegative = 0.0
 
 
 @dataclass(frozen=True)
@@ -370,6 +371,10 @@ class Experiment:
         return chosen
 
     def __post_init__(self) -> None:
+        action = self.task.action
+        if action.max_thrust == 0.0:
+            action = replace(action, max_thrust=4.0 * self.vehicle.controller.max_thrust)
+            object.__setattr__(self, "task", replace(self.task, action=action))
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             message = (
                 f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius"

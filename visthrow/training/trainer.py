@@ -124,7 +124,7 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
     MismatchError where the experiment's task observes or acts otherwise; the message names every
     difference."""
     try:
-        policy.require(contract_of(experiment), TASK, allow=("observation.latency",))
+        policy.require(contract_of(experiment), TASK, ("observation.latency", "action.max_thrust"))
     except MismatchError as error:
         raise MismatchError(f"--from: the task of this run is not the policy's; {error}") from None
     if (policy.estimator is None) == (experiment.algorithm == "distillation"):

@@ -2,12 +2,15 @@
 file finds its base.
 """
 
-from pytest import mark, raises
+from pytest import approx, mark, raises
 
 from tests.commands import run_command
+from tests.configs import load_experiment
 from visthrow import config
 from visthrow.common.errors import ConfigError
-from visthrow.task import Experiment
+from visthrow.onboard.policy import Policy, find_policy
+from visthrow.task import Experiment, contract_of
+from visthrow.training.trainer import fitted
 
 
 @mark.parametrize(
@@ -87,6 +90,18 @@ from visthrow.task import Experiment
 def test_the_command_refuses(kind, name, change, message, capsys):
     assert run_command(f"config {kind} {name} --set {change}") == 2
     assert message in capsys.readouterr().err
+
+
+def test_the_thrust_of_an_action_is_the_vehicles_unless_it_is_set():
+    sets = ["vehicle=vehicle/x500.toml"]
+    heavy = load_experiment("state", sets)
+    assert heavy.task.action.max_thrust == approx(4 * heavy.vehicle.controller.max_thrust)
+    assert contract_of(heavy)["action"]["max_thrust"] == approx(45.2)
+    assert config.loads(Experiment, config.dumps(heavy), (), name="run") == heavy
+    weaker = load_experiment("state", [*sets, "task.action.max_thrust=30"])
+    assert weaker.task.action.max_thrust == 30.0
+    shipped = Policy.load(find_policy("state"))
+    assert fitted(heavy, shipped).task.action == heavy.task.action  # a throttle fits any vehicle
 
 
 @mark.parametrize("name", ["vision", "vision_ideal", "state_far"])
