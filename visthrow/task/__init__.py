@@ -40,7 +40,7 @@ class ActionParams(Bounded):
     """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
     max_rate: tuple[Positive, Positive, Positive]  # body rates at +-1 [rad/s]
-    # collective thrust at +1 [N]; 0 stands for that of the experiment's vehicle, which then replaces it
+    # collective thrust at +1 [N]; an experiment replaces 0 by its vehicle's
     max_thrust: NotNegative = 0.0
 
 
