@@ -9,7 +9,7 @@ from torch.testing import assert_close
 
 from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
 from camera.mount import rotation_from_vector
-from tests.configs import load_experiment
+from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.training.env import ThrowEnv
@@ -48,14 +48,8 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
     """Rotor drag, the motors' lag and unsteady thrust are in the sway: taken for the ball's motion
     they turned the pitch by 0.06 deg.
     """
-    quiet = (
-        "task.noise.observation_step=0.0",
-        "task.noise.observation_bias=0.0",
-        "camera.noise.step_std=0.0",
-        "camera.noise.bias_std=0.0",
-    )
-    changes = [*quiet, "camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03"]
-    flown = hover_start(load_experiment("vision_ideal", changes))
+    errors = ("camera.mount.rotation_error_std=0.05", "camera.noise.scale_std=0.03")
+    flown = hover_start(quiet("vision_ideal", *errors))
     torch.manual_seed(0)
     with torch.inference_mode():
         env, found = ThrowEnv(flown, "cpu", 0, 6), []

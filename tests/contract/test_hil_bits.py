@@ -18,7 +18,7 @@ from hil.control.recording.record import RunRecorder, lines, load_run
 from hil.control.runner import OperatorInput, Runner
 from hil.links.backends.base import Status
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
-from tests.contract.test_pilot import quiet
+from tests.configs import quiet
 from tests.hil_flight import TICK, Spy, params
 from tests.hil_runs import record_run, saved_policy
 from visthrow.onboard.observations import layout_of

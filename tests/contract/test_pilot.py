@@ -9,7 +9,7 @@ import torch
 from numpy.testing import assert_array_equal
 from pytest import mark, raises
 
-from tests.configs import load_experiment
+from tests.configs import load_experiment, quiet
 from visthrow.common.errors import MismatchError, PolicyError
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
@@ -18,35 +18,6 @@ from visthrow.throws.loading import load_policy
 from visthrow.training.env import ThrowEnv
 
 STEPS = 120
-
-
-def quiet(name: str) -> Experiment:
-    """An experiment without any noise or latency."""
-    experiment = load_experiment(name)
-    noise = replace(
-        experiment.task.noise,
-        observation_step=0.0,
-        observation_bias=0.0,
-        command_step=0.0,
-        command_bias=0.0,
-    )
-    camera = replace(
-        experiment.camera,
-        noise=replace(
-            experiment.camera.noise,
-            step_std=0.0,
-            bias_std=0.0,
-            drop_probability=0.0,
-            latency=0.0,
-            wrong_probability=0.0,
-            held_probability=0.0,
-            scale_std=0.0,
-        ),
-        mount=replace(experiment.camera.mount, rotation_error_std=0.0, position_error_std=0.0),
-    )
-    observation = replace(experiment.task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
-    task = replace(experiment.task, noise=noise, observation=observation)
-    return replace(experiment, task=task, camera=camera)
 
 
 def random_policy(experiment: Experiment, seed: int = 0) -> Policy:

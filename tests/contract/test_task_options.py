@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, raises
 
 from sim.hybrid import rope_variants, tether_lengths
-from tests.configs import load_experiment
+from tests.configs import load_experiment, quiet
 from visthrow import cli
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
@@ -53,14 +53,7 @@ def test_a_moving_goal_is_seen_late_and_its_velocity_is_learnt():
     """Without noise the actor's offset is to the goal of 10 ms ago, and the fit reaches the true
     velocity.
     """
-    quiet = [
-        "task.noise.observation_step=0.0",
-        "task.noise.observation_bias=0.0",
-        "task.noise.command_step=0.0",
-    ]
-    env = ThrowEnv(
-        experiment("state_moving", *quiet, "task.observation.latency=[0.01,0.01]"), count=32
-    )
+    env = ThrowEnv(quiet("state_moving", "task.observation.latency=[0.01,0.01]"), count=32)
     hover = env.previous_action.clone()
     alive = torch.ones(32, dtype=torch.bool)
     for _ in range(12):

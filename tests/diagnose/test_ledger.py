@@ -9,20 +9,6 @@ from pytest import mark
 from bench.diagnose import ledger, sealed
 from visthrow.paper import measurements
 
-
-def world(effects: dict, named: list, kind: str = "1x10", **more) -> dict:
-    """A line of a ledger."""
-    recipe = {"effects": effects, "plant": "rod", "seed": 1}
-    overall = "KNOWN" if named else "NO EFFECT"
-    return {
-        "kind": kind,
-        "recipe": recipe,
-        "named": named,
-        "overall": overall,
-        "explain_s": 1.0,
-    } | more
-
-
 SHIPPED = {
     name: [
         json.loads(line) for line in (Path(ledger.__file__).parent / name).read_text().splitlines()

@@ -29,8 +29,6 @@ AGREEMENT = {
 """Largest distance to the simulator at 0.25 ms [m], vehicle or ball, until the separation of a hard
 throw.
 """
-FREE_RATE, LOWEST = 9.0, 0.8
-"""Body rate [rad/s] and height [m] that a calm pilot keeps to in free flight about 1.9 m."""
 
 
 def imported(source: str) -> set[str]:

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from sim.hybrid import HybridSim
-from sim.params import GRAVITY, AirParams
+from sim.params import GRAVITY, AirParams, VehicleParams
 from sim.reference.plant import ReferencePlant
 from sim.reference.reference_extras import ReferenceExtras
 from tests.plants import EVERYTHING, paper_plant, plain_vehicle
@@ -20,6 +20,7 @@ from tests.simulators import bare_quadrotor
 from visthrow.throws.plants import flown
 
 STEPS = 12  # of 20 ms
+GROUND = frozenset({"ground_effect"})
 REFERENCE_STEP = 2e-3  # s, at most; of order 4: payloads move by 2 nm against steps of a quarter
 AGREEMENT = 3e-4  # m; the simulator's steps of 1 ms alone leave 0.2 mm after such a swing
 DISTINCT = 10.0  # times that agreement an effect must move the payload for the test to say anything
@@ -294,13 +295,22 @@ def test_a_rope_that_gives_is_a_spring(steps):
     assert_allclose(change, expected[0] - expected[1], atol=0.12 * norm(change))  # the mount drifts
 
 
+def slowing(time_constant_down: float) -> VehicleParams:
+    """A plain vehicle whose rotors slow down more slowly than they speed up."""
+    vehicle = plain_vehicle(paper_plant().vehicle, motor="asymmetric")
+    motor = replace(vehicle.motor, time_constant_down=time_constant_down)
+    return replace(vehicle, motor=motor)
+
+
 def test_ground_effect_lifts_as_the_formula_says():
-    vehicle = paper_plant().vehicle
+    vehicle = slowing(0.1)
     height, effect = 0.06, 1.5
     thrust = vehicle.body.mass * GRAVITY
     rise = []
     for air in (AirParams(), AirParams(ground_effect=effect)):
-        sim = bare_quadrotor(vehicle, 1, precision="float64", control_period=1e-3, airs=[air])
+        sim = bare_quadrotor(
+            vehicle, precision="float64", control_period=1e-3, airs=[air], extensions=GROUND
+        )
         sim.place(np.array([[0.0, 0.0, height]]))
         sim.set_command(np.array([[thrust, 0.0, 0.0, 0.0]]))
         sim.step()
@@ -310,9 +320,8 @@ def test_ground_effect_lifts_as_the_formula_says():
 
 
 def test_asymmetric_motor_is_first_order_one_way():
-    vehicle = plain_vehicle(paper_plant().vehicle)
-    slow = replace(vehicle.motor, kind="asymmetric", time_constant_down=0.1)
-    sim = bare_quadrotor(replace(vehicle, motor=slow), 1, precision="float64", step=5e-4)
+    vehicle = slowing(0.1)
+    sim = bare_quadrotor(vehicle, precision="float64", step=5e-4, extensions=GROUND)
     sim.place(np.array([[0.0, 0.0, 1.0]]))
     before = sim.get("motor_speed")[0, 0]
     sim.set_command(np.array([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]]))

@@ -87,11 +87,8 @@ def test_a_second_of_full_range_commands(precision):
         {"delay": 0.0},
         {"delay": 0.0467},
         {"delay": 0.04},
-        {"controller": "geometric"},
-        {"controller": "motor_mixing"},
-        {"motor": "instant"},
-        {"battery": "ideal"},
-        {"aero": "none"},
+        {"controller": "geometric", "motor": "instant"},
+        {"controller": "motor_mixing", "battery": "ideal", "aero": "none"},
     ],
     ids=str,
 )

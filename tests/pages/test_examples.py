@@ -12,7 +12,7 @@ from pytest import approx, mark, raises
 from camera.fisheye import Fisheye
 from camera.params import CameraParams
 from hil.poses.sources import images
-from tests.unit.on_view import test_camera_command as drawn
+from tests import boards
 from visthrow import config
 from visthrow.training import rewards, trainer
 
@@ -60,16 +60,14 @@ def test_poses_are_projected_as_a_picture_shows_them(tmp_path, monkeypatch, caps
 
 def test_a_camera_is_calibrated(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    board = drawn.BOARDS["chessboard"]
-    lens = Fisheye(drawn.LENS)
-    for i, picture in enumerate(drawn.pictures(board, lens)):
+    for i, picture in enumerate(boards.pictures("chessboard")):
         cv2.imwrite(f"{i}.png", picture)
     words = (
         f"{' '.join(map(str, sorted(tmp_path.glob('*.png'))))} --columns 7 --rows 5 --square 0.04"
     )
     run("calibrate_camera", words, monkeypatch)
     made = config.load(CameraParams, tmp_path / "my_camera.toml").fisheye
-    assert made.fx == approx(drawn.LENS.fx, rel=0.01)
+    assert made.fx == approx(boards.LENS.fx, rel=0.01)
 
 
 def test_a_flight_is_exported(tmp_path, monkeypatch, capsys):

@@ -12,7 +12,7 @@ from scipy.special import ellipk
 from sim.hybrid import HybridSim
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, BodyParams, PlantParams, QueueParams
-from tests.plants import paper_plant, plain_vehicle
+from tests.plants import paper_plant, plain_plant, plain_vehicle
 from tests.simulators import bare_quadrotor, numerics, rods
 
 PERIOD = 1e-4
@@ -252,12 +252,10 @@ def test_hover_is_an_equilibrium():
     """What a reset leaves is steady where the battery is ideal; with a real one the voltage's
     compensation is not.
     """
-    plant = paper_plant()
-    ideal = replace(plant.vehicle, battery=replace(plant.vehicle.battery, kind="ideal"))
-    sim = HybridSim(replace(plant, vehicle=ideal, sim=numerics(precision="float64")), 1)
+    plant = replace(plain_plant(), sim=numerics(precision="float64"))
+    sim = HybridSim(plant, 1, extensions=frozenset({"push"}))
     sim.place(np.array([[0.0, 0.0, 2.0]]))
-    weight = GRAVITY * (ideal.body.mass + plant.rope.rope_mass + plant.rope.payload_mass)
-    sim.set_command([[weight, 0.0, 0.0, 0.0]])
+    sim.set_command([[GRAVITY * plant.total_mass, 0.0, 0.0, 0.0]])
     advance(sim, 50)
     assert_allclose(sim.get("pos_w")[0], [0.0, 0.0, 2.0], atol=1e-9)
     assert_allclose(sim.get("vel_w")[0], 0.0, atol=1e-9)
@@ -268,7 +266,7 @@ def test_hover_is_an_equilibrium():
 
 def test_external_wrench():
     """Force over mass and torque over inertia, added to a vehicle in free fall."""
-    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric", motor="instant")
+    vehicle = plain_vehicle(paper_plant().vehicle, controller="geometric")
     idle = replace(vehicle.controller, min_thrust=0.0, geometric_gain=0.0)
     vehicle = replace(vehicle, controller=idle, queue=QueueParams(0.0))
     sim = bare_quadrotor(vehicle, 2, "rk4", 0.002, precision="float64", gravity=0.0)
@@ -284,8 +282,7 @@ def test_external_wrench():
 
 def test_a_rope_does_not_keep_a_wrench_from_acting():
     """The same push on vehicle, rope and payload: all of their mass is accelerated."""
-    plant = paper_plant()
-    plant = replace(plant, vehicle=plain_vehicle(plant.vehicle), sim=numerics(precision="float64"))
+    plant = replace(plain_plant(), sim=numerics(precision="float64"))
     pushed, free = (HybridSim(plant, 1, extensions=frozenset({"push"})) for _ in range(2))
     pushed.set_wrench([[0.2, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
     totals = []

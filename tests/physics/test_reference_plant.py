@@ -9,111 +9,11 @@ from pytest import mark, raises
 
 from sim.params import GRAVITY
 from sim.reference.plant import ReferencePlant
-from tests.oracle.bare_rope import BareScene
-from tests.oracle.converged import converged
-from tests.plants import SCENES, paper_plant, plain_plant
-from tests.scenes import Wrench, load_scene
+from tests.plants import paper_plant, plain_plant
 
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
 STILL = np.zeros((1, 3))
 HIGH = np.array([[0.0, 0.0, 1.5]])
-
-
-def unloaded(**changes):
-    """The hard throw's bodies without thrust and damping, swinging and turning."""
-    scene = load_scene(SCENES / "hard_throw.toml")
-    free = (Wrench(0.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),)
-    start = {
-        "schedule": free,
-        "joint_damping": 0.0,
-        "rate_b": (1.0, -2.0, 3.0),
-        "cable_rate_w": (2.0, 6.0, 1.0),
-    }
-    return replace(scene, **{**start, **changes})
-
-
-def momentum(bare):
-    """Linear momentum [kg m/s] of quadrotor, segments and ball, and their total first moment [kg
-    m].
-    """
-    scene = bare.scene
-    n, n_dot = bare.rope
-    ball, ball_vel = bare.ball
-    # Upwards from the ball: the lower end of the last segment, then middle after middle.
-    length, total, moment = (
-        scene.segment_length,
-        scene.mass * bare.body[7:10],
-        scene.mass * bare.body[:3],
-    )
-    end, end_vel = ball - scene.ball_offset * n[-1], ball_vel - scene.ball_offset * n_dot[-1]
-    total, moment = total + scene.ball_mass * ball_vel, moment + scene.ball_mass * ball
-    for direction, velocity in zip(n[::-1], n_dot[::-1]):
-        total = total + scene.segment_mass * (end_vel - 0.5 * length * velocity)
-        moment = moment + scene.segment_mass * (end - 0.5 * length * direction)
-        end, end_vel = end - length * direction, end_vel - length * velocity
-    return total, moment
-
-
-def test_everything_together_falls_freely():
-    """The centre of mass follows g t^2 / 2 and the momentum m g t whatever rope and vehicle do."""
-    bare = BareScene(unloaded(), 5e-4)
-    start, first = momentum(bare)
-    mass, time = bare.scene.total_mass, 0.2
-    bare.advance(time)
-    total, moment = momentum(bare)
-    gravity = np.array([0.0, 0.0, -GRAVITY])
-    assert_allclose(
-        total, start + mass * gravity * time, atol=1e-7
-    )  # order 4 of the joints' motion
-    assert_allclose(moment, first + start * time + 0.5 * mass * gravity * time**2, atol=1e-8)
-
-
-def test_energy_stays_without_damping_and_falls_with_it():
-    times = np.array([0.0, 0.4])
-    energy = converged(unloaded(), 50e-6, times).energy.sum(axis=1)
-    assert abs(energy[1] - energy[0]) < 1e-9
-    damped = converged(unloaded(joint_damping=1e-5), 50e-6, times).energy.sum(axis=1)
-    assert damped[1] < damped[0] - 1e-4
-
-
-def test_pendulum_period():
-    """One rod on a vehicle of a tonne: T = 2 pi sqrt(I / (m g c)) (1 + amplitude^2 / 16)."""
-    amplitude = 0.05
-    scene = unloaded(
-        mass=1e3,
-        inertia=(10.0, 10.0, 10.0),
-        segments=1,
-        segment_length=0.33,
-        segment_mass=0.004,
-        vel_w=(0.0, 0.0, 0.0),
-        rate_b=(0.0, 0.0, 0.0),
-        cable_rate_w=(0.0, 0.0, 0.0),
-        direction=(np.sin(amplitude), 0.0, -np.cos(amplitude)),
-    )
-    scene = replace(
-        scene, schedule=(Wrench(0.0, (0.0, 0.0, scene.total_mass * GRAVITY), (0.0, 0.0, 0.0)),)
-    )
-    reach = scene.segment_length + scene.ball_offset
-    inertia = (
-        scene.segment_mass * scene.segment_length**2 / 3
-        + scene.ball_mass * reach**2
-        + scene.ball_inertia
-    )
-    arm = scene.segment_mass * scene.segment_length / 2 + scene.ball_mass * reach
-    period = 2 * np.pi * np.sqrt(inertia / (arm * GRAVITY)) * (1 + amplitude**2 / 16)
-    bare = BareScene(scene, 2e-3)
-    bare.advance(period / 4)
-    # At the quarter it passes the vertical at its greatest rate: a position off zero is a time off
-    # the period. The vehicle gives by the ball's share of the mass, 6e-5.
-    assert abs(bare.rope[0][0, 0]) < 1e-4 * amplitude
-    assert (
-        abs(
-            np.abs(bare.rope[1][0, 0])
-            / np.sqrt(2 * arm * GRAVITY * (1 - np.cos(amplitude)) / inertia)
-            - 1
-        )
-        < 1e-4
-    )
 
 
 def swinging(plant, step=5e-4, count=1, **start):

@@ -10,7 +10,7 @@ from pytest import approx, fixture, mark, param
 from torch.testing import assert_close
 
 from tests.commands import run_command
-from tests.configs import load_experiment
+from tests.configs import QUIET, load_experiment
 from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
 from visthrow.onboard.policy import Policy
@@ -150,14 +150,7 @@ def test_the_pilot_remembers_as_training_does(whole):
     """The same commands from poses on board as from the environment's observations, with a memory
     that starts anew.
     """
-    noise = ("observation_step", "observation_bias", "command_step", "command_bias")
-    quiet = [
-        *(f"task.noise.{name}=0.0" for name in noise),
-        "camera.noise.step_std=0.0",
-        "camera.noise.bias_std=0.0",
-        "task.observation.latency=[0.0,0.0]",
-    ]
-    experiment = config.load(Experiment, whole / "config.toml", quiet)
+    experiment = config.load(Experiment, whole / "config.toml", QUIET)
     policy = Policy.load(whole / "policy.npz")
     env, pilot = ThrowEnv(experiment, "cpu", 3, 3), Pilot(policy, experiment.camera, 3)
     for _ in range(2):

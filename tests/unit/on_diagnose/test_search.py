@@ -263,12 +263,6 @@ def test_catalogues_that_contradict_themselves_are_refused():
         replace(EFFECTS[0], floor=0.0)
 
 
-def small_causes(seed: int) -> SyntheticModel:
-    """Every effect at its floor: nothing that matters."""
-    signs = default_rng(seed).choice((-1.0, 1.0), len(EFFECTS))
-    return world(truth={e.name: s for e, s in zip(EFFECTS, signs)}, seed=seed, gust=0.3, noise=0.5)
-
-
 def test_flights_without_a_window_are_counted(monkeypatch):
     monkeypatch.setattr(search, "check", lambda *_: [])
     diagnosis = search.diagnose([None] * 9, world(truth={"effect_03": 12.0}, seed=4), laws=False)

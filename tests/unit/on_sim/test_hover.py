@@ -121,14 +121,6 @@ def settled(times, distances, within):
     return times[outside[-1]] if len(outside) else 0.0
 
 
-def energy(plant: Pendulum) -> float:
-    """Return kinetic and potential energy of vehicle and payload [J]."""
-    load_pos_w = plant.pos_w + LENGTH * plant.rope_w
-    load_vel_w = plant.vel_w + LENGTH * np.cross(plant.rope_rate_w, plant.rope_w)
-    kinetic = (VEHICLE * np.sum(plant.vel_w**2) + PAYLOAD * np.sum(load_vel_w**2)) / 2
-    return float(kinetic + GRAVITY * (VEHICLE * plant.pos_w[0, 2] + PAYLOAD * load_pos_w[0, 2]))
-
-
 def test_settles_from_half_a_metre_with_the_payload():
     starts = GOAL + 0.5 * np.array(
         [[1, 0, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1], [0.6, 0.64, -0.48]]

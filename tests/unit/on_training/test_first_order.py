@@ -10,7 +10,7 @@ from pytest import approx, mark, param
 from torch.testing import assert_close
 
 from sim.params import GRAVITY
-from tests.configs import load_experiment
+from tests.configs import QUIET, load_experiment
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy, find_policy
@@ -26,15 +26,6 @@ SMALL = [
     "first_order.horizon=14",
     "first_order.initial_release=-0.3",
 ]
-QUIET = [
-    "task.noise.observation_step=0",
-    "task.noise.observation_bias=0",
-    "task.noise.command_step=0",
-    "task.noise.command_bias=0",
-    "camera.noise.step_std=0",
-    "camera.noise.bias_std=0",
-]
-
 SECOND_ORDER = 0.01
 """A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at
 its ends.

@@ -9,24 +9,13 @@ import numpy as np
 import torch
 from pytest import fixture, mark
 
-from camera.calibrate.boards import BoardParams
 from camera.calibrate.files import read
 from camera.fisheye import Fisheye
-from camera.mount import rotation_from_vector
-from camera.params import FisheyeParams
 from tests import lens_files
+from tests.boards import LENS, pictures
 from tests.commands import run_command
-from tests.drawn import pixel_rays
 from visthrow.cli import main
 
-LENS = FisheyeParams(320, 320, 96.0, 97.0, 161.0, 157.0, 0.01, -0.004, fov_deg=190.0)
-LARGE = FisheyeParams(640, 640, 192.0, 194.0, 322.5, 314.5, 0.01, -0.004, fov_deg=190.0)
-"""The same lens over twice the pixels: a ChArUco marker needs some."""
-BOARDS = {
-    "chessboard": BoardParams(7, 5, 0.04),
-    "circles": BoardParams(7, 5, 0.04, "circles"),
-    "charuco": BoardParams(7, 5, 0.04, "charuco", 0.03),
-}
 WRITERS = {
     name: getattr(lens_files, f"write_{name}") for name in ("opencv", "kalibr", "ros", "basalt")
 }
@@ -60,149 +49,47 @@ C++ port for VI-SLAM).
 OCAM_PX = 0.5
 
 
-def texture(board: BoardParams, scale: int) -> tuple[np.ndarray, float]:
-    """A printed board, grey, ``scale`` pixels a square, and where its first point lies in it
-    [squares].
-    """
-    if board.pattern == "charuco":
-        return (
-            board.charuco().generateImage((scale * (board.columns + 1), scale * (board.rows + 1))),
-            1.0,
-        )
-    page = np.full((scale * (board.rows + 1), scale * (board.columns + 1)), 255, np.uint8)
-    for j in range(board.rows + 1):
-        for i in range(board.columns + 1):
-            if board.pattern == "circles" and i < board.columns and j < board.rows:
-                cv2.circle(page, ((i + 1) * scale, (j + 1) * scale), scale // 4, 0, -1, cv2.LINE_AA)
-            elif board.pattern == "chessboard" and (i + j) % 2:
-                page[j * scale : (j + 1) * scale, i * scale : (i + 1) * scale] = 0
-    return page, 1.0
-
-
-def pictures(board: BoardParams, lens: Fisheye) -> list[np.ndarray]:
-    """Pictures of a board in eight poses, shape (H, W) of the lens."""
-    tilts = [
-        (0.1, 0.2, 0.0),
-        (-0.5, 0.3, 0.2),
-        (0.4, -0.5, -0.3),
-        (0.4, 0.3, 0.1),
-        (0.6, 0.1, 0.4),
-        (-0.3, -0.6, 0.5),
-        (0.0, 0.0, 0.7),
-        (0.5, 0.5, 0.2),
-    ]
-    places = [
-        (0.0, 0.0),
-        (0.13, 0.1),
-        (-0.14, 0.1),
-        (-0.16, -0.1),
-        (0.12, -0.13),
-        (0.0, 0.14),
-        (0.0, -0.14),
-        (0.05, 0.0),
-    ]
-    samples, scale = 3, 60
-    page, first = texture(board, scale)
-    page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
-    rays, seen = pixel_rays(lens, samples)
-    found = []
-    for tilt, place in zip(tilts, places, strict=True):
-        rot_cm = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
-        origin = torch.tensor([*place, 0.18], dtype=torch.float64) - rot_cm @ torch.from_numpy(
-            board.corners_m().mean(0)
-        )
-        normal = rot_cm[:, 2]
-        depth = (normal @ origin) / (rays @ normal)
-        on_board = (rays * depth[..., None] - origin) @ rot_cm / board.square_size
-        u, v = ((on_board[..., i] + first + 1.0) * scale - 0.5 for i in (0, 1))
-        inside = (seen & (depth > 0.0)).numpy()
-        drawn = cv2.remap(
-            page,
-            u.float().numpy(),
-            v.float().numpy(),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=110,
-        )
-        drawn = np.where(inside, drawn, 0).astype(np.float32)
-        mean = drawn.reshape(lens.params.height, samples, lens.params.width, samples).mean((1, 3))
-        found.append(np.round(mean).astype(np.uint8))
-    return found
-
-
 @fixture(scope="module")
-def boards(tmp_path_factory):
-    """Give the folder of pictures of a kind of board, drawn when asked for."""
-    root = tmp_path_factory.mktemp("boards")
-
-    def folder(name: str):
-        if not (root / name).exists():
-            (root / name).mkdir()
-            for i, image in enumerate(
-                pictures(BOARDS[name], Fisheye(LARGE if name == "charuco" else LENS))
-            ):
-                cv2.imwrite(str(root / name / f"{i}.png"), image)
-        return root / name
-
-    return folder
+def board(tmp_path_factory):
+    """Give the words after a command that name a folder of pictures of a chessboard."""
+    folder = tmp_path_factory.mktemp("board")
+    for i, image in enumerate(pictures("chessboard")):
+        cv2.imwrite(str(folder / f"{i}.png"), image)
+    return [str(folder), "--board", *["chessboard", "7", "5", "0.04"]]
 
 
-def words(board: BoardParams) -> list[str]:
-    marker = [str(board.marker_size)] if board.marker_size else []
-    return [
-        "--board",
-        board.pattern,
-        str(board.columns),
-        str(board.rows),
-        str(board.square_size),
-        *marker,
-    ]
-
-
-def calibration(kind: str, folder, boards) -> list[str]:
-    """Words after ``visthrow camera calibrate`` for a source of a kind."""
-    if kind in BOARDS:
-        return [str(boards(kind)), *words(BOARDS[kind]), "--fov-deg", "190"]
-    path = folder / f"{kind}.calibration"
+def calibration(kind: str, folder) -> str:
+    """Write a calibration of a kind and return its path."""
+    path = folder / f"{kind}.{'json' if kind == 'basalt' else 'yaml'}"
     if kind == "ocam":
         path.write_text(OCAM)
-        return [str(path), "--fov-deg", "200"]
-    WRITERS[kind](path.with_suffix(".json" if kind == "basalt" else ".yaml"), LENS)
-    return [str(path.with_suffix(".json" if kind == "basalt" else ".yaml"))]
+    else:
+        WRITERS[kind](path, LENS)
+    return str(path)
 
 
-SLOW = {"opencv", "ros", "basalt", "ocam", "circles", "charuco"}
-"""Kinds whose config trains and flies in the slow run alone; kalibr and chessboard do by default.
-"""
-
-
-def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, boards, capsys):
+def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, board, capsys):
     right = tmp_path / "kalibr.yaml"
     lens_files.write_kalibr(right, LENS)
     assert run_command(f"camera calibrate {right} --out {tmp_path}/right.toml") == 0
-    asked = [str(boards("chessboard")), *words(BOARDS["chessboard"])]
-    assert run_command(f"camera check {tmp_path}/right.toml", *asked) == 0
+    assert run_command(f"camera check {tmp_path}/right.toml", *board) == 0
     said = capsys.readouterr().out
     assert "the configured lens fits" in said
     text = (tmp_path / "right.toml").read_text()
     (tmp_path / "wrong.toml").write_text(text.replace("fx = 96.0", "fx = 99.0"))
-    assert run_command(f"camera check {tmp_path}/wrong.toml", *asked) == 1
+    assert run_command(f"camera check {tmp_path}/wrong.toml", *board) == 1
     assert "does NOT fit" in capsys.readouterr().out
-    assert run_command("camera check fisheye", *asked) == 2
+    assert run_command("camera check fisheye", *board) == 2
     assert "320 x 320 px came; expected 640 x 640" in capsys.readouterr().err
 
 
-def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, boards, capsys):
+def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, board, capsys):
     lens_files.write_ros(tmp_path / "ros.yaml", LENS)
     camera, out = tmp_path / "camera.toml", tmp_path / "seen.png"
     assert run_command(f"camera calibrate {tmp_path}/ros.yaml --out {camera}") == 0
-    frame = str(boards("chessboard") / "0.png")
-    assert (
-        run_command(
-            f"camera show {camera} {frame} --straight 100 --out {out}", *words(BOARDS["chessboard"])
-        )
-        == 0
-    )
+    frame = f"{board[0]}/0.png"
+    command = f"camera show {camera} {frame} --straight 100 --out {out}"
+    assert run_command(command, *board[1:]) == 0
     said = capsys.readouterr().out
     assert "4 of 4 keypoints of the goal, 4 of 4 of the payload" in said
     assert float(said.split("(blue): ")[1].split()[0]) < 0.2
@@ -248,7 +135,7 @@ def test_ocam_agrees_with_its_own_inverse_polynomial(tmp_path):
 
 @mark.parametrize("kind", [*WRITERS, "ocam"])
 def test_the_tool_is_told_from_the_text(kind, tmp_path):
-    assert kind in read(calibration(kind, tmp_path, None)[0])[0]
+    assert kind in read(calibration(kind, tmp_path))[0]
 
 
 @mark.parametrize(

@@ -2,7 +2,7 @@
 ordinary one for each.
 """
 
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ from pytest import approx, mark, raises
 
 from sim.params import GRAVITY
 from sim.vehicle_class import draw
-from tests.configs import load_experiment
+from tests.configs import QUIET, load_experiment
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.onboard import actions as act
@@ -36,10 +36,9 @@ def experiment(*overrides: str, policy: str = "any") -> Experiment:
     return load_experiment(policy, ["fleet.count=3", *overrides])
 
 
-def of(name: str, policy: str = "any") -> Experiment:
-    return experiment(
-        f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0", policy=policy
-    )
+def of(name: str, policy: str = "any", overrides: Sequence[str] = ()) -> Experiment:
+    own = (f'vehicle="vehicle/{name}.toml"', f'rope="rope/{name}.toml"', "fleet.count=0")
+    return experiment(*own, *overrides, policy=policy)
 
 
 def random_policy(of: Experiment, seed: int = 0) -> Policy:
@@ -123,38 +122,10 @@ def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them(
         assert float(queued[e]) == approx(most, rel=0.15), "five deviations of the commands' noise"
 
 
-def quiet(base: Experiment) -> Experiment:
-    """The experiment without noise, latency, faults of the camera or other masses and ropes."""
-    task = base.task
-    clear = dict.fromkeys(
-        (
-            "step_std",
-            "bias_std",
-            "drop_probability",
-            "wrong_probability",
-            "held_probability",
-            "scale_std",
-        ),
-        0.0,
-    )
-    mount = replace(base.camera.mount, rotation_error_std=0.0, position_error_std=0.0)
-    camera = replace(base.camera, mount=mount, noise=replace(base.camera.noise, **clear))
-    noise = replace(
-        task.noise, observation_step=0.0, observation_bias=0.0, command_step=0.0, command_bias=0.0
-    )
-    start = replace(task.start, mass=0.0, tether_variants=1)
-    observation = replace(task.observation, latency=(0.0, 0.0), latency_jitter=0.0)
-    return replace(
-        base,
-        camera=camera,
-        task=replace(task, noise=noise, start=start, observation=observation),
-    )
-
-
 @mark.parametrize("kind", ["any", "any_vision"])
 @mark.parametrize("name", NAMED)
 def test_a_pilot_decides_in_si_units_what_the_policy_decides_in_the_vehicles(name, kind):
-    base = quiet(of(name, kind))
+    base = of(name, kind, [*QUIET, "task.start.mass=0.0", "task.start.tether_variants=1"])
     policy, env = random_policy(base), ThrowEnv(base, "cpu", seed=1, count=4)
     own, one = specialised(policy, base)
     pilot, units = (
