@@ -1,10 +1,17 @@
 """The command line, run in this process."""
 
+from collections.abc import Iterable
+
 from visthrow import cli
 
 
-def run_command(line: str, *words: str) -> int:
-    """Run a visthrow command, given by its words in one line and by further ones; returns its exit
-    status.
+def set_words(settings: Iterable[str]) -> list[str]:
+    """Return the words of a command that set keys of its configuration."""
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+def run_command(line: str, *words: str, sets: Iterable[str] = ()) -> int:
+    """Run a visthrow command, given by its words in one line, by further ones and by the settings
+    of its configuration; returns its exit status.
     """
-    return cli.main([*line.split(), *words])
+    return cli.main([*line.split(), *words, *set_words(sets)])

@@ -11,8 +11,8 @@ from numpy.testing import assert_allclose
 from pytest import approx, raises
 
 from sim.hybrid import rope_variants, tether_lengths
+from tests.commands import run_command
 from tests.configs import load_experiment, quiet
-from visthrow import cli
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
 from visthrow.throws.loading import load_policy
@@ -131,21 +131,10 @@ def test_departures_are_refused_unless_allowed_and_then_named():
 
 
 def test_the_table_of_a_departing_policy_says_so(tmp_path, capsys):
-    words = [
-        "compare",
-        "state",
-        "--config",
-        "state",
-        "--set",
-        "rope.length=0.34",
-        "--throws",
-        "2",
-        "--targets",
-        "2.0",
-    ]
-    words += ["--device", "cpu", "--out", str(tmp_path)]
-    assert cli.main(words) == 2
-    assert cli.main([*words, "--allow", "rope"]) == 0
+    command = "compare state --config state --set rope.length=0.34 --throws 2 --targets 2.0"
+    command += f" --device cpu --out {tmp_path}"
+    assert run_command(command) == 2
+    assert run_command(f"{command} --allow rope") == 0
     assert "flown with rope.length = 0.34" in capsys.readouterr().out
     assert "flown with rope.length = 0.34" in (tmp_path / "compare-hybrid.md").read_text()
 

@@ -3,7 +3,6 @@ another autopilot, cut recordings.
 """
 
 import contextlib
-import shutil
 import socket
 
 from pytest import fixture, raises
@@ -19,7 +18,6 @@ from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.open_source import open_source
 from tests.commands import run_command
 from tests.configs import load_run
-from tests.hil_runs import record_run, saved_policy
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
 
@@ -99,34 +97,6 @@ def test_a_stray_byte_does_not_make_its_sender_the_vehicle(wire):
             stranger.recv(1000)
 
 
-def test_another_kind_of_autopilot_is_not_taken_for_the_vehicle(wire):
-    """A PX4 that happens to send to the port of a run that expects an ArduPilot: it is asked for
-    nothing.
-    """
-    run = wire()
-    other, heard = run.peer()
-    for _ in range(3):
-        other.send(beat(mav.MAV_AUTOPILOT_PX4))
-        run.poll(1.0)
-    other.pump(lambda: 0.0)
-    assert heard == []
-    assert run.backend.status(run.now).note == "no heartbeat"
-    (line,) = run.said
-    assert "it is a PX4, expected is a ARDUPILOTMEGA" in line
-
-
-def test_a_bridge_of_the_motion_capture_and_the_autopilot_share_a_port(wire):
-    """D3: poses of one sender, the vehicle of another, with the same ids."""
-    run = wire()
-    vehicle, bridge = run.peer()[0], run.peer()[0]
-    vehicle.send(beat())
-    run.poll()
-    bridge.send(pose())
-    assert [p.body for p in run.poll()] == ["vehicle"]
-    assert run.backend._heartbeat is not None
-    assert run.said == []
-
-
 def test_poses_come_on_a_port_of_their_own(wire):
     """As `ardupilot.toml` has it: the autopilot on its own device, the poses by UDP."""
     run = wire("fake", 'source.device="udp:127.0.0.1:{other}"')
@@ -198,19 +168,3 @@ def test_check_says_who_is_heard_with_which_ids(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(MavlinkSource, "poll", poll)
     assert run_command(f'hil check --seconds 0.1 --set link.device="udp:127.0.0.1:{number}"') == 1
     assert f"nobody speaks on udp:127.0.0.1:{number}" in capsys.readouterr().out
-
-
-def test_a_replay_of_a_cut_recording_is_no_success(tmp_path, capsys):
-    record_run(tmp_path / "run", saved_policy(tmp_path), seconds=3.0)
-    assert run_command(f"hil replay {tmp_path}/run") == 0
-    ticks = tmp_path / "run" / "ticks.jsonl"
-    rows = ticks.read_text().splitlines()
-    for kept, gone in ((rows[:6], len(rows) - 6), (rows[:50] + rows[53:], 3)):
-        shutil.copytree(tmp_path / "run", tmp_path / "cut", dirs_exist_ok=True)
-        (tmp_path / "cut" / "ticks.jsonl").write_text("\n".join(kept) + "\n")
-        capsys.readouterr()
-        assert run_command(f"hil replay {tmp_path}/cut") == 1
-        assert f"CUT: {gone} of {len(rows)} ticks are missing" in capsys.readouterr().out
-    (tmp_path / "run" / "summary.json").unlink()
-    assert run_command(f"hil replay {tmp_path}/run") == 1
-    assert "CUT: no summary" in capsys.readouterr().out

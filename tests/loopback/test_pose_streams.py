@@ -39,8 +39,7 @@ def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     monkeypatch.setattr(
         "hil.check.open_source", lambda *args: (sent, None, ManualClock(sent.start))
     )
-    words = [word for setting in SETTINGS for word in ("--set", setting)]
-    status = run_command(f"hil check --seconds {SECONDS - 0.1}", *words)
+    status = run_command(f"hil check --seconds {SECONDS - 0.1}", sets=SETTINGS)
     out = capsys.readouterr().out
     fails = [line for line in out.splitlines() if line.startswith("FAIL")]
     assert status == bool(stream.says), out
@@ -59,6 +58,6 @@ def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, c
     sent = Sent(loaded(), STREAMS["100 Hz"])
     opened = sent, sent.links[0], ManualClock(sent.start)
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
-    words = [word for setting in (*SETTINGS, "backend=ardupilot") for word in ("--set", setting)]
-    assert run_command(f"hil check --seconds {SECONDS - 0.1}", *words) == 1
+    settings = [*SETTINGS, "backend=ardupilot"]
+    assert run_command(f"hil check --seconds {SECONDS - 0.1}", sets=settings) == 1
     assert "FAIL  autopilot not ready (no heartbeat)" in capsys.readouterr().out

@@ -18,6 +18,7 @@ import time
 import numpy as np
 from pytest import fixture, mark
 
+from bench.processes import free_port
 from hil.control.recording.playback import replay
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
@@ -38,12 +39,6 @@ of them.
 
 START = 5.0
 """After which a run whose output is not read has begun to listen [s]."""
-
-
-def free_port(kind=socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 class Pair:

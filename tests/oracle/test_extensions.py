@@ -297,8 +297,8 @@ def test_a_rope_that_gives_is_a_spring(steps):
 
 def slowing(time_constant_down: float) -> VehicleParams:
     """A plain vehicle whose rotors slow down more slowly than they speed up."""
-    vehicle = plain_vehicle(paper_plant().vehicle, motor="asymmetric")
-    motor = replace(vehicle.motor, time_constant_down=time_constant_down)
+    vehicle = plain_vehicle(paper_plant().vehicle)
+    motor = replace(vehicle.motor, kind="asymmetric", time_constant_down=time_constant_down)
     return replace(vehicle, motor=motor)
 
 

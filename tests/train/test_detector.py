@@ -17,7 +17,7 @@ from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
 from sim.params import RopeParams
-from tests.commands import run_command
+from tests.commands import run_command, set_words
 from visthrow import cli, config
 from visthrow.cli.fly import _rendered_eyes
 from visthrow.detector_training.eyes import HANGING, RenderedEyes
@@ -33,8 +33,7 @@ NEAR = {"contours": 0.01, "learnt": 0.015}
 
 
 def train(folder, *words: str) -> int:
-    sets = [word for name in SMALL for word in ("--set", name)]
-    return cli.main([*f"detector train --out {folder} --device cpu".split(), *sets, *words])
+    return run_command(f"detector train --out {folder} --device cpu", *set_words(SMALL), *words)
 
 
 def test_a_training_is_resumed_and_leaves_weights(tmp_path, capsys):

@@ -9,7 +9,7 @@ import torch
 from pytest import approx, fixture, mark, param
 from torch.testing import assert_close
 
-from tests.commands import run_command
+from tests.commands import run_command, set_words
 from tests.configs import QUIET, load_experiment
 from visthrow import cli, config
 from visthrow.onboard.pilot import Pilot
@@ -35,7 +35,7 @@ throws.
 
 
 def overrides(*extra):
-    return [part for item in (*SMALL, *extra) for part in ("--set", item)]
+    return set_words((*SMALL, *extra))
 
 
 def words(folder, *extra):

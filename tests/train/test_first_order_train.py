@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from pytest import fixture, mark
 
+from tests.commands import set_words
 from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.onboard.policy import Policy
@@ -27,12 +28,8 @@ SMALL = [
 
 
 def words(folder, *extra):
-    sets = [part for item in SMALL for part in ("--set", item)]
-    return [
-        *f"train state --device cpu --out {folder} --checkpoint-every 1".split(),
-        *sets,
-        *extra,
-    ]
+    command = f"train state --device cpu --out {folder} --checkpoint-every 1"
+    return [*command.split(), *set_words(SMALL), *extra]
 
 
 def same(one, two):

@@ -19,7 +19,7 @@ from numpy.testing import assert_array_equal
 from pytest import approx, fixture, mark, raises
 from torch.testing import assert_close
 
-from tests.commands import run_command
+from tests.commands import run_command, set_words
 from tests.configs import load_experiment
 from visthrow import cli, config
 from visthrow.common import storage
@@ -45,10 +45,8 @@ SMALL = [
 
 def train(folder, *extra):
     """Run the command on the CPU; return its exit status."""
-    words = f"train laptop --device cpu --out {folder} --checkpoint-every 1".split()
-    for item in SMALL:
-        words += ["--set", item]
-    return cli.main(words + list(extra))
+    command = f"train laptop --device cpu --out {folder} --checkpoint-every 1"
+    return run_command(command, *set_words(SMALL), *extra)
 
 
 def weights(folder):
@@ -169,18 +167,9 @@ def test_a_policy_is_taken_up_and_an_error_that_it_has_ends_the_run(tmp_path, ca
     a metre at once.
     """
     folder = tmp_path / "run"
-    words = f"train laptop --from state --until 1.0 --evaluate-every 1 --out {folder}".split()
-    words += [
-        "--device",
-        "cpu",
-        "--set",
-        "ppo.environments=16",
-        "--set",
-        "ppo.steps=4",
-        "--set",
-        "rope.length=0.5",
-    ]
-    assert cli.main(words) == 0
+    command = f"train laptop --from state --until 1.0 --evaluate-every 1 --out {folder}"
+    settings = ("ppo.environments=16", "ppo.steps=4", "rope.length=0.5")
+    assert run_command(f"{command} --device cpu", sets=settings) == 0
     assert iterations_of(folder) == [1]
     shipped, taken = Policy.load(find_policy("state")), Policy.load(folder / "policy.npz")
     for a, b in zip(
@@ -297,11 +286,9 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
         "task.noise.observation_step=0.04",
         'flown=["task.noise.observation_step=0.0"]',
     ]
-    words = ["train", "state", "--from", "state", "--iterations", "1", "--device", "cpu"]
-    for change in changes:
-        words += ["--set", change]
     figures = tmp_path / "figures.json"
-    assert cli.main([*words, "--out", f"{tmp_path}/run", "--json", str(figures)]) == 0
+    command = f"train state --from state --iterations 1 --device cpu --json {figures}"
+    assert run_command(f"{command} --out {tmp_path}/run", sets=changes) == 0
     printed = capsys.readouterr().out
     assert "under the faults of its training:" in printed
     assert re.search(r"target 2\.0 m: error 0\.\d+ \[0\.\d+, 0\.\d+\] m", printed)

@@ -9,6 +9,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
+from tests.commands import run_command
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
@@ -316,38 +317,28 @@ def test_the_recording_is_written(tmp_path, found):
 @mark.parametrize(
     ("arguments", "said"),
     [
-        (["explain", "nothing.npz"], "nothing.npz"),
-        (["blind", "nothing.npz"], "nothing.npz"),
-        (["plan", "nothing.npz"], "nothing.npz"),
-        (["explain", "nothing.npz", "--config", "nobody"], "nobody"),
-        (["map", "."], "a folder, expected a file"),
-        (["plan", "nothing.npz", "--hall", "nan,5,3"], "--hall nan,5,3: expected lengths above 0"),
-        (["plan", "nothing.npz", "--hall", "5,5,0.5"], "a height above 0.8 m"),
-        (["plan", "nothing.npz", "--manoeuvres", "hoover"], "did you mean 'hover'"),
-        (["explain", SWING, "--config", "pendulum_encoder", "--only", ""], "no effect ''"),
+        ("explain nothing.npz", "nothing.npz"),
+        ("blind nothing.npz", "nothing.npz"),
+        ("plan nothing.npz", "nothing.npz"),
+        ("explain nothing.npz --config nobody", "nobody"),
+        ("map .", "a folder, expected a file"),
+        ("plan nothing.npz --hall nan,5,3", "--hall nan,5,3: expected lengths above 0"),
+        ("plan nothing.npz --hall 5,5,0.5", "a height above 0.8 m"),
+        ("plan nothing.npz --manoeuvres hoover", "did you mean 'hover'"),
+        (f"explain {SWING} --config pendulum_encoder --only=", "no effect ''"),
         (
-            [
-                "explain",
-                SWING,
-                "--config",
-                "pendulum_encoder",
-                "--test",
-                "other.csv",
-                "--no-report",
-            ],
+            f"explain {SWING} --config pendulum_encoder --test other.csv --no-report",
             "other.csv: no such file",
         ),
-        (["explain", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-        (["blind", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-        (["plan", "nothing.npz", "--out", SWING], "single_pendulum_id.csv.gz is no folder"),
-        (["check", "nothing.npz", "--json", "."], "it is a folder; expected a file"),
+        (f"explain nothing.npz --out {SWING}", "single_pendulum_id.csv.gz is no folder"),
+        (f"blind nothing.npz --out {SWING}", "single_pendulum_id.csv.gz is no folder"),
+        (f"plan nothing.npz --out {SWING}", "single_pendulum_id.csv.gz is no folder"),
+        ("check nothing.npz --json .", "it is a folder; expected a file"),
     ],
 )
 def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, arguments, said):
-    from visthrow.cli import main
-
     monkeypatch.chdir(tmp_path)
-    assert main(["diagnose", *arguments]) == 2
+    assert run_command(f"diagnose {arguments}") == 2
     printed = capsys.readouterr()
     assert said in printed.err
     assert printed.out == "", "before the search"

@@ -9,7 +9,6 @@ from hil.poses.pose import Pose
 from hil.poses.sources.pose_source import RecordedSource
 from tests.commands import run_command
 from tests.hil_flight import OURS
-from visthrow.cli import main
 
 
 def opened(poses):
@@ -27,8 +26,7 @@ def test_an_attitude_that_is_none_is_told_in_words(monkeypatch, capsys, quat):
         for body, z in (("vehicle", 1.333), ("payload", 0.95))
     ]
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
-    settings = [word for setting in OURS for word in ("--set", setting)]
-    assert run_command("hil check --seconds 1.9", *settings) == 1
+    assert run_command("hil check --seconds 1.9", sets=OURS) == 1
     out = capsys.readouterr().out
     fails = [line for line in out.splitlines() if line.startswith("FAIL")]
     assert len(fails) == 2, "the vehicle's alone"
@@ -45,8 +43,7 @@ def test_what_the_autopilot_check_found_fails_the_check(monkeypatch, capsys):
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
     results = [(True, "parameters were read"), (False, "hover share measured 0.9")]
     monkeypatch.setattr("hil.check.AutopilotCheck.results", lambda *args: results)
-    settings = [word for setting in OURS for word in ("--set", setting)]
-    assert run_command("hil check --seconds 2.4", *settings) == 1
+    assert run_command("hil check --seconds 2.4", sets=OURS) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[-2:] == ["parameters were read", "FAIL  hover share measured 0.9"]
 
@@ -61,14 +58,7 @@ def test_a_wrong_unit_of_a_live_source_fails_the_check(monkeypatch, capsys):
         for body, z in (("vehicle", 1333.0), ("payload", 900.0)):
             poses.append(Pose(t, t, body, (300.0 * t, 0.0, z), (0.0, 0.0, 0.0, 1.0)))
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened(poses))
-    command = [
-        "hil",
-        "check",
-        "--seconds",
-        "1.9",
-        *(word for setting in OURS for word in ("--set", setting)),
-    ]
-    assert main(command) == 1
+    assert run_command("hil check --seconds 1.9", sets=OURS) == 1
     out = capsys.readouterr().out
     assert "FAIL  pos_w: 300 m/s" in out
     assert "FAIL  payload_pos_w: 300 m/s" in out

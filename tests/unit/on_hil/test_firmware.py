@@ -11,6 +11,7 @@ import threading
 import numpy as np
 from pytest import approx, fixture, raises, skip
 
+from bench.processes import free_port
 from hil.errors import RunError
 from hil.links import msp
 from hil.links.backends.betaflight import BOX_ARM, HIGH, LOW
@@ -31,12 +32,6 @@ from visthrow.throws.wire_plant import make_motors
 @fixture
 def params():
     return load_run("betaflight_sitl").betaflight
-
-
-def free_port(kind=socket.SOCK_STREAM):
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 def test_samples_are_forward_right_down_and_the_force_turned_round():
@@ -110,7 +105,7 @@ def stub(tmp_path, monkeypatch):
     """
     if shutil.which("gcc") is None:
         skip("no C compiler")
-    source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port(socket.SOCK_DGRAM)
+    source, program, port = tmp_path / "stub.c", tmp_path / "stub", free_port()
     source.write_text(STUB)
     subprocess.run(["gcc", "-o", program, source, "-lpthread"], check=True)
     monkeypatch.setattr(packets, "SENSORS", port)
@@ -203,7 +198,7 @@ class Answers:
 
 @fixture
 def answers(monkeypatch):
-    port = free_port()
+    port = free_port(socket.SOCK_STREAM)
     monkeypatch.setattr(firmware, "PORTS", (port, port + 1))
     server = Answers(port, forgets=("min_check",))
     yield server
@@ -226,7 +221,9 @@ def test_a_program_that_is_not_there_is_named(tmp_path):
 
 
 def test_a_program_that_ends_at_once_is_told(tmp_path, monkeypatch):
-    monkeypatch.setattr(firmware, "PORTS", (free_port(), free_port()))
+    monkeypatch.setattr(
+        firmware, "PORTS", (free_port(socket.SOCK_STREAM), free_port(socket.SOCK_STREAM))
+    )
     with raises(RunError, match="does not listen"):
         Firmware("/bin/false", tmp_path).start()
 
@@ -246,7 +243,7 @@ def test_the_bridge_sees_arming_and_the_release_channel(params, monkeypatch):
     """What the firmware says by MSP becomes events, and the release's channel opens the mechanism
     once.
     """
-    mine = free_port()
+    mine = free_port(socket.SOCK_STREAM)
     monkeypatch.setattr(betaflight, "PORTS", (0, mine))
     monkeypatch.setattr(
         packets.Sensors, "_run", lambda sensors, data: np.array([[0.4, 0.2, 0.3, 0.1]])

@@ -14,7 +14,7 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.handcarry import MOVES, MeasuredMove, collect, find_steps, judge, summary_text
 from hil.poses.pose import Pose
 from hil.poses.sources.pose_source import RecordedSource
-from visthrow.cli import main
+from tests.commands import run_command
 from visthrow.common.rotations import multiply
 from visthrow.logs.axes import TURNS as AXES
 
@@ -147,13 +147,7 @@ def test_the_command_on_a_recording(tmp_path, capsys, axes, status):
         f"source.columns={columns}",
         f'frames.vehicle.axes="{axes}"',
     )
-    command = [
-        "hil",
-        "check",
-        "--hand-carry",
-        *(word for setting in settings for word in ("--set", setting)),
-    ]
-    assert main(command) == status
+    assert run_command("hil check --hand-carry", sets=settings) == status
     out = capsys.readouterr().out
     assert ("FAIL" in out) == bool(status)
     assert ('would fit: axes = "y,x,-z"' in out) == bool(status)

@@ -35,7 +35,6 @@ from hil.poses.sources.images import (
 from tests.commands import run_command
 from tests.configs import load_run
 from tests.drawn import render_scene
-from visthrow.cli import main
 from visthrow.common.errors import ConfigError
 
 SMALL = FisheyeParams(280, 280, 72.9, 72.9, 139.5, 139.5)
@@ -332,8 +331,7 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
         "delay.source=0.0",
     )
     out = tmp_path / "run"
-    command = ["hil", "record", "--out", str(out)]
-    assert main([*command, *(word for setting in settings for word in ("--set", setting))]) == 0
+    assert run_command(f"hil record --out {out}", sets=settings) == 0
     ticks = list(lines(out / "ticks.jsonl"))
     looked = [line for line in ticks if line["detection"] is not None]
     assert len(looked) == FRAMES
@@ -350,10 +348,7 @@ def test_the_runner_flies_on_what_the_detector_saw(folder, tmp_path, capsys):
     try:
         assert run_command(f"hil replay {out}") == 0
         assert "all bit for bit the same" in capsys.readouterr().out
-        assert (
-            main([*command[:-1], str(tmp_path / "b"), *(w for s in settings for w in ("--set", s))])
-            == 2
-        )
+        assert run_command(f"hil record --out {tmp_path}/b", sets=settings) == 2
         assert "expected lines of file,time_s" in capsys.readouterr().err
     finally:
         (folder / "away").rename(folder / STAMPS)

@@ -11,7 +11,6 @@ from hil.errors import SourceError
 from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
 from tests.commands import run_command
-from visthrow.cli import main
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
 
@@ -303,14 +302,7 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys, kind):
         f"source.logs=[{logs}]",
     )
     out = tmp_path / "run"
-    command = [
-        "hil",
-        "record",
-        "--out",
-        str(out),
-        *(word for setting in settings for word in ("--set", setting)),
-    ]
-    assert main(command) == 0
+    assert run_command(f"hil record --out {out}", sets=settings) == 0
     told = capsys.readouterr().out
     assert "vehicle: 60 poses taken; refused: none" in told
     assert "payload: 60 poses taken; refused: none" in told

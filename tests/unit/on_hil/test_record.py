@@ -70,6 +70,10 @@ def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
     for path in run_folder.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     data = (tmp_path / "ticks.jsonl").read_bytes()
+    rows = data.splitlines(keepends=True)
+    (tmp_path / "ticks.jsonl").write_bytes(b"".join(rows[:50] + rows[53:]))
+    assert run_command(f"hil replay {tmp_path}") == 1
+    assert f"CUT: 3 of {len(rows)} ticks are missing" in capsys.readouterr().out
     (tmp_path / "ticks.jsonl").write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
     assert run_command(f"hil replay {tmp_path}") == 1, (

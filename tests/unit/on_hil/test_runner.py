@@ -12,7 +12,6 @@ from hil.control.hovering import Hovering
 from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import can_hand_over
-from hil.errors import RunError
 from hil.links.backends.base import HOLD, Status
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections
@@ -77,16 +76,6 @@ def test_a_throw_from_idle_to_done():
     assert not pilot.errors
 
 
-def test_the_mechanisms_own_time_is_taken_off_and_a_slow_one_is_refused():
-    pilot = runner(mechanism=0.08)
-    decisions = fly(pilot, 6.0)
-    latch = next(d.time for d in decisions if d.release)
-    assert pilot.backend.release_times == [approx(latch + 0.03)]
-    assert runner(mechanism=0.114).latch.trip(1.0, (0.0, 0.0, 0.0)) == 1.0
-    with raises(RunError, match=r"takes 0\.12 s .* trained with 0\.11 s"):
-        runner(mechanism=0.12)
-
-
 def test_nothing_is_released_without_the_operators_word():
     pilot, decisions = thrown(words=lambda time, state: OperatorInput(), seconds=8.0)
     assert changes(decisions)[-1][0] == "ready"
@@ -97,11 +86,6 @@ def test_nothing_is_released_without_the_operators_word():
         words=lambda t, s: OperatorInput(arm=s == "ready" and t < 3),
     )
     assert decisions[-1].state == "ready", "one word, one throw"
-
-
-def test_a_policy_that_never_releases_is_stopped():
-    _, decisions = thrown(action=NEVER, seconds=9.0)
-    assert ("recover", "the policy did not release in time") in changes(decisions)
 
 
 START = 3.0  # the policy that never releases throws from about 2.1 s to 7.1 s

@@ -4,7 +4,7 @@ import json
 
 from pytest import importorskip
 
-from visthrow import cli
+from tests.commands import run_command
 from visthrow.cli import compare
 from visthrow.paper.baseline import spline, thrower
 from visthrow.throws import results
@@ -26,8 +26,8 @@ def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, 
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     out = tmp_path / "rows.json"
-    words = ["compare", "state", "baseline", "--throws", "2", "--targets", "1.5", "--device", "cpu"]
-    assert cli.main([*words, *f"--out {tmp_path} --json {out}".split()]) == 0
+    command = "compare state baseline --throws 2 --targets 1.5 --device cpu"
+    assert run_command(f"{command} --out {tmp_path} --json {out}") == 0
     rows = json.loads(out.read_text())["rows"]
     own = thrower.title_of(thrower.IDEAL, "none")
     assert [row["policy"] for row in rows] == [

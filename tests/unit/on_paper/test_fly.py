@@ -9,7 +9,6 @@ from pytest import approx, fixture, importorskip, mark, raises
 
 from tests.commands import run_command
 from tests.configs import load_experiment
-from visthrow import cli
 from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
 from visthrow.paper.baseline import front, spline
@@ -165,10 +164,8 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
     monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
     packed = tmp_path / "all.json"
-    words = (
-        f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}".split()
-    )
-    assert cli.main(words) == 0
+    command = f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}"
+    assert run_command(command) == 0
     text = (tmp_path / "report.md").read_text()
     assert "0.127 ± 0.019, 1.546 ± 0.010" in text, "the paper's TO+MPC stands beside the own model"
     assert "learnt state policy, training simulator" in text
@@ -183,7 +180,7 @@ def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "front.png").stat().st_size > 10_000
     assert text.splitlines()[0] in capsys.readouterr().out
     kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()}
-    assert cli.main(words) == 0
+    assert run_command(command) == 0
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "throws").iterdir()} == kept, (
         "nothing is flown twice"
     )

@@ -12,7 +12,7 @@ import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
 
 from tests.commands import run_command
-from visthrow import cli, config
+from visthrow import config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
 from visthrow.paper.sweep import pool
@@ -399,21 +399,9 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, capsys)
     importorskip("submitit")
     from visthrow.paper.sweep.cluster import Cluster
 
-    words = [
-        "sweep",
-        "run",
-        path,
-        "--out",
-        str(tmp_path / "out"),
-        "--slurm",
-        "partition=gpu",
-        "--devices",
-        "2",
-        "--minutes",
-        "9",
-    ]
     monkeypatch.setenv("PATH", str(tmp_path))
-    assert cli.main(words) == 2
+    command = f"sweep run {path} --out {tmp_path}/out --slurm partition=gpu --devices 2 --minutes 9"
+    assert run_command(command) == 2
     assert "no jobs can be submitted from here" in capsys.readouterr().err
     for name, text in (
         ("srun", ""),

@@ -2,15 +2,15 @@
 
 from numpy.linalg import norm
 
-from visthrow import cli
+from tests.commands import run_command
 from visthrow.logs.flightlog import FlightLog
 
 
 def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
     ends = {}
     for name in ("rk4", "euler"):
-        words = ["fly", "--no-rope", name, "--target", "1", "0.5", "--out", str(tmp_path / name)]
-        assert cli.main([*words, *["--policy", "state", "--device", "cpu"]]) == 0
+        command = f"fly --no-rope {name} --target 1 0.5 --policy state --device cpu"
+        assert run_command(f"{command} --out {tmp_path}/{name}") == 0
         log = FlightLog.load(tmp_path / name / "flight.npz")
         assert "payload_pos_w" not in log
         ends[name] = log["pos_w"].values
@@ -20,6 +20,5 @@ def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
 
 
 def test_it_takes_no_option_of_a_throw(tmp_path, capsys):
-    words = ["fly", "--no-rope", "--save", str(tmp_path / "a.npz"), "--out", str(tmp_path)]
-    assert cli.main(words) == 2
+    assert run_command(f"fly --no-rope --save {tmp_path}/a.npz --out {tmp_path}") == 2
     assert "--no-rope" in capsys.readouterr().err

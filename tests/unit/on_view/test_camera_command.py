@@ -14,7 +14,6 @@ from camera.fisheye import Fisheye
 from tests import lens_files
 from tests.boards import LENS, pictures
 from tests.commands import run_command
-from visthrow.cli import main
 
 WRITERS = {
     name: getattr(lens_files, f"write_{name}") for name in ("opencv", "kalibr", "ros", "basalt")
@@ -142,20 +141,20 @@ def test_the_tool_is_told_from_the_text(kind, tmp_path):
     ("words", "message"),
     [
         (
-            ["{notes}", "--out", "{out}"],
+            "{notes} --out {out}",
             "no camera of a known tool; expected one of basalt, kalibr, camodocal, svo",
         ),
-        (["{ocam}", "--out", "{out}"], "lines of numbers.*expected five"),
-        (["{folder}", "--out", "{out}"], r"--board \(missing\); expected --board chessboard"),
+        ("{ocam} --out {out}", "lines of numbers.*expected five"),
+        ("{folder} --out {out}", r"--board \(missing\); expected --board chessboard"),
         (
-            ["{folder}", "--board", "charuco", "7", "5", "0.04", "--out", "{out}"],
+            "{folder} --board charuco 7 5 0.04 --out {out}",
             "marker of 0.0 m; expected a side above 0",
         ),
         (
-            ["{folder}", "--board", "chessboard", "7", "5", "0.04", "--out", "{out}"],
+            "{folder} --board chessboard 7 5 0.04 --out {out}",
             "no picture in",
         ),
-        (["{ocam}", "--out", "{notes}"], r"notes\.txt; expected a file that ends in \.toml"),
+        ("{ocam} --out {notes}", r"notes\.txt; expected a file that ends in \.toml"),
     ],
 )
 def test_wrong_input_is_named(words, message, tmp_path, capsys):
@@ -163,9 +162,7 @@ def test_wrong_input_is_named(words, message, tmp_path, capsys):
     notes.write_text("not a calibration\n")
     ocam.write_text("\n".join(OCAM.splitlines()[:8]))
     folder.mkdir()
-    filled = [
-        w.format(notes=notes, ocam=ocam, folder=folder, out=tmp_path / "c.toml") for w in words
-    ]
-    assert main(["camera", "calibrate", *filled]) == 2
+    filled = words.format(notes=notes, ocam=ocam, folder=folder, out=tmp_path / "c.toml")
+    assert run_command(f"camera calibrate {filled}") == 2
     assert re.search(message, capsys.readouterr().err)
     assert notes.read_text() == "not a calibration\n"

@@ -181,22 +181,22 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
 @mark.parametrize(
     ("arguments", "said"),
     [
-        (["config", "vehicel"], "did you mean 'vehicle'"),
-        (["config", "vehicle", "papr"], "did you mean 'paper'"),
-        (["config", "vehicle", "paper", "--set", "body.mas=1"], "did you mean 'mass'"),
-        (["config", "vehicle", "--set", "body.mass=1"], "--set needs the NAME"),
+        ("config vehicel", "did you mean 'vehicle'"),
+        ("config vehicle papr", "did you mean 'paper'"),
+        ("config vehicle paper --set body.mas=1", "did you mean 'mass'"),
+        ("config vehicle --set body.mass=1", "--set needs the NAME"),
         (
-            ["config", "vehicle", "paper", "--set", "body.mass=-1"],
+            "config vehicle paper --set body.mass=-1",
             "above 0 and at most 100000 (with body.mass=-1)",
         ),
-        (["config", "vehicle", "deep.toml"], "deep.toml: no valid TOML: brackets are nested too"),
-        (["sweep", "status", "trial", "--out", "deep.toml"], "deep.toml is a file; expected a"),
+        ("config vehicle deep.toml", "deep.toml: no valid TOML: brackets are nested too"),
+        ("sweep status trial --out deep.toml", "deep.toml is a file; expected a"),
     ],
 )
 def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("deep.toml").write_text(f"a = {'[' * 3000}{']' * 3000}")
-    assert cli.main(arguments) == 2
+    assert run_command(arguments) == 2
     assert said in capsys.readouterr().err
 
 
@@ -204,27 +204,27 @@ def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
     ("words", "said"),
     [
         (
-            ["camera", "show", "fisheye", "--target", "nan", "0"],
+            "camera show fisheye --target nan 0",
             "--target: 'nan'; expected a finite number",
         ),
         (
-            ["camera", "show", "fisheye", "--height", "-1"],
+            "camera show fisheye --height -1",
             "--height: '-1'; expected a number above 0",
         ),
-        (["train", "state", "--minutes", "inf"], "--minutes: 'inf'; expected a number above 0"),
-        (["train", "state", "--until", "-0.1"], "--until: '-0.1'; expected a number above 0"),
-        (["diagnose", "map", "a.csv", "--mass", "-2"], "--mass: '-2'; expected a number above 0"),
-        (["fly", "--seed", "-1"], "--seed: '-1'; expected a whole number of 0 or more"),
-        (["hil", "check", "--speed", "0"], "--speed: '0'; expected a number above 0"),
+        ("train state --minutes inf", "--minutes: 'inf'; expected a number above 0"),
+        ("train state --until -0.1", "--until: '-0.1'; expected a number above 0"),
+        ("diagnose map a.csv --mass -2", "--mass: '-2'; expected a number above 0"),
+        ("fly --seed -1", "--seed: '-1'; expected a whole number of 0 or more"),
+        ("hil check --speed 0", "--speed: '0'; expected a number above 0"),
         (
-            ["hil", "fake", "--msp-port", "70000"],
+            "hil fake --msp-port 70000",
             "--msp-port: '70000'; expected a port, 1 to 65535",
         ),
     ],
 )
 def test_numbers_that_mean_nothing_are_refused_before_the_work(words, said, capsys):
     with raises(SystemExit, match="2"):
-        cli.main(words)
+        run_command(words)
     assert said in capsys.readouterr().err
 
 

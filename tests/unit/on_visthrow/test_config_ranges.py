@@ -19,6 +19,7 @@ from visthrow.training.trainer import fitted
         ("vehicle", "paper", "body.mass=-1", "body: mass is -1.0; expected above 0"),
         ("rope", "paper", "length=-0.2", "length is -0.2; expected above 0"),
         ("rope", "paper", "length=0", "length is 0.0; expected above 0"),
+        ("rope", "paper", "payload_inertia=1.0", "payload_inertia"),
         ("rope", "paper", "segments=0", "expected 1 to 64"),
         ("rope", "paper", "segments=100", "expected 1 to 64"),
         ("camera", "fisheye", "fisheye.fov_deg=400", "expected above 0 and at most 360"),
