@@ -45,13 +45,12 @@ def sources(place: str) -> list[Path]:
     return [path for path in paths if re.match(place, path.relative_to(ROOT).as_posix())]
 
 
-@cache
-def imported(path: Path) -> set[str]:
+def imports_of(path: Path, root: Path) -> set[str]:
     """Return every absolute module name that a file imports anywhere, ``from a import b`` as
     ``a.b`` too.
     """
     names = set()
-    package = path.relative_to(ROOT).parent.parts
+    package = path.relative_to(root).parent.parts
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
@@ -60,6 +59,11 @@ def imported(path: Path) -> set[str]:
             module = ".".join((*above, *([node.module] if node.module else [])))
             names |= {f"{module}.{alias.name}" for alias in node.names}
     return names
+
+
+@cache
+def imported(path: Path) -> set[str]:
+    return imports_of(path, ROOT)
 
 
 RULES = [

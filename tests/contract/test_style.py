@@ -13,6 +13,7 @@ from pathlib import Path
 from pytest import fixture, mark
 
 from bench.mutations.__main__ import load
+from tests.contract.test_imports import imports_of
 
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
@@ -38,25 +39,15 @@ def modules(root: Path, packages: Iterable[str]) -> dict[str, Path]:
     }
 
 
-def imports(name: str, path: Path, known: Mapping[str, object]) -> set[str]:
-    """Return the modules among ``known`` that a module imports anywhere."""
-    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
-    found = set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            above = package[: len(package) - node.level + 1] if node.level else []
-            module = ".".join([*above, *([node.module] if node.module else [])])
-            inside = {f"{module}.{alias.name}" for alias in node.names}
-            found |= {module if part not in known else part for part in inside}
-    return found & set(known) - {name}
-
-
 def graph(root: Path, packages: Iterable[str] = PACKAGES) -> dict[str, set[str]]:
     """Return module -> modules that it imports."""
     known = modules(root, packages)
-    return {name: imports(name, path, known) for name, path in known.items()}
+    arrows = {}
+    for module, path in known.items():
+        names = imports_of(path, root)
+        targets = {name if name in known else name.rpartition(".")[0] for name in names}
+        arrows[module] = targets & set(known) - {module}
+    return arrows
 
 
 def circles(arrows: Mapping[str, set[str]]) -> list[list[str]]:

@@ -4,12 +4,12 @@ import socket
 
 from pytest import approx, fixture
 
+from bench.processes import free_port
 from hil.control.loop import Loop
 from hil.control.recording.playback import replay
 from hil.control.recording.record import RunRecorder
 from hil.links.team_link import MARK, MESSAGE, RELEASE, TeamLink, TeamLinkParams
 from tests.hil_flight import AutoOperator, changes
-from tests.loopback.test_throw import free_port
 from tests.loopback.wire import peers
 from visthrow.throws.wire_plant import make
 

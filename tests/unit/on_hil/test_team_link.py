@@ -3,6 +3,7 @@
 import numpy as np
 from pytest import approx, mark, raises
 
+from bench.processes import free_port
 from hil.errors import ConfigError
 from hil.links.clock import ManualClock, Ticker
 from hil.links.team_link import (
@@ -16,7 +17,6 @@ from hil.links.team_link import (
     TeamLink,
     TeamLinkParams,
 )
-from tests.loopback.test_throw import free_port
 
 PERIOD = 0.02
 
