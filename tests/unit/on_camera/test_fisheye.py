@@ -1,6 +1,7 @@
 """Fisheye model: round trip, derivatives and validity on the whole sphere."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -178,21 +179,10 @@ def test_pixels_beyond_the_field_of_view_do_not_unproject():
     )
 
 
-@mark.parametrize(
-    ("change", "message"),
-    [
-        ({"k1": -0.3}, "stops growing"),
-        ({"k1": 1.0, "k4": -0.5}, "stops growing"),
-        ({"fx": 0.0}, "fx"),
-        ({"fx": float("nan")}, "fx"),
-        ({"width": 0}, "width"),
-        ({"fov_deg": 361.0}, "fov_deg"),
-    ],
-)
-def test_bad_intrinsics_are_refused(change, message):
-    values = {**EQUIDISTANT.__dict__, **change}
-    with raises(ValueError, match=message):
-        Fisheye(FisheyeParams(**values))
+@mark.parametrize("change", [{"k1": -0.3}, {"k1": 1.0, "k4": -0.5}])
+def test_a_radius_that_stops_growing_is_refused(change):
+    with raises(ValueError, match="stops growing"):
+        Fisheye(replace(EQUIDISTANT, **change))
 
 
 def test_monotonic_limit_closed_form():

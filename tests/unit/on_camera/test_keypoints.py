@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 import torch
-from pytest import approx, mark, raises
+from pytest import approx, mark
 
 from camera.fisheye import Fisheye
 from camera.keypoints import (
@@ -270,12 +270,3 @@ def test_batch_of_many_equals_batch_of_one_bit_for_bit():
         one, visible = keypoints(camera, *(part[row] for part in arguments), turned)
         assert torch.equal(one, points[row])
         assert torch.equal(visible, valid[row])
-
-
-@mark.parametrize(
-    ("field", "value"),
-    [("goal_side", 0.0), ("payload_radius", -0.1), ("payload_radius", float("nan"))],
-)
-def test_bad_sizes_are_refused(field, value):
-    with raises(ValueError, match=field):
-        KeypointCamera(replace(PARAMS, **{field: value}))
