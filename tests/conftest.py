@@ -26,3 +26,15 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@fixture
+def refused(capsys):
+    """Function that runs a command, which must end with status 2 and say why."""
+    from tests.commands import run_command
+
+    def run(line, *words, said, sets=()):
+        assert run_command(line, *words, sets=sets) == 2
+        assert said in capsys.readouterr().err
+
+    return run

@@ -12,7 +12,6 @@ from pytest import fixture, mark, raises
 
 from bench import report, start
 from bench.diagnose.two_checkouts import compare
-from tests.commands import run_command
 from tests.configs import load_experiment
 from visthrow import cli
 from visthrow.common.errors import StorageError
@@ -84,9 +83,8 @@ def test_records_refuse_what_they_are_not(kept):
         report.record_path("../x")
 
 
-def test_mistakes_are_told(capsys):
-    assert run_command("bench records no_such_record") == 2
-    assert "no record" in capsys.readouterr().err
+def test_mistakes_are_told(refused):
+    refused("bench records no_such_record", said="no record")
 
 
 def test_an_answer_that_is_an_error_is_no_right_null(tmp_path, capsys):

@@ -44,6 +44,5 @@ def test_the_load_in_halves_takes_two_throws_of_time(tmp_path):
     assert halves["landed"] == 1.0
 
 
-def test_a_policy_that_is_not_there_is_told(tmp_path, capsys):
-    assert run_command(f"cooperative fly trio --out {tmp_path}") == 2
-    assert "no policy 'trio'" in capsys.readouterr().err
+def test_a_policy_that_is_not_there_is_told(tmp_path, refused):
+    refused(f"cooperative fly trio --out {tmp_path}", said="no policy 'trio'")

@@ -78,16 +78,16 @@ def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):
     )
 
 
-def test_what_is_no_bundle(tmp_path, capsys):
+def test_what_is_no_bundle(tmp_path, refused):
     (tmp_path / "no.zip").write_bytes(b"PK no")
-    assert run_command(f"hil replay {tmp_path}/no.zip") == 2
-    assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
+    refused(
+        f"hil replay {tmp_path}/no.zip", said="expected a folder of a run, or the bundle of one"
+    )
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as bundle:
         bundle.writestr("holiday.txt", "x")
-    assert run_command(f"hil replay {tmp_path}/other.zip") == 2
-    assert (
-        "other.zip: no bundle of a run, it holds holiday.txt; expected config.toml"
-        in capsys.readouterr().err
+    refused(
+        f"hil replay {tmp_path}/other.zip",
+        said="other.zip: no bundle of a run, it holds holiday.txt; expected config.toml",
     )
     with zipfile.ZipFile(tmp_path / "out.zip", "w") as bundle:
         bundle.writestr("../outside.txt", "x")
@@ -95,10 +95,12 @@ def test_what_is_no_bundle(tmp_path, capsys):
     assert not (tmp_path.parent / "outside.txt").exists()
 
 
-def test_a_damaged_bundle_is_refused_in_a_sentence(aborted, tmp_path, capsys):
+def test_a_damaged_bundle_is_refused_in_a_sentence(aborted, tmp_path, refused):
     whole = bytearray(pack(aborted[0]).read_bytes())
     for at in range(200, 6000):  # within what is packed: bytes that no deflated block begins with
         whole[at] ^= 0xFF
     (tmp_path / "damaged.zip").write_bytes(whole)
-    assert run_command(f"hil replay {tmp_path}/damaged.zip") == 2
-    assert "expected a folder of a run, or the bundle of one" in capsys.readouterr().err
+    refused(
+        f"hil replay {tmp_path}/damaged.zip",
+        said="expected a folder of a run, or the bundle of one",
+    )

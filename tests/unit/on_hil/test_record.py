@@ -146,7 +146,9 @@ def test_a_folder_that_cannot_be_made(tmp_path, capsys):
     assert "--out" in said
 
 
-def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder, tmp_path, capsys):
+def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(
+    run_folder, tmp_path, refused
+):
     """The links write before there is a recorder: a second run into a folder emptied the first
     one's link.tlog.
     """
@@ -154,8 +156,7 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder
     first = tmp_path / "first"
     shutil.copytree(run_folder, first)
     (first / "link.tlog").write_bytes(b"of the first run")
-    assert run_command(f"hil run --out {first} --set {device}") == 2
-    assert "holds a run already" in capsys.readouterr().err
+    refused(f"hil run --out {first} --set {device}", said="holds a run already")
     assert (first / "link.tlog").read_bytes() == b"of the first run"
     late = [
         "--config",
@@ -163,14 +164,12 @@ def test_a_run_that_is_refused_leaves_nothing_new_and_nothing_changed(run_folder
         "--set",
         "betaflight.device=tcp:127.0.0.1:9",
     ]  # nobody listens there
-    assert run_command(f"hil run --out {tmp_path}/new --set {device}", *late) == 2
-    assert "cannot connect" in capsys.readouterr().err
+    refused(f"hil run --out {tmp_path}/new --set {device}", *late, said="cannot connect")
     assert not (tmp_path / "new").exists()
 
 
-def test_a_view_is_a_recording(run_folder, tmp_path, capsys):
-    assert run_command(f"hil view {run_folder} --out {tmp_path}/a.txt") == 2
-    assert "ends in .rrd or .mcap" in capsys.readouterr().err
+def test_a_view_is_a_recording(run_folder, tmp_path, refused):
+    refused(f"hil view {run_folder} --out {tmp_path}/a.txt", said="ends in .rrd or .mcap")
     assert not (tmp_path / "a.txt").exists()
 
 
@@ -223,7 +222,7 @@ axes = "x,y,z"
 """
 
 
-def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
+def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused):
     """``hil run`` on recorded poses: as fast as it goes, the policy asked at every tick, nothing
     released.
     """
@@ -253,8 +252,7 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys):
     assert run_command("hil record --set states.check=0.5 --out looked", *wrong) == 0
     assert "throws 0" in capsys.readouterr().out, "recorded to the end although the checks fail"
     assert len(load_run("looked")[2]) == len(ticks)
-    assert run_command("hil run --config mine.toml --out run") == 2
-    assert "holds a run already" in capsys.readouterr().err
+    refused("hil run --config mine.toml --out run", said="holds a run already")
 
 
 def test_a_run_whose_poses_cease_in_flight_is_packed_and_fails(tmp_path, monkeypatch, capsys):

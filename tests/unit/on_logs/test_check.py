@@ -620,7 +620,7 @@ def test_the_plant_says_how_long_the_cable_must_be(tmp_path, capsys):
         assert ("another cable" in capsys.readouterr().out) == told
 
 
-def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys):
+def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, capsys, refused):
     """A flying model's cable and mass are of use without a table; a mapping is not, and is not
     ignored in silence.
     """
@@ -648,10 +648,11 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
             == 2
         )
         assert refused in capsys.readouterr().err
-    assert run_command(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml") == 2
-    assert refused in capsys.readouterr().err
-    assert run_command(f"diagnose explain {tmp_path}/t.csv --config {tmp_path}/mine.toml") == 2
-    assert "where that holds a model, such as [flyer]" in capsys.readouterr().err
+    refused(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml", said=refused)
+    refused(
+        f"diagnose explain {tmp_path}/t.csv --config {tmp_path}/mine.toml",
+        said="where that holds a model, such as [flyer]",
+    )
     for files, setup in (
         (["a.npz", "t.csv"], str(tmp_path / "mine.toml")),
         (["a.npz"], "cf_payload"),

@@ -115,9 +115,8 @@ def test_the_note_does_not_contradict_the_title():
     assert "flew the others, the folders do not say" in mixed
 
 
-def test_what_holds_no_throws(tmp_path, capsys):
-    assert run_command(f"compare --from {tmp_path}/none") == 2
-    assert "no such folder" in capsys.readouterr().err
+def test_what_holds_no_throws(tmp_path, refused):
+    refused(f"compare --from {tmp_path}/none", said="no such folder")
     (tmp_path / "summary.json").write_text("{}")
     with raises(LogError, match=r"no throw-\*.npz in it \(summary.json\).*visthrow hil view"):
         from_runs.logs_of([tmp_path])
@@ -127,5 +126,4 @@ def test_what_holds_no_throws(tmp_path, capsys):
     bare = FlightLog({}, {"policy": "x"})
     with raises(LogError, match="holds no throw of a run"):
         from_runs.entries([bare])
-    assert run_command(f"compare vision --from {tmp_path}") == 2
-    assert "the runs say which policies" in capsys.readouterr().err
+    refused(f"compare vision --from {tmp_path}", said="the runs say which policies")

@@ -287,14 +287,17 @@ def test_a_policy_that_is_compared_with_itself_is_numbered(dropper):
     assert unique_names([load_policy(dropper)] * 2) == ["dropper 1", "dropper 2"]
 
 
-def test_compare_throws_under_the_conditions_of_its_options(dropper, tmp_path, capsys, monkeypatch):
+def test_compare_throws_under_the_conditions_of_its_options(
+    dropper, tmp_path, refused, monkeypatch
+):
     def throw(loaded, *conditions):
         raise ConfigError(f"thrown {len(loaded)} {conditions}")
 
     monkeypatch.setattr("visthrow.cli.compare.throw_hybrid", throw)
     options = f"--targets 0.5 1 --throws 7 --seed 3 --device cpu --calibrate --out {tmp_path}"
-    assert run_command(f"compare {dropper} {dropper} {options}") == 2
-    assert "thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)" in capsys.readouterr().err
+    refused(
+        f"compare {dropper} {dropper} {options}", said="thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)"
+    )
 
 
 def test_protocol_on_the_reference_plant(dropper, monkeypatch):
@@ -409,20 +412,18 @@ def test_table_says_success_rate_and_leaves_failures_blank():
         ),
     ],
 )
-def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, capsys):
-    assert run_command(f"{words.replace('DROPPER', str(dropper))} --out {tmp_path}/out") == 2
-    assert message in capsys.readouterr().err
+def test_bad_input_is_refused_in_one_line(words, message, dropper, tmp_path, refused):
+    refused(f"{words.replace('DROPPER', str(dropper))} --out {tmp_path}/out", said=message)
     assert not (tmp_path / "out").exists()
 
 
 @mark.parametrize("command", ["fly --policy", "compare"])
 def test_a_folder_that_cannot_be_made_is_refused_before_the_work(
-    command, dropper, tmp_path, capsys, monkeypatch
+    command, dropper, tmp_path, refused, monkeypatch
 ):
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setattr("sim.hybrid.HybridSim.step", None)  # nothing may fly
-    assert run_command(f"{command} {dropper} --out {tmp_path}/file/out") == 2
-    assert "cannot make the folder" in capsys.readouterr().err
+    refused(f"{command} {dropper} --out {tmp_path}/file/out", said="cannot make the folder")
 
 
 def test_a_policy_without_its_config_asks_for_one(tmp_path):

@@ -19,6 +19,5 @@ def test_the_vehicle_alone_flies_to_its_point_by_either_integrator(tmp_path):
     assert 0.0 < apart.max() < 0.02
 
 
-def test_it_takes_no_option_of_a_throw(tmp_path, capsys):
-    assert run_command(f"fly --no-rope --save {tmp_path}/a.npz --out {tmp_path}") == 2
-    assert "--no-rope" in capsys.readouterr().err
+def test_it_takes_no_option_of_a_throw(tmp_path, refused):
+    refused(f"fly --no-rope --save {tmp_path}/a.npz --out {tmp_path}", said="--no-rope")

@@ -75,11 +75,13 @@ def test_every_channel_is_there_with_its_unit_and_schema(flown):
     assert json.loads(about["flight"]["policy"]) == "vision"
 
 
-def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, capsys):
+def test_tables_beside_it_and_an_ending_that_no_writer_has(flown, tmp_path, refused):
     assert (flown / "flight.csv").read_text().startswith("time [s],")
     assert (flown / "flight.parquet").stat().st_size > 0
-    assert run_command(f"fly --out {tmp_path} --export flight.xyz") == 2
-    assert "'.xyz'; expected one of .csv, .parquet, .mcap" in capsys.readouterr().err
+    refused(
+        f"fly --out {tmp_path} --export flight.xyz",
+        said="'.xyz'; expected one of .csv, .parquet, .mcap",
+    )
 
 
 def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
@@ -90,16 +92,17 @@ def test_fly_allows_another_rope_when_asked(tmp_path, capsys):
     assert "flown with another rope.length than trained with: 0.4" in capsys.readouterr().out
 
 
-def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, capsys):
-    assert run_command(f"fly --out {tmp_path} --set task.noise.command_step=0") == 2
-    assert "fly sends commands as they are" in capsys.readouterr().err
+def test_fly_refuses_a_switch_that_would_change_nothing(tmp_path, refused):
+    refused(
+        f"fly --out {tmp_path} --set task.noise.command_step=0",
+        said="fly sends commands as they are",
+    )
 
 
-def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, capsys):
+def test_a_missing_package_is_named_before_the_flight(tmp_path, monkeypatch, refused):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     folder = tmp_path / "flown"
-    assert run_command(f"fly --out {folder} --export {tmp_path}/flight.mcap") == 2
-    assert "visthrow[recordings]" in capsys.readouterr().err
+    refused(f"fly --out {folder} --export {tmp_path}/flight.mcap", said="visthrow[recordings]")
     assert not folder.exists()
 
 

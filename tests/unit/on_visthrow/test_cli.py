@@ -141,10 +141,9 @@ def test_a_reader_that_goes_away_is_no_failure():
     assert child.wait() == 0
 
 
-def test_a_place_that_cannot_be_written_is_refused_before_the_work(command, tmp_path, capsys):
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(command, tmp_path, refused):
     command(KeyboardInterrupt())
-    assert run_command(f"try --json {tmp_path}") == 2
-    assert "it is a folder" in capsys.readouterr().err
+    refused(f"try --json {tmp_path}", said="it is a folder")
 
 
 def test_a_missing_optional_package_names_the_extra(command, capsys):
@@ -193,11 +192,10 @@ def test_config_prints_what_loads_back(capsys, tmp_path):
         ("sweep status trial --out deep.toml", "deep.toml is a file; expected a"),
     ],
 )
-def test_config_mistakes(arguments, said, capsys, tmp_path, monkeypatch):
+def test_config_mistakes(arguments, said, refused, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("deep.toml").write_text(f"a = {'[' * 3000}{']' * 3000}")
-    assert run_command(arguments) == 2
-    assert said in capsys.readouterr().err
+    refused(arguments, said=said)
 
 
 @mark.parametrize(
