@@ -4,6 +4,7 @@ what nuisances do.
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -28,6 +29,8 @@ from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, Moun
 from tests.drawn import Clutter, render_scene
 from tests.unit.on_camera.nuisance import NuisanceParams, degrade
 
+f64 = partial(torch.tensor, dtype=torch.float64)
+
 LENS = FisheyeParams(400, 400, 104.2, 104.2, 199.5, 199.5)
 CAMERA = KeypointCamera(
     CameraParams(
@@ -36,10 +39,10 @@ CAMERA = KeypointCamera(
     dtype=torch.float64,
 )
 DETECTOR = Detector(CAMERA.fisheye, 0.033, 0.25)
-POS = torch.tensor([[0.1, 0.0, 1.3]], dtype=torch.float64)
-ROT = rotation_from_vector(torch.tensor([[0.05, 0.3, 0.1]], dtype=torch.float64))
-BALL = torch.tensor([[0.12, 0.05, 0.9]], dtype=torch.float64)
-GOAL = torch.tensor([[0.9, -0.3]], dtype=torch.float64)
+POS = f64([[0.1, 0.0, 1.3]])
+ROT = rotation_from_vector(f64([[0.05, 0.3, 0.1]]))
+BALL = f64([[0.12, 0.05, 0.9]])
+GOAL = f64([[0.9, -0.3]])
 GREEN, YELLOW = (0.16, 0.55, 0.26), (0.80, 0.88, 0.20)
 CLUTTER = (
     Clutter(
@@ -72,8 +75,8 @@ def scene():
 def cluttered():
     """Neither goal nor payload in view, only what resembles them."""
     far = (
-        torch.tensor([[60.0, 0.0]], dtype=torch.float64),
-        torch.tensor([[60.0, 5.0, 0.5]], dtype=torch.float64),
+        f64([[60.0, 0.0]]),
+        f64([[60.0, 5.0, 0.5]]),
     )
     return rendered(CLUTTER, *far)
 
@@ -198,8 +201,8 @@ def test_bites_out_of_an_outline_do_not_shrink_it():
 @mark.parametrize("yaw", np.linspace(-3.1, 3.1, 9))
 def test_corners_are_named_by_the_world(yaw):
     """Whatever the heading and however the detector turned about the square."""
-    rot_wb = rotation_from_vector(torch.tensor([[0.1, 0.2, 0.0]], dtype=torch.float64))[0]
-    turn = rotation_from_vector(torch.tensor([[0.0, 0.0, yaw]], dtype=torch.float64))[0]
+    rot_wb = rotation_from_vector(f64([[0.1, 0.2, 0.0]]))[0]
+    turn = rotation_from_vector(f64([[0.0, 0.0, yaw]]))[0]
     rot_wc = (turn @ rot_wb @ CAMERA.rot_cb.T).numpy()
     corners_w = goal_square(0.25).numpy() + [0.5, -0.8, -1.3]
     rays = corners_w / norm(corners_w, axis=1, keepdims=True) @ rot_wc

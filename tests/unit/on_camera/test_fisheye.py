@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -9,6 +10,8 @@ from pytest import mark, raises
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
+
+f64 = partial(torch.tensor, dtype=torch.float64)
 
 EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)
@@ -67,14 +70,9 @@ def test_closed_form_at_90_and_110_degrees():
     # 90 deg.
     lens = Fisheye(EQUIDISTANT)
     t = math.radians(105.0)
-    points = torch.tensor(
-        [[2.0, 0.0, 0.0], [0.0, 3.0 * math.sin(t), 3.0 * math.cos(t)]], dtype=torch.float64
-    )
+    points = f64([[2.0, 0.0, 0.0], [0.0, 3.0 * math.sin(t), 3.0 * math.cos(t)]])
     pixels, valid = lens.project(points)
-    expected = torch.tensor(
-        [[319.5 + 166.6786 * math.pi / 2, 319.5], [319.5, 319.5 + 166.6786 * t]],
-        dtype=torch.float64,
-    )
+    expected = f64([[319.5 + 166.6786 * math.pi / 2, 319.5], [319.5, 319.5 + 166.6786 * t]])
     assert torch.allclose(pixels, expected, atol=1e-10)
     assert valid.all()
 
@@ -84,10 +82,7 @@ def test_closed_form_at_90_and_110_degrees():
 def test_gradcheck_past_90_degrees(params, degrees):
     lens = Fisheye(params)
     t = math.radians(degrees)
-    point = (
-        torch.tensor([[0.6 * math.sin(t), 0.8 * math.sin(t), math.cos(t)]], dtype=torch.float64)
-        * 1.3
-    )
+    point = f64([[0.6 * math.sin(t), 0.8 * math.sin(t), math.cos(t)]]) * 1.3
     point.requires_grad_()
     assert torch.autograd.gradcheck(lambda p: lens.project(p)[0], (point,))
     assert torch.autograd.gradcheck(lambda p: lens.project_normalized(p)[0], (point,))
@@ -96,7 +91,7 @@ def test_gradcheck_past_90_degrees(params, degrees):
 @LENSES
 def test_unprojection_gradient(params):
     lens = Fisheye(params)
-    normalized = torch.tensor([[0.1, 0.2], [-0.6, 0.3], [0.0, -0.97]], dtype=torch.float64)
+    normalized = f64([[0.1, 0.2], [-0.6, 0.3], [0.0, -0.97]])
     pixels = lens.denormalize(normalized).requires_grad_()
     assert torch.autograd.gradcheck(lambda p: lens.unproject(p)[0], (pixels,))
 
@@ -159,9 +154,7 @@ def test_points_beside_the_sensor_are_not_valid_keypoints():
     assert not lens.circle_inside_image
     assert Fisheye(EQUIDISTANT).circle_inside_image
     t = math.radians(99.0)
-    points = torch.tensor(
-        [[0.0, math.sin(t), math.cos(t)], [math.sin(t), 0.0, math.cos(t)]], dtype=torch.float64
-    )
+    points = f64([[0.0, math.sin(t), math.cos(t)], [math.sin(t), 0.0, math.cos(t)]])
     pixels, valid = lens.project(points)
     assert valid.all()
     assert lens.on_sensor(pixels).tolist() == [False, True]
@@ -170,7 +163,7 @@ def test_points_beside_the_sensor_are_not_valid_keypoints():
 
 def test_pixels_beyond_the_field_of_view_do_not_unproject():
     lens = Fisheye(BENT)
-    pixels = lens.denormalize(torch.tensor([[1.01, 0.0], [0.99, 0.0]], dtype=torch.float64))
+    pixels = lens.denormalize(f64([[1.01, 0.0], [0.99, 0.0]]))
     rays, valid = lens.unproject(pixels)
     assert valid.tolist() == [False, True]
     assert rays.isfinite().all()

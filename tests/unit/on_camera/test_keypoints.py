@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import torch
 from pytest import approx, mark
@@ -17,6 +18,8 @@ from camera.keypoints import (
 )
 from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
+
+f64 = partial(torch.tensor, dtype=torch.float64)
 
 LENS = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
 PARAMS = CameraParams(
@@ -49,14 +52,12 @@ def scene(environments: int, dtype: torch.dtype = torch.float32):
 def test_downward_mount_axes():
     pos_w, rot_wb = hover(2.0)
     front, left, below = [1.0, 0.0, 2.0], [0.0, 1.0, 2.0], [0.0, 0.0, 0.0]
-    points_w = torch.tensor([[front, left, below]], dtype=torch.float64)
+    points_w = f64([[front, left, below]])
     points_c = points_c_from_w(
         points_w, pos_w, rot_wb, nominal_rot_cb(MountParams()), torch.zeros(3, dtype=torch.float64)
     )
     # Front is up in the image (-y_c), left is left (-x_c), below is ahead of the lens (+z_c).
-    expected = torch.tensor(
-        [[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]], dtype=torch.float64
-    )
+    expected = f64([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
     assert torch.allclose(points_c[0], expected, atol=1e-12)
 
 
@@ -64,8 +65,8 @@ def test_mount_rotation_is_about_body_axes():
     # Pitch -90 deg about body y (left) turns the downward camera to the front: z_c = +x_b; image
     # top is then body up.
     rot_cb = nominal_rot_cb(MountParams(rpy_deg=(0.0, -90.0, 0.0)))
-    assert torch.allclose(rot_cb[2], torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64), atol=1e-9)
-    assert torch.allclose(rot_cb[1], torch.tensor([0.0, 0.0, -1.0], dtype=torch.float64), atol=1e-9)
+    assert torch.allclose(rot_cb[2], f64([1.0, 0.0, 0.0]), atol=1e-9)
+    assert torch.allclose(rot_cb[1], f64([0.0, 0.0, -1.0]), atol=1e-9)
     assert torch.allclose(rot_cb @ rot_cb.T, torch.eye(3, dtype=torch.float64), atol=1e-9)
 
 
@@ -87,10 +88,10 @@ def test_rotation_vector_against_the_matrix_exponential():
 def test_extrinsic_error_moves_and_turns_the_camera():
     camera = KeypointCamera(CENTRED, dtype=torch.float64)
     angle = 0.05
-    rotation_error = torch.tensor([[0.0, -angle, 0.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
-    position_error = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]], dtype=torch.float64)
+    rotation_error = f64([[0.0, -angle, 0.0], [0.0, 0.0, 0.0]])
+    position_error = f64([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]])
     pos_w, rot_wb = hover(2.0, 2)
-    payload_w = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64).expand(2, 3)
+    payload_w = f64([[0.0, 0.0, 1.0]]).expand(2, 3)
     goal_w = torch.zeros(2, 2, dtype=torch.float64)
     points, _ = keypoints(
         camera, pos_w, rot_wb, goal_w, payload_w, camera.extrinsics(rotation_error, position_error)
@@ -98,12 +99,8 @@ def test_extrinsic_error_moves_and_turns_the_camera():
     middle = points[:, 4:].mean(1)
     # Camera pitched to the front by 0.05 rad: the ball below lies 0.05 rad towards the image's
     # bottom. Camera 0.1 m forward: atan(0.1) in the same direction.
-    assert torch.allclose(
-        middle[0], torch.tensor([0.0, angle / EDGE], dtype=torch.float64), atol=1e-6
-    )
-    assert torch.allclose(
-        middle[1], torch.tensor([0.0, math.atan(0.1) / EDGE], dtype=torch.float64), atol=1e-4
-    )
+    assert torch.allclose(middle[0], f64([0.0, angle / EDGE]), atol=1e-6)
+    assert torch.allclose(middle[1], f64([0.0, math.atan(0.1) / EDGE]), atol=1e-4)
 
 
 def test_goal_corners_order_and_place():
@@ -124,17 +121,17 @@ def test_goal_below_a_level_vehicle_closed_form():
         pos_w,
         rot_wb,
         torch.zeros(1, 2, dtype=torch.float64),
-        torch.tensor([[0.0, 0.0, 0.5]], dtype=torch.float64),
+        f64([[0.0, 0.0, 0.5]]),
     )
     # Corner 0 (front left) 0.125 m each way, 1 m below: angle atan(0.125 sqrt 2), up and left in
     # the image, 45 deg.
     c = math.atan(0.125 * math.sqrt(2.0)) / EDGE / math.sqrt(2.0)
-    expected = torch.tensor([[-c, -c], [c, -c], [c, c], [-c, c]], dtype=torch.float64)
+    expected = f64([[-c, -c], [c, -c], [c, c], [-c, c]])
     assert valid.all()
     assert torch.allclose(points[0, :4], expected, atol=1e-12)
     # Ball of 33 mm at 0.5 m on the axis: a circle of radius asin(0.066).
     a = math.asin(0.066) / EDGE
-    box = torch.tensor([[-a, 0.0], [0.0, -a], [a, 0.0], [0.0, a]], dtype=torch.float64)
+    box = f64([[-a, 0.0], [0.0, -a], [a, 0.0], [0.0, a]])
     assert torch.allclose(points[0, 4:], box, atol=1e-9)
 
 
@@ -202,11 +199,9 @@ def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
     # 102 deg off the axis.
     camera = KeypointCamera(CENTRED, dtype=torch.float64)
     pos_w, _ = hover(1.0)
-    rot_wb = rotation_from_vector(
-        torch.tensor([[0.0, math.radians(40.0), 0.0]], dtype=torch.float64)
-    )
-    goal_w = torch.tensor([[math.tan(math.radians(62.0)), 0.0]], dtype=torch.float64)
-    above_w = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
+    rot_wb = rotation_from_vector(f64([[0.0, math.radians(40.0), 0.0]]))
+    goal_w = f64([[math.tan(math.radians(62.0)), 0.0]])
+    above_w = f64([[0.0, 0.0, 2.0]])
     points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
     assert valid[0, :4].all()
     assert not valid[0, 4:].any()
@@ -237,9 +232,7 @@ def test_out_of_view_tells_nothing_but_that():
     camera = KeypointCamera(honest, dtype=torch.float64)
     pos_w, rot_wb = hover(1.0, 3)
     goal_w = torch.zeros(3, 2, dtype=torch.float64)
-    above_w = torch.tensor(
-        [[0.0, 0.0, 2.0], [0.5, 0.3, 2.2], [-0.4, 0.0, 1.8]], dtype=torch.float64
-    )
+    above_w = f64([[0.0, 0.0, 2.0], [0.5, 0.3, 2.2], [-0.4, 0.0, 1.8]])
     points, valid = keypoints(camera, pos_w, rot_wb, goal_w, above_w)
     assert not valid[:, 4:].any()
     assert torch.equal(points[:1], points[1:2])

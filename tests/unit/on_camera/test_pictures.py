@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +15,8 @@ from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, Moun
 from camera.rectify import ViewParams, rectify, view_map
 from tests.drawn import pixel_rays, render_scene
 
+f64 = partial(torch.tensor, dtype=torch.float64)
+
 LENS = FisheyeParams(320, 320, 83.3, 83.3, 159.5, 159.5)
 CAMERA = KeypointCamera(
     CameraParams(
@@ -25,12 +28,10 @@ CAMERA = KeypointCamera(
 
 def throw_scene(pitch_deg: float):
     """A vehicle before the throw, its keypoints and its picture."""
-    pos_w = torch.tensor([[0.3, 0.05, 1.3]], dtype=torch.float64)
-    rot_wb = rotation_from_vector(
-        torch.tensor([[0.1, math.radians(pitch_deg), 0.2]], dtype=torch.float64)
-    )
-    goal_w = torch.tensor([[1.4, 0.2]], dtype=torch.float64)
-    ball_w = torch.tensor([[0.45, 0.1, 1.02]], dtype=torch.float64)
+    pos_w = f64([[0.3, 0.05, 1.3]])
+    rot_wb = rotation_from_vector(f64([[0.1, math.radians(pitch_deg), 0.2]]))
+    goal_w = f64([[1.4, 0.2]])
+    ball_w = f64([[0.45, 0.1, 1.02]])
     points, valid = keypoints(CAMERA, pos_w, rot_wb, goal_w, ball_w)
     eye_w = pos_w[0] + rot_wb[0] @ CAMERA.position_b
     frame = render_scene(
@@ -90,12 +91,10 @@ def test_turned_view_looks_where_it_says():
     pixels, seen = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, yaw_deg=50.0))
     # Equidistant: 50 deg to the right is 83.3 * 50 deg from the principal point, along u.
     assert seen.all()
-    expected = torch.tensor([159.5 + 83.3 * math.radians(50.0), 159.5], dtype=torch.float64)
+    expected = f64([159.5 + 83.3 * math.radians(50.0), 159.5])
     assert torch.allclose(pixels[20, 20], expected, atol=1e-9)
     up, _ = view_map(CAMERA.fisheye, ViewParams(41, 41, 60.0, pitch_deg=50.0))
-    assert torch.allclose(
-        up[20, 20], torch.tensor([159.5, 159.5 - 83.3 * math.radians(50.0)], dtype=torch.float64)
-    )
+    assert torch.allclose(up[20, 20], f64([159.5, 159.5 - 83.3 * math.radians(50.0)]))
     _, past = view_map(CAMERA.fisheye, ViewParams(41, 41, 90.0, yaw_deg=100.0))
     assert not past[20, 40]
 
