@@ -24,7 +24,7 @@ from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, serve
 from visthrow import config
-from visthrow.common.arguments import ABOVE_ZERO, PORT, SOLVER, WHOLE
+from visthrow.common.arguments import ABOVE_ZERO, PORT, WHOLE, add_option
 from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--plant", metavar="MODULE:FUNCTION", help=maker)
     add("--policy", metavar="POLICY", default="vision", help="whose plant is flown")
     add("--seed", type=WHOLE, default=0, help="of start, noise and loss")
-    add("--solver", **{**SOLVER, "dest": "changes"})
+    add_option(parser, "--solver", shared=True, dest="changes")
     add("--rate", metavar="HZ", type=ABOVE_ZERO, default=100.0, help="poses a second of each body")
     add("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
     add("--sign", metavar="KEYFILE", help="sign messages, as of `hil run`")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from visthrow.common.arguments import add_common, add_conditions, add_out
+from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write, writable
@@ -22,21 +22,6 @@ from visthrow.throws.results import Entry
 BASELINE = "baseline"  # trajectory optimisation and MPC, beside the policies
 DEFAULT_POLICIES = ("state", "vision")
 DEFAULT_TARGETS = (1.5, 2.0, 2.5)
-
-EXAMPLES = """\
-examples:
-  visthrow compare                               state against vision, 200 throws at three targets
-  visthrow compare vision runs/v2/policy.npz     a shipped policy against one of your own
-  visthrow compare state baseline --throws 50    against trajectory optimisation and MPC
-  visthrow compare --plant reference-realistic --throws 50   on the independent plant (minutes)
-  visthrow compare --from runs/hil/*             throws of HIL runs, from their folders
-
-A throw starts in hover with the payload near z = 0.95 m. The landing error is the horizontal
-distance from the target. The duration runs from the policy's start to the landing. Smoothness is
-the root mean square change of the normalised commands from step to step. The policy 'baseline'
-gives four rows: one in the controller's own model, an idealised bound, and three on the plant that
-compensate no, most or all known delays.
-"""
 
 
 @dataclass(frozen=True)
@@ -83,46 +68,7 @@ def _landings(entry: Entry, throws: Any) -> tuple[str, np.ndarray]:
     return entry.name, throws.landing_w[throws.success] - (throws.target, 0.0)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = EXAMPLES
-    add = parser.add_argument
-    add(
-        "policies",
-        metavar="POLICY",
-        nargs="*",
-        help="shipped names, policy files, or baseline (default: state vision)",
-    )
-    add(
-        "--from",
-        dest="runs",
-        nargs="+",
-        metavar="RUN",
-        help="throw nothing: take the throws of HIL runs from their folders",
-    )
-    add(
-        "--targets",
-        type=float,
-        nargs="+",
-        default=list(DEFAULT_TARGETS),
-        metavar="M",
-        help="distances along x [m]",
-    )
-    add(
-        "--throws",
-        type=int,
-        default=200,
-        metavar="N",
-        help="for each policy and target (default: 200)",
-    )
-    add_conditions(parser, "each policy's")
-    hover = (
-        "begin each throw with a hover that calibrates its camera, as the runner does (vision"
-        " policies, plant hybrid)"
-    )
-    add("--calibrate", action="store_true", help=hover)
-    add_out(parser, "out/compare", "for table, CSV and plot")
-    add_common(parser)
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

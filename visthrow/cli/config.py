@@ -3,30 +3,11 @@
 import argparse
 
 from visthrow import config
-from visthrow.common.arguments import add_common
+from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError
 from visthrow.config import kinds
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n"
-        "  visthrow config vehicle                        the names of the shipped vehicles\n"
-        "  visthrow config vehicle paper                  all values of one of them\n"
-        "  visthrow config vehicle mine.toml              check a file of your own\n"
-        "  visthrow config vehicle paper --set body.mass=0.25\n"
-    )
-    parser.add_argument(
-        "kind", metavar="KIND", help=f"what to configure: {', '.join(_kind_names())}"
-    )
-    parser.add_argument(
-        "name",
-        metavar="NAME",
-        nargs="?",
-        help="a shipped name or a TOML file; without it, list the names",
-    )
-    add_common(parser, device=False, json=True)
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

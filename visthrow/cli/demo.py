@@ -7,13 +7,9 @@ import time
 from pathlib import Path
 
 from visthrow.cli import compare, fly
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError
 from visthrow.common.storage import writable
-
-# at each of compare's targets in the training simulator, for each policy; ``--throws`` asks for
-# another number
-THROWS = 100
 
 # on the reference plant, for each policy; one such throw costs seconds
 REFERENCE_THROWS = 6
@@ -22,22 +18,7 @@ REFERENCE_TARGETS = (2.0,)  # [m]
 SEED = 0
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = (
-        "Takes less than a minute on two CPU cores. No GPU is needed and none is used.\n"
-    )
-    add_out(parser, "out/demo", "for pictures, tables and recording")
-    parser.add_argument(
-        "--throws",
-        type=int,
-        default=THROWS,
-        metavar="N",
-        help=(
-            f"for each policy and target in the training simulator (default: {THROWS}); on the"
-            f" reference plant {REFERENCE_THROWS} at most"
-        ),
-    )
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

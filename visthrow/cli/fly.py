@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from visthrow.common.arguments import add_common, add_conditions, add_out
+from visthrow.common.arguments import declared
 from visthrow.onboard.shipped import find_policy
 
 FILES = {
@@ -15,56 +15,7 @@ FILES = {
 }
 
 
-EXAMPLES = """\
-examples:
-  visthrow fly                                   the shipped vision policy, a target 2 m ahead
-  visthrow fly --policy state --target 1.5
-  visthrow fly --target 1.2 0.8                  a target 1.2 m ahead and 0.8 m to the left
-  visthrow fly --plant reference-realistic       on the independent plant (about a minute)
-  visthrow fly --no-rope --target 1.5            the vehicle alone
-
-The vehicle hovers until the swing is quiet, the policy throws, the hover controller brings it back.
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = EXAMPLES
-    add = parser.add_argument
-    add(
-        "--policy",
-        default="vision",
-        metavar="POLICY",
-        help="a shipped name or a policy file (default: vision)",
-    )
-    add(
-        "--target",
-        type=float,
-        nargs="+",
-        default=[2.0],
-        metavar="M",
-        help="distance ahead, or x and y [m] (default: 2.0)",
-    )
-    add_conditions(parser, "the policy's")
-    pixels = "detect keypoints in rendered pictures instead of projecting them"
-    alone = (
-        "fly the vehicle alone from hover to above the target, without rope, payload or policy;"
-        " integrated by rk4 (the default) or euler"
-    )
-    add("--no-rope", nargs="?", const="rk4", choices=("rk4", "euler"), help=alone)
-    add("--pixels", choices=("learnt", "contours"), help=pixels)
-    saved = (
-        "write the policy for these conditions: one for any vehicle becomes one for this vehicle,"
-        " which hil can fly"
-    )
-    add("--save", metavar="FILE", help=saved)
-    add_out(parser, "out/fly", "for the files")
-    export = (
-        "also write the flight for other programs: .mcap (Foxglove), .parquet or .csv; may be"
-        " repeated"
-    )
-    add("--export", action="append", default=[], metavar="FILE", help=export)
-    add_common(parser)
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -3,23 +3,9 @@
 import argparse
 from pathlib import Path
 
+from visthrow.common.arguments import declared
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the action of the command."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    export = actions.add_parser(
-        "export",
-        help="write the network as ONNX or C",
-        description="Write a policy's network as ONNX (.onnx) or C99 (.c), by the ending.",
-        epilog=(
-            "examples:\n"
-            "  visthrow policy export vision --out vision.onnx\n"
-            "  visthrow policy export runs/mine/policy.npz --out policy.c\n"
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    export.add_argument("policy", metavar="POLICY", help="a shipped name or a policy file")
-    export.add_argument("--out", metavar="FILE", required=True, help="FILE.onnx or FILE.c")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,9 +11,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from visthrow.common.errors import suggest
+from visthrow.common.toml_text import tables_beside
 
 Commands = Mapping[str, tuple[str, str]]
 """Name -> (help, module).
@@ -43,70 +46,73 @@ WHOLE = checked(int, lambda x: x >= 0, "a whole number of 0 or more")
 PORT = checked(int, lambda x: 0 < x < 65536, "a port, 1 to 65535")
 
 
+TYPES: Mapping[str, Callable[[str], Any]] = {
+    "number": NUMBER,
+    "above zero": ABOVE_ZERO,
+    "whole": WHOLE,
+    "port": PORT,
+    "int": int,
+    "float": float,
+    "solver": "sim.solver={}".format,
+}
+"""Readers of words of the command line by their names in tables of arguments."""
+
+SHARED: Mapping[str, Mapping[str, Any]] = tables_beside(__file__, "data/arguments.toml")
+"""Options that several commands have: name -> argparse's keywords."""
+
+
+def add_option(
+    parser: argparse.ArgumentParser, name: str, shared: bool = False, **values: Any
+) -> None:
+    """Add an argument; ``shared``: the one of this name in :data:`SHARED`, with changed values."""
+    if shared:
+        values = {**SHARED[name], **values}
+    reader = values.get("type")
+    if isinstance(reader, str):
+        values["type"] = TYPES[reader]
+    parser.add_argument(name, **values)
+
+
+def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None:
+    """Add the arguments, actions and defaults of a table of ``commands.toml``.
+
+    Its keys: ``epilog``, ``arguments`` (name -> keywords of :func:`add_option`), ``actions``
+    (name -> a table of the same form with ``help``), ``dest`` of the chosen action, ``defaults``.
+    """
+    parser.epilog = table.get("epilog")
+    for name, values in table.get("arguments", {}).items():
+        add_option(parser, name, **values)
+    parser.set_defaults(**table.get("defaults", {}))
+    if "actions" in table:
+        dest = table.get("dest", "action")
+        actions = parser.add_subparsers(dest=dest, metavar="ACTION", required=True)
+        form = argparse.RawDescriptionHelpFormatter
+        for name, action in table["actions"].items():
+            texts = {key: action[key] for key in ("help", "description") if key in action}
+            add_table(action, actions.add_parser(name, formatter_class=form, **texts))
+
+
+def declared(module: str) -> Callable[[argparse.ArgumentParser], None]:
+    """Return a command's ``add_arguments``: its table in the ``commands.toml`` beside its module,
+    named as that is.
+    """
+    tables = tables_beside(module, "commands.toml")
+    return partial(add_table, tables[Path(module).stem])
+
+
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
     """Add the options that commands share:
 
     ``--set``, ``--device`` (see ``visthrow.training.compute_device.resolve``) and ``--json``.
     """
-    parser.add_argument(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help=(
-            "change one value of the configuration, for instance --set vehicle.body.mass=0.25; may"
-            " be repeated"
-        ),
-    )
-    if device:
-        parser.add_argument(
-            "--device",
-            default="auto",
-            metavar="NAME",
-            help="auto, cpu, cuda or cuda:1 (default: a GPU if there is one)",
-        )
-    if json:
-        parser.add_argument(
-            "--json", metavar="FILE", help="write the printed figures to this file as well"
-        )
-
-
-SOLVER: Mapping[str, Any] = {
-    "dest": "overrides",
-    "action": "append",
-    "default": [],
-    "type": "sim.solver={}".format,
-    "metavar": "NAME",
-    "help": "physics engine of vehicle and rope (sim.solver)",
-}
-"""Option of a command that flies the training simulator."""
+    for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
+        if wanted:
+            add_option(parser, name, shared=True)
 
 
 def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
     """Add ``--out``: the folder of what a command writes."""
-    parser.add_argument(
-        "--out", default=default, metavar="FOLDER", help=f"{what} (default: {default})"
-    )
-
-
-def add_conditions(parser: argparse.ArgumentParser, whose: str) -> None:
-    """Add what throws are flown under: ``--plant``, ``--seed``, ``--config``, ``--allow``."""
-    add = parser.add_argument
-    add(
-        "--plant",
-        default="hybrid",
-        metavar="NAME",
-        help="hybrid (the training simulator, the default), reference, or reference-realistic",
-    )
-    add("--seed", type=WHOLE, default=0, help="seed of starts, noise and plant (default: 0)")
-    add("--config", metavar="NAME", help=f"fly in this train config instead of {whose} own")
-    allow = (
-        "permit this difference from the conditions of the policy's training (vehicle,"
-        " rope.length); may be repeated"
-    )
-    add("--allow", action="append", default=[], metavar="KEY", help=allow)
-    add("--solver", **SOLVER)
+    add_option(parser, "--out", shared=True, default=default, help=f"{what} (default: %(default)s)")
 
 
 def add_commands(

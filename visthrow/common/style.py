@@ -24,4 +24,4 @@ def use() -> None:
     import matplotlib.style
 
     matplotlib.use("Agg")
-    matplotlib.style.use(Path(__file__).with_name("pictures.mplstyle"))
+    matplotlib.style.use(Path(__file__).with_name("data") / "pictures.mplstyle")

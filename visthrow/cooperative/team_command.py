@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
+from visthrow.common.arguments import declared
 
 POLICIES = ("pair", "pair_vision")
 """Shipped policies, each with the configuration of its name in ``configs/cooperative``."""
@@ -12,34 +12,7 @@ POLICIES = ("pair", "pair_vision")
 SHIPPED = Path(__file__).with_name("policies")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the actions of the command."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    demo = actions.add_parser("demo", help="throw once with the shipped policy and draw it")
-    flight = actions.add_parser("fly", help="throw once and write a picture and a recording")
-    comparison = actions.add_parser("compare", help="throw many times under every fault")
-    for one in (demo, flight):
-        add_out(one, "out/cooperative", "for picture and recording")
-    for one in (flight, comparison):
-        one.add_argument("--target", type=ABOVE_ZERO, default=2.0, help="along x [m] (default: 2)")
-        one.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
-        one.add_argument(
-            "--solver",
-            choices=("tree", "mujoco"),
-            default="tree",
-            help="of the bodies: the training's, or MuJoCo with 15 segments (default: tree)",
-        )
-    flight.add_argument("policy", nargs="?", default="pair", help=f"of {', '.join(POLICIES)}")
-    flight.add_argument(
-        "--fault",
-        choices=("none", "weak", "late", "old"),
-        default="none",
-        help="of a vehicle, a latch or the messages (default: none)",
-    )
-    comparison.add_argument("policies", nargs="*", default=["pair"], metavar="POLICY")
-    comparison.add_argument("--throws", type=WHOLE, default=200, help="of each (default: 200)")
-    comparison.add_argument("--json", metavar="FILE", help="write the figures to this file as well")
-    demo.set_defaults(policy="pair", target=2.0, seed=0, solver="tree", fault="none")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from visthrow import config
-from visthrow.common.arguments import ABOVE_ZERO, NUMBER, WHOLE, add_common
+from visthrow.common.arguments import declared
 from visthrow.common.errors import VisthrowError
 from visthrow.training.compute_device import resolve
 
@@ -23,87 +23,7 @@ CHECKPOINT = "checkpoint.pt"
 WEIGHTS = "learnt.npz"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
-    _add_train(actions.add_parser("train", help="train it; rendering and learning on one device"))
-    _add_throw(
-        actions.add_parser(
-            "throw",
-            help="throws closed loop on rendered pictures: render, detect, policy, simulate",
-        )
-    )
-
-
-def _add_train(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "name",
-        nargs="?",
-        default="small",
-        metavar="NAME",
-        help="of configs/detector, or a file (default: small)",
-    )
-    add(
-        "--out",
-        default="runs/detector",
-        metavar="FOLDER",
-        help="for checkpoint and weights (default: runs/detector)",
-    )
-    add(
-        "--textures",
-        metavar="FOLDER",
-        help="photographs for ground and walls (default: those of scikit-image)",
-    )
-    add("--minutes", type=ABOVE_ZERO, metavar="N", help="stop after so long; --resume goes on")
-    add("--resume", action="store_true", help="go on from the checkpoint in --out")
-    add_common(parser, json=False)
-
-
-def _add_throw(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--policy",
-        default="vision",
-        metavar="POLICY",
-        help="a shipped name or a file (default: vision)",
-    )
-    add(
-        "--by",
-        default="contours",
-        choices=("learnt", "contours"),
-        help="detector (default: contours)",
-    )
-    add(
-        "--weights", metavar="FILE", help="of the learnt detector (default: those that are shipped)"
-    )
-    add("--target", type=NUMBER, default=2.0, metavar="M", help="distance (default: 2.0)")
-    add(
-        "--throws",
-        type=int,
-        default=20,
-        metavar="N",
-        help="each in a hall of its own (default: 20)",
-    )
-    add(
-        "--jobs",
-        type=int,
-        default=1,
-        metavar="N",
-        help="processes; the throws do not depend on them (default: 1)",
-    )
-    add(
-        "--plant", default="hybrid", metavar="NAME", help="hybrid, reference or reference-realistic"
-    )
-    add(
-        "--nuisances",
-        type=NUMBER,
-        default=0.5,
-        metavar="X",
-        help="0: clean, 1: as bad as in training (default: 0.5)",
-    )
-    add("--seed", type=WHOLE, default=0, help="of everything random")
-    add_common(parser)
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import WHOLE, add_common, add_out
+from visthrow.common.arguments import declared
 from visthrow.common.workers import status
 
-TARGETS = (1.5, 2.0, 2.5)
 POLICY_THROWS = 100  # throws of each learnt policy for its point on the front
 
 TITLE = "Trajectory optimisation and MPC: {throws} throws a row, bounds on {bounds}"
@@ -22,73 +21,7 @@ NOTE = (
 )
 
 
-EXAMPLES = (
-    "examples:\n  visthrow baseline                              tables at three targets and"
-    " the sweep at 2.0 m (minutes)\n  visthrow baseline --quick                      two"
-    " throws, a small sweep, own model alone\n  visthrow baseline --plants hybrid"
-    " reference-realistic --no-sweep\n\nThe baseline plans the payload's path to a release"
-    " state by projectile motion, with height and speed of a\nlearnt policy's release, and"
-    " tracks it with a nonlinear MPC. It is flown in the MPC's own pendulum model,"
-    " an\nidealised upper bound, and on the plants, with and without making up for delays and"
-    " the release's lag.\nWhat is flown is kept in the output folder; interrupted and started"
-    " again, the command goes on.\n"
-)
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = EXAMPLES
-    parser.add_argument(
-        "--targets", type=float, nargs="+", default=list(TARGETS), metavar="M", help="along x [m]"
-    )
-    parser.add_argument(
-        "--throws", type=int, default=10, metavar="N", help="a row (default: 10, as in the paper)"
-    )
-    parser.add_argument(
-        "--plants",
-        nargs="*",
-        default=["hybrid"],
-        metavar="NAME",
-        help="beside the own model: hybrid, reference, reference-realistic (default: hybrid)",
-    )
-    parser.add_argument(
-        "--release-from",
-        metavar="POLICY",
-        help=(
-            "measure release height and speed on its throws (default: as measured on the shipped"
-            " state policy)"
-        ),
-    )
-    parser.add_argument(
-        "--policies",
-        nargs="*",
-        default=["state", "vision"],
-        metavar="POLICY",
-        help="points on the front",
-    )
-    parser.add_argument(
-        "--payload-bounds",
-        action="store_true",
-        help=(
-            "bound the payload's path alone, as the paper does, not the vehicle's thrust: plans"
-            " that tracking may fail on"
-        ),
-    )
-    parser.add_argument("--no-sweep", action="store_true", help="tables by target only")
-    parser.add_argument(
-        "--quick",
-        action="store_true",
-        help="two throws, one speed and two weights, own model alone",
-    )
-    parser.add_argument("--seed", type=WHOLE, default=0, help="of starts and noise (default: 0)")
-    parser.add_argument(
-        "--config",
-        default="state",
-        metavar="NAME",
-        help="train config whose plant is flown (default: state)",
-    )
-    add_out(parser, "out/baseline", "for page, tables, pictures and the single results")
-    add_common(parser, device=False)
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

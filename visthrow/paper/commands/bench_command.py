@@ -2,18 +2,9 @@
 
 import argparse
 
+from visthrow.common.arguments import declared
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the action of the command."""
-    records = parser.add_subparsers(dest="bench", metavar="ACTION", required=True).add_parser(
-        "records",
-        help="print the recorded measurements as Markdown",
-        description=(
-            "Print the recorded measurements as Markdown: the command and commit that made each,"
-            " and the command of today."
-        ),
-    )
-    records.add_argument("names", metavar="NAME", nargs="*", help="records to print (default: all)")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

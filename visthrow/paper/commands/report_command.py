@@ -4,7 +4,7 @@ import argparse
 import time
 from pathlib import Path
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 from visthrow.common.errors import StorageError
 
 TITLE = "Throwing with a quadrotor: the paper's evidence and ours"
@@ -18,26 +18,7 @@ LEAD = (
 """The page's introduction."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow report                                the page, from the committed"
-        " records\n  visthrow report --results runs/sweep/throws    add the throws of your sweep\n"
-        "\n'visthrow sweep run quick' makes a few throws within minutes; 'visthrow sweep run paper'"
-        " and 'gap' make those\nof the page.\n"
-    )
-    parser.add_argument(
-        "--results",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="FOLDER",
-        help="folders with further results of throws",
-    )
-    parser.add_argument(
-        "--records", metavar="FOLDER", help="folder of records (default: those of the package)"
-    )
-    add_out(parser, "out/report", "for page, tables and pictures")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

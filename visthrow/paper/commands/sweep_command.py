@@ -11,71 +11,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import NUMBER
+from visthrow.common.arguments import declared
 
-DEFAULT_OUT = "runs/sweep"
-ACTIONS = ("run", "status", "collect", "work")
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the command."""
-    parser.epilog = (
-        "examples:\n  visthrow sweep run paper --devices cuda:0,cuda:1 --jobs 30    all runs of"
-        " configs/sweep/paper.toml\n  visthrow sweep run paper --minutes 9                         "
-        " stop after 9 minutes; the same command goes on\n  visthrow sweep run paper --slurm"
-        " partition=gpu --devices 8 --minutes 60    as jobs of a cluster\n  visthrow sweep status"
-        " paper                                   a line a run\n  visthrow sweep collect paper"
-        " --records out/records            what is committed of it\n\nWhat is done is not done"
-        " again: a training run is known by its resolved config and seed, throws by the"
-        " policy's\ncontent and everything else they depend on. Ctrl-C, a kill or a power cut lose"
-        " what was not yet in a checkpoint.\n"
-    )
-    add = parser.add_argument
-    add("action", choices=ACTIONS, help="work is what run starts processes with")
-    add("list", metavar="LIST", help="name of configs/sweep, or a TOML file of your own")
-    add(
-        "--out",
-        metavar="FOLDER",
-        default=DEFAULT_OUT,
-        help=f"of all results (default: {DEFAULT_OUT})",
-    )
-    devices = "one training at once on each: cuda:0,cuda:1; with a cluster how many (default: auto)"
-    add("--devices", metavar="NAMES", default="auto", help=devices)
-    add(
-        "--jobs",
-        type=int,
-        metavar="N",
-        help="throws on the reference plant at once (default: one a core)",
-    )
-    add(
-        "--minutes",
-        type=NUMBER,
-        help="end after so long with checkpoints; on a cluster the length of a job",
-    )
-    add(
-        "--slurm",
-        metavar="KEY=VALUE",
-        action="append",
-        help="submit jobs, with this option of sbatch; may be repeated",
-    )
-    add(
-        "--records",
-        metavar="FOLDER",
-        help="collect: where to (default: records beside the results)",
-    )
-    add("--units", metavar="NAMES", help="work: which, with commas between")
-    add("--device", default="auto", help="work: where")
-    add("--parent", type=int, metavar="ID", help="work: process with which this one is to end")
-    add(
-        "--set",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help=(
-            "change one value of the list, for instance --set runs.full.seeds=[1]; may be repeated"
-        ),
-    )
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
