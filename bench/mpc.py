@@ -45,14 +45,11 @@ def measure(experiment, throws: int, core: int | None = None) -> Report:
     figures = []
     for target in TARGETS:
         unit = thrower.unit("hybrid", "both", target, throws)
-        plan = thrower.plan_of(
-            experiment,
-            *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds")),
-        )
+        plan = thrower.plan_of(experiment, unit)
         delays = fly.delays_of(experiment, "both")
         for plant, name in (("pendulum", "own model"), ("hybrid", "training simulator")):
             if plant == "pendulum":
-                flown = fly.fly_pendulum(plan, throws, 0, experiment.release.landing_height)
+                flown = fly.fly_pendulum(plan, throws, 0)
             else:
                 flown = fly.fly_plant(plan, plant, experiment, delays, throws, 0)
             times = 1e3 * flown.step_times

@@ -17,7 +17,7 @@ def line(series: int, solver: str, rows: list[dict[str, Any]]) -> figures.Line:
     for row in rows:
         half = 1.96 * row["error_std"] / math.sqrt(row["success"] * row["throws"])
         mean = row["error_mean"]
-        values.append(Interval(mean, mean - half, mean + half, "throws"))
+        values.append(Interval(mean, mean - half, mean + half))
     return figures.Line(f"through {solver}", [row["seconds"] for row in rows], values, series)
 
 

@@ -290,7 +290,7 @@ def draw(
     """Draw the largest of some doublets about each axis: the firmware's rate, and those of vehicles
     under the same commands.
     """
-    from visthrow.common import style
+    from visthrow.view import style
 
     style.use()
     import matplotlib.pyplot as plt

@@ -110,7 +110,7 @@ def draw(path: Path, record: dict) -> None:
     """Draw where the throws through the firmware landed: a panel a distance, the goal in the
     middle.
     """
-    from visthrow.common import style
+    from visthrow.view import style
 
     style.use()
     import matplotlib.pyplot as plt

@@ -76,8 +76,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     rope = config.load(RopeParams, config.find("rope", "paper"))
     eyes = RenderedEyes(
         camera,
-        rope.mount,
-        rope.length + rope.payload_offset,
+        rope,
         1,
         3,
         method=by,
@@ -101,7 +100,7 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
     with raises(ValueError, match="expected one of learnt, contours"):
-        RenderedEyes(camera, rope.mount, rope.length + rope.payload_offset, 1, 0, method="magic")
+        RenderedEyes(camera, rope, 1, 0, method="magic")
 
 
 def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError
 from visthrow.common.extras import load_extra
-from visthrow.common.storage import atomic_write, writable
+from visthrow.common.storage import atomic_write, writable, write_json
 from visthrow.common.workers import status
 from visthrow.onboard.shipped import find_policy
 from visthrow.throws.results import Entry
@@ -127,8 +127,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _publish(args: argparse.Namespace, comparison: Comparison, figures: dict[str, Any]) -> int:
     """Print and write a comparison; ``figures``: what its JSON says beside the rows."""
-    from visthrow.common.storage import write_json
-
     print(comparison.text())
     for path in comparison.write(Path(args.out)):
         print(path)

@@ -12,7 +12,7 @@ add_arguments = declared(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of a kind, or one resolved config."""
-    if args.kind not in _kind_names():
+    if args.kind not in kinds.KINDS:
         kinds.schema_of(args.kind)
     if args.name is None:
         names = config.available(args.kind)
@@ -30,7 +30,3 @@ def run(args: argparse.Namespace) -> int:
 
         write_json(args.json, config.to_dict(resolved))
     return 0
-
-
-def _kind_names() -> list[str]:
-    return [key for key in kinds.SCHEMAS if "/" not in key]

@@ -5,6 +5,9 @@ import sys
 from pathlib import Path
 
 from visthrow.common.arguments import declared
+from visthrow.common.errors import ConfigError
+from visthrow.common.extras import load_extra
+from visthrow.common.storage import check_place, writable, write_json
 from visthrow.onboard.shipped import find_policy
 
 FILES = {
@@ -21,7 +24,6 @@ add_arguments = declared(__file__)
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     find_policy(args.policy)  # said before anything heavy is imported
-    from visthrow.common.storage import check_place, writable, write_json
     from visthrow.throws.loading import load_policy
     from visthrow.throws.recorded import check_goal, fly
     from visthrow.training.compute_device import resolve
@@ -66,8 +68,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _check(args: argparse.Namespace) -> None:
     """Raise ConfigError for arguments that no flight follows."""
-    from visthrow.common.errors import ConfigError
-    from visthrow.common.extras import load_extra
     from visthrow.logs.export import FORMATS
     from visthrow.throws.plants import known_plant
 
@@ -110,18 +110,14 @@ def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
 
 def _rendered_eyes(loaded, method: str, seed: int):
     """Return a detector on rendered pictures for a vision policy."""
-    from visthrow.common.errors import ConfigError
-    from visthrow.common.extras import load_extra
-
     rendered = load_extra("visthrow.detector_training.eyes", "detector", "--pixels", ConfigError)
     if loaded.policy.contract["observation"]["layout"] != "vision":
         raise ConfigError(
             f"--pixels with policy '{loaded.name}', which sees states; expected a vision policy"
         )
-    rope = loaded.experiment.rope
-    reach = rope.length + rope.payload_offset
+    experiment = loaded.experiment
     return rendered.RenderedEyes(
-        loaded.experiment.camera, rope.mount, reach, 1, seed, method=method, keep=True
+        experiment.camera, experiment.rope, 1, seed, method=method, keep=True
     )
 
 

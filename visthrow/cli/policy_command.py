@@ -10,8 +10,8 @@ add_arguments = declared(__file__)
 
 def run(args: argparse.Namespace) -> int:
     """Export a policy."""
-    from visthrow.cli.c_source import write_c
-    from visthrow.cli.onnx_file import write_onnx
+    from visthrow.cli.export.c_source import write_c
+    from visthrow.cli.export.onnx_file import write_onnx
     from visthrow.common.errors import PolicyError
     from visthrow.onboard.policy import Policy, find_policy
 

@@ -69,15 +69,10 @@ def command() -> str:
     return " ".join([program, *map(shlex.quote, words)])
 
 
-def versions() -> dict[str, str]:
-    """Return the installed version of each package that can change a figure."""
-    return dict(_versions())
-
-
 @cache
-def _versions() -> dict[str, str]:
-    """They are looked for once: a process that records many runs has the same packages in all of
-    them.
+def versions() -> dict[str, str]:
+    """Return the installed version of each package that can change a figure; they are looked for
+    once, as a process that records many runs has the same packages in all of them.
     """
     versions = {"visthrow": __version__, "python": platform.python_version()}
     for name in PACKAGES:
@@ -104,11 +99,10 @@ def processors() -> dict[str, Any]:
 
 def collect() -> dict[str, Any]:
     """Return all of it, with the time [UTC]."""
-    time = datetime.now(UTC).isoformat(timespec="seconds")
     return {
         "commit": commit(),
         "command": command(),
-        "time": time,
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
         "versions": versions(),
         "processors": processors(),
     }

@@ -4,8 +4,7 @@ NumPy alone.
 
 Throws of one training run are not independent evidence about the recipe that trained it: another
 seed may throw otherwise. Where several runs are given, a bootstrap sample draws runs first and then
-throws within each (two levels); with one run the interval speaks of that run's throws alone, and
-:class:`Interval` says so in ``levels``.
+throws within each (two levels); with one run the interval speaks of that run's throws alone.
 
 Source: Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13 (percentile) and 14
 (BCa); Davison and Hinkley, "Bootstrap Methods and their Application", 1997, sec. 3.8 (hierarchical
@@ -33,7 +32,6 @@ class Interval:
     value: float
     low: float
     high: float
-    levels: str  # "throws", or "runs and throws"
 
     def __contains__(self, value: float) -> bool:
         return self.low <= value <= self.high
@@ -75,12 +73,10 @@ def _checked(groups: Groups | ndarray) -> list[ndarray]:
     return groups_with_data
 
 
-def _interval(value: float, samples: ndarray, runs: int) -> Interval:
+def _interval(value: float, samples: ndarray) -> Interval:
     tail = 0.5 * (1.0 - LEVEL)
     low, high = np.quantile(samples, (tail, 1.0 - tail))
-    return Interval(
-        float(value), float(low), float(high), "runs and throws" if runs > 1 else "throws"
-    )
+    return Interval(float(value), float(low), float(high))
 
 
 def _mean(groups: list[ndarray]) -> ndarray:
@@ -94,7 +90,7 @@ def mean(groups: Groups | ndarray, seed: int = 0, draws: int = DRAWS) -> Interva
     """
     groups_with_data = _checked(groups)
     samples = _resampled(groups_with_data, np.random.default_rng(seed), draws)
-    return _interval(float(_mean(groups_with_data)), samples, len(groups_with_data))
+    return _interval(_mean(groups_with_data), samples)
 
 
 def difference(a: Groups | ndarray, b: Groups | ndarray, draws: int = DRAWS) -> Interval:
@@ -107,7 +103,7 @@ def _of_both(function: np.ufunc, a: Groups | ndarray, b: Groups | ndarray, draws
     second = _checked(b)
     rng = np.random.default_rng(0)
     samples = function(_resampled(first, rng, draws), _resampled(second, rng, draws))
-    return _interval(function(_mean(first), _mean(second)), samples, max(len(first), len(second)))
+    return _interval(function(_mean(first), _mean(second)), samples)
 
 
 def paired(a: ndarray, b: ndarray) -> Interval:
@@ -140,7 +136,7 @@ def correlation(x: ndarray, y: ndarray) -> Interval:
         )
     index = np.random.default_rng(0).integers(len(x), size=(DRAWS, len(x)))
     samples = _pearson(x[index], y[index])
-    return _interval(float(_pearson(x[None], y[None])[0]), samples[np.isfinite(samples)], 1)
+    return _interval(_pearson(x[None], y[None])[0], samples[np.isfinite(samples)])
 
 
 def _pearson(x: ndarray, y: ndarray) -> ndarray:
@@ -186,9 +182,7 @@ def bias(groups: Groups | ndarray) -> Bias:
     center = _mean(groups_with_data)
     square = float(np.mean([(group**2).sum(1).mean() for group in groups_with_data]))
     offset = float(np.hypot(*center))
-    along, lateral = (
-        _interval(float(center[i]), samples[:, i], len(groups_with_data)) for i in range(2)
-    )
+    along, lateral = (_interval(center[i], samples[:, i]) for i in range(2))
     scatter = float(np.sqrt(max(square - offset**2, 0.0)))
     return Bias(along, lateral, offset, scatter, offset**2 / square if square > 0.0 else 0.0)
 

@@ -24,7 +24,7 @@ from typing import Any, TypeGuard, TypeVar
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config import schema as _schema
-from visthrow.config.kinds import kinds_of
+from visthrow.config.kinds import KINDS, kinds_of
 from visthrow.config.schema import BASE_KEY, NONE_WORD, ConfigTable, Leaf, dataclass_of, merged
 
 T = TypeVar("T")
@@ -95,8 +95,7 @@ def find(kind: str, name: str | Path) -> Path:
     elif (root / kind / f"{text}.toml").is_file():
         return root / kind / f"{text}.toml"
     if not (root / kind).is_dir():
-        kinds = (folder.name for folder in root.iterdir() if folder.is_dir())
-        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, kinds)}")
+        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, KINDS)}")
     raise ConfigError(
         f"no {kind} config '{text}' (neither a shipped name nor a file);"
         f" {suggest(text, available(kind))}"

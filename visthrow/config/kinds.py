@@ -8,6 +8,9 @@ from visthrow.common.toml_text import tables_beside
 SCHEMAS: dict[str, str] = tables_beside(__file__, "kinds.toml")
 """``kind`` or ``kind/name`` -> ``module:class``; the longer key wins."""
 
+KINDS = [key for key in SCHEMAS if "/" not in key]
+"""Folders of configs."""
+
 
 def schema_of(kind: str, name: str = "") -> type:
     """Return the schema of a config, whose module is imported only now; ConfigError for a kind of
@@ -15,10 +18,7 @@ def schema_of(kind: str, name: str = "") -> type:
     """
     target = SCHEMAS.get(f"{kind}/{name}") or SCHEMAS.get(kind)
     if target is None:
-        raise ConfigError(
-            f"no kind of config '{kind}';"
-            f" {suggest(kind, (key for key in SCHEMAS if '/' not in key))}"
-        )
+        raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, KINDS)}")
     return resolve_name(target)
 
 
@@ -26,8 +26,5 @@ def kinds_of(schema: type) -> list[str]:
     """Return the folders of configs whose files fill a schema: none for one that no shipped config
     has.
     """
-    return [
-        key
-        for key, target in SCHEMAS.items()
-        if target == f"{schema.__module__}:{schema.__name__}" and "/" not in key
-    ]
+    target = f"{schema.__module__}:{schema.__name__}"
+    return [key for key in KINDS if SCHEMAS[key] == target]

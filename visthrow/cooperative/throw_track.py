@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from numpy import ndarray
 
-from visthrow.common import style
 from visthrow.common.free_fall import free_flight
 from visthrow.common.storage import savez
 from visthrow.cooperative.team import TeamExperiment
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.cooperative.team_training import fly
 from visthrow.onboard.observations import rotation_from_quat
+from visthrow.view import style
 
 DIAGONALS = 0.07 * np.array(
     [[[1.0, 1.0, 0.0], [-1.0, -1.0, 0.0]], [[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0]]]

@@ -91,12 +91,10 @@ def _thrown(
 
     bad = Nuisances(*(looks["nuisances"],) * len(fields(Nuisances)))
     camera = loaded.experiment.camera
-    rope = loaded.experiment.rope
     halls = 1000 * job.seed + job.batch
     eyes = RenderedEyes(
         camera,
-        rope.mount,
-        rope.length + rope.payload_offset,
+        loaded.experiment.rope,
         job.count,
         halls,
         **looks | {"nuisances": bad},
@@ -121,10 +119,7 @@ def train(args: argparse.Namespace) -> int:
         else:
             present = "no checkpoint to resume from"
         raise VisthrowError(f"{folder}: {present}")
-    if args.textures is None:
-        files = None
-    else:
-        files = photographs(args.textures)
+    files = photographs(args.textures) if args.textures else None
     fit = Fit(
         params,
         config.load(CameraParams, config.find("camera", "fisheye")),

@@ -18,6 +18,7 @@ from camera.detectors.learnt import LearntDetector, Networks
 from camera.fisheye import Fisheye
 from camera.keypoints import KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
+from sim.params import RopeParams
 from visthrow.common.storage import atomic_write
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Draw, Nuisances, Scenes, dressed, posed_scenes
@@ -63,14 +64,12 @@ class RenderedEyes:
         frames: of the first vehicle, BGR, each with what was found: image, keypoints (8, 2),
             validity (8,).
         seen: keypoints and validity of the last look, (E, 8, 2) and (E, 8).
-        found: how often ball and goal were found, frames looked at, and throws that were refused.
     """
 
     def __init__(
         self,
         params: CameraParams,
-        mount_b: Sequence[float],
-        below: float,
+        rope: RopeParams,
         count: int,
         seed: int,
         device: str = "cpu",
@@ -83,8 +82,7 @@ class RenderedEyes:
         """Draw the halls; ValueError for another detector, no weights, no photographs.
 
         Args:
-            params: camera. mount_b: of the rope [m], body frame. below: the ball's centre hangs so
-                far below it [m].
+            params: camera. rope: that the ball hangs on.
             count: E. seed: of halls and sensors. device: of the renderer. method: one of `METHODS`.
             samples: rays a pixel.
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
@@ -95,8 +93,8 @@ class RenderedEyes:
         self.params = params
         self.count = count
         self._keep = keep
-        self._mount_b = np.array(mount_b, float)
-        self._below = below
+        self._mount_b = np.array(rope.mount)
+        self._below = rope.length + rope.payload_offset
         self.renderer = Renderer(params.fisheye, device, photographs(names=HELD_OUT), samples)
         self._draw = (count, seed)
         self._nuisances = nuisances or Nuisances()
@@ -113,9 +111,15 @@ class RenderedEyes:
         self._followed: list[BallGoalTracker] = []
         self.frames: list[tuple[ndarray, Tensor, Tensor]] = []
         self.seen: tuple[ndarray, ndarray] | None = None
-        self.found = {**dict.fromkeys(THINGS, 0), "frames": 0, "refused": 0}
         # looks of each vehicle in which it was found
         self._hits = {name: np.zeros(count, int) for name in THINGS}
+        self._refused = 0
+
+    @property
+    def found(self) -> dict[str, int]:
+        """How often ball and goal were found, frames looked at, and throws that were refused."""
+        hits = {name: int(hits.sum()) for name, hits in self._hits.items()}
+        return hits | {"frames": self.count * self._looks, "refused": self._refused}
 
     def look(
         self, snapshot: Any, measured: Any, goal_w: ndarray, carried: Sequence[bool] | ndarray
@@ -158,7 +162,7 @@ class RenderedEyes:
             for name in THINGS
             for e in np.flatnonzero(self._hits[name] < SURE * self._looks)
         }
-        self.found["refused"] = len(lost)
+        self._refused = len(lost)
         return lost
 
     def _hanging(self, rot_wb: ndarray) -> BallGoalTracker:
@@ -185,11 +189,8 @@ class RenderedEyes:
         distance = HANGING if carried else None
         prior = self._followed[e].prior(rot_wc, rot_wb[:, 2], eye_w, distance, stamp)
         detections = self.detector.detect(picture, prior)
-        self.found["frames"] += 1
         for name in THINGS:
-            hit = getattr(detections, name) is not None
-            self._hits[name][e] += hit
-            self.found[name] += hit
+            self._hits[name][e] += getattr(detections, name) is not None
         return self._followed[e].take(detections, rot_wc, stamp)
 
     def sheet(self, path: Path) -> Path:

@@ -12,7 +12,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import torch
+from numpy import ndarray
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -469,24 +472,23 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
 def platt(logits: Tensor, hits: Tensor) -> tuple[float, float]:
     """Factor and offset of logits that make them probabilities.
 
-    Source: Platt, "Probabilistic outputs for support vector machines", 1999; Newton's steps with a
-    weak prior at 1 and 0."""
-    weights = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    x = torch.stack([logits, torch.ones_like(logits)], -1)
-    prior = torch.tensor([1.0, 0.0], dtype=torch.float64)
-    for _ in range(50):
-        p = (x @ weights).sigmoid()
-        gradient = x.T @ (p - hits) + 0.5 * (weights - prior)
-        hessian = x.T @ (x * (p * (1 - p))[:, None]) + 0.5 * torch.eye(2, dtype=torch.float64)
-        weights = weights - torch.linalg.solve(hessian, gradient).clamp(-1.0, 1.0)
-    return float(weights[0]), float(weights[1])
+    Source: Platt, "Probabilistic outputs for support vector machines", 1999, with a weak prior at 1
+    and 0."""
+
+    def loss(weights: ndarray) -> float:
+        logit = weights[0] * logits.numpy() + weights[1]
+        prior = 0.25 * ((weights - start) ** 2).sum()
+        return (np.logaddexp(0.0, logit) - hits.numpy() * logit).sum() + prior
+
+    start = np.array([1.0, 0.0])
+    factor, offset = minimize(loss, start).x
+    return float(factor), float(offset)
 
 
 def _angle_between(rays: Tensor, references: Tensor) -> Tensor:
     """Angles between unit rays [rad], exact for small ones."""
     sine = torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1)
-    backward = (rays * references).sum(-1) < 0.0
-    return sine.clamp(max=1.0).asin() + backward * math.pi / 2
+    return torch.atan2(sine, (rays * references).sum(-1))
 
 
 def _chosen(labels: Labels, rows: Tensor) -> Labels:

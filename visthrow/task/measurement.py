@@ -23,6 +23,12 @@ def pilots_hover() -> RandomizationParams:
     return config.load(RandomizationParams, config.find("start", "hover"))
 
 
+def without_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:
+    """Return columns, a row a throw, with NaN in the rows of failed throws."""
+    blank = np.where(success, 1.0, np.nan)
+    return {name: (blank * values.T).T for name, values in columns.items()}
+
+
 @dataclass(frozen=True)
 class Throws:
     """Results of N throws at one target; entries of failed throws are NaN."""

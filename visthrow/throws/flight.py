@@ -16,6 +16,7 @@ from numpy import ndarray
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.onboard.pilot import Pilot
 from visthrow.task import Experiment
+from visthrow.task.measurement import without_failed
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
 from visthrow.training import terminations
@@ -400,18 +401,15 @@ class Scores(FlightObserver):
         """Return a row a throw, NaN where it failed; ``goal_w`` where goals move."""
         landing = flight.plant.landing
         success = landing.landed & ~flight.failed
-        blank = np.where(success, 1.0, np.nan)
-        point = landing.point_w[:, :2] * blank[:, None]
+        point = landing.point_w[:, :2]
         goal = flight.goal_at(landing.time)[:, :2]
-        if np.any(flight.pilots.goal_vel_w):
-            moving = {"goal_w": goal * blank[:, None]}
-        else:
-            moving = {}
-        return {
-            "success": success,
+        columns = {
             "landing_w": point,
             "error": np.linalg.norm(point - goal, axis=1),
-            "duration": (landing.time - flight.begin) * blank,
-            "clearance": np.where(success, self.clearance, np.nan),
-            "smoothness": self.smoothness.value * blank,
-        } | moving
+            "duration": landing.time - flight.begin,
+            "clearance": self.clearance,
+            "smoothness": self.smoothness.value,
+        }
+        if np.any(flight.pilots.goal_vel_w):
+            columns["goal_w"] = goal
+        return {"success": success} | without_failed(success, columns)

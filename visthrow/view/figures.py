@@ -1,6 +1,6 @@
 """Pictures of the report: intervals, scatter, fronts, curves.
 
-All in the style of :mod:`visthrow.common.style`.
+All in the style of :mod:`visthrow.view.style`.
 """
 
 from collections.abc import Sequence
@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
-from visthrow.common import style
 from visthrow.common.statistics import Interval, pareto
 from visthrow.common.toml_text import tables_beside
+from visthrow.view import style
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # width of a picture over the whole page [inch]

@@ -20,6 +20,7 @@ from camera.overlay import draw_overlay
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
 from visthrow.common.storage import atomic_write
+from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import FlightLog
 
 IMAGE_PERIOD = 0.04  # between two pictures of the image plane [s]
@@ -29,6 +30,9 @@ _SCHEMAS = Path(__file__).parent / "data/mcap_schemas.json"
 
 Rates are in rad/s; a signal's unit and frame are its channel's metadata.
 """
+
+SCENE = tables_beside(__file__, "data/mcap_scene.toml")
+"""Thing of the 3D panel -> how it looks."""
 
 Message = tuple[float, str, str, dict[str, Any]]
 """Time [s], topic, schema, content; `write` adds the time to a content of Foxglove's."""
@@ -116,40 +120,23 @@ def _scene(log: FlightLog, experiment: Any) -> Iterator[Message]:
     """Rope, ball and goal as things of the 3D panel."""
 
     def thing(time: float, name: str, kind: str, shape: dict[str, Any]) -> Message:
-        entity = {
-            "frame_id": "world",
-            "id": name,
-            "frame_locked": False,
-            kind: [shape],
-        }
+        entity = {"frame_id": "world", "id": name, "frame_locked": False, kind: [shape]}
         return time, "/scene", "foxglove.SceneUpdate", {"deletions": [], "entities": [entity]}
 
     for time, row in _rows(log, "cable_points_w"):
-        line = {
-            "type": 0,
-            "pose": _pose((0.0, 0.0, 0.0)),
-            "thickness": 0.006,
-            "scale_invariant": False,
-            "points": [_named("xyz", point) for point in row],
-            "color": _named("rgba", (0.35, 0.3, 0.25, 1.0)),
-            "colors": [],
-            "indices": [],
-        }
-        yield thing(time, "rope", "lines", line)
+        points = [_named("xyz", point) for point in row]
+        line = {"pose": _pose((0.0, 0.0, 0.0)), "points": points}
+        yield thing(time, "rope", "lines", line | SCENE["rope"])
     width = 2.0 * experiment.rope.payload_radius
     side = experiment.camera.goal_side
     solids = (
-        ("payload_pos_w", "ball", "spheres", (width, width, width), (0.8, 0.85, 0.1, 1.0)),
-        ("goal_w", "goal", "cubes", (side, side, 0.004), (0.2, 0.7, 0.3, 1.0)),
+        ("payload_pos_w", "ball", "spheres", (width, width, width)),
+        ("goal_w", "goal", "cubes", (side, side, 0.004)),
     )
-    for channel, name, kind, size, colour in solids:
+    for channel, name, kind, size in solids:
         for time, row in _rows(log, channel):
-            solid = {
-                "pose": _pose(row),
-                "size": _named("xyz", size),
-                "color": _named("rgba", colour),
-            }
-            yield thing(time, name, kind, solid)
+            solid = {"pose": _pose(row), "size": _named("xyz", size)}
+            yield thing(time, name, kind, solid | SCENE[name])
 
 
 def _pictures(log: FlightLog, experiment: Any) -> Iterator[Message]:

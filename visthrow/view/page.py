@@ -1,11 +1,9 @@
 """Puts sections into one self-contained page, and into Markdown with its pictures beside it."""
 
 import base64
-import functools
 import html
 import re
 from collections.abc import Sequence
-from importlib import resources
 from pathlib import Path
 
 from visthrow import __version__
@@ -13,6 +11,9 @@ from visthrow.common.storage import atomic_write
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
+LEADS = {"missing": "*Missing.* ", "finding": "- "}
+"""Kind of a paragraph -> what stands before it in Markdown."""
+
 _CODE = re.compile(r"`(.+?)`")
 
 
@@ -21,31 +22,20 @@ def _marked(text: str) -> str:
     return _CODE.sub(r"<code>\1</code>", _BOLD.sub(r"<b>\1</b>", html.escape(text, quote=False)))
 
 
-def _is_kind(kind: type, part: object) -> bool:
-    return isinstance(part, kind)
-
-
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the whole page; it loads nothing from elsewhere."""
     import jinja2
     import markupsafe
 
-    template = (
-        resources.files("visthrow.view").joinpath("data/page.html.j2").read_text(encoding="utf-8")
-    )
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
+    loader = jinja2.PackageLoader("visthrow.view", "data")
+    how = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
+    environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, **how)
     environment.filters["marked"] = lambda text: markupsafe.Markup(_marked(text))
     environment.filters["inline"] = lambda png: (
         "data:image/png;base64," + base64.b64encode(png).decode("ascii")
     )
-    for kind in (Text, Grid, Picture):
-        test = functools.partial(_is_kind, kind)
-        environment.tests[kind.__name__.lower()] = test
-    return environment.from_string(template).render(
-        title=title, lead=lead, sections=sections, version=__version__
-    )
+    template = environment.get_template("page.html.j2")
+    return template.render(title=title, lead=lead, sections=sections, version=__version__)
 
 
 def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
@@ -55,10 +45,7 @@ def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
         lines.append(f"## {section.title}")
         for part in section.parts:
             if isinstance(part, Text):
-                lines.append(
-                    {"missing": "*Missing.* ", "finding": "- ", "why": ""}.get(part.kind, "")
-                    + part.text
-                )
+                lines.append(LEADS.get(part.kind, "") + part.text)
             elif isinstance(part, Grid):
                 lines.append(part.markdown())
             else:

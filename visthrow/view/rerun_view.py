@@ -19,11 +19,11 @@ from numpy import ndarray
 from camera.fisheye import Fisheye
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera
 from camera.params import CameraParams
-from visthrow.common import style
 from visthrow.common.errors import StorageError
 from visthrow.common.storage import atomic_write
 from visthrow.common.toml_text import tables_beside
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view import style
 
 TIMELINE = "throw_time"
 SIGNALS = tables_beside(__file__, "data/signals.toml")
@@ -46,7 +46,7 @@ def whole(stream: rr.RecordingStream, log: FlightLog, experiment: Any) -> None:
     send(stream, log)
     if "landing" in log:
         _landing(stream, log)
-    for name, entity, _ in TRAILS:
+    for name, entity in TRAILS.items():
         _trail(stream, log, name, entity)
 
 
@@ -84,53 +84,52 @@ def colour_code(hexadecimal: str, alpha: int = 255) -> list[int]:
     return [*(int(hexadecimal[i : i + 2], 16) for i in (1, 3, 5)), alpha]
 
 
-TRAILS = (
-    ("payload_pos_w", "world/trail/ball", style.PAYLOAD),
-    ("pos_w", "world/trail/vehicle", style.QUIET),
-)
-"""Channel, entity and colour of the lines that grow during a throw."""
+TRAILS = {"payload_pos_w": "world/trail/ball", "pos_w": "world/trail/vehicle"}
+"""Channel -> entity of the lines that grow during a throw."""
+
+
+def _looks() -> dict[str, dict[str, Any]]:
+    looks = tables_beside(__file__, "data/rerun_looks.toml")
+    for look in looks.values():
+        opacity = look.pop("opacity", 255)
+        names = look["colors"]
+        look["colors"] = [colour_code(getattr(style, name, name), opacity) for name in names]
+    return looks
+
+
+LOOKS = _looks()
+"""Entity -> how the viewer draws it."""
 
 
 def still(stream: rr.RecordingStream, goal_w: Any, experiment: Any) -> None:
     """Send what does not move: ground, shapes, strokes, the camera's field of view; the target is
     at ``goal_w`` [m], shape (3,).
     """
-    goal = np.asarray(goal_w, dtype=float)
-    scene = _scene(goal, experiment) | _vehicle(experiment.vehicle.rotors)
-    for entity, shapes in (scene | _plane(experiment.camera)).items():
-        stream.log(entity, *shapes, static=True)
+    _draw_scene(stream, np.asarray(goal_w, dtype=float), experiment)
+    _draw_vehicle(stream, experiment.vehicle.rotors)
+    _draw_plane(stream, experiment.camera)
 
 
-Shapes = dict[str, tuple[Any, ...]]
-"""Entity -> what is drawn there for good."""
+def _draw(stream: rr.RecordingStream, entity: str, shape: Any, *places: Any, **values: Any) -> None:
+    """Send a shape that does not move, as :data:`LOOKS` has it."""
+    stream.log(entity, shape(*places, **values, **LOOKS[entity]), static=True)
 
 
-def _scene(goal: ndarray, experiment: Any) -> Shapes:
-    """Ground, goal, ball, rope and trails."""
+def _draw_scene(stream: rr.RecordingStream, goal: ndarray, experiment: Any) -> None:
+    """Send ground, goal, ball, rope and trails."""
+    stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     reach = 0.5 * np.abs(goal[:2]) + FIELD
     middle = [*(0.5 * goal[:2]), -0.011]
-    box = {"centers": [middle], "half_sizes": [[*reach, 0.01]]}
-    floor = rr.Boxes3D(**box, colors=[[232, 230, 224]], fill_mode="solid")
+    _draw(stream, "world/ground", rr.Boxes3D, centers=[middle], half_sizes=[[*reach, 0.01]])
     half = experiment.camera.goal_side / 2.0
     corners = half * np.array([[1, 1, 0], [1, -1, 0], [-1, -1, 0], [-1, 1, 0], [1, 1, 0]])
-    green = [colour_code(style.GOAL)]
-    square = rr.LineStrips3D([corners + [0, 0, 0.003]], radii=0.006, colors=green)
-    sizes = [[experiment.rope.payload_radius] * 3]
-    yellow = [colour_code(style.PAYLOAD)]
-    ball = rr.Ellipsoids3D(half_sizes=sizes, colors=yellow, fill_mode="solid")
-    strip = rr.LineStrips3D.from_fields
-    brown = [colour_code(style.ROPE)]
-    shapes: Shapes = {}
-    for _, entity, colour in TRAILS:
-        shapes[entity] = (strip(radii=0.004, colors=[colour_code(colour, 170)]),)
-    return shapes | {
-        "world": (rr.ViewCoordinates.RIGHT_HAND_Z_UP,),
-        "world/ground": (floor,),
-        "world/goal": (square, rr.Transform3D(translation=goal)),
-        "world/goal/centre": (rr.Points3D([[0.0, 0.0, 0.0]], radii=0.012, colors=green),),
-        "world/ball": (ball,),
-        "world/rope": (strip(radii=0.003, colors=brown),),
-    }
+    stream.log("world/goal", rr.Transform3D(translation=goal), static=True)
+    _draw(stream, "world/goal", rr.LineStrips3D, [corners + [0, 0, 0.003]])
+    _draw(stream, "world/goal/centre", rr.Points3D, [[0.0, 0.0, 0.0]])
+    radius = experiment.rope.payload_radius
+    _draw(stream, "world/ball", rr.Ellipsoids3D, half_sizes=[[radius] * 3])
+    for entity in ("world/rope", *TRAILS.values()):
+        _draw(stream, entity, rr.LineStrips3D.from_fields)
 
 
 def send(stream: rr.RecordingStream, log: FlightLog) -> None:
@@ -160,27 +159,19 @@ def send(stream: rr.RecordingStream, log: FlightLog) -> None:
 
 def _landing(stream: rr.RecordingStream, log: FlightLog) -> None:
     label = f"{100 * log.meta['result']['error']:.1f} cm off"
-    mark = rr.Points3D.from_fields(radii=0.015, colors=[colour_code(style.INK)], labels=[label])
-    stream.log("world/landing", mark, static=True)
+    _draw(stream, "world/landing", rr.Points3D.from_fields, labels=[label])
     where = rr.Points3D.columns(positions=log["landing"].values.astype(np.float32))
     _send(stream, "world/landing", log, "landing", where)
 
 
-def _vehicle(rotors: Any) -> Shapes:
+def _draw_vehicle(stream: rr.RecordingStream, rotors: Any) -> None:
     hubs = np.column_stack((rotors.x, rotors.y, np.full(4, rotors.z)))
     arms = [np.vstack(([0.0, 0.0, rotors.z], hub)) for hub in hubs]
-    dark = [colour_code(style.VEHICLE)]
-    # the front ones stand out
-    colours = [style.COLOURS[0] if hub[0] > 0 else "#9AA5B1" for hub in hubs]
     disc = [rotors.radius, rotors.radius, 0.002]
-    look = {"fill_mode": "solid", "colors": list(map(colour_code, colours))}
-    discs = rr.Ellipsoids3D(centers=hubs + [0, 0, 0.008], half_sizes=[disc] * 4, **look)
-    body = rr.Boxes3D(half_sizes=[[0.028, 0.018, 0.014]], colors=dark, fill_mode="solid")
-    return {
-        "world/vehicle/arms": (rr.LineStrips3D(arms, radii=0.005, colors=dark),),
-        "world/vehicle/body": (body,),
-        "world/vehicle/rotors": (discs,),
-    }
+    centers = hubs + [0, 0, 0.008]
+    _draw(stream, "world/vehicle/arms", rr.LineStrips3D, arms)
+    _draw(stream, "world/vehicle/body", rr.Boxes3D, half_sizes=[[0.028, 0.018, 0.014]])
+    _draw(stream, "world/vehicle/rotors", rr.Ellipsoids3D, centers=centers, half_sizes=[disc] * 4)
 
 
 def _trail(stream: rr.RecordingStream, log: FlightLog, name: str, entity: str) -> None:
@@ -202,13 +193,16 @@ def trail(stream: rr.RecordingStream, name: str, time: float, points: ndarray) -
     Its channel is one of :data:`TRAILS`, its end at a time [s], zero as in the logs sent; points
     [m], shape (N, 3)."""
     stream.set_time(TIMELINE, duration=time)
-    entity = next(entity for channel, entity, _ in TRAILS if channel == name)
-    stream.log(entity, rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
+    stream.log(TRAILS[name], rr.LineStrips3D.from_fields(strips=[points.astype(np.float32)]))
 
 
-def _plane(camera: CameraParams) -> Shapes:
-    """Field of view and body axes, in normalised image coordinates times 100, so that the viewer's
-    strokes fit.
+GROUPS = {"goal": slice(GOAL_KEYPOINTS), "payload": slice(GOAL_KEYPOINTS, None)}
+"""Things -> their keypoints."""
+
+
+def _draw_plane(stream: rr.RecordingStream, camera: CameraParams) -> None:
+    """Send field of view and body axes, in normalised image coordinates times 100, so that the
+    viewer's strokes fit.
     """
     import torch
 
@@ -216,43 +210,28 @@ def _plane(camera: CameraParams) -> Shapes:
     angle = np.linspace(0.0, 2.0 * np.pi, 121)
     circle = 100 * np.column_stack((np.cos(angle), np.sin(angle)))
     right = float(lens.radius_from_angle(torch.tensor(np.pi / 2)) / lens.edge_radius)
-    grey = [150, 150, 150]
-    look = {"colors": [grey, [80, 80, 80]], "radii": [0.7, 0.4], "show_labels": False}
-    rings = rr.LineStrips2D([circle, right * circle], **look)
+    _draw(stream, "camera/field_of_view", rr.LineStrips2D, [circle, right * circle])
     # a strip's own label would stand in the middle, on the ball
     places = [[0.0, 95.0], [0.0, 100.0 * right - 4.0]]
     names = [f"{camera.fisheye.fov_deg / 2:g}° off the axis", "90°"]
+    _draw(stream, "camera/angles", rr.Points2D, places, labels=names)
     # rows: the body's x and y as directions in the image
     axes = 22.0 * KeypointCamera(camera).rot_cb.numpy().T[:2, :2]
-    pale = [200, 200, 200]
-    arrows = rr.Arrows2D(vectors=axes, radii=0.5, colors=pale, show_labels=False)
-    labels = rr.Points2D(1.2 * axes, labels=["x", "y"], radii=0.1, colors=pale)
-    point = rr.Points2D.from_fields
-    shapes: Shapes = {
-        "camera/field_of_view": (rings,),
-        "camera/angles": (rr.Points2D(places, labels=names, radii=0.1, colors=grey),),
-        "camera/body_axes": (arrows,),
-        "camera/body_axes/names": (labels,),
-        "camera/invalid": (point(radii=1.2, colors=[[170, 170, 170]]),),
-    }
-    for name, colour in GROUPS.items():
-        outline = rr.LineStrips2D.from_fields(radii=0.5, colors=[colour])
-        shapes[f"camera/{name}"] = (point(radii=1.8, colors=[colour]),)
-        shapes[f"camera/{name}/outline"] = (outline,)
-    return shapes
-
-
-GROUPS = {"goal": [60, 200, 80], "payload": [230, 60, 60]}  # keypoints and their colours
+    _draw(stream, "camera/body_axes", rr.Arrows2D, vectors=axes)
+    _draw(stream, "camera/body_axes/names", rr.Points2D, 1.2 * axes, labels=["x", "y"])
+    for name in ("invalid", *GROUPS):
+        _draw(stream, f"camera/{name}", rr.Points2D.from_fields)
+    for name in GROUPS:
+        _draw(stream, f"camera/{name}/outline", rr.LineStrips2D.from_fields)
 
 
 def _image(stream: rr.RecordingStream, log: FlightLog) -> None:
-    """Keypoints in the plane of :func:`_plane`; those that are not valid stand grey where they
+    """Keypoints in the plane of :func:`_draw_plane`; those that are not valid stand grey where they
     read.
     """
     points = 100.0 * log["keypoints"].values
     valid = log["keypoints_valid"].values.astype(bool)
-    parts = (slice(GOAL_KEYPOINTS), slice(GOAL_KEYPOINTS, None))
-    for name, part in zip(GROUPS, parts, strict=True):
+    for name, part in GROUPS.items():
         _points(stream, log, f"camera/{name}", points[:, part], valid[:, part])
         _outline(stream, log, name, points[:, part], valid[:, part].all(axis=1))
     _points(stream, log, "camera/invalid", points, ~valid)

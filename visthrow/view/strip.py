@@ -11,11 +11,11 @@ import torch
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, keypoints
 from camera.overlay import draw_overlay
 from camera.params import CameraParams
-from visthrow.common import style
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.common.storage import atomic_write
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view import style
 from visthrow.view.figures import LOOKS
 from visthrow.view.parts import png_of
 

@@ -133,8 +133,8 @@ def draw(path: str | Path, stages: Stages, title: str) -> None:
     """Draw for each stage how many of its times are longer than a time, as a PNG file; raises
     `StorageError` where it cannot be written.
     """
-    from visthrow.common import style
     from visthrow.common.storage import atomic_write
+    from visthrow.view import style
     from visthrow.view.parts import png_of
 
     style.use()

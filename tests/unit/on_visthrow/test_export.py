@@ -76,7 +76,7 @@ def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
 def test_onnx_gives_the_policys_actions(name, tmp_path):
     from onnx.reference import ReferenceEvaluator
 
-    from visthrow.cli.onnx_file import write_onnx
+    from visthrow.cli.export.onnx_file import write_onnx
 
     policy = POLICIES[name]
     write_onnx(policy, tmp_path / "policy.onnx")
@@ -92,7 +92,7 @@ def test_onnx_gives_the_policys_actions(name, tmp_path):
 
 @mark.parametrize("name", ["state", "recurrent"])
 def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
-    from visthrow.cli.c_source import write_c
+    from visthrow.cli.export.c_source import write_c
 
     policy = POLICIES[name]
     source, library = tmp_path / "policy.c", tmp_path / "policy.so"

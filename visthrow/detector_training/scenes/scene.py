@@ -59,10 +59,6 @@ class Scenes:
         """Return the scenes on another device."""
         return Scenes(*(table.to(device) for table in vars(self).values()))
 
-    def part(self, rows: slice) -> "Scenes":
-        """Return some of the scenes."""
-        return Scenes(*(table[rows] for table in vars(self).values()))
-
 
 def lens_row(lens: FisheyeParams, vignetting: float = 0.5) -> Tensor:
     """Row of a lens, shape (10,)."""

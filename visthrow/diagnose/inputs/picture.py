@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from visthrow.common import style
 from visthrow.common.storage import atomic_write
 from visthrow.logs.check.rows import worst
 from visthrow.logs.check.run import Checked
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view import style
 from visthrow.view.parts import png_of
 
 CHANNELS_DRAWN = 10  # channels in a picture

@@ -1,4 +1,4 @@
-"""Pictures of a diagnosis, in the style of :mod:`visthrow.common.style`; each function returns a
+"""Pictures of a diagnosis, in the style of :mod:`visthrow.view.style`; each function returns a
 PNG.
 """
 
@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from visthrow.common import style
 from visthrow.diagnose.likelihood.evidence import covariance
 from visthrow.diagnose.likelihood.forms import READABLE, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
@@ -18,6 +17,7 @@ from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.held_out import Work
 from visthrow.diagnose.select.result import Diagnosis
+from visthrow.view import style
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # [inch]

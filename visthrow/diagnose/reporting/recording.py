@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from visthrow.common import style
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.reporting.pictures import AFTER, BEFORE, left_over
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog
+from visthrow.view import style
 from visthrow.view.rerun_view import colour_code, recording
 
 TIMELINE = "flight_time"

@@ -22,7 +22,7 @@ from visthrow.paper.baseline.mpc import MPC, MPCParams, SolverError
 from visthrow.paper.baseline.pendulum_model import Pendulum
 from visthrow.paper.baseline.throw_plan import ThrowPlan, landing_point
 from visthrow.task import Experiment
-from visthrow.task.measurement import Throws, pilots_hover
+from visthrow.task.measurement import Throws, pilots_hover, without_failed
 from visthrow.throws.flight import (
     FALL_TIME,
     Decision,
@@ -60,13 +60,21 @@ class Flown(Throws):
     step_times: ndarray  # of all steps of the controller [s], shape (K,)
 
 
-def _off(plan: ThrowPlan, pos_w: ndarray, vel_w: ndarray, good: ndarray) -> dict[str, ndarray]:
-    """Distances of payloads from the planned release at separation; NaN where a throw failed."""
-    blank = np.where(good, 1.0, np.nan)
-    return {
-        "position_error": np.linalg.norm(pos_w - plan.release.pos_w, axis=1) * blank,
-        "velocity_error": np.linalg.norm(vel_w - plan.release.vel_w, axis=1) * blank,
-    }
+def _flown(
+    plan: ThrowPlan,
+    success: ndarray,
+    separated: tuple[ndarray, ndarray] | ndarray,
+    step_times: list[float],
+    **columns: ndarray,
+) -> Flown:
+    """Results of throws; ``separated``: position [m] and velocity [m/s] of the payloads at
+    separation.
+    """
+    pos_w, vel_w = separated
+    columns["position_error"] = np.linalg.norm(pos_w - plan.release.pos_w, axis=1)
+    columns["velocity_error"] = np.linalg.norm(vel_w - plan.release.vel_w, axis=1)
+    columns = without_failed(success, columns)
+    return Flown(plan.target, success, **columns, step_times=np.array(step_times))
 
 
 def _normalised(params: MPCParams, command: ndarray) -> ndarray:
@@ -92,19 +100,14 @@ def random_starts(plan: ThrowPlan, count: int, seed: int) -> ndarray:
     state[:, pm.POS] += sample(start.position)
     state[:, pm.VEL] += sample(start.velocity)
     state[:, pm.DIR] += np.tan(math.radians(start.cable_angle_deg)) * sample([1.0, 1.0, 0.0])
-    state[:, pm.DIR] /= np.linalg.norm(state[:, pm.DIR], axis=1, keepdims=True)
-    rate = math.radians(start.cable_rate_deg) * sample([1.0, 1.0, 1.0])
-    state[:, pm.RATE] = rate - (rate * state[:, pm.DIR]).sum(1, keepdims=True) * state[:, pm.DIR]
+    state[:, pm.RATE] = math.radians(start.cable_rate_deg) * sample([1.0, 1.0, 1.0])
     state[:, 12:15] = 0.5 * np.radians(sample(start.attitude_deg))
-    state[:, pm.QUAT] /= np.linalg.norm(state[:, pm.QUAT], axis=1, keepdims=True)
+    pm.normalise(state.T)
     return state
 
 
-def fly_pendulum(
-    plan: ThrowPlan, count: int = 10, seed: int = 0, landing_height: float = 0.04
-) -> Flown:
-    """Fly a plan so many times in the pendulum that the controller believes in; the landing's
-    height [m] is the payload's centre's.
+def fly_pendulum(plan: ThrowPlan, count: int = 10, seed: int = 0) -> Flown:
+    """Fly a plan so many times in the pendulum that the controller believes in.
 
     A throw fails when the controller's programme is not solved, the cable slackens or the payload
     falls short. The release comes at the plan's time, within a control period if need be."""
@@ -138,22 +141,19 @@ def fly_pendulum(
         except SolverError:
             good[e] = False
         smoothness[e] = change.value[0]
-    point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], landing_height)
+    point, fall = landing_point(state[:, pm.POS], state[:, pm.VEL], plan.release.landing_height)
     good &= np.isfinite(fall)
-    blank = np.where(good, 1.0, np.nan)
-    landing = point * blank[:, None]
-    error = np.linalg.norm(landing - [plan.target, 0.0], axis=1)
-    return Flown(
-        plan.target,
+    return _flown(
+        plan,
         good,
-        landing,
-        error,
-        (plan.path.duration + fall) * blank,
-        np.full(count, np.nan),
-        smoothness * blank,
-        **_off(plan, state[:, pm.POS], state[:, pm.VEL], good),
-        tracking=np.sqrt(tracking / steps) * blank,
-        step_times=np.array(times),
+        (state[:, pm.POS], state[:, pm.VEL]),
+        times,
+        landing_w=point,
+        error=np.linalg.norm(point - [plan.target, 0.0], axis=1),
+        duration=plan.path.duration + fall,
+        clearance=np.full(count, np.nan),
+        smoothness=smoothness,
+        tracking=np.sqrt(tracking / steps),
     )
 
 
@@ -322,10 +322,7 @@ class Controllers(Pilots):
         side = np.sign((predicted[:, pm.QUAT] * measured[:, pm.QUAT]).sum(1, keepdims=True))
         measured[:, pm.QUAT] *= side
         estimate = predicted + TRUST * (measured - predicted)
-        for part in (pm.DIR, pm.QUAT):
-            estimate[:, part] /= np.linalg.norm(estimate[:, part], axis=1, keepdims=True)
-        direction = estimate[:, pm.DIR]
-        estimate[:, pm.RATE] -= (estimate[:, pm.RATE] * direction).sum(1, keepdims=True) * direction
+        pm.normalise(estimate.T)
         self._estimate = estimate
         return estimate
 
@@ -351,9 +348,8 @@ class _Tracking(Scores):
         self._period += 1
         elapsed = self._period * flight.plant.period
         due = current.attached & (elapsed <= path.duration)
-        self._sum += due * (
-            (current.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]) ** 2
-        ).sum(1)
+        off = current.payload_pos_w - path.sample(np.array([elapsed]))[0, 0]
+        self._sum += due * (off**2).sum(1)
         self._due += due
         for e in np.flatnonzero(snapshot.attached & ~current.attached):
             since = flight.plant.time - flight.plant.landing.separation_time[e]
@@ -366,17 +362,10 @@ class _Tracking(Scores):
     def flown(self, flight: Flight) -> Flown:
         """Results of all throws."""
         columns = self.columns(flight)
-        off = _off(self.pilots.plan, *self.separated, columns["success"])
-        tracking = np.sqrt(self._sum / np.maximum(self._due, 1)) * np.where(
-            columns["success"], 1.0, np.nan
-        )
-        return Flown(
-            self.pilots.plan.target,
-            **columns,
-            **off,
-            tracking=tracking,
-            step_times=np.array(self.pilots.times),
-        )
+        columns["tracking"] = np.sqrt(self._sum / np.maximum(self._due, 1))
+        plan = self.pilots.plan
+        success = columns.pop("success")
+        return _flown(plan, success, self.separated, self.pilots.times, **columns)
 
 
 def fly_plant(

@@ -27,7 +27,7 @@ CORNER = (2.5, 0.5)  # duration [s] and landing error [m] that hypervolumes are 
 
 def hypervolume(points: np.ndarray, corner: tuple[float, float] = CORNER) -> float:
     """Area between points (N, 2), smaller is better, and a corner [s m]."""
-    dominating = points[np.all(points < corner, axis=1)] if len(points) else points
-    front = dominating[pareto(dominating)] if len(dominating) else dominating
-    right = np.append(front[1:, 0], corner[0]) if len(front) else front
-    return float(((right - front[:, 0]) * (corner[1] - front[:, 1])).sum()) if len(front) else 0.0
+    dominating = points[np.all(points < corner, axis=1)]
+    front = dominating[pareto(dominating)]
+    widths = np.diff(front[:, 0], append=corner[0])
+    return float((widths * (corner[1] - front[:, 1])).sum())

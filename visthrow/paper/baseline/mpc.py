@@ -104,21 +104,15 @@ class MPC:
         """
         n = self.params.stages
         eye = np.arange(STATES)
-        row = [eye]
-        column = [eye]
+        places = [(eye, eye)]
         for k in range(n):
-            block = np.meshgrid(eye + (k + 1) * STATES, np.arange(WIDTH) + k * WIDTH, indexing="ij")
-            row += [block[0].ravel(), eye + (k + 1) * STATES]
-            column += [block[1].ravel(), eye + (k + 1) * WIDTH]
-        row = np.concatenate(row)
-        column = np.concatenate(column)
-        self._order = np.lexsort((row, column))
-        shape = ((n + 1) * STATES, n * WIDTH + STATES)
-        count = np.bincount(column, minlength=shape[1])
-        pointer = np.concatenate([[0], np.cumsum(count)])
-        self._matrix = sparse.csc_matrix(
-            (np.ones(len(row)), row[self._order], pointer), shape=shape
-        )
+            row, column = np.indices((STATES, WIDTH)).reshape(2, -1)
+            places.append((row + (k + 1) * STATES, column + k * WIDTH))
+            places.append((eye + (k + 1) * STATES, eye + (k + 1) * WIDTH))
+        row, column = np.concatenate(places, axis=1)
+        numbered = sparse.csc_matrix((np.arange(len(row)), (row, column)))
+        self._order = numbered.data
+        self._matrix = sparse.csc_matrix((np.ones(len(row)), numbered.indices, numbered.indptr))
 
     def _fill(self, by_state: ndarray, by_input: ndarray) -> None:
         n = self.params.stages

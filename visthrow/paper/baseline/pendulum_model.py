@@ -30,6 +30,9 @@ DIR = slice(6, 9)
 RATE = slice(9, 12)
 QUAT = slice(12, 16)
 
+_SUCCESSOR = [1, 2, 0]  # axes of a cross product
+_LAST = [2, 0, 1]
+
 _TINY = 1e-30  # complex step: so small that the derivative has no truncation error
 
 
@@ -67,26 +70,21 @@ def derivative(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
     """Rate of change of states, shape (16, ...), under thrust [N] and body rates [rad/s], shape (4,
     ...); complex numbers pass through.
     """
-    qx, qy, qz, wx, wy, wz, x, y, z, w = state[6:]
+    direction = state[DIR]
+    rate = state[RATE]
+    x, y, z, w = state[QUAT]
     thrust, p, q, r = control
-    bx = 2.0 * (x * z + w * y)
-    thrust_y = 2.0 * (y * z - w * x)
-    bz = 1.0 - 2.0 * (x * x + y * y)
-    along_cable = thrust * (qx * bx + qy * thrust_y + qz * bz)
-    inward = model.vehicle_mass * model.length * (wx * wx + wy * wy + wz * wz)
+    axis = np.array([2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)])
+    lever = model.vehicle_mass * model.length
+    along_cable = thrust * (direction * axis).sum(0)
+    inward = lever * (rate * rate).sum(0)
     pull = (along_cable - inward) / (model.vehicle_mass + model.payload_mass)
-    turn = -thrust / (model.vehicle_mass * model.length)
     out = np.empty_like(state)
-    out[0:3] = state[3:6]
-    out[3] = pull * qx
-    out[4] = pull * qy
-    out[5] = pull * qz - GRAVITY
-    out[6] = wy * qz - wz * qy
-    out[7] = wz * qx - wx * qz
-    out[8] = wx * qy - wy * qx
-    out[9] = turn * (qy * bz - qz * thrust_y)
-    out[10] = turn * (qz * bx - qx * bz)
-    out[11] = turn * (qx * thrust_y - qy * bx)
+    out[POS] = state[VEL]
+    out[VEL] = pull * direction
+    out[5] -= GRAVITY
+    out[DIR] = _cross(rate, direction)
+    out[RATE] = -thrust / lever * _cross(direction, axis)
     out[12] = 0.5 * (w * p + y * r - z * q)
     out[13] = 0.5 * (w * q + z * p - x * r)
     out[14] = 0.5 * (w * r + x * q - y * p)
@@ -94,19 +92,29 @@ def derivative(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
     return out
 
 
-def _advance(model: Pendulum, state: ndarray, control: ndarray, period: float) -> ndarray:
-    """One step of the classical Runge-Kutta method, then direction and quaternion at unit length, w
-    across q.
+def _cross(a: ndarray, b: ndarray) -> ndarray:
+    """Cross product of vectors, shape (3, ...) each."""
+    return a[_SUCCESSOR] * b[_LAST] - a[_LAST] * b[_SUCCESSOR]
+
+
+def normalise(columns: ndarray) -> None:
+    """Bring direction and quaternion of states, shape (16, ...), to unit length and the cable's
+    rate across its direction, in place; written without conjugates for the complex step.
     """
+    direction = columns[DIR]
+    direction /= np.sqrt((direction * direction).sum(0))
+    columns[RATE] -= direction * (direction * columns[RATE]).sum(0)
+    columns[QUAT] /= np.sqrt((columns[QUAT] * columns[QUAT]).sum(0))
+
+
+def _advance(model: Pendulum, state: ndarray, control: ndarray, period: float) -> ndarray:
+    """One step of the classical Runge-Kutta method, then :func:`normalise`."""
     k1 = derivative(model, state, control)
     k2 = derivative(model, state + (0.5 * period) * k1, control)
     k3 = derivative(model, state + (0.5 * period) * k2, control)
     k4 = derivative(model, state + period * k3, control)
     out = state + (period / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
-    # written without conjugates for the complex step
-    out[DIR] /= np.sqrt((out[DIR] * out[DIR]).sum(0))
-    out[RATE] -= out[DIR] * (out[DIR] * out[RATE]).sum(0)
-    out[QUAT] /= np.sqrt((out[QUAT] * out[QUAT]).sum(0))
+    normalise(out)
     return out
 
 
@@ -156,15 +164,6 @@ def tension(model: Pendulum, state: ndarray, control: ndarray) -> ndarray:
     pull = derivative(model, np.moveaxis(state, -1, 0), np.moveaxis(control, -1, 0))[3:6].copy()
     pull[2] += GRAVITY
     return -model.payload_mass * (pull * np.moveaxis(state, -1, 0)[DIR]).sum(0)
-
-
-def vehicle(model: Pendulum, state: ndarray) -> tuple[ndarray, ndarray]:
-    """Position [m] and velocity [m/s] of the vehicle, shape (..., 3) each."""
-    direction = state[..., DIR]
-    rate = state[..., RATE]
-    return state[..., POS] - model.length * direction, state[..., VEL] - model.length * np.cross(
-        rate, direction
-    )
 
 
 def hover(model: Pendulum, payload_w: ndarray) -> tuple[ndarray, ndarray]:

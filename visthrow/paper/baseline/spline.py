@@ -19,16 +19,20 @@ from functools import lru_cache
 
 import numpy as np
 from numpy import ndarray
+from scipy.interpolate import PPoly
 from scipy.optimize import least_squares
 from scipy.special import perm
 
 from sim.params import GRAVITY
 from visthrow.common.errors import VisthrowError
-from visthrow.paper.baseline.pendulum_model import Pendulum
+from visthrow.paper.baseline.pendulum_model import INPUTS, STATES, Pendulum
 
 SEGMENTS = 4
 ORDER = 8
 SMOOTH = 6  # derivatives 0 to 5 agree where two segments meet, and are given at the start
+
+PLANE = [0, 2]  # axes of the throw: ahead and up
+UP = np.array([0.0, GRAVITY])  # holds against gravity, in the plane [m/s^2]
 
 END = 5  # derivatives 0 to 4 are given at the release
 
@@ -121,12 +125,9 @@ class Spline:
         """
         time = np.atleast_1d(np.asarray(time, dtype=float))
         clipped = np.clip(time, 0.0, self.duration)
-        starts = np.concatenate([[0.0], np.cumsum(self.times)])
-        segment = np.clip(
-            np.searchsorted(starts, clipped, side="right") - 1, 0, len(self.times) - 1
-        )
-        local = clipped - starts[segment]
-        out = np.einsum("tdk,tkc->tdc", _rows(local, derivatives), self.coefficients[segment])
+        breaks = np.append(0.0, np.cumsum(self.times))
+        pieces = PPoly(self.coefficients[:, ::-1].swapaxes(0, 1), breaks)
+        out = np.stack([pieces(clipped, n) for n in range(derivatives)], axis=1)
         past = (time - clipped)[:, None]
         out[:, 0] += past * out[:, 1]
         out[:, 2:][past[:, 0] > 0.0] = 0.0
@@ -202,12 +203,9 @@ def residuals(
     path /= (times[None] ** np.arange(SMOOTH)[:, None, None])[:, :, :, None, None]
     path = path.reshape(SMOOTH, -1, 2)
     weight = np.sqrt(np.repeat(times / samples, samples, axis=1)).reshape(-1)
-    force, change = _thrust(model, path, np.array([0.0, GRAVITY]))[:2]
+    force, change = _thrust(model, path)[:2]
     size = np.linalg.norm(force, axis=1)
-    turn = (
-        np.abs(force[:, 0] * change[:, 1] - force[:, 1] * change[:, 0])
-        / np.maximum(size, 0.05) ** 2
-    )
+    turn = np.abs(_turn(force, change)) / np.maximum(size, 0.05) ** 2
     begin = np.repeat(unit[:, 0, 0, 0], SEGMENTS * samples)
     excess = np.array(
         [
@@ -238,32 +236,17 @@ def optimise(
     params: PlanParams,
     tick: tuple[float, float] = (0.02, 0.0),
 ) -> Spline:
-    """Plan the payload's path from hover to the release.
+    """Plan the payload's path from hover to the release, in the plane of x and z.
 
-    Raises PlanError: no horizontal velocity, a release beside the plane, or the optimisation does
-    not find a path.
+    Raises PlanError: the optimisation does not find a path.
 
     Args:
         model, params: whose thrust the bounds are on.
-        start_w, end_w: [m], shape (3,), in a vertical plane with ``velocity_w`` [m/s], which is not
-            vertical.
+        start_w, end_w: [m], shape (3,). velocity_w: at the release [m/s], shape (3,).
         tick: period and offset [s]: the duration is the offset and a whole number of periods, so
             that a controller of that period can release at its end.
     """
-    heading = np.array([*velocity_w[:2], 0.0])
-    speed = float(np.linalg.norm(heading))
-    if not speed > 1e-6:
-        raise PlanError(f"release velocity {velocity_w}; expected a horizontal part")
-    basis = np.stack([heading / speed, [0.0, 0.0, 1.0]])  # (2, 3)
-    aside = np.linalg.norm((end_w - start_w) - basis.T @ (basis @ (end_w - start_w)))
-    if not aside < 1e-6:
-        raise PlanError(
-            f"the release lies {aside:g} m beside the plane of start and velocity; expected it"
-            " within"
-        )
-    begin = np.array([0.0, start_w[2]])
-    velocity = basis @ velocity_w
-    end = basis @ (end_w - start_w) + begin
+    begin, end, velocity = (vector[PLANE] for vector in (start_w, end_w, velocity_w))
 
     def build(x: ndarray, total: float) -> tuple[ndarray, ndarray]:
         ratio = np.exp(np.concatenate([np.zeros((len(x), 1)), x[:, -(SEGMENTS - 1) :]], axis=1))
@@ -282,9 +265,9 @@ def optimise(
     if not np.isfinite(value):
         raise PlanError(f"no path from {start_w} to {end_w} at {velocity_w} m/s")
     unit, times = (item[0] for item in build(x[None], total))
-    lifted = (unit / (times[:, None] ** np.arange(ORDER))[:, :, None]) @ basis
-    lifted[:, 0] += [*start_w[:2], 0.0]
-    return Spline(times, lifted)
+    coefficients = np.zeros((SEGMENTS, ORDER, 3))
+    coefficients[..., PLANE] = unit / (times[:, None] ** np.arange(ORDER))[:, :, None]
+    return Spline(times, coefficients)
 
 
 def _search(objective: Callable, tick: tuple[float, float]) -> tuple[float, float, ndarray]:
@@ -346,49 +329,48 @@ def _base(begin: ndarray, end: ndarray, velocity: ndarray, total: float) -> ndar
 
 
 def flat_reference(model: Pendulum, path: ndarray) -> tuple[ndarray, ndarray]:
-    """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path, position and five
-    derivatives, shape (T, 6, 3).
+    """States (T, 16) and inputs (T, 4) of the pendulum along a payload's path in the plane of x and
+    z, position and five derivatives, shape (T, 6, 3).
 
-    The attitude is the shortest turn from level to the thrust's direction. Raises PlanError: the
-    payload falls freely, where the cable has no direction.
+    The vehicle pitches, and does not roll or yaw. Raises PlanError: the payload falls freely, where
+    the cable has no direction.
 
     Source: Sreenath, Lee, Kumar, CDC 2013, Lemma 1: payload position and heading are flat outputs.
     """
-    chain = np.moveaxis(path, 1, 0)
-    up = np.array([0.0, 0.0, GRAVITY])
-    if np.any(np.linalg.norm(chain[2] + up, axis=1) < 1e-3 * GRAVITY):
+    chain = np.moveaxis(path[..., PLANE], 1, 0)
+    if np.any(np.linalg.norm(chain[2] + UP, axis=1) < 1e-3 * GRAVITY):
         raise PlanError(
             "the planned payload falls freely; expected a taut cable all along the path"
         )
-    force, change, direction, first = _thrust(model, chain, up)
-    axis, turn = _unit(force, change)
-    half = np.column_stack([-axis[:, 1], axis[:, 0], 0.0 * axis[:, 0], 1.0 + axis[:, 2]])
-    quat, spin = _unit(
-        half, np.column_stack([-turn[:, 1], turn[:, 0], 0.0 * turn[:, 0], turn[:, 2]])
-    )
-    v = quat[:, :3]
-    w = quat[:, 3:]
-    dv = spin[:, :3]
-    dw = spin[:, 3:]
-    rates = 2.0 * (w * dv - dw * v - np.cross(v, dv))
-    state = np.concatenate(
-        [chain[0], chain[1], direction, np.cross(direction, first), quat], axis=1
-    )
-    return state, np.column_stack([np.linalg.norm(force, axis=1), rates])
+    force, change, direction, first = _thrust(model, chain)
+    pitch = np.arctan2(force[:, 0], force[:, 1])
+    state = np.zeros((len(path), STATES))
+    state[:, :6] = path[:, :2].reshape(-1, 6)
+    state[:, [6, 8]] = direction
+    state[:, 10] = direction[:, 1] * first[:, 0] - direction[:, 0] * first[:, 1]
+    state[:, 13] = np.sin(0.5 * pitch)
+    state[:, 15] = np.cos(0.5 * pitch)
+    control = np.zeros((len(path), INPUTS))
+    control[:, 0] = np.linalg.norm(force, axis=1)
+    control[:, 2] = _turn(force, change) / control[:, 0] ** 2
+    return state, control
 
 
-def _thrust(
-    model: Pendulum, chain: ndarray, up: ndarray
-) -> tuple[ndarray, ndarray, ndarray, ndarray]:
-    """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path
-    (6, T, D).
+def _turn(force: ndarray, change: ndarray) -> ndarray:
+    """Pitch rate of planar forces times their squares, from their rates of change, shape (T,)."""
+    return change[:, 0] * force[:, 1] - change[:, 1] * force[:, 0]
+
+
+def _thrust(model: Pendulum, chain: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    """Thrust vector [N], its rate of change, cable direction and its rate of change, from a path in
+    the plane (6, T, 2).
     """
     _, _, acc, jerk, snap, crackle = chain
-    unit = _unit(acc + up, jerk, snap, crackle)
+    unit = _unit(acc + UP, jerk, snap, crackle)
     direction, first, second, third = (-x for x in unit)
     mass = model.vehicle_mass + model.payload_mass
-    force = mass * (acc + up) - model.vehicle_mass * model.length * second
-    return force, mass * jerk - model.vehicle_mass * model.length * third, direction, first
+    lever = model.vehicle_mass * model.length
+    return mass * (acc + UP) - lever * second, mass * jerk - lever * third, direction, first
 
 
 def _unit(*chain: ndarray) -> list[ndarray]:

@@ -5,6 +5,7 @@ Source: the paper, Sec. IV-A: release height and speed are mirrored from a learn
 release state follows from the drag-free flight to the target. The release is horizontal."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy import ndarray
@@ -30,6 +31,7 @@ class ReleaseState:
     pos_w: ndarray  # [m], shape (3,)
     vel_w: ndarray  # [m/s], shape (3,)
     fall_time: float  # from release to landing [s]
+    landing_height: float  # of the payload's centre [m]
 
 
 def landing_point(pos_w: ndarray, vel_w: ndarray, landing_height: float) -> tuple[ndarray, ndarray]:
@@ -53,9 +55,8 @@ def release_for(target: float, height: float, speed: float, landing_height: floa
             f" {landing_height:g} m and above 0"
         )
     fall = float(fall_time(np.float64(height - landing_height), np.float64(0.0)))
-    return ReleaseState(
-        np.array([target - speed * fall, 0.0, height]), np.array([speed, 0.0, 0.0]), fall
-    )
+    pos_w = np.array([target - speed * fall, 0.0, height])
+    return ReleaseState(pos_w, np.array([speed, 0.0, 0.0]), fall, landing_height)
 
 
 def default_release(target: float) -> tuple[float, float]:
@@ -102,7 +103,6 @@ class ThrowPlan:
     target: float  # [m] along x
     release: ReleaseState
     path: Spline
-    params: PlanParams
 
     @property
     def duration(self) -> float:
@@ -119,6 +119,7 @@ class ThrowPlan:
         return states, inputs
 
 
+@lru_cache(maxsize=64)
 def plan_throw(
     model: Pendulum,
     target: float,
@@ -136,4 +137,4 @@ def plan_throw(
     release = release_for(target, height, speed, landing_height)
     start = np.array([0.0, 0.0, START_HEIGHT])
     path = optimise(model, start, release.pos_w, release.vel_w, params, (period, lag % period))
-    return ThrowPlan(model, target, release, path, params)
+    return ThrowPlan(model, target, release, path)

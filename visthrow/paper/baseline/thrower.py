@@ -110,28 +110,21 @@ def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
     return config.load(Experiment, config.find("train", name), overrides)
 
 
-@lru_cache(maxsize=64)
-def plan_of(
-    experiment: Experiment,
-    target: float,
-    height: float,
-    speed: float,
-    w_t: float,
-    rho: float,
-    bounds: str,
-) -> ThrowPlan:
-    """Return the plan of a unit, whose entries the arguments are."""
-    params = replace(PlanParams(), duration=w_t, energy=rho)
-    params = params if bounds == BOUNDS[0] else payload_bounds_only(params)
+def plan_of(experiment: Experiment, unit: dict[str, Any]) -> ThrowPlan:
+    """Return the plan of a unit on an experiment's plant."""
+    params = replace(PlanParams(), duration=unit["w_t"], energy=unit["rho"])
+    if unit["bounds"] != BOUNDS[0]:
+        params = payload_bounds_only(params)
+    release = experiment.release
     return plan_throw(
         pendulum_of(plant_of(experiment)),
-        target,
-        height,
-        speed,
+        unit["target"],
+        unit["height"],
+        unit["speed"],
         params,
-        experiment.release.landing_height,
+        release.landing_height,
         experiment.sim.control_period,
-        experiment.release.lag,
+        release.lag,
     )
 
 
@@ -140,13 +133,11 @@ def fly_unit(unit: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any
     the controller's steps [ms].
     """
     experiment = _experiment(unit["config"], tuple(unit["overrides"]))
-    plan = plan_of(
-        experiment, *(unit[key] for key in ("target", "height", "speed", "w_t", "rho", "bounds"))
-    )
+    plan = plan_of(experiment, unit)
     count = unit["throws"]
     seed = unit["seed"]
     if unit["plant"] == IDEAL:
-        flown = fly_pendulum(plan, count, seed, experiment.release.landing_height)
+        flown = fly_pendulum(plan, count, seed)
     else:
         delays = delays_of(experiment, unit["compensation"])
         where = compute_device.resolve("auto") if unit["plant"] == "hybrid" else "cpu"
@@ -157,9 +148,8 @@ def fly_unit(unit: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any
     columns.pop("step_times", None)  # as many as throws by chance
     extra = {"planned": round(plan.duration, 6)}
     if len(flown.step_times):
-        extra["step_ms"] = [
-            round(1e3 * float(t), 3) for t in np.percentile(flown.step_times, (50, 99))
-        ]
+        steps = 1e3 * np.percentile(flown.step_times, (50, 99))
+        extra["step_ms"] = steps.round(3).tolist()
     return columns, extra
 
 

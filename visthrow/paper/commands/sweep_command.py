@@ -11,14 +11,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import declared
+from visthrow.common.arguments import EXIT_INTERRUPTED, declared
+from visthrow.common.errors import ConfigError
 
 add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run, tell, collect."""
-    from visthrow.common.errors import ConfigError
     from visthrow.paper.sweep import sweep_record as record
     from visthrow.paper.sweep.work_units import load_list
 
@@ -40,7 +40,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
-    from visthrow.common.arguments import EXIT_INTERRUPTED
     from visthrow.paper.sweep.pool import Local, ProcessPool
     from visthrow.training import compute_device
 
@@ -77,7 +76,6 @@ def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
 
 
 def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str, ...]) -> Any:
-    from visthrow.common.errors import ConfigError
     from visthrow.paper.sweep.cluster import Cluster
 
     wrong = [item for item in args.slurm if "=" not in item]
@@ -91,7 +89,6 @@ def _cluster(args: argparse.Namespace, out: Path, jobs: int, changes: tuple[str,
 
 
 def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
-    from visthrow.common.errors import ConfigError
     from visthrow.paper.sweep.work import work as do
 
     if not args.units:

@@ -110,7 +110,7 @@ def paper_ratio(variant: str) -> st.Interval | None:
             std / mean / math.sqrt(PAPER_THROWS), full_std / full / math.sqrt(PAPER_FULL_THROWS)
         )
     )
-    return st.Interval(ratio, ratio - half, ratio + half, "throws")
+    return st.Interval(ratio, ratio - half, ratio + half)
 
 
 def _row(variant: str, trainings: list[Result]) -> dict[str, str]:

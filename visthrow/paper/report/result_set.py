@@ -50,11 +50,9 @@ class ResultSet:
         """
         if departures is not ANY:
             conditions |= {"departures": departures}
-        best: dict[str, Result] = {}
-        for result in self.matching(kind="policy", plant=plant, target=target, **conditions):
-            name = result.unit["policy"]
-            if name not in best or result.unit["throws"] > best[name].unit["throws"]:
-                best[name] = result
+        matching = self.matching(kind="policy", plant=plant, target=target, **conditions)
+        ascending = sorted(matching[::-1], key=lambda result: result.unit["throws"])
+        best = {result.unit["policy"]: result for result in ascending}
         return [best[name] for name in sorted(best)]
 
     def shipped(self, name: str, plant: str, target: float) -> Result | None:

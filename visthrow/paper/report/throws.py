@@ -171,7 +171,7 @@ def _paper(target: float) -> tuple[st.Interval, float] | None:
         return None
     gap = vision[0] - state[0]
     half = 1.96 * math.hypot(vision[1], state[1]) / math.sqrt(10.0)
-    return st.Interval(gap, gap - half, gap + half, "throws"), vision[2] - state[2]
+    return st.Interval(gap, gap - half, gap + half), vision[2] - state[2]
 
 
 def _sentence(gap: st.Interval) -> str:

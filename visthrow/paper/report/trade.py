@@ -276,7 +276,7 @@ def hypervolume(selected: Sequence[Result]) -> st.Interval | None:
         samples.append(front.hypervolume(np.stack(resampled)))
     low, high = np.quantile(samples, (0.025, 0.975))
     value = front.hypervolume(np.stack([s.mean(0) for s in sets]))
-    return st.Interval(value, float(low), float(high), "throws")
+    return st.Interval(value, float(low), float(high))
 
 
 def _summed(title: str, label: str, selected: Sequence[Result]) -> tuple[str, ...]:

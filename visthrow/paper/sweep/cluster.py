@@ -10,7 +10,8 @@ from typing import Any
 
 from visthrow.common.errors import ConfigError
 from visthrow.paper.sweep.pool import Task
-from visthrow.paper.sweep.work import EXIT_STOPPED
+from visthrow.paper.sweep.work import EXIT_STOPPED, work
+from visthrow.paper.sweep.work_units import load_list
 
 SLACK = 5  # minutes that a job is granted beyond its piece: start of the process, last checkpoint
 
@@ -101,8 +102,5 @@ def do(
     minutes: float,
 ) -> int:
     """Do a task's units in a job; returns the exit status of ``visthrow sweep work``."""
-    from visthrow.paper.sweep.work import work
-    from visthrow.paper.sweep.work_units import load_list
-
     os.chdir(folder)
     return work(load_list(list_name, changes), Path(out), ids, device, minutes)

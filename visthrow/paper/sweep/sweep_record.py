@@ -4,7 +4,7 @@ throws.
 
 import csv
 import json
-from itertools import chain
+from itertools import accumulate, chain
 from pathlib import Path
 from typing import Any
 
@@ -48,18 +48,15 @@ def _state(source: ResultSource, out: Path) -> tuple[str, float]:
     if not source.config:
         return "there already", 0.0
     rows = _progress(source, out)
-    seconds = _seconds(rows)
+    seconds = sum(_spent(rows)[-1:])
+    count = f"{len(rows)} of {source.iterations} iterations"
     if source.done(out):
         error = _final(source, out)["error_mean"]
-        return (
-            f"done in {seconds:.0f} s" + ("" if error is None else f", {error:.3f} m at 2.0 m"),
-            seconds,
-        )
+        place = "" if error is None else f", {error:.3f} m at 2.0 m"
+        return f"done in {seconds:.0f} s{place}", seconds
     if held(lock_of(out, source.id)):
-        return f"running, {len(rows)} of {source.iterations} iterations", seconds
-    return (
-        f"stopped after {len(rows)} of {source.iterations} iterations" if rows else "not begun"
-    ), seconds
+        return f"running, {count}", seconds
+    return f"stopped after {count}" if rows else "not begun", seconds
 
 
 def collect(work: SweepWork, out: Path, records: Path) -> list[Path]:
@@ -107,8 +104,9 @@ def _progress(source: ResultSource, out: Path) -> list[dict[str, str]]:
         return [row for row in csv.DictReader(file) if row.get("wall_s")]
 
 
-def _seconds(rows: list[dict[str, str]]) -> float:
-    return sum(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows)
+def _spent(rows: list[dict[str, str]]) -> list[float]:
+    """Return the seconds of work up to the end of each iteration."""
+    return list(accumulate(float(row["rollout_s"]) + float(row["learning_s"]) for row in rows))
 
 
 def _summary(source: ResultSource, out: Path) -> dict[str, Any]:
@@ -131,18 +129,11 @@ def _run(source: ResultSource, out: Path) -> dict[str, Any]:
     experiment = source.experiment()
     per_iteration = experiment.samples
     step = max(len(rows) // CURVE_POINTS, 1)
+    spent = _spent(rows)
     curve = []
-    seconds = 0.0
-    for i, row in enumerate(rows, 1):
-        seconds += float(row["rollout_s"]) + float(row["learning_s"])
-        if i % step == 0:
-            curve.append(
-                [
-                    int(row["iteration"]) * per_iteration,
-                    round(seconds, 2),
-                    round(float(row["landing_error"]), 5),
-                ]
-            )
+    for i in range(step - 1, len(rows), step):
+        steps = int(rows[i]["iteration"]) * per_iteration
+        curve.append([steps, round(spent[i], 2), round(float(rows[i]["landing_error"]), 5)])
     pieces = [
         json.loads(path.read_text())
         for path in sorted((source.folder(out) / PIECES).glob("*.json"))
@@ -157,7 +148,7 @@ def _run(source: ResultSource, out: Path) -> dict[str, Any]:
         "iterations": len(rows),
         "environments": experiment.ppo.environments,
         "steps": len(rows) * per_iteration,
-        "seconds": round(seconds, 2),
+        "seconds": round(spent[-1], 2),
         "wall_s": round(sum(piece["seconds"] for piece in pieces), 2),
         "pieces": len(pieces),
         "device": (summary["processors"].get("gpu") or [summary["processors"]["cpu"]])[0],

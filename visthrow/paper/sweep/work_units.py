@@ -6,7 +6,6 @@ the commit: a changed config is another run, and its folder another folder. Thro
 :mod:`visthrow.throws.results` knows them, by all that they depend on, the policy file's content
 included."""
 
-import json
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -88,14 +87,8 @@ class ThrowUnit:
     @property
     def id(self) -> str:
         """Name on the command line."""
-        return ":".join(
-            [
-                self.source.id,
-                self.set,
-                f"{self.target:g}",
-                *([] if self.batch is None else [str(self.batch)]),
-            ]
-        )
+        place = "" if self.batch is None else f":{self.batch}"
+        return f"{self.source.id}:{self.set}:{self.target:g}{place}"
 
     def unit(self, out: Path) -> dict[str, Any]:
         """Return the key of :mod:`visthrow.throws.results`; the policy must exist."""
@@ -210,10 +203,7 @@ def expand(name: str, params: SweepList) -> SweepWork:
             listed = throws.setdefault(source.id, [])
             for label in group.throws:
                 throw = params.throws[label]
-                if params.most_throws is None:
-                    count = throw.count
-                else:
-                    count = min(throw.count, params.most_throws)
+                count = min(throw.count, params.most_throws or throw.count)
                 fresh = _throws(source, label, replace(throw, count=count))
                 listed.extend(unit for unit in fresh if unit not in listed)
     return SweepWork(
@@ -271,9 +261,7 @@ def _experiment(name: str, changes: tuple[str, ...]) -> Experiment:
 def _shipped_config(path: Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
     from visthrow.throws.loading import load_policy
 
-    return json.loads(
-        json.dumps(config.to_dict(load_policy(path, None, changes, allow=_ANYTHING).experiment))
-    )
+    return config.to_dict(load_policy(path, None, changes, allow=_ANYTHING).experiment)
 
 
 _ANYTHING = ("observation", "action", "control_period", "release", "vehicle", "rope", "camera")

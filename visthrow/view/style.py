@@ -17,6 +17,8 @@ VEHICLE = "#3A3F47"
 ROPE = "#8A6D3B"
 PAYLOAD = "#D55E00"
 GOAL = "#009E73"
+FRONT = COLOURS[0]  # rotors
+REAR = "#9AA5B1"
 
 
 def use() -> None:
