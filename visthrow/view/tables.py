@@ -24,6 +24,11 @@ PAPER = {
 PAPER_ABLATIONS = {name: tuple(figures) for name, figures in _TABLES["ablations"].items()}
 """Variant -> landing error [m] and duration [s], mean and deviation, and where the throws land."""
 
+PAPER_FRONT: list[list[float]] = _TABLES["front"]
+"""Release speed [m/s], w_t, rho, landing error [m], duration [s], position [m] and velocity error
+[m/s] at release of the paper's TO+MPC.
+"""
+
 PAPER_NOTE = (
     "The paper's figures are ten throws a target, of a real vehicle for policies and in its own"
     " pendulum model for TO+MPC; ours are simulated. No vehicle was flown for this project, so the"

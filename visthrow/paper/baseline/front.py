@@ -1,4 +1,4 @@
-"""Settings that trade agility for accuracy, the paper's front, and what a front is worth."""
+"""Settings that trade agility for accuracy, and what a front is worth."""
 
 import numpy as np
 
@@ -11,16 +11,6 @@ WEIGHTS = ((1e6, 0.005), (200e3, 0.005), (50e3, 0.005), (30e3, 0.01), (3e3, 0.3)
 
 FRONT_TARGET = 2.0  # target of the sweep (the paper, Table IV) [m]
 FRONT_THROWS = 10  # throws of a setting, as in the paper
-
-PAPER_FRONT = (
-    (2.2, 50e3, 0.005, 0.413, 1.285, 0.044, 0.143),
-    (2.2, 30e3, 0.005, 0.252, 1.394, 0.059, 0.100),
-    (1.7, 30e3, 0.01, 0.087, 1.461, 0.044, 0.071),
-    (1.7, 3e3, 0.3, 0.027, 2.128, 0.037, 0.004),
-)
-"""Release speed [m/s], w_t, rho, landing error [m], duration [s], position [m] and velocity error
-[m/s] at release (Table IV).
-"""
 
 CORNER = (2.5, 0.5)  # duration [s] and landing error [m] that hypervolumes are measured from
 

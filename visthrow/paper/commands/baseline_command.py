@@ -54,7 +54,15 @@ def run(args: argparse.Namespace) -> int:
     if swept:
         policies = [_thrown(name, args) for name in args.policies]
         kinds = [(thrower.IDEAL, "none"), *((plant, "both") for plant in args.plants)]
-        panels = [(SHORT[plant], plant, ((made_up, bounds),), "hybrid") for plant, made_up in kinds]
+        panels = [
+            {
+                "heading": SHORT[plant],
+                "plant": plant,
+                "kinds": [(made_up, bounds)],
+                "policies_on": "hybrid",
+            }
+            for plant, made_up in kinds
+        ]
         names = [result.unit["policy"] for result in policies]
         document.append(
             trade.front_section(result_set.ResultSet((*front, *policies)), panels, names)

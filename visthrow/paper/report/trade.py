@@ -3,6 +3,7 @@ accuracy with the policies on it.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy import ndarray
@@ -12,28 +13,18 @@ from visthrow.paper import measurements
 from visthrow.paper.baseline import front, thrower
 from visthrow.paper.baseline.front import FRONT_TARGET, FRONT_THROWS
 from visthrow.paper.baseline.thrower import BOUNDS
-from visthrow.paper.report.result_set import SHIPPED, SHORT, ResultSet, cells, landed
+from visthrow.paper.report.result_set import SHIPPED, SHORT, WORDS, ResultSet, cells, landed
 from visthrow.task.measurement import TARGETS
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
-from visthrow.view.tables import PAPER, of_paper
+from visthrow.view.tables import PAPER, PAPER_FRONT, of_paper
 
 DRAWS = 800  # bootstrap samples of a hypervolume
 
-KINDS = (("both", BOUNDS[0]), ("both", BOUNDS[1]), ("delay", BOUNDS[0]))
-PANELS = (
-    (
-        "own model\n(policies: training simulator)",
-        thrower.IDEAL,
-        (("none", BOUNDS[0]), ("none", BOUNDS[1])),
-        "hybrid",
-    ),
-    ("training simulator", "hybrid", KINDS, "hybrid"),
-    ("realistic reference plant", "reference-realistic", KINDS, "reference-realistic"),
-)
-"""Title, the baseline's plant, its (compensation, bounds), the plant of the policies on it; the
-first is the paper's comparison.
+PANELS: list[dict[str, Any]] = WORDS["panels"]
+"""Panels of the front: heading, the baseline's plant, its (compensation, bounds), the plant of the
+policies on it; the first is the paper's comparison.
 """
 
 
@@ -158,7 +149,9 @@ def _bar(thrown: ResultSet) -> str:
 
 
 def front_section(
-    thrown: ResultSet, rows_of_panels: Sequence[tuple] = PANELS, names: Sequence[str] = SHIPPED
+    thrown: ResultSet,
+    rows_of_panels: Sequence[dict[str, Any]] = PANELS,
+    names: Sequence[str] = SHIPPED,
 ) -> Section:
     """Return the sweep on each plant, as in :data:`PANELS`, with the policies of these names on it,
     and who beats whom.
@@ -167,7 +160,7 @@ def front_section(
     sums: list = []
     missing: list = []
     picture = None
-    panels = [_panel(thrown, row, names, sentences, sums, missing) for row in rows_of_panels]
+    panels = [_panel(thrown, names, sentences, sums, missing, **row) for row in rows_of_panels]
     lead = Text(
         f"Release speed, duration and energy weights are swept at {FRONT_TARGET:g} m. A setting"
         " counts where all its throws landed. Plans bound the payload's path alone, as the paper's"
@@ -207,12 +200,20 @@ def front_section(
 
 
 def _panel(
-    thrown: ResultSet, row: tuple, names: Sequence[str], sentences: list, sums: list, missing: list
+    thrown: ResultSet,
+    names: Sequence[str],
+    sentences: list,
+    sums: list,
+    missing: list,
+    *,
+    heading: str,
+    plant: str,
+    kinds: Sequence[Sequence[str]],
+    policies_on: str,
 ) -> figures.Trade:
     """Return the panel of a row of :data:`PANELS`, fronts, policies and the paper's points; add its
     sentences, its sums, what it lacks.
     """
-    heading, plant, kinds, policies_on = row
     title = SHORT[plant]
     ideal = plant == thrower.IDEAL
     shipped = [(name, thrown.shipped(name, policies_on, FRONT_TARGET)) for name in names]
@@ -254,7 +255,7 @@ def _point(result: Result) -> tuple[float, float]:
 
 
 def _paper_points() -> tuple[tuple[str, ndarray], ...]:
-    swept = np.array([(row[4], row[3]) for row in front.PAPER_FRONT])
+    swept = np.array([(row[4], row[3]) for row in PAPER_FRONT])
     vehicle = [PAPER[(name, FRONT_TARGET)] for name in SHIPPED]
     return (
         ("the paper's TO+MPC, its own model", swept),
@@ -352,7 +353,7 @@ def _breakdown(thrown: ResultSet) -> Grid | None:
     if not selected:
         return None
     rows = []
-    for v, w_t, rho, e, d, p, u in front.PAPER_FRONT:
+    for v, w_t, rho, e, d, p, u in PAPER_FRONT:
         figures_of_row = (f"{e:.3f}", f"{d:.3f}", f"{100 * p:.1f}", f"{100 * u:.1f}")
         rows.append((*_setting(v, w_t, rho), "the paper's", *figures_of_row))
     for r in sorted(selected, key=lambda r: (r.unit["bounds"], r.unit["speed"], -r.unit["w_t"])):
