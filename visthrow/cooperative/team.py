@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 from sim.hybrid import rope_variants
-from sim.params import VehicleParams, changed
+from sim.params import changed
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
@@ -94,18 +94,12 @@ def members(experiment: TeamExperiment) -> dict[str, list[Any]]:
         weak = world < faults
         late = world >= LEVELS - faults
         part = (world if weak else LEVELS - 1 - world) / max(faults - 1, 1)
-        if weak:
-            gain = between(team.weak, part)
-        else:
-            gain = 1.0
-        if late:
-            delay = between(team.late, part)
-        else:
-            delay = 0.0
-        for v in range(team.vehicles):
-            vehicles.append(_weakened(vehicle, gain if v == 0 else 1.0))
-            lag = release.lag + (delay if v == 0 else 0.0)
-            releases.append(dataclasses.replace(release, lag=lag))
+        gain = between(team.weak, part) if weak else 1.0
+        delay = between(team.late, part) if late else 0.0
+        weakened = {"thrust.gain": tuple(gain * one for one in vehicle.thrust.gain)}
+        delayed = dataclasses.replace(release, lag=release.lag + delay)
+        vehicles += [changed(vehicle, weakened), *[vehicle] * (team.vehicles - 1)]
+        releases += [delayed, *[release] * (team.vehicles - 1)]
     ropes = rope_variants(experiment.rope, experiment.task.start)
     return {"vehicles": vehicles, "releases": releases, "ropes": ropes}
 
@@ -114,12 +108,6 @@ def between(interval: tuple[float, float], part: Any) -> Any:
     """Value at this share of the way from the lower to the upper end."""
     low, high = interval
     return low + (high - low) * part
-
-
-def _weakened(vehicle: VehicleParams, gain: float) -> VehicleParams:
-    """The vehicle with a gain of all its rotors."""
-    gains = tuple(gain * one for one in vehicle.thrust.gain)
-    return changed(vehicle, {"thrust.gain": gains})
 
 
 FAULTS: dict[str, dict[str, Any]] = {

@@ -14,7 +14,7 @@ vehicle in ways that no quadrotor follows."""
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -96,13 +96,6 @@ class PlanParams:
     max_turn: float = 9.0  # of the thrust's direction [rad/s]
     # of squared excess, integrated over time; relative to the bound, or in m and weights [1/s]
     penalty: float = 1e5
-
-
-def payload_bounds_only(params: PlanParams) -> PlanParams:
-    """Return the parameters without our bounds on the thrust: the paper's plan, which a vehicle
-    need not be able to follow.
-    """
-    return replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from visthrow import config
 from visthrow.paper.baseline import NAME
 from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
 from visthrow.paper.baseline.pendulum_model import pendulum_of
-from visthrow.paper.baseline.spline import PlanParams, payload_bounds_only
+from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_throw
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
@@ -113,8 +113,8 @@ def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
 def plan_of(experiment: Experiment, unit: dict[str, Any]) -> ThrowPlan:
     """Return the plan of a unit on an experiment's plant."""
     params = replace(PlanParams(), duration=unit["w_t"], energy=unit["rho"])
-    if unit["bounds"] != BOUNDS[0]:
-        params = payload_bounds_only(params)
+    if unit["bounds"] != BOUNDS[0]:  # the paper's plan, which a vehicle need not be able to follow
+        params = replace(params, max_thrust=np.inf, least_lift=-np.inf, max_turn=np.inf)
     release = experiment.release
     return plan_throw(
         pendulum_of(plant_of(experiment)),

@@ -34,8 +34,9 @@ def run(args: argparse.Namespace) -> int:
     folders = [_folder(name) for name in args.results]
     writable(out)
     thrown = result_set.read([records], folders)
-    paths = page.write(out, TITLE, LEAD, sections(thrown))
-    print(summary(thrown))
+    chapters = sections(thrown)
+    paths = page.write(out, TITLE, LEAD, chapters)
+    print(summary(chapters[0]))
     for path in paths[:2]:
         print(path)
     print(
@@ -94,26 +95,19 @@ def sections(thrown) -> list:
     chapters = []
     for make in makers:
         status(f"section {len(chapters) + 1} of {len(makers)}")
-        chapters.append(make(thrown))
+        chapter = make(thrown)
+        findings = thrown.findings.get(chapter.name, "").split("\n\n")
+        reasons = tuple(Text(text, "why") for text in findings if text)
+        chapters.append(replace(chapter, parts=chapter.parts + reasons))
     status("")
-    return [
-        replace(
-            s,
-            parts=(
-                *s.parts,
-                *(Text(p, "why") for p in thrown.findings.get(s.name, "").split("\n\n") if p),
-            ),
-        )
-        for s in chapters
-    ]
+    return chapters
 
 
-def summary(thrown) -> str:
-    """Return the table that is printed."""
-    from visthrow.paper.report.throws import throws_section
+def summary(chapter) -> str:
+    """Return the table that is printed, that of the policies' throws."""
     from visthrow.view.parts import Grid
 
-    grids = [part for part in throws_section(thrown).parts if isinstance(part, Grid)]
+    grids = [part for part in chapter.parts if isinstance(part, Grid)]
     if grids:
         return grids[0].markdown() + "\n"
     return "no throws of the shipped policies are recorded; see visthrow sweep run quick\n"
