@@ -79,7 +79,7 @@ def add_table(table: Mapping[str, Any], parser: argparse.ArgumentParser) -> None
     Its keys: ``epilog``, ``arguments`` (name -> keywords of :func:`add_option`), ``actions``
     (name -> a table of the same form with ``help``), ``dest`` of the chosen action, ``defaults``.
     """
-    parser.epilog = table.get("epilog")
+    parser.epilog = table.get("epilog", parser.epilog)
     for name, values in table.get("arguments", {}).items():
         add_option(parser, name, **values)
     parser.set_defaults(**table.get("defaults", {}))

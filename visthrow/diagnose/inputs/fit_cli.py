@@ -4,41 +4,9 @@ flights or tests.
 
 import argparse
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    parser.epilog = (
-        "examples:\n  visthrow diagnose fit hover.csv circle.csv --config mine.toml --out runs/fit "
-        "    a vehicle without payload\n  visthrow diagnose fit stand.csv:a1_* --config motor_stand"
-        "                          a motor with one propeller\n  visthrow config vehicle"
-        " runs/fit/vehicle.toml                                    what came of it\n"
-    )
-    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
-    parser.add_argument(
-        "--config",
-        required=True,
-        metavar="NAME",
-        help="of configs/diagnose, or a file; with a model in it",
-    )
-    parser.add_argument(
-        "--free",
-        nargs="+",
-        default=[],
-        metavar="EFFECT",
-        help="what is fitted (default: by the model)",
-    )
-    parser.add_argument(
-        "--vehicle",
-        default="paper",
-        metavar="NAME",
-        help="lends all that is not fitted (default: paper)",
-    )
-    add_out(parser, "out/fit", "for vehicle.toml and fit.json")
-    parser.add_argument(
-        "--json", metavar="FILE", help="write the printed figures to this file as well"
-    )
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

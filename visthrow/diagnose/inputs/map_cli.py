@@ -6,28 +6,10 @@ import argparse
 import json
 from pathlib import Path
 
-from visthrow.common.arguments import ABOVE_ZERO
+from visthrow.common.arguments import declared
 from visthrow.common.errors import LogError
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    parser.epilog = (
-        "examples:\n  visthrow diagnose map flight.csv                    print the proposal\n "
-        " visthrow diagnose map flight.csv --out mine.toml    write it; answer its questions,"
-        " then\n  visthrow diagnose check flight.csv --config mine.toml\n"
-    )
-    parser.add_argument("file", metavar="FILE", help="a table, or a recording of another tool")
-    parser.add_argument(
-        "--mass",
-        metavar="KG",
-        type=ABOVE_ZERO,
-        help="of the vehicle alone, from a scale, in kilograms",
-    )
-    parser.add_argument(
-        "--time-unit", choices=("s", "ms", "us", "ns"), help="of the stamps, where it is known"
-    )
-    parser.add_argument("--out", metavar="FILE", help="write the mapping to this file")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:

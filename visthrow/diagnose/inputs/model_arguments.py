@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import WHOLE, add_common
+from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.select.result import Diagnosis
@@ -19,53 +19,7 @@ DEFAULT_PLANT = "state"
 THROW = "throw"  # name of the model that is no setup's own: the whole throw
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments that explain, plan and blind share."""
-    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
-    parser.add_argument(
-        "--config",
-        metavar="NAME",
-        help="of configs/diagnose, or a file: how tables are read, and which model",
-    )
-    parser.add_argument(
-        "--plant",
-        metavar="NAME",
-        default=DEFAULT_PLANT,
-        help=(
-            "of configs/train, or a file: vehicle, rope and release of the model that is diagnosed"
-            f" (default: {DEFAULT_PLANT})"
-        ),
-    )
-    parser.add_argument(
-        "--only", metavar="NAMES", help="consider these effects alone, separated by commas"
-    )
-    parser.add_argument(
-        "--measured",
-        metavar="NAME=SD",
-        action="append",
-        default=[],
-        help=(
-            "the configured value behind this effect was measured with this deviation, such as"
-            " mass_quad=0.0003 from a scale; several by commas, or one an option"
-        ),
-    )
-    parser.add_argument(
-        "--overrule",
-        metavar="ROW",
-        action="append",
-        default=[],
-        help="keep logs that this row of check would refuse, such as 'units command'",
-    )
-    parser.add_argument(
-        "--without",
-        metavar="FLIGHTS",
-        default="",
-        help="numbers of flights to leave out, from 0, by commas",
-    )
-    parser.add_argument(
-        "--seed", type=WHOLE, default=0, help="of the null worlds and bootstraps (default: 0)"
-    )
-    add_common(parser)
+add_arguments = declared(__file__)
 
 
 class Opened:

@@ -5,20 +5,16 @@ been named.
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
 
-    parser.epilog = (
-        "example:\n  visthrow diagnose blind flights/*.npz                 detection limits of"
-        " every effect in these flights\n"
-    )
-    shared(parser)
-    add_out(parser, "out/blind", "of picture and JSON")
+    add_shared(parser)
+    declared(__file__)(parser)
 
 
 def run(args: argparse.Namespace) -> int:

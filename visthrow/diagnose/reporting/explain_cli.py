@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
 
 if TYPE_CHECKING:
@@ -20,31 +20,10 @@ DIAGNOSIS = "diagnosis.json"  # in the report's folder; `diagnose apply` reads i
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
 
-    parser.epilog = (
-        "examples:\n  visthrow diagnose explain flights/*.npz                      throws of ours,"
-        " against the training simulator\n  visthrow diagnose explain flights --plant mine.toml    "
-        "     against a vehicle and rope of your own\n  visthrow diagnose explain swing.csv"
-        " --config pendulum_encoder  another model, tables read by its mapping\n"
-    )
-    shared(parser)
-    parser.add_argument(
-        "--test",
-        metavar="LOG",
-        nargs="+",
-        default=[],
-        help="say what the names are worth on these flights, too",
-    )
-    add_out(parser, "out/explain", "of the report")
-    parser.add_argument(
-        "--no-report",
-        action="store_true",
-        help="print the verdicts and write diagnosis.json; no gain, no page, no recording",
-    )
-    parser.add_argument(
-        "--no-blind", action="store_true", help="leave the detection limits out of the report"
-    )
+    add_shared(parser)
+    declared(__file__)(parser)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -7,47 +7,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import ABOVE_ZERO, WHOLE, add_out
+from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError, expect_known
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as shared
+    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
 
-    parser.epilog = (
-        "examples:\n  visthrow diagnose plan flights/*.npz                                the next"
-        " flight after these\n  visthrow diagnose plan flights/*.npz --about ground_effect         "
-        " what would show this effect\n  visthrow diagnose plan flights/*.npz --hall 4,3,2.5"
-        " --speed 2       in a small hall\n  visthrow diagnose plan log*.csv --config cf_payload"
-        " --steps 0   only rank the manoeuvres that there are\n"
-    )
-    shared(parser)
-    parser.add_argument(
-        "--manoeuvres", metavar="NAMES", help="choose among these, by commas; default all"
-    )
-    parser.add_argument(
-        "--about",
-        metavar="NAMES",
-        default="",
-        help="plan for these effects, by commas; default: all unclear ones",
-    )
-    parser.add_argument(
-        "--steps",
-        type=WHOLE,
-        default=6,
-        help="generations of the optimiser; 0: only rank manoeuvres (default: 6)",
-    )
-    parser.add_argument(
-        "--hall",
-        metavar="X,Y,Z",
-        default="5,5,2.6",
-        help="room that the path stays in [m] (default: 5,5,2.6)",
-    )
-    parser.add_argument(
-        "--speed", type=ABOVE_ZERO, default=3.0, help="of the vehicle at most [m/s] (default: 3)"
-    )
-    add_out(parser, "out/plan", "of references and JSON")
+    add_shared(parser)
+    declared(__file__)(parser)
 
 
 def run(args: argparse.Namespace) -> int:
