@@ -90,19 +90,20 @@ class MujocoTeam:
         self.load_vel_w.numpy()[world] = data.qvel[:3]
         places = data.qpos[3:].reshape(self.team, -1)
         speeds = data.qvel[3:].reshape(self.team, -1)
+        rows = slice(world * self.team, (world + 1) * self.team)
+        bodies.pos_w.numpy()[rows] = places[:, :3]
+        bodies.quat_wb.numpy()[rows] = np.roll(places[:, 3:7], -1, axis=1)
+        bodies.vel_w.numpy()[rows] = speeds[:, :3]
+        bodies.rate_b.numpy()[rows] = speeds[:, 3:6]
+        bodies.payload_pos_w.numpy()[rows] = data.qpos[:3]
+        bodies.payload_vel_w.numpy()[rows] = data.qvel[:3]
         for k in range(self.team):
-            row = world * self.team + k
-            bodies.pos_w.numpy()[row] = places[k, :3]
-            bodies.quat_wb.numpy()[row] = np.roll(places[k, 3:7], -1)
-            bodies.vel_w.numpy()[row] = speeds[k, :3]
-            bodies.rate_b.numpy()[row] = speeds[k, 3:6]
             first = model.body(f"{k}_rod0").id
             rods = slice(first, first + self.world.params.rope.segments)
             directions = -data.xmat[rods].reshape(-1, 3, 3)[:, :, 2]
+            row = rows.start + k
             bodies.cable_dir_w.numpy()[:, row] = directions
             bodies.cable_vel_w.numpy()[:, row] = np.cross(data.cvel[rods, :3], directions)
-            bodies.payload_pos_w.numpy()[row] = data.qpos[:3]
-            bodies.payload_vel_w.numpy()[row] = data.qvel[:3]
 
 
 def _compile(members: list[tuple]) -> "mujoco.MjModel":

@@ -7,6 +7,7 @@ sharpness once more, on the device."""
 
 import math
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -123,34 +124,6 @@ def other_lens(lens, generator: torch.Generator):
     return replace(
         lens, fx=lens.fx * scale, fy=lens.fy * scale, k1=bend, fov_deg=math.degrees(2.0 * half)
     )
-
-
-class FramePool:
-    """Rendered frames and their labels, of one lens a block of frames."""
-
-    def __init__(self, params: FitParams, camera: CameraParams, renderer: Renderer) -> None:
-        """Start empty."""
-        self.params = params
-        self.camera = camera
-        self.renderer = renderer
-        self.blocks: list[tuple[Tensor, Labels, Fisheye]] = []
-
-    def refill(self, step: int) -> None:
-        """Render the frames of a step; the oldest go."""
-        p = self.params
-        seed = p.seed * 1_000_003 + step
-        generator = torch.Generator().manual_seed(seed)
-        lens = self.camera.fisheye
-        if torch.rand(1, generator=generator).item() < p.lenses:
-            lens = other_lens(lens, generator)
-        self.blocks.append(
-            rendered(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
-        )
-        del self.blocks[: -max(p.pool // p.fresh, 1)]
-
-    def take(self, generator: torch.Generator) -> tuple[Tensor, Labels, Fisheye]:
-        """Frames of one block, at random."""
-        return self.blocks[int(torch.randint(len(self.blocks), (1,), generator=generator))]
 
 
 def rendered(
@@ -284,7 +257,8 @@ class Fit:
         self.device = device
         self.networks = Networks().to(device)
         self.renderer = Renderer(camera.fisheye, device, files, params.samples)
-        self.pool = FramePool(params, camera, self.renderer)
+        # frames, their labels and their lens, the oldest first
+        self.pool = deque(maxlen=max(params.pool // params.fresh, 1))
         self.optimizer = torch.optim.AdamW(
             self.networks.parameters(), params.learning_rate, weight_decay=1e-4
         )
@@ -309,9 +283,9 @@ class Fit:
         seed = p.seed * 7_000_003 + self.step
         generator = torch.Generator(self.device).manual_seed(seed)
         host = torch.Generator().manual_seed(seed)
-        if self.step % p.reuse == 0 or not self.pool.blocks:
-            self.pool.refill(self.step)
-        frames, labels, lens = self.pool.take(host)
+        if self.step % p.reuse == 0 or not self.pool:
+            self.pool.append(self._render())
+        frames, labels, lens = self.pool[int(torch.randint(len(self.pool), (1,), generator=host))]
         chosen = torch.randperm(len(frames), generator=host)[: p.batch].to(self.device)
         frames = frames[chosen]
         labels = _chosen(labels, chosen)
@@ -328,6 +302,16 @@ class Fit:
         self.rates.step()
         self.step += 1
         return {name: float(value.detach()) for name, value in losses.items()}
+
+    def _render(self) -> tuple[Tensor, Labels, Fisheye]:
+        """Render the fresh frames of this step."""
+        p = self.params
+        seed = p.seed * 1_000_003 + self.step
+        generator = torch.Generator().manual_seed(seed)
+        lens = self.camera.fisheye
+        if torch.rand(1, generator=generator).item() < p.lenses:
+            lens = other_lens(lens, generator)
+        return rendered(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
 
     def look_loss(
         self, kind: str, frames: Tensor, labels: Labels, lens: Fisheye, places, generator

@@ -67,18 +67,12 @@ def pyramid(files: list[Path]) -> np.ndarray:
         side = min(picture.shape[:2])
         top = (picture.shape[0] - side) // 2
         margin = (picture.shape[1] - side) // 2
-        level = cv2.resize(
-            picture[top : top + side, margin : margin + side, ::-1],
-            (SIZE, SIZE),
-            interpolation=cv2.INTER_AREA,
-        )
-        levels = [level]
-        for _ in range(MIPS - 1):
-            level = cv2.resize(
-                level, (level.shape[1] // 2, level.shape[0] // 2), interpolation=cv2.INTER_AREA
-            )
-            levels.append(level)
-        rows.append(np.concatenate([np.ascontiguousarray(one).reshape(-1) for one in levels]))
+        level = picture[top : top + side, margin : margin + side, ::-1]
+        levels = []
+        for k in range(MIPS):
+            level = cv2.resize(level, (SIZE >> k, SIZE >> k), interpolation=cv2.INTER_AREA)
+            levels.append(level.ravel())
+        rows.append(np.concatenate(levels))
     if rows:
         return np.stack(rows)
     return np.zeros((0, 1), np.uint8)
