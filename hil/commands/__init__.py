@@ -2,7 +2,11 @@
 
 import argparse
 
-from visthrow.common.arguments import ABOVE_ZERO, add_common
+from visthrow.common.arguments import add_table
+from visthrow.common.toml_text import tables_beside
+
+TABLES = tables_beside(__file__, "commands.toml")
+"""Groups of arguments: those of an action bear its name."""
 
 FLIES = ("run", "record", "calibrate")
 
@@ -32,13 +36,15 @@ def examples(action: str = "") -> str:
     return "\n".join(["examples:", *lines]) + (DURING if action in ("", *FLIES) else "")
 
 
-def add_source_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of whatever receives poses: configuration, time, clock and signing."""
-    add = parser.add_argument
-    add("--config", metavar="NAME", default="dry_run", help="of configs/hil, or a file")
-    add_common(parser, device=False, json=False)
-    add("--seconds", type=ABOVE_ZERO, help="end after this time")
-    speed = "of the clock; below 1 with a fake of the same speed"
-    add("--speed", type=ABOVE_ZERO, default=1.0, help=speed)
-    signing = "sign MAVLink messages, and reject any that is not signed"
-    add("--sign", metavar="KEYFILE", help=signing)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of an action, which is the last word of the parser's program."""
+    action = parser.prog.split()[-1]
+    groups = [action]
+    if action in FLIES:
+        groups = ["source", "flight", action]
+    elif action == "check":
+        groups = ["source", action]
+    for group in groups:
+        if group in TABLES:
+            add_table(TABLES[group], parser)
+    parser.epilog = examples(action)

@@ -2,13 +2,7 @@
 
 import argparse
 
-from hil.commands import examples
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    parser.epilog = examples("replay")
-    parser.add_argument("folder", metavar="FOLDER", help="of a run, or its bundle")
+from hil.commands import add_arguments as add_arguments
 
 
 def run(args: argparse.Namespace) -> int:
