@@ -24,7 +24,7 @@ from hil.rehearsal.fake import VEHICLE_ID, Fake, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from hil.rehearsal.process import AFTER_LANDING, FAKES, load_fake, load_plant, serve
 from visthrow import config
-from visthrow.common.arguments import ABOVE_ZERO, PORT, WHOLE, add_option
+from visthrow.common.arguments import declared
 from visthrow.common.errors import suggest
 from visthrow.common.storage import writable
 from visthrow.onboard.policy import Policy, find_policy
@@ -48,44 +48,9 @@ BALL_LAG = 0.06
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the action."""
+    declared(__file__)(parser)
+    parser.set_defaults(after=AFTER_LANDING)
     parser.epilog = examples("fake")
-    add = parser.add_argument
-    kinds = ", ".join((*FAKES, "module:class", *SITL))
-    add("--kind", default="ardupilot", help=f"of autopilot or bridge: {kinds}")
-    maker = f"function that makes the vehicle (default: {PLANT}, behind a firmware {MOTORS})"
-    add("--plant", metavar="MODULE:FUNCTION", help=maker)
-    add("--policy", metavar="POLICY", default="vision", help="whose plant is flown")
-    add("--seed", type=WHOLE, default=0, help="of start, noise and loss")
-    add_option(parser, "--solver", shared=True, dest="changes")
-    add("--rate", metavar="HZ", type=ABOVE_ZERO, default=100.0, help="poses a second of each body")
-    add("--device", default="udpout:127.0.0.1:14560", help="the runner's port")
-    add("--sign", metavar="KEYFILE", help="sign messages, as of `hil run`")
-    add("--seconds", type=ABOVE_ZERO, default=60.0, help="end after this time")
-    after = "end this long after the payload's landing [s]"
-    add("--after", type=ABOVE_ZERO, default=AFTER_LANDING, help=after)
-    add("--speed", type=ABOVE_ZERO, default=1.0, help="of the clock")
-    answers = "to the release: accepted, in-progress, denied, silent, stuck"
-    add("--answer", default="accepted", help=answers)
-    option = "of hil.rehearsal.fake.FakeOptions: silent_after=12, parameters.GUID_OPTIONS=0, ..."
-    add(
-        "--option",
-        dest="overrides",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help=option,
-    )
-    msp = "where a fake listens that has a port of its own"
-    add("--msp-port", type=PORT, default=14561, help=msp)
-    program = "of --kind betaflight-sitl: Betaflight's for a PC, to fly the plant's motors"
-    add("--firmware", metavar="PROGRAM", help=program)
-    folder = "of the firmware's settings and blackbox"
-    add("--folder", metavar="FOLDER", default="out/firmware", help=folder)
-    setup = "of the run that the firmware is set up for"
-    add("--config", metavar="NAME", default="betaflight_sitl", help=setup)
-    station = "where px4-sih hears PX4 itself: its port for ground stations"
-    add("--autopilot", default="udp:127.0.0.1:14550", help=station)
-    add("--out", metavar="FILE", help="write the report here")
 
 
 def run(args: argparse.Namespace) -> int:
