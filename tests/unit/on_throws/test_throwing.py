@@ -17,7 +17,7 @@ from sim.params import GRAVITY
 from tests.commands import run_command
 from tests.configs import load_experiment
 from visthrow import config
-from visthrow.cli import compare, demo
+from visthrow.cli import compare
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
@@ -325,9 +325,8 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path)
     for name in compare.DEFAULT_POLICIES:
         dropping_policy(name).save(tmp_path / f"{name}.npz")
-    monkeypatch.setattr(demo, "THROWS", 3)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    assert run_command(f"demo --out {tmp_path}/out") == 0
+    assert run_command(f"demo --throws 3 --out {tmp_path}/out") == 0
     told = capsys.readouterr().out
     assert "needs MuJoCo" in told
     listed = [
