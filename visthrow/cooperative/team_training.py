@@ -35,10 +35,9 @@ class TeamTraining(PPOTraining):
 
     def rollout(self) -> None:
         if self._eager:
-            work = self._rollout
+            self._rollout()
         else:
-            work = super().rollout
-        work()
+            super().rollout()
 
     def collect(self, done: float) -> None:
         team = self.experiment.team
@@ -65,10 +64,7 @@ class TeamTraining(PPOTraining):
                 figures = self.learn(done)
             count += 1
             spent = time.perf_counter() - start
-            if iterations:
-                done = count / iterations
-            else:
-                done = min(spent / seconds, 1.0)
+            done = count / iterations if iterations else min(spent / seconds, 1.0)
             yield figures | {"iteration": count, "seconds": spent}
 
 
@@ -95,10 +91,7 @@ def fly(
         build: another solver of the bodies.
         record: called with the environment before each step.
     """
-    if device.startswith("cuda"):
-        devices = [device]
-    else:
-        devices = []
+    devices = [device] if device.startswith("cuda") else []
     with torch.random.fork_rng(devices=devices):
         torch.manual_seed(seed)
         rows = count * experiment.team.vehicles

@@ -85,10 +85,7 @@ class Pilots(ABC):
         self.experiment = experiment
         self.goal_w = goal_w
         self.first_action = first_action
-        if goal_vel_w is None:
-            self.goal_vel_w = np.zeros_like(goal_w)
-        else:
-            self.goal_vel_w = goal_vel_w
+        self.goal_vel_w = np.zeros_like(goal_w) if goal_vel_w is None else goal_vel_w
 
     @abstractmethod
     def decide(self, flight: "Flight", snapshot: Snapshot, latched: ndarray) -> Decision:
@@ -155,10 +152,7 @@ class Policies(Pilots):
             else:
                 looked = self.eyes.seen
         for pilot, part in zip(self.pilots, self.slices):
-            if looked is None:
-                keypoints = None
-            else:
-                keypoints = (looked[0][part], looked[1][part])
+            keypoints = None if looked is None else (looked[0][part], looked[1][part])
             views = [getattr(snapshot, name)[part] for name in VIEWS]
             outs.append(pilot.act(*views, goal_w[part], snapshot.attached[part], keypoints))
         names = ("command", "release", "action", *(["observation"] if len(outs) == 1 else []))
@@ -232,10 +226,7 @@ class Flight:
         self.pilots = pilots
         self.recorder = recorder or FlightObserver()
         self._now: Snapshot | None = None
-        if home_w is None:
-            self.home_w = self.now.pos_w
-        else:
-            self.home_w = home_w
+        self.home_w = self.now.pos_w if home_w is None else home_w
         self.begin = math.nan
         self.open = np.ones(count, bool)
         self.flown = np.zeros(count, bool)

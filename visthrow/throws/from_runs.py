@@ -106,10 +106,7 @@ def _row(log: FlightLog) -> tuple[float, ...]:
         return (np.nan,) * 5
     offset = _offset(log)
     distance = np.linalg.norm(offset)
-    if distance > 0.0:
-        direction = offset / distance
-    else:
-        direction = np.array([1.0, 0.0])
+    direction = offset / distance if distance > 0.0 else np.array([1.0, 0.0])
     landed = np.array(result["landing_w"][:2]) - np.array(log.meta["home_w"][:2])
     side = direction[0] * landed[1] - direction[1] * landed[0]
     return (

@@ -130,10 +130,7 @@ class HybridPlant:
         self.period = self.params.sim.control_period
         self._start = start
         self._action = experiment.task.action
-        if start is None:
-            ropes = None
-        else:
-            ropes = rope_variants(self.params.rope, start)
+        ropes = None if start is None else rope_variants(self.params.rope, start)
         self._sim = HybridSim(self.params, count, device, seed, ropes=ropes, motors=motors)
         self._rng = np.random.default_rng(seed)
         self._command_bias = np.zeros((count, 4))
@@ -157,10 +154,7 @@ class HybridPlant:
         self._latched = np.zeros(count, bool)
         self._separation = np.full(count, np.nan)
         self._ropes: list[LooseRope | None] = [None] * count
-        if self.noise is None:
-            bias = 0.0
-        else:
-            bias = self.noise.observation_bias
+        bias = 0.0 if self.noise is None else self.noise.observation_bias
         self._bias = bias * self._rng.standard_normal((5, count, 3))
         self._age = self._rng.uniform(*self.latency, count)
         self._error = np.zeros((5, count, 3))

@@ -77,10 +77,7 @@ class _Full(LogRecorder):
         throws = sent.action is not None
         if sent.release[0] and self.latch is None:
             self.latch = state.time
-        if self.pilots.eyes is not None and throws:
-            looked = self.pilots.eyes.seen
-        else:
-            looked = None
+        looked = self.pilots.eyes.seen if self.pilots.eyes is not None and throws else None
         points, valid = looked or self.pilots.pilots[0].see(
             snapshot.pos_w, snapshot.quat_wb, snapshot.payload_pos_w, self.pilots.goal_w
         )
@@ -217,10 +214,7 @@ def _hovering(
     def finished(flight: Flight) -> bool:
         nonlocal calm
         close = np.linalg.norm(flight.now.pos_w[0] - home) < QUIET_OFFSET
-        if close and quiet(flight.now):
-            calm = calm + flight.plant.period
-        else:
-            calm = 0.0
+        calm = calm + flight.plant.period if close and quiet(flight.now) else 0.0
         return flight.elapsed >= shortest - 1e-9 and (
             calm >= QUIET_TIME or flight.elapsed >= longest
         )

@@ -122,10 +122,7 @@ def plan(
     """Cut throws of each policy at each target into batches, with all policies in one batch or each
     in its own.
     """
-    if together:
-        groups = [tuple(range(policies))]
-    else:
-        groups = [(i,) for i in range(policies)]
+    groups = [tuple(range(policies))] if together else [(i,) for i in range(policies)]
     cut = batches(throws, size)
     return [
         Job(group, target, *part, seed) for target in targets for group in groups for part in cut

@@ -258,10 +258,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
     for axis, panel in zip(axes[0], panels):
         for series, label, points in panel.fronts:
             colour, marker = _look(series)
-            if len(points):
-                best = points[pareto(points)]
-            else:
-                best = points
+            best = points[pareto(points)]
             axis.plot(*points.T, marker, color=colour, **LOOKS["settings"])
             artists = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])
             labels[label] = artists[0]

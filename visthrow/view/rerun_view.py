@@ -272,10 +272,7 @@ def _signals(stream: rr.RecordingStream, log: FlightLog) -> None:
         components = np.atleast_2d(log[channel].values.T.astype(float))
         for (entity, curve), values in zip(curves.items(), components, strict=True):
             label, number, *pale = curve
-            if pale:
-                colour = _paler(style.COLOURS[number])
-            else:
-                colour = style.COLOURS[number]
+            colour = _paler(style.COLOURS[number]) if pale else style.COLOURS[number]
             label = label.format(states=states)
             series = rr.SeriesLines(names=[label], colors=[colour_code(colour)])
             stream.log(f"signals/{entity}", series, static=True)
