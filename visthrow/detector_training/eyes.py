@@ -117,7 +117,7 @@ class RenderedEyes:
 
     @property
     def found(self) -> dict[str, int]:
-        """How often ball and goal were found, frames looked at, and throws that were refused."""
+        """Counts of the finds of ball and goal, of frames, and of throws that were refused."""
         hits = {name: int(hits.sum()) for name, hits in self._hits.items()}
         return hits | {"frames": self.count * self._looks, "refused": self._refused}
 

@@ -1,6 +1,7 @@
 """Plants, flights, the protocol on the reference plant, and the commands that fly and compare."""
 
 import csv
+import importlib.util
 import json
 import subprocess
 import sys
@@ -325,7 +326,11 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path)
     for name in compare.DEFAULT_POLICIES:
         dropping_policy(name).save(tmp_path / f"{name}.npz")
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        "importlib.util.find_spec",
+        lambda name, *parent: None if name == "mujoco" else find(name, *parent),
+    )
     assert run_command(f"demo --throws 3 --out {tmp_path}/out") == 0
     told = capsys.readouterr().out
     assert "needs MuJoCo" in told
