@@ -10,7 +10,7 @@ from visthrow.common.arguments import add_commands, run_command
 ACTIONS = {
     "check": (
         "check logs: clocks, units, frames, gaps, excitation, and what they can answer",
-        "visthrow.diagnose.inputs.check_cli",
+        "visthrow.diagnose.reporting.check_cli",
     ),
     "map": (
         "propose a mapping for the columns of a table, and ask for what it cannot infer",

@@ -2,7 +2,7 @@
 axes, on which clock.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from visthrow.common.errors import ConfigError, suggest
@@ -129,3 +129,12 @@ class TableMap:
             if channel.clock and channel.clock not in (self.clocks or {}):
                 hint = suggest(channel.clock, self.clocks or {})
                 raise ConfigError(f"channel '{channel.name}': no clock '{channel.clock}'; {hint}")
+
+    def entry(self, name: str) -> ChannelMap | None:
+        """Return the mapping of a channel; None where it has none."""
+        return next((channel for channel in self.channels if channel.name == name), None)
+
+    def with_entry(self, entry: ChannelMap) -> "TableMap":
+        """Return the mapping with another entry in the place of that of its name."""
+        channels = [entry if c.name == entry.name else c for c in self.channels]
+        return replace(self, channels=tuple(channels))

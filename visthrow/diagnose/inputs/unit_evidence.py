@@ -2,15 +2,18 @@
 thrust carries.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
+from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel
+from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.unit_names import UNITS
 
 LENGTHS = ("m", "mm", "cm")
@@ -21,89 +24,129 @@ LIGHTEST = 0.01
 """Of what is tracked and flies by four rotors [kg]: from 10 up a number of kilograms may be one of
 grams.
 """
+SURE = 5.0
+"""Nats by which a reading must beat all others: odds of 148 to 1."""
 
-USUAL = (0.7, 1.4)
-"""What vehicles of 13 recorded flights accelerate by, over what their lean makes."""
-
+# of the logarithm of what a vehicle accelerates by over what its lean makes: those of 13 recorded
+# flights lie from 0.7 to 1.4
+_SCATTER = 0.17
 # over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of
 # 0.3 deg [s]
 _SPAN = 0.2
-_DECADES = 0.5  # half of the least step between two lengths
-_LEANS = 0.02  # least acceleration of a lean that says something: 0.1 deg [m/s^2]
 _FALLS = 0.15  # of gravity, that a fall may be off by: drag of a light ball
 # of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of
 # 13 flights in any unit
 _SHARE = 0.1
 _HALL = (0.1, 60.0)  # what a path in a hall reaches from the origin of the capture [m]
+# nats against a unit in which a path leaves a hall or does not fall as it falls
+_OUTSIDE = 15.0
+_FAR = 2.5  # deviations beyond which doubt grows with the distance alone: more than a lean may push
 
 
-Lean = tuple[str, str, float]
-"""Unit of length, unit of the angles, and path over lean in them."""
+@dataclass(frozen=True)
+class Attitude:
+    """One way to read the columns of an attitude."""
+
+    entry: ChannelMap
+    channel: Channel
+    doubt: float  # nats against it before any path is looked at
+    words: str = ""  # by which it differs from the other ways
+
+    @property
+    def kind(self) -> tuple[str, str]:
+        """Order of a quaternion and axes of the world: all but the unit of angles."""
+        return self.entry.order, self.entry.axes
 
 
-def by_lean(
-    time: np.ndarray,
-    path: np.ndarray,
-    attitudes: Mapping[str, Channel],
-    units: Iterable[str] = LENGTHS,
-) -> list[Lean]:
-    """Find the units in which a path does what its vehicle's lean makes of gravity: level, a
-    rotor's lean accelerates by g tan(tilt).
+@dataclass(frozen=True)
+class Reading:
+    """One way to read the columns of a path, beside an attitude."""
+
+    unit: str
+    attitude: Attitude | None
+    doubt: float  # nats against it, less those of other readings of the same path
+    why: str
+
+    @property
+    def words(self) -> str:
+        """Unit, and the attitude's reading where there are several."""
+        way = self.attitude.words if self.attitude is not None else ""
+        return f"'{self.unit}'" + (f" with {way}" if way else "")
+
+
+def readings(
+    time: np.ndarray, path: np.ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
+) -> list[Reading]:
+    """Weigh all readings of a path, the likeliest first.
+
+    Level, a rotor's lean accelerates by about g sin(tilt); what is thrown falls with g; and a path
+    stays in a hall.
 
     Args:
         time: Stamps of the path [s], shape (T,).
         path: The path in its unknown unit, shape (T, 3).
-        attitudes: Attitudes by the unit of their angles.
         units: Units of length that are tried.
-
-    Returns:
-        Each pair of units that goes together; none where nothing leans.
+        attitudes: Readings of the vehicle's attitude; None where there is no attitude.
     """
-    time, path = rising(time, path)
-    fits = []
-    stamps, acc = physics.accelerations(time, path, "m", _SPAN)
-    for angle, attitude in attitudes.items():
-        time_q, quat = attitude.samples()
-        if min(len(stamps), len(time_q)) < 50:
-            continue
-        up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
-        lean = relations.mean_over(
-            stamps, GRAVITY * up[:, :2] / np.maximum(up[:, 2:], 0.2), stamps, _SPAN
-        )
-        size, does = (
-            float(np.sqrt(np.sum(np.var(values, axis=0)))) for values in (lean, acc[:, :2])
-        )
-        if size < _LEANS or does <= 0.0:
-            continue
-        ratios = {unit: does * UNITS[unit][1] / size for unit in units}
-        fits += [
-            (unit, angle, ratio)
-            for unit, ratio in ratios.items()
-            if abs(np.log10(ratio)) < _DECADES
-        ]
-    return fits
+    reach = float(np.nanmax(np.abs(path)))
+    fall = by_fall(time, path)
+    attitudes = list(attitudes)
+    leans = [(0.0, 0.0) if way is None else _by_lean(time, path, way) for way in attitudes]
+    together: dict[tuple[str, str] | None, float] = {}  # angles in whatever unit
+    for way, (_, nats) in zip(attitudes, leans):
+        kind = way.kind if way is not None else None
+        together[kind] = max(together.get(kind, 0.0), nats)
+    leaning = max(together.values(), default=0.0) > SURE
+    listed = []
+    for attitude, (times, _) in zip(attitudes, leans):
+        nats = together[attitude.kind if attitude is not None else None] if leaning else 0.0
+        for unit in units:
+            size = UNITS[unit][1]
+            doubt = (attitude.doubt if attitude is not None else 0.0) - nats
+            doubt += _OUTSIDE * (not _HALL[0] <= size * reach <= _HALL[1])
+            doubt += _OUTSIDE * (fall not in ("", unit))
+            why = f"{unit} by the size of a hall: {reach:.3g} from the origin"
+            if leaning and times > 0.0:
+                doubt += _huber(np.log(size * times) / _SCATTER)
+                why = f"{unit} by gravity: it accelerates by {size * times:.2g} times what its lean"
+                why += " makes"
+            elif fall:
+                why = f"{unit} by gravity: a part of it falls freely"
+            listed.append(Reading(unit, attitude, doubt, why))
+    return sorted(listed, key=lambda reading: reading.doubt)
 
 
-def lean_misfit(time: np.ndarray, path: np.ndarray, attitude: Channel) -> tuple[float, float]:
-    """Measure how badly the force on a path points along its vehicle's z axis.
-
-    Args:
-        time: Stamps of the path [s], shape (T,).
-        path: The path [m], z up, shape (T, 3).
-        attitude: Of the vehicle.
-
-    Returns:
-        Mean square of the force across that axis [m^2/s^4], and half the number of samples that
-        count as independent; infinite and 0 where too little is known.
+def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> tuple[float, float]:
+    """Return how many times what its lean makes a path accelerates by, in its own unit, and the
+    nats for their going together; 0 where nothing leans.
     """
-    time_q, quat = attitude.samples()
-    stamps, acc = physics.accelerations(*rising(time, path), "m", _SPAN)
+    time_q, quat = attitude.channel.samples()
+    turned = path @ turn_to(attitude.entry.axes)
+    stamps, acc = physics.accelerations(*rising(time, turned), "m", _SPAN)
     if min(len(stamps), len(time_q)) < 50:
-        return np.inf, 0.0
+        return 0.0, 0.0
     up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
-    sideways = np.cross(up, acc + [0.0, 0.0, GRAVITY])
-    floor = 1e-4  # noise of a still path [m^2/s^4]
-    return float(np.mean(np.sum(sideways**2, axis=1))) + floor, 0.5 * float(np.ptp(stamps)) / _SPAN
+    lean = relations.mean_over(stamps, GRAVITY * up[:, :2], stamps, _SPAN)
+    lean = lean - np.mean(lean, axis=0)
+    acc = acc[:, :2] - np.mean(acc[:, :2], axis=0)
+    size, moves = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (lean, acc))
+    if size <= 0.0 or moves <= 0.0:
+        return 0.0, 0.0
+    correlation = float(np.mean(np.sum(lean * acc, axis=1))) / (size * moves)
+    independent = float(np.ptp(stamps)) / _SPAN
+    correlation = min(max(correlation, 0.0), 0.999)
+    return moves / size, -0.5 * independent * float(np.log(1.0 - correlation**2))
+
+
+def _huber(deviations: float) -> float:
+    """Nats against a ratio so many deviations off."""
+    near = min(abs(deviations), _FAR)
+    return near * (abs(deviations) - 0.5 * near)
+
+
+def turn_to(axes: str) -> np.ndarray:
+    """Return the matrix that turns rows about a source's axes into ours."""
+    return turn_of(axes or OURS).T
 
 
 def by_fall(time: np.ndarray, path: np.ndarray) -> str:
@@ -114,22 +157,12 @@ def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     if not len(acc):
         return ""
     down = GRAVITY * np.vstack([np.eye(3), -np.eye(3)])
-    off = {unit: np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2) for unit in LENGTHS}
-    shares = {
-        unit: float(np.max(np.mean(excess < _FALLS * GRAVITY, axis=0)))
-        for unit, excess in off.items()
-    }
+    shares = {}
+    for unit in LENGTHS:
+        off = np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2)
+        shares[unit] = float(np.max(np.mean(off < _FALLS * GRAVITY, axis=0)))
     best = max(shares, key=shares.__getitem__)
     return best if shares[best] > _SHARE else ""
-
-
-def by_hall(path: np.ndarray) -> tuple[list[str], float]:
-    """Find the units in which a path stays in a hall.
-
-    Returns them and how far it reaches from the origin, in its own unit.
-    """
-    reach = float(np.nanmax(np.abs(path)))
-    return [unit for unit in LENGTHS if _HALL[0] <= reach * UNITS[unit][1] <= _HALL[1]], reach
 
 
 def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> str:
@@ -153,6 +186,5 @@ def rising(time: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows that are numbers, later than those before."""
     good = np.isfinite(time) & np.all(np.isfinite(path), axis=1)
     time = time[good]
-    path = path[good]
     later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
-    return time[later], path[later]
+    return time[later], path[good][later]

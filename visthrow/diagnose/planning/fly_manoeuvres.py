@@ -47,6 +47,8 @@ LOST = 10.0  # the same of a vehicle that flies off
 # mass of a setup's cable, in that of its payload: the setup's model has it without mass
 THREAD = 1e-3
 
+ROWS = ("pos_w", "vel_w", "acc_w", "yaw", "rates_b", "thrust_factor", "release")
+"""What is flown of a reference."""
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 
 
@@ -232,17 +234,15 @@ class SimulatedFlight:
         """Return a flight log like the throw's: poses from motion capture, commands as sent."""
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
         measured = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
+        sent = self.reference.time
         channels = {
             "pos_w": Channel(self.time, measured["pos_w"], "m", "world"),
             "quat_wb": Channel(self.time, measured["quat_wb"], "1", "world"),
-            "command": Channel(self.reference.time, self.commands, "N, rad/s", "body"),
+            "payload_pos_w": Channel(self.time, measured["payload_pos_w"], "m", "world"),
+            "command": Channel(sent, self.commands, "N, rad/s", "body"),
+            "release_command": Channel(sent, self.reference.release.astype(float), "1"),
         }
-        if self.manoeuvre.payload:
-            channels["payload_pos_w"] = Channel(self.time, measured["payload_pos_w"], "m", "world")
-            channels["release_command"] = Channel(
-                self.reference.time, self.reference.release.astype(float), "1"
-            )
-        return FlightLog(channels, {"period": PERIOD})
+        return self._log(channels)
 
     def setup_log(
         self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()
@@ -251,141 +251,99 @@ class SimulatedFlight:
         thrust, and what an IMU on board measures.
         """
         truth = self.truth
-        time = self.time
+        turns = matrix_of_quat(truth["quat_wb"])
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
-        volts = (
-            params.reference_voltage
-            * truth["voltage"]
-            / self.plant.vehicle.battery.reference_voltage
-        )
+        battery = self.plant.vehicle.battery.reference_voltage
+        volts = params.reference_voltage * truth["voltage"] / battery
         measured = {
-            params.position: truth["pos_w"],
-            "payload_pos_w": truth["payload_pos_w"],
-            "rate_b": truth["rate_b"],
+            params.position: (truth["pos_w"], "m", "world"),
+            "payload_pos_w": (truth["payload_pos_w"], "m", "world"),
+            "rate_b": (truth["rate_b"], "rad/s", "body"),
         }
-        channels = {
-            name: Channel(
-                time,
-                values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape),
-                unit,
-                frame,
-            )
-            for (name, values), unit, frame in zip(
-                measured.items(), ("m", "m", "rad/s"), ("world", "world", "body")
-            )
-        }
+        channels = {}
+        for name, (values, unit, frame) in measured.items():
+            values = values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape)
+            channels[name] = Channel(self.time, values, unit, frame)
+        force_b = np.einsum("nji,nj->ni", turns, force_w)
         channels |= {
-            params.attitude: Channel(time, truth["quat_wb"], "1", "world"),
+            params.attitude: Channel(self.time, truth["quat_wb"], "1", "world"),
             params.input: self._input(params),
-            "acc_b": Channel(
-                time,
-                np.einsum("nji,nj->ni", matrix_of_quat(truth["quat_wb"]), force_w),
-                "m/s^2",
-                "body",
-            ),
-            "battery_voltage": Channel(time, volts, "V"),
+            "acc_b": Channel(self.time, force_b, "m/s^2", "body"),
         }
-        absent = {"battery_voltage"} - set(extra) | (
-            set() if self.manoeuvre.payload else {"payload_pos_w"}
-        )
-        return FlightLog(
-            {name: channel for name, channel in channels.items() if name not in absent}, {}
-        )
+        if "battery_voltage" in extra:
+            channels["battery_voltage"] = Channel(self.time, volts, "V")
+        return self._log(channels)
+
+    def _log(self, channels: dict[str, Channel]) -> FlightLog:
+        """Return a log of channels, without those of a payload that is not carried."""
+        absent = () if self.manoeuvre.payload else ("payload_pos_w", "release_command")
+        kept = {name: channel for name, channel in channels.items() if name not in absent}
+        return FlightLog(kept, {"period": PERIOD})
 
     def _input(self, params: FlyerParams) -> Channel:
         """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
         if params.input in ("command", "thrust_command"):
-            command = command_of(params.thrust_map, self.commands[:, :1])
-            values = (
-                np.hstack((command, self.commands[:, 1:])) if params.input == "command" else command
-            )
-            return Channel(
-                self.reference.time, values, "N, rad/s" if params.input == "command" else "N"
-            )
+            thrust = command_of(params.thrust_map, self.commands[:, :1])
+            whole = params.input == "command"
+            values = np.hstack((thrust, self.commands[:, 1:])) if whole else thrust
+            return Channel(self.reference.time, values, "N, rad/s" if whole else "N")
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
-        lagged = thrust + self.plant.vehicle.motor.time_constant * np.gradient(
-            thrust, SAMPLE_PERIOD, axis=0
-        )
-        stamps = (
-            self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
-        )  # samples that are held stand for what lies about them
+        lag = self.plant.vehicle.motor.time_constant
+        lagged = thrust + lag * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
+        # samples that are held stand for what lies about them
+        stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
         return Channel(stamps, command_of(params.thrust_map, lagged), "1")
 
 
 def fly(
     plant: PlantParams, manoeuvres: Sequence[Manoeuvre], seed: int, device: str = "cpu"
 ) -> list[SimulatedFlight]:
-    """Fly all manoeuvres at once; those without payload drop it first."""
+    """Fly all manoeuvres at once; those without payload drop it first, and all hover where their
+    reference begins.
+    """
     from sim.hybrid import HybridSim
 
     references = [m.reference() for m in manoeuvres]
+    count = len(references)
+    rows = max(len(r.time) for r in references)
+    plan = {name: np.stack([_held(getattr(r, name), rows) for r in references], 1) for name in ROWS}
     plant = replace(plant, sim=replace(plant.sim, control_period=SAMPLE_PERIOD))
-    sim = HybridSim(plant, len(references), device)
-    start = np.array([r.pos_w[0] for r in references])
-    sim.place(start)
-    pilot = _Pilot(sim, plant, references, np.array([m.payload for m in manoeuvres]))
-    for _ in range(round(APPROACH_SECONDS / PERIOD)):
-        pilot.step(None)
-    sampled = [pilot.step(i) for i in range(max(len(r.time) for r in references))]
+    motors = plant.vehicle.controller
+    thrusts = {"min_thrust": 4.0 * motors.min_thrust, "max_thrust": 4.0 * motors.max_thrust}
+    controller = HoverController(replace(TRACKING, **thrusts), PERIOD, count)
+    gains = controller.params
+    sim = HybridSim(plant, count, device)
+    sim.place(plan["pos_w"][0])
+    dropped = ~np.array([m.payload for m in manoeuvres])
+    sent = []
+    sampled: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLED}
+    for row in range(-round(APPROACH_SECONDS / PERIOD), rows):
+        wanted = {name: values[max(row, 0)] for name, values in plan.items()}
+        push = wanted["vel_w"] + wanted["acc_w"] / gains.velocity_gain
+        goal = wanted["pos_w"] + push / gains.position_gain
+        state = [sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")]
+        mass = np.where(dropped, plant.vehicle.body.mass, plant.total_mass)
+        command = controller.step(*state, goal, mass, wanted["yaw"])
+        if row >= 0:
+            command[:, 1:] += wanted["rates_b"]
+            command[:, 0] *= wanted["thrust_factor"]
+            dropped = dropped | wanted["release"]
+            sent.append(command)
+        sim.set_command(command, dropped)
+        for _ in range(round(PERIOD / SAMPLE_PERIOD)):
+            for name in SAMPLED if row >= 0 else ():
+                sampled[name].append(sim.get(name).astype(float))
+            sim.step()
     flights = []
     for e, (r, m) in enumerate(zip(references, manoeuvres)):
-        rows = len(r.time)
-        truth = {name: np.concatenate([s[name][:, e] for s in sampled[:rows]]) for name in SAMPLED}
-        commands = np.array([row[e] for row in pilot.sent[:rows]])
-        flights.append(
-            SimulatedFlight(m, r, plant, truth, commands, np.random.default_rng([seed, e]))
-        )
+        steps = len(r.time) * round(PERIOD / SAMPLE_PERIOD)
+        truth = {name: np.array([x[e] for x in sampled[name][:steps]]) for name in SAMPLED}
+        commands = np.array([command[e] for command in sent[: len(r.time)]])
+        rng = np.random.default_rng([seed, e])
+        flights.append(SimulatedFlight(m, r, plant, truth, commands, rng))
     return flights
 
 
-class _Pilot:
-    """Follows the references and keeps what it sent."""
-
-    def __init__(
-        self, sim, plant: PlantParams, references: Sequence[Reference], carried: np.ndarray
-    ) -> None:
-        self.sim = sim
-        self.references = references
-        self.loaded = plant.total_mass
-        self.bare = plant.vehicle.body.mass
-        motors = plant.vehicle.controller
-        limits = replace(
-            TRACKING, min_thrust=4.0 * motors.min_thrust, max_thrust=4.0 * motors.max_thrust
-        )
-        self.controller = HoverController(limits, PERIOD, len(references))
-        self.sent: list[np.ndarray] = []
-        self.let_go = ~carried
-
-    def step(self, row: int | None) -> dict[str, np.ndarray]:
-        """Send one command and hold it for a period; without a row, hover where the reference
-        begins.
-
-        Returns samples of the period: :data:`SAMPLED`, shape (S, E, ...).
-        """
-        rows = [min(row or 0, len(r.time) - 1) for r in self.references]
-        place, speed, push = (
-            np.array([getattr(r, name)[i] for r, i in zip(self.references, rows)])
-            for name in ("pos_w", "vel_w", "acc_w")
-        )
-        gains = self.controller.params
-        goal = place + (speed + push / gains.velocity_gain) / gains.position_gain
-        pos, quat, vel = (
-            self.sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")
-        )
-        mass = np.where(self.let_go, self.bare, self.loaded)
-        yaw = np.array([r.yaw[i] for r, i in zip(self.references, rows)])
-        command = self.controller.step(pos, quat, vel, goal, mass, yaw)
-        if row is not None:
-            command[:, 1:] += np.array([r.rates_b[i] for r, i in zip(self.references, rows)])
-            command[:, 0] *= np.array([r.thrust_factor[i] for r, i in zip(self.references, rows)])
-            self.let_go = self.let_go | np.array(
-                [r.release[i] for r, i in zip(self.references, rows)]
-            )
-            self.sent.append(command)
-        self.sim.set_command(command, self.let_go)
-        samples: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLED}
-        for _ in range(round(PERIOD / SAMPLE_PERIOD)):
-            for name, values in samples.items():
-                values.append(self.sim.get(name).astype(float))
-            self.sim.step()
-        return {name: np.array(values) for name, values in samples.items()}
+def _held(values: np.ndarray, rows: int) -> np.ndarray:
+    """Return rows of a reference, and its last one from there on."""
+    return values[np.minimum(np.arange(rows), len(values) - 1)]

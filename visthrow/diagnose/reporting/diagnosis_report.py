@@ -15,7 +15,10 @@ from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
-from visthrow.view.parts import Grid, Picture, Section, Text
+from visthrow.view.parts import Grid, Picture, Section, Text, section
+
+OPEN = (result.CLASS, result.NOT_IDENTIFIABLE)
+"""Verdicts that another flight may settle."""
 
 
 def sentence_of(diagnosis: Diagnosis) -> str:
@@ -165,285 +168,195 @@ def sections(
     """All sections of the page; ``step_check``: channel -> largest difference between the replay
     and one with finer steps, in sigmas.
     """
-    parts = [_verdict(diagnosis, gain)]
+    listed = [
+        _verdict(diagnosis, gain),
+        _residuals(diagnosis),
+        _gain(gain),
+        _candidates(diagnosis),
+        _levels(diagnosis),
+        _laws(diagnosis),
+        *_catalogue(diagnosis),
+        _blind(blind, diagnosis),
+        _next_flights(diagnosis),
+        _ground(diagnosis, step_check or {}, provenance or {}),
+    ]
+    return [part for part in listed if part.parts]
+
+
+def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
+    lines = [*diagnosis.reasons]
+    lines += [f"**{word}.** {text}" for word, text in _statements(diagnosis, gain)]
+    if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
+        law = diagnosis.laws[0]
+        size = f"{law.coefficient:.3g} ± {law.sd:.2g} {law.unit}"
+        lines.append(f"**Law.** {law.formula} with c = {size}.")
+    picture = None
+    if gain is not None and gain.landing is not None:
+        lines.append(f"**Landing.** {landing_sentence(gain.landing)}")
+        if gain.landing.moved:
+            caption = "Predicted landings, seen from the measured ones."
+            picture = Picture("landings", pictures.landings(gain.landing), caption)
+    return section("verdict", "Verdict", *(Text(line, "finding") for line in lines), picture)
+
+
+def _residuals(diagnosis: Diagnosis) -> Section:
     work = diagnosis.work
+    drawn = []
     if work is not None and diagnosis.theta:
-        parts.append(_residuals(work))
-    if gain is not None:
-        parts.append(_gain(gain, diagnosis))
-    if diagnosis.steps:
-        parts.append(_candidates(diagnosis))
-    if diagnosis.levels:
-        parts.append(_levels(diagnosis))
-    if diagnosis.laws:
-        parts.append(_laws(diagnosis))
-    if work is not None:
-        parts.append(_catalogue(diagnosis))
-        caption = "Correlation of the estimates with every effect free."
-        alike = Picture("confusion", pictures.confusion(diagnosis), caption)
-        parts.append(Section("confusion", "What looks alike", (alike,)))
-    if blind is not None:
-        parts.append(_blind(blind, diagnosis))
-    parts += _next_flights(diagnosis)
-    parts.append(_ground(diagnosis, step_check, provenance))
-    return parts
+        caption = "residuals before and after"
+        if any(window.nuisance.size for window in work.after.windows):
+            caption += ", with each window's initial state fitted"
+        for c, name in enumerate(work.problem.model.channels):
+            if any(np.any(window.channel == c) for window in work.after.windows):
+                png = pictures.residuals(work, c)
+                drawn.append(Picture(f"residual_{name}", png, f"{name}: {caption}."))
+    return section("residuals", "Residuals before and after", *drawn)
 
 
-def _residuals(work: Any) -> Section:
-    fitted = any(w.nuisance.size for w in work.after.windows)
-    caption = "residuals before and after"
-    caption += ", with each window's initial state fitted." if fitted else "."
-    drawn = tuple(
-        Picture(f"residual_{name}", pictures.residuals(work, c), f"{name}: {caption}")
-        for c, name in enumerate(work.problem.model.channels)
-        if any(np.any(w.channel == c) for w in work.after.windows)
+def _gain(gain: Gain | None) -> Section:
+    title = "Gain on flights that were not used"
+    if gain is None:
+        return section("gain", title)
+    rows = []
+    for c in gain.channels:
+        unit, before, after, floor, box = _errors(c)
+        less = f"{percent(c.gain, 1)} % {c.interval}"
+        worse = "worse" if c.high < 0.0 else ""
+        rows.append((c.channel, unit, before, after, less, floor, box or "-", worse))
+    shares = [f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()]
+    predicted = f"predictions from the first {HEAD_SECONDS:g} s of each window"
+    note = (
+        f"Root mean square errors of {'whole windows' if gain.whole else predicted},"
+        f" {gain.left_out} left out in {gain.folds} folds, the selection repeated in each"
+        f" ({', '.join(shares) or 'nothing in any'}). Interval: 95 %, jackknife over flights."
+        f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
     )
-    return Section("residuals", "Residuals before and after", drawn)
+    header = (
+        "channel | unit | as it stands | with what was named | less | noise alone | black box | "
+    )
+    picture = None
+    if any(len(c.horizons) > 1 for c in gain.channels):
+        over = "time in the window" if gain.whole else "horizon of the prediction"
+        picture = Picture("horizons", pictures.horizons(gain), f"Error over the {over}.")
+    grid = Grid.from_rows("Held-out prediction error", header, rows, note)
+    return section("gain", title, grid, picture)
 
 
 def _candidates(diagnosis: Diagnosis) -> Section:
+    if not diagnosis.steps:
+        return section("ladder", "Candidates")
     text = Text(
         "Nats of evidence that each candidate would bring, or a set in place of the names"
         " before; as a line what it must exceed; marks: with the simulation run again (circle:"
         " taken, triangle: beaten)."
     )
-    parts = [text, Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates.")]
-    rows = tuple((", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets)
-    if len(rows) > 1:
-        title = "Sets of causes that explain the flights as well"
-        parts.append(Grid(title, ("set", "nats behind"), rows))
-    return Section("ladder", "Candidates", tuple(parts))
-
-
-def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
-    parts: list[Text | Picture] = [Text(reason, "finding") for reason in diagnosis.reasons]
-    parts += [Text(f"**{word}.** {text}", "finding") for word, text in _statements(diagnosis, gain)]
-    if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
-        law = diagnosis.laws[0]
-        parts.append(
-            Text(
-                f"**Law.** {law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}.",
-                "finding",
-            )
-        )
-    if gain is not None and gain.landing is not None:
-        parts.append(Text(f"**Landing.** {landing_sentence(gain.landing)}", "finding"))
-        if gain.landing.moved:
-            parts.append(
-                Picture(
-                    "landings",
-                    pictures.landings(gain.landing),
-                    "Predicted landings, seen from the measured ones.",
-                )
-            )
-    return Section("verdict", "Verdict", tuple(parts))
-
-
-def _gain(gain: Gain, diagnosis: Diagnosis) -> Section:
-    title = "Gain on flights that were not used"
-    rows = []
-    for c in gain.channels:
-        unit, before, after, floor, box = _errors(c)
-        less = f"{percent(c.gain, 1)} % {c.interval}"
-        rows.append(
-            (
-                c.channel,
-                unit,
-                before,
-                after,
-                less,
-                floor,
-                box or "-",
-                "worse" if c.high < 0.0 else "",
-            )
-        )
-    named = (
-        ", ".join(f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items())
-        or "nothing in any"
-    )
-    channels = (
-        "whole windows"
-        if gain.whole
-        else f"predictions from the first {HEAD_SECONDS:g} s of each window"
-    )
-    note = (
-        f"Root mean square errors of {channels}, {gain.left_out} left out in {gain.folds} "
-        f"folds, the"
-        f" selection repeated in each ({named}). Interval: 95 %, jackknife over flights."
-        f" Log-likelihood: {gain.nats_per_sample:+.3f} nats a sample."
-    )
-    header = (
-        "channel",
-        "unit",
-        "as it stands",
-        "with what was named",
-        "less",
-        "noise alone",
-        "black box",
-        "",
-    )
-    grid = Grid("Held-out prediction error", header, tuple(rows), note)
-    if all(len(c.horizons) < 2 for c in gain.channels):
-        return Section("gain", title, (grid,))
-    caption = (
-        "Error over the time in the window."
-        if gain.whole
-        else "Error over the horizon of the prediction."
-    )
-    return Section("gain", title, (grid, Picture("horizons", pictures.horizons(gain), caption)))
+    ladder = Picture("ladder", pictures.ladder(diagnosis), "Ladder of candidates.")
+    rows = [(", ".join(names) or "nothing", f"{nats:.1f}") for names, nats in diagnosis.sets]
+    title = "Sets of causes that explain the flights as well"
+    sets = Grid.from_rows(title, "set | nats behind", rows if len(rows) > 1 else [])
+    return section("ladder", "Candidates", text, ladder, sets)
 
 
 def _levels(diagnosis: Diagnosis) -> Section:
-    rows = tuple(
-        (
-            level.block,
-            level.phase,
-            f"{level.before:.3g}",
-            f"{level.after:.3g}",
-            f"{level.after / level.quiet:.1f}",
-            "more than gusts" if level.excessive else "",
-        )
-        for level in diagnosis.levels
-    )
-    header = (
-        "what",
-        "phase",
-        "as it stands",
-        "with what was named",
-        "times the quietest phase",
-        "",
-    )
+    header = "what | phase | as it stands | with what was named | times the quietest phase | "
+    rows = []
+    for level in diagnosis.levels:
+        sizes = (f"{level.before:.3g}", f"{level.after:.3g}", f"{level.after / level.quiet:.1f}")
+        excess = "more than gusts" if level.excessive else ""
+        rows.append((level.block, level.phase, *sizes, excess))
     note = (
         "Deviation of what moves the vehicle besides the model [N; N m]. Gusts do not know the"
         " phase of the flight."
     )
-    return Section(
-        "levels",
-        "Forces that nothing explains",
-        (Grid("Latent forces", header, rows, note, heads=2),),
-    )
+    grid = Grid.from_rows("Latent forces", header, rows, note, heads=2)
+    return section("levels", "Forces that nothing explains", grid)
 
 
 def _laws(diagnosis: Diagnosis) -> Section:
-    rows = tuple(
-        (
-            law.formula,
-            law.block,
-            f"{law.coefficient:.4g} ± {law.sd:.2g}",
-            law.unit,
-            f"{law.nats:.1f}",
-        )
-        for law in diagnosis.laws
-    )
+    rows = []
+    for law in diagnosis.laws:
+        size = f"{law.coefficient:.4g} ± {law.sd:.2g}"
+        rows.append((law.formula, law.block, size, law.unit, f"{law.nats:.1f}"))
     note = (
         "Nats over the same causes without the term, less the log of the number of terms as simple"
         " as it."
     )
-    return Section(
-        "laws",
-        "Laws outside the catalogue",
-        (Grid("Terms", ("law", "on", "c", "unit", "nats"), rows, note),),
-    )
+    grid = Grid.from_rows("Terms", "law | on | c | unit | nats", rows, note)
+    return section("laws", "Laws outside the catalogue", grid)
 
 
-def _catalogue(diagnosis: Diagnosis) -> Section:
-    rows = tuple(
-        (
-            f.name,
-            f.verdict,
-            f.block,
-            f"{f.estimate:.3g}" if f.estimate else "",
-            f"{f.low:.3g}",
-            f"{f.high:.3g}",
-            f"{f.floor:.3g}",
-            f.unit,
-            "; ".join(
-                f.missing
-                or (f.manoeuvres if f.verdict in (result.CLASS, result.NOT_IDENTIFIABLE) else ())
-            ),
+def _catalogue(diagnosis: Diagnosis) -> list[Section]:
+    """The effects, and which of them look alike."""
+    if diagnosis.work is None:
+        return []
+    rows = []
+    for f in diagnosis.findings:
+        sizes = (f"{f.estimate:.3g}" if f.estimate else "", f"{f.low:.3g}", f"{f.high:.3g}")
+        needs = f.missing or (f.manoeuvres if f.verdict in OPEN else ())
+        rows.append(
+            (f.name, f.verdict, f.block, *sizes, f"{f.floor:.3g}", f.unit, "; ".join(needs))
         )
-        for f in diagnosis.findings
-    )
-    header = ("effect", "verdict", "block", "size", "from", "to", "floor", "unit", "needs")
+    header = "effect | verdict | block | size | from | to | floor | unit | needs"
     note = " ".join(f"**{verdict}**: {meaning}." for verdict, meaning in result.VERDICTS.items())
-    parts = (
-        Picture(
-            "verdicts",
-            pictures.verdicts(diagnosis),
-            "95 % intervals of all effects in their floors.",
-        ),
-        Grid("All effects", header, rows, note, heads=3),
-    )
-    return Section("catalogue", "Every effect of the catalogue", parts)
+    caption = "95 % intervals of all effects in their floors."
+    intervals = Picture("verdicts", pictures.verdicts(diagnosis), caption)
+    grid = Grid.from_rows("All effects", header, rows, note, heads=3)
+    caption = "Correlation of the estimates with every effect free."
+    alike = Picture("confusion", pictures.confusion(diagnosis), caption)
+    return [
+        section("catalogue", "Every effect of the catalogue", intervals, grid),
+        section("confusion", "What looks alike", alike),
+    ]
 
 
-def _blind(blind: Blind, diagnosis: Diagnosis) -> Section:
-    rows = tuple(
-        (c.name, "-" if np.isnan(c.limit) else f"{c.limit:.3g}", c.unit) for c in blind.curves
-    )
-    floors = [f.floor for f in diagnosis.findings]
+def _blind(blind: Blind | None, diagnosis: Diagnosis) -> Section:
+    title = "What these flights can detect"
+    if blind is None:
+        return section("blind", title)
+    rows = [(c.name, "-" if np.isnan(c.limit) else f"{c.limit:.3g}", c.unit) for c in blind.curves]
     note = (
         f"Size that would be named, up to its class, in 90 % of worlds; noise: {blind.noise}. False"
         f" alarms without a hidden effect: {100 * blind.false_alarms:.2f} % of {blind.worlds}"
         " worlds."
     )
-    parts = (
-        Picture(
-            "completeness",
-            pictures.completeness(blind, floors),
-            "Sizes from which hidden effects are named.",
-        ),
-        Grid("Detection limits in these flights", ("effect", "limit", "unit"), rows, note),
-    )
-    return Section("blind", "What these flights can detect", parts)
+    png = pictures.completeness(blind, [f.floor for f in diagnosis.findings])
+    picture = Picture("completeness", png, "Sizes from which hidden effects are named.")
+    header = "effect | limit | unit"
+    grid = Grid.from_rows("Detection limits in these flights", header, rows, note)
+    return section("blind", title, picture, grid)
 
 
-def _next_flights(diagnosis: Diagnosis) -> list[Section]:
+def _next_flights(diagnosis: Diagnosis) -> Section:
     """Manoeuvres that the catalogue names for what stays open."""
-    open_ones = (result.CLASS, result.NOT_IDENTIFIABLE)
     serves: dict[str, list[str]] = {}
     for f in diagnosis.findings:
-        for manoeuvre in f.manoeuvres if f.verdict in open_ones else ():
+        for manoeuvre in f.manoeuvres if f.verdict in OPEN else ():
             serves.setdefault(manoeuvre, []).append(f.name)
     ranked = sorted(serves.items(), key=lambda item: -len(item[1]))
-    rows = tuple((manoeuvre, ", ".join(names)) for manoeuvre, names in ranked)
+    rows = [(manoeuvre, ", ".join(names)) for manoeuvre, names in ranked]
     note = (
         "`visthrow diagnose plan` simulates them in these flights' model and ranks them by what"
         " they would tell."
     )
-    grid = Grid("Manoeuvres", ("manoeuvre", "would show or separate"), rows, note)
-    return [Section("plan", "What to fly next", (grid,))] if rows else []
+    grid = Grid.from_rows("Manoeuvres", "manoeuvre | would show or separate", rows, note)
+    return section("plan", "What to fly next", grid)
 
 
 def _ground(
-    diagnosis: Diagnosis,
-    step_check: Mapping[str, float] | None,
-    provenance: Mapping[str, Any] | None,
+    diagnosis: Diagnosis, step_check: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> Section:
-    rows = [
-        (
-            "flights, windows, samples",
-            f"{diagnosis.flights}, {diagnosis.windows}, {diagnosis.samples}",
-        ),
-        (
-            "threshold",
-            (
-                f"{diagnosis.threshold:.2f} nats, exceeded by the best of all effects in 0.5 % of"
-                " null worlds"
-            ),
-        ),
-        ("seed of the null worlds", str(diagnosis.seed)),
-        ("seconds", f"{diagnosis.seconds:.1f}"),
-    ]
-    rows += [
-        (f"noise of {name} in what was stated", f"{scale:.2f}")
-        for name, scale in diagnosis.sensor_scale.items()
-    ]
-    rows += [
-        (f"replay against finer steps, {name}", f"{value:.2g} sigma")
-        for name, value in (step_check or {}).items()
-    ]
-    rows += [(str(key), str(value)) for key, value in (provenance or {}).items()]
-    return Section(
-        "ground", "What this rests on", (Grid("Numbers", ("what", "value"), tuple(rows), heads=2),)
-    )
+    null = "exceeded by the best of all effects in 0.5 % of null worlds"
+    facts = {
+        "flights, windows, samples": f"{diagnosis.flights}, {diagnosis.windows},"
+        f" {diagnosis.samples}",
+        "threshold": f"{diagnosis.threshold:.2f} nats, {null}",
+        "seed of the null worlds": diagnosis.seed,
+        "seconds": f"{diagnosis.seconds:.1f}",
+    }
+    for name, scale in diagnosis.sensor_scale.items():
+        facts[f"noise of {name} in what was stated"] = f"{scale:.2f}"
+    for name, value in step_check.items():
+        facts[f"replay against finer steps, {name}"] = f"{value:.2g} sigma"
+    rows = [(str(key), str(value)) for key, value in {**facts, **provenance}.items()]
+    grid = Grid.from_rows("Numbers", "what | value", rows, heads=2)
+    return section("ground", "What this rests on", grid)

@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read, look, print."""
     from visthrow.common.storage import write_json
-    from visthrow.diagnose.inputs.picture import draw
     from visthrow.diagnose.inputs.setup import known, read_logs
+    from visthrow.diagnose.reporting.log_picture import draw
     from visthrow.logs.check.run import check, table
 
     logs = read_logs(

@@ -1,0 +1,117 @@
+"""Columns of a foreign table by their names: which belong together, and in which unit."""
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from visthrow.common.toml_text import tables_beside
+from visthrow.logs.readers.table import Table
+from visthrow.logs.readers.text_table import unit_of
+from visthrow.logs.unit_names import UNITS
+
+NAMES = tables_beside(__file__, "column_names.toml")
+PATTERNS = {name: re.compile(text, re.IGNORECASE) for name, text in NAMES["patterns"].items()}
+HINTS = {kind: re.compile(text, re.IGNORECASE) for kind, text in NAMES["hints"].items()}
+WHOLE = ("012345678", "0123", "1234", "xyzw", "xyz")
+"""Components that make a matrix, motors or a quaternion, and a vector."""
+
+_SPLIT = re.compile(r"[^A-Za-z0-9]+|(?<=[a-z])(?=[A-Z])|(?<=\D)(?=\d)|(?<=\d)(?=\D)")
+_BRACKETS = re.compile(r"^(.+?)\s*[\[(]\s*([^\d\[\]()][^\[\]()]*|)\s*[\])]$")
+_NUMBERED = re.compile(r"^(.*?)[._\[]?([0-8])\]?$")
+
+
+@dataclass
+class Group:
+    """Columns that belong together."""
+
+    stem: str  # that their names share
+    columns: tuple[str, ...]
+    values: np.ndarray  # shape (T, number of columns)
+    unit: str = ""  # by their names, "" where these do not say
+
+    @property
+    def listed(self) -> str:
+        """The columns for messages."""
+        return ", ".join(self.columns)
+
+    def matches(self, pattern: str) -> bool:
+        """Tell whether what the names share matches a pattern of ``column_names.toml``."""
+        return bool(PATTERNS[pattern].search(self.stem))
+
+    def hints_at(self, kind: str) -> bool:
+        """Tell whether the names hint at this kind, and at no other one but a position."""
+        kinds = {name for name, pattern in HINTS.items() if pattern.search(self.stem)}
+        return kind in kinds and kinds <= {kind, "position"}
+
+
+def groups_of(numbers: Table) -> list[Group]:
+    """Group columns by their names: whole vectors, quaternions, matrices and sets of motors, then
+    single ones.
+    """
+    families: dict[tuple[int, str, str, str], dict[str, str]] = {}
+    for name in numbers:
+        base, unit = split_unit(name)
+        if motor := PATTERNS["motor"].match(base):
+            key = (0, "motor", motor[1] + (motor[3] or ""), unit)
+            families.setdefault(key, {})[motor[2]] = name
+        if numbered := _NUMBERED.match(base):
+            families.setdefault((1, numbered[1], "", unit), {})[numbered[2]] = name
+        if part := PATTERNS["component"].match(base):
+            ending = part[2].lower()
+            unit = unit or NAMES["units"].get((part[3] or "").lower(), "")
+            key = (2, part[1] + NAMES["families"].get(ending, ""), "", unit)
+            families.setdefault(key, {}).setdefault(NAMES["components"][ending], name)
+    listed = [
+        (stem, unit, [places[place] for place in whole])
+        for (_, stem, _, unit), places in sorted(families.items(), key=lambda item: item[0][0])
+        for whole in WHOLE
+        if set(whole) == places.keys()
+    ]
+    listed += [("", "", names) for names in _neighbours(numbers)]
+    listed += [(name, unit_by_name(name), [name]) for name in numbers]
+    groups = []
+    used: set[str] = set()
+    for stem, unit, names in listed:
+        if not used.intersection(names):
+            values = np.column_stack([numbers[name] for name in names])
+            groups.append(Group(stem, tuple(names), values, unit))
+            used.update(names)
+    return groups
+
+
+def _neighbours(numbers: Table) -> list[list[str]]:
+    """Group the columns of a table without a header: four of length 1, and threes of the others."""
+    names = list(numbers)
+    groups: list[list[str]] = []
+    run: list[str] = []
+    while names and all(name.startswith("column ") for name in names):
+        four = np.column_stack([numbers[name] for name in names[:4]])
+        if four.shape[1] == 4 and np.nanmax(np.abs(np.linalg.norm(four, axis=1) - 1.0)) < 0.05:
+            groups.append(names[:4])
+            del names[:4], run[:]
+            continue
+        run.append(names.pop(0))
+        if len(run) == 3:
+            groups.append(run)
+            run = []
+    return groups
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return a name without the unit in brackets at its end, and that unit, "" where none is."""
+    match = _BRACKETS.match(name)
+    if match is None:
+        return name, ""
+    unit = unit_of(match[2])
+    spellings = (match[2], unit or "", NAMES["units"].get(unit or "", ""))
+    known = next((spelling for spelling in spellings if spelling in UNITS), "")
+    return (match[1], known) if known or unit is not None else (name, "")
+
+
+def unit_by_name(name: str) -> str:
+    """Return the unit that a name says, in brackets or by its last word; "" where it says none."""
+    unit = split_unit(name)[1]
+    last = re.split(r"[^A-Za-z0-9]+", name.rstrip(")]} "))[-1].lower()
+    words = [word.lower() for word in _SPLIT.split(name) if word] or [last]
+    return unit or NAMES["units"].get(last) or NAMES["units"].get(words[-1], "")

@@ -1,0 +1,543 @@
+"""Recognition of channels among groups of columns of one table, by names, values and physics."""
+
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from visthrow.common.errors import ConfigError, LogError
+from visthrow.common.rotations import rotate_back
+from visthrow.diagnose.inputs.columns import HINTS, NAMES, PATTERNS, Group, split_unit
+from visthrow.diagnose.inputs.unit_evidence import (
+    LENGTHS,
+    SURE,
+    THRUSTS,
+    Attitude,
+    Reading,
+    readings,
+    rising,
+    turn_to,
+)
+from visthrow.logs.check import physics, relations
+from visthrow.logs.flightlog import Channel
+from visthrow.logs.mapping import ChannelMap
+from visthrow.logs.readers.table import lost_rows, make_channel
+from visthrow.logs.unit_names import UNITS
+
+UPS = ("", "x,-z,y")
+"""Axes of a world whose z is up, and of one whose y is, as Motive's."""
+_MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
+"""Unit of commands of motors by what they exceed."""
+# Of a path's derivative with what may be it: correlations that settle it, and that suggest it,
+_FIRMLY = 0.8
+_BELONGS = 0.6
+_REACH = 0.2  # delays that are tried [s]
+_LATEST = 0.15  # the longest delay that counts [s]
+_SPAN = 0.1  # over which a path is differentiated [s]
+_COARSE = 0.02  # step of the grid on which many pairs are compared [s]
+_COMPARED = 1000  # rows on which the distance of two paths is judged
+_LARGEST_THRUST = 5000.0  # in any unit: what is larger counts to 65535, as a Crazyflie's
+_TURN = 7.0  # above a full turn in radians: degrees
+_UNUSUAL = 1.0  # nats against an order or axes that are not the usual ones
+_TILTED = 10.0  # nats against an attitude that leans over for half of the time
+_PACK = (2.5, 60.0)  # of any vehicle's battery [V]
+_MOTIONS = {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}
+
+
+@dataclass(frozen=True)
+class Path:
+    """A path in metres, z up."""
+
+    group: Group
+    unit: str
+    pos_w: np.ndarray  # shape (T, 3)
+    why: str
+
+
+def moves(values: np.ndarray) -> bool:
+    """Tell whether rows of numbers, shape (T, columns), differ."""
+    whole = values[np.all(np.isfinite(values), axis=1)]
+    return len(whole) > 0 and bool(np.any(np.ptp(whole, axis=0) > 0.0))
+
+
+def rises(cells: np.ndarray) -> bool:
+    """Tell whether a column rises as a clock does."""
+    steps = np.diff(cells[np.isfinite(cells)])
+    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and float(np.mean(steps > 0.0)) > 0.3
+
+
+class Recognition:
+    """Decides which group of a table's columns is which channel.
+
+    Attributes:
+        questions: What neither names nor physics tell.
+        why: Reasons, by channel.
+    """
+
+    def __init__(self, time: np.ndarray, groups: list[Group], settings: dict[str, str]) -> None:
+        """Take the groups that move, at stamps [s]; ``settings`` stand above a table's numbers."""
+        self.time = time
+        self.settings = settings
+        self.questions: list[str] = []
+        self.why: dict[str, str] = {}
+        for group in groups:
+            group.values = np.where(lost_rows(time, group.values)[:, None], np.nan, group.values)
+        self._groups = [group for group in groups if moves(group.values)]
+        self._taken: set[tuple[str, ...]] = set()
+        self._made: dict[str, tuple[ChannelMap, Channel]] = {}
+
+    def channels(self) -> list[ChannelMap]:
+        """Recognise what can be, the vehicle's attitude and path first."""
+        self._quaternions()
+        self._other_attitudes()
+        self._positions()
+        self._velocities()
+        self._rates()
+        self._forces()
+        self._motors()
+        self._single_columns()
+        self._thrust()
+        self._ask_what_is_open()
+        return [entry for entry, _ in self._made.values()]
+
+    def _open(self, size: int, targets: bool = False) -> list[Group]:
+        """Groups of so many columns that no channel has; ``targets``: those of set-points too."""
+        return [
+            group
+            for group in self._groups
+            if group.columns not in self._taken
+            and len(group.columns) == size
+            and (targets or not group.matches("target"))
+        ]
+
+    def _group(self, name: str) -> Group:
+        """Group that a channel was made of."""
+        return next(g for g in self._groups if g.columns == self._made[name][0].columns)
+
+    def _take(self, name: str, group: Group, unit: str, why: str, **options: Any) -> bool:
+        """Make a channel of a group, unless its units contradict what the name stands for;
+        ``options``: of its :class:`ChannelMap`.
+        """
+        if name in self._made:
+            return False
+        values = group.values
+        held = bool(np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5)
+        entry = ChannelMap(name, group.columns, unit, held=held, **options)
+        try:
+            channel, _ = make_channel(self.time, values, entry, "table")
+        except (ConfigError, LogError):
+            return False
+        self._taken.add(group.columns)
+        self._made[name] = entry, channel
+        self.why[name] = why + ("; its values are held between measurements" if held else "")
+        return True
+
+    def _quaternions(self) -> None:
+        for group in self._open(4):
+            length = np.nanmedian(np.linalg.norm(group.values, axis=1))
+            if group.stem == "motor" or not 0.95 < length < 1.05:
+                continue
+            name, frame = "quat_wb", ""
+            if group.matches("not_vehicle"):
+                name, frame = "payload_quat_wb", "world"
+            if frame and group.matches("camera"):
+                name, frame = "marker_quat_c", "camera"
+            if name == "quat_wb" and name in self._made and group.matches("estimate"):
+                name, frame = "est_quat_wb", "world"
+            largest = int(np.argmax(np.nanmean(np.abs(group.values), axis=0)))
+            order = "xyzw" if _lettered(group) or largest == 3 else "wxyz"
+            options = {"kind": "quaternion", "order": order, "frame": frame}
+            self._take(name, group, "1", "four columns of length 1", **options)
+
+    def _other_attitudes(self) -> None:
+        """Attitudes as rotation matrices, rotation vectors or angles."""
+        for group in self._open(9):
+            if group.matches("rotation") and not group.matches("not_vehicle"):
+                self._take("quat_wb", group, "1", "nine columns of a rotation", kind="matrix")
+        for group in self._open(3):
+            vector = group.matches("rotvec") and not group.matches("not_vehicle")
+            if not vector and not (group.hints_at("euler") and self._smooth(group)):
+                continue
+            largest = float(np.nanpercentile(np.abs(group.values), 99))
+            unit = _angle_unit(group)
+            kind = "rotvec" if vector else "euler"
+            why = f"{'three angles' if vector else 'roll, pitch, yaw'} up to {largest:.3g} {unit}"
+            if self._take("quat_wb", group, unit, why, kind=kind) and vector:
+                self.questions.append(
+                    f"are {group.listed} a rotation vector (Vicon's angle-axis), as taken, or roll,"
+                    ' pitch and yaw (kind = "euler")?'
+                )
+
+    def _attitudes(self) -> list[Attitude | None]:
+        """All ways to read the columns of the vehicle's attitude, None where it has none."""
+        if "quat_wb" not in self._made:
+            return [None]
+        entry, _ = self._made["quat_wb"]
+        group = self._group("quat_wb")
+        motive = "Format Version" in self.settings
+        open_unit = entry.kind == "euler" and not group.unit and entry.unit == "rad"
+        open_order = entry.kind == "quaternion" and not _lettered(group)
+        units = ("rad", "deg") if open_unit else (entry.unit,)
+        orders = ("wxyz", "xyzw") if open_order else (entry.order,)
+        ups = UPS if self.settings else UPS[:1]
+        ways: list[Attitude | None] = []
+        for unit, order, axes in product(units, orders, ups):
+            tried = replace(entry, unit=unit, order=order, axes=axes, body_axes=axes)
+            channel = make_channel(self.time, group.values, tried, "table")[0]
+            if not np.any(channel.valid):
+                continue
+            doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
+            doubt += _TILTED * (physics.median_tilt(channel) > physics.STEEPEST)
+            words = [unit] * open_unit + [f"order {order}"] * open_order
+            words += [f"axes {axes or 'x,y,z'}"] * (len(ups) > 1)
+            ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
+        return ways
+
+    def _positions(self) -> None:
+        smooth = [g for g in self._open(3) if self._smooth(g) and g.unit not in ("deg", "rad")]
+        groups = [g for g in smooth if g.hints_at("position") or g.unit in LENGTHS]
+        unnamed = [g for g in smooth if not any(hint.search(g.stem) for hint in HINTS.values())]
+        if not groups and unnamed:  # no name speaks of a place
+            groups = unnamed
+            listed = "; ".join(group.listed for group in groups)
+            self.questions.append(f"are these positions? Names do not say: {listed}")
+        slopes = groups + [g for g in smooth if g.hints_at("velocity")]
+        groups = self._without_derivatives(groups, slopes)
+        for group in [g for g in groups if g.matches("camera")]:
+            unit = readings(self.time, group.values, _lengths(group), [None])[0].unit
+            why = "three columns that move smoothly; their name speaks of a camera"
+            self._take("marker_pos_c", group, unit, why, frame="camera")
+        paths = self._paths([g for g in groups if not g.matches("camera")])
+        pay = self._payload(paths, unnamed)
+        if pay is not None:
+            upper, lower, why = pay
+            paths = [path for path in paths if path.group is not lower.group]
+        paths.sort(key=lambda path: path.group.matches("load"))
+        if pay is not None and upper is not None and not upper.group.matches("estimate"):
+            paths.sort(key=lambda path: path is not upper)  # the payload hangs below it
+        for path in paths:
+            group = path.group
+            usual = "mocap_pos_w" if group.matches("capture") else "pos_w"
+            usual = "est_pos_w" if group.matches("estimate") else usual
+            wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
+            smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd){path.why}"
+            for name in ["pos_w"] * (usual == "pos_w" or path is paths[0]) + [usual]:
+                frame = "" if name == "pos_w" else "world"
+                if self._take(name, group, path.unit, smoothly, frame=frame, axes=self._up()):
+                    break
+        if len(paths) > 1:
+            listed = "; ".join(path.group.listed for path in paths)
+            self.questions.append(
+                f"several positions ({listed}): which is the vehicle's, and by which sensor? The"
+                " first is taken"
+            )
+        if pay is not None:
+            self._take("payload_pos_w", lower.group, lower.unit, why + lower.why, axes=self._up())
+
+    def _up(self) -> str:
+        """Axes of the world, as the attitude has them."""
+        return self._made["quat_wb"][0].axes if "quat_wb" in self._made else ""
+
+    def _paths(self, groups: list[Group]) -> list[Path]:
+        """Settle the units of paths and the reading of the attitude together: those that fit best
+        what a lean, a fall and a hall make of a path. What leaves several is asked about.
+        """
+        attitudes = self._attitudes()
+        ranked = [readings(self.time, group.values, _lengths(group), attitudes) for group in groups]
+        alone = [Reading("", way, way.doubt, "") for way in attitudes if way is not None]
+        deciding = min(ranked, key=lambda listed: listed[0].doubt, default=alone)
+        if alone:
+            self._settle_attitude(sorted(deciding, key=lambda reading: reading.doubt))
+        paths = []
+        for group, listed in zip(groups, ranked):
+            if listed is not deciding:
+                listed = [r for r in listed if r.attitude is deciding[0].attitude]
+            best, *others = listed
+            rivals = [r.words for r in others if r.doubt < best.doubt + SURE]
+            if rivals:
+                reach = float(np.nanmax(np.abs(group.values)))
+                self.questions.append(
+                    f"{group.listed} reach {reach:.3g} from the origin: {best.words} is a guess;"
+                    f" {' and '.join(rivals)} would do as well"
+                )
+            pos_w = UNITS[best.unit][1] * group.values @ turn_to(self._up())
+            paths.append(Path(group, best.unit, pos_w, "" if group.unit else f"; {best.why}"))
+        return paths
+
+    def _settle_attitude(self, ranked: list[Reading]) -> None:
+        """Take the likeliest way to read the attitude; ask where no path says which one is."""
+        best, *others = ranked
+        rivals = [r for r in others if r.attitude is not best.attitude]
+        self._made["quat_wb"] = best.attitude.entry, best.attitude.channel
+        if not rivals:
+            return
+        nats = rivals[0].doubt - best.doubt
+        if nats >= SURE:
+            self.why["quat_wb"] += f"; {best.attitude.words} by gravity, {nats:.0f} nats"
+        elif not best.unit:
+            listed = " and ".join(r.attitude.words for r in rivals)
+            self.questions.append(
+                f"attitude {', '.join(best.attitude.entry.columns)}: {best.attitude.words} is a"
+                f" guess; {listed} would do as well"
+            )
+
+    def _payload(
+        self, paths: list[Path], unnamed: list[Group]
+    ) -> tuple[Path | None, Path, str] | None:
+        """Find the path below another one that keeps its distance from it, or what nothing names
+        and does so in its unit. Returns that other one, the path and the reason.
+        """
+        best = None
+        rows = slice(None, None, max(1, len(self.time) // _COMPARED))
+        known = {path.group.columns for path in paths}
+        for upper in paths:
+            size = UNITS[upper.unit][1]
+            nameless = [
+                Path(group, upper.unit, size * group.values @ turn_to(self._up()), "")
+                for group in unnamed
+                if group.columns not in known
+            ]
+            for lower in paths + nameless:
+                gap = lower.pos_w[rows] - upper.pos_w[rows]
+                length = np.linalg.norm(gap, axis=1)
+                middle = np.nanmedian(length)
+                spread = np.nanstd(length) / max(middle, 1e-9)
+                hangs = spread < 0.1 and np.nanmedian(gap[:, 2]) < -0.3 * middle
+                if 0.05 < middle < 20.0 and hangs and (best is None or spread < best[0]):
+                    why = f"keeps {middle:.3f} m from another path, below it"
+                    best = spread, upper, lower, why
+        if best is not None:
+            return best[1:]
+        if len(paths) == 1 and PATTERNS["not_vehicle"].search(" ".join(paths[0].group.columns)):
+            return None, paths[0], "the only path, and its name speaks of no vehicle"
+        return None
+
+    def _smooth(self, group: Group) -> bool:
+        values = group.values[np.all(np.isfinite(group.values), axis=1)]
+        if len(values) < 50:
+            return False
+        moves_by = np.std(values, axis=0)
+        steps = np.std(np.diff(values, axis=0), axis=0)
+        return bool(np.max(moves_by) > 0.0 and np.max(steps) < 0.3 * np.max(moves_by))
+
+    def _without_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
+        """Return the groups that are no derivative of another path; of captures with many markers
+        all pairs are compared in one product.
+        """
+        grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
+        if not groups or len(grid) < 25:
+            return groups
+        laid = {g.columns: _on_grid(self.time, g.values, grid) for g in groups + paths}
+        slopes = [_normalised(np.gradient(laid[path.columns], axis=0)) for path in paths]
+        values = [_normalised(laid[group.columns]) for group in groups]
+        firm = np.array(slopes) @ np.array(values).T > _FIRMLY
+        return [
+            group
+            for group, column in zip(groups, firm.T)
+            if group.unit in LENGTHS  # a length is no velocity, whatever it goes with
+            or not any(hit and path is not group for hit, path in zip(column, paths))
+        ]
+
+    def _best(
+        self, stamps: np.ndarray, derived: np.ndarray, groups: list[Group]
+    ) -> tuple[relations.Relation, Group] | None:
+        """Return the group that goes best with what was derived of others, and how; None where none
+        does.
+        """
+        best = None
+        for group in groups:
+            time, values = rising(self.time, group.values)
+            if min(len(stamps), len(time)) < 100:
+                continue
+            relation = relations.relate(stamps, derived, time, values, reach=_REACH)
+            if relation is None or abs(relation.delay) > _LATEST:
+                continue
+            if relation.correlation > (best[0].correlation if best else _BELONGS):
+                best = relation, group
+        return best
+
+    def _velocities(self) -> None:
+        for name in ("pos_w", "payload_pos_w", "est_pos_w"):
+            if name not in self._made:
+                continue
+            entry, channel = self._made[name]
+            slope = relations.derivative(*rising(self.time, self._group(name).values), _SPAN)
+            best = self._best(*slope, [g for g in self._open(3) if g.unit not in LENGTHS])
+            if name == "pos_w" and self._body_velocity(
+                channel, best[0].correlation if best else 0.0
+            ):
+                continue
+            if best is None:
+                continue
+            relation, group = best
+            size = UNITS[entry.unit][1] / relation.scale
+            unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
+            why = f"the derivative of {name}, correlation {relation.correlation:.2f},"
+            why += f" {relation.scale:.3g} of its unit a second"
+            frame = "world" if name == "est_pos_w" else ""
+            self._take(name.replace("pos", "vel"), group, unit, why, frame=frame, axes=self._up())
+
+    def _body_velocity(self, path: Channel, in_world: float) -> bool:
+        """Take a velocity that is the path's in the body's axes rather than in the world's, where
+        it goes together with the path by a correlation.
+        """
+        if "quat_wb" not in self._made:
+            return False
+        stamps, slope = relations.derivative(*path.samples(), _SPAN)
+        attitude = self._made["quat_wb"][1].samples()
+        if min(len(stamps), len(attitude[0])) < 100:
+            return False
+        turned = rotate_back(relations.attitude_at(*attitude, stamps), slope)
+        best = self._best(stamps, turned, [g for g in self._open(3) if g.hints_at("velocity")])
+        if best is None:
+            return False
+        relation, group = best
+        independent = 0.5 * float(np.ptp(stamps)) / _REACH
+        unlike = max(1.0 - relation.correlation**2, 1e-6)
+        nats = independent * np.log((1.0 - in_world**2) / unlike)
+        if nats < SURE or relation.correlation < _FIRMLY:
+            return False
+        unit = group.unit if group.unit.endswith("/s") else "m/s"
+        why = f"the derivative of pos_w in the body's axes, {nats:.0f} nats over the world's"
+        return self._take("vel_b", group, unit, why, frame="body")
+
+    def _rates(self) -> None:
+        derived = np.empty(0), np.empty((0, 3))
+        if "quat_wb" in self._made:
+            derived = relations.rates_of(*self._made["quat_wb"][1].samples())
+        ranked = []
+        for group in [g for g in self._open(3) if g.hints_at("rate_b")]:
+            time, values = rising(self.time, group.values)
+            relation = relations.relate(*derived, time, values, reach=_REACH)
+            score = relation.axes_correlation if relation is not None else 0.0
+            ranked.append((score, group, float(np.sqrt(np.mean(np.var(values, axis=0))))))
+        if not ranked:
+            return
+        score, group, size = max(ranked, key=lambda candidate: candidate[0])
+        largest = float(np.nanpercentile(np.abs(group.values), 99))
+        why = f"99 % within {largest:.3g}"
+        unit = NAMES["usual_units"].get(group.columns[0], "deg/s" if largest > 30.0 else "rad/s")
+        unit = group.unit if group.unit.endswith("/s") else unit
+        if score > _BELONGS:
+            times = size / max(float(np.sqrt(np.mean(np.var(derived[1], axis=0)))), 1e-6)
+            unit = "deg/s" if times > 7.0 else "rad/s"
+            why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
+        elif not group.unit:
+            self.questions.append(
+                f"are the rates {group.listed} in rad/s or deg/s? '{unit}' is taken: no attitude"
+                " says"
+            )
+        self._take("rate_b", group, unit, why)
+
+    def _forces(self) -> None:
+        for group in [g for g in self._open(3) if g.hints_at("acc_b")]:
+            size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
+            for unit in ("m/s^2", "g", "mg"):
+                if 0.8 < size * UNITS[unit][1] / physics.GRAVITY < 1.25:
+                    why = f"a middle size of {size:.3g}: gravity in {unit}"
+                    self._take("acc_b", group, unit, why, frame="body")
+
+    def _motors(self) -> None:
+        for group in [g for g in self._open(4) if g.stem == "motor"]:
+            high = float(np.nanpercentile(group.values, 99))
+            words = " ".join(group.columns)
+            if group.unit in ("rpm", "rad/s") or PATTERNS["speed"].search(words):
+                unit = group.unit or ("rpm" if "rpm" in words.lower() else "rad/s")
+                why = f"four rotors' speeds up to {high:.5g} {unit}"
+                self._take("motor_speed", group, unit, why)
+                order = "front left, front right, rear left, rear right"
+                self.questions.append(
+                    f"rotors {group.listed}: order them {order}; are they electrical revolutions"
+                    " (divide by pole pairs)?"
+                )
+                continue
+            unit = next(unit for above, unit in _MOTOR_UNITS if high > above)
+            if self._take("motor_command", group, unit, f"four motors up to {high:.5g}"):
+                self.questions.append(
+                    f"motors {group.listed}: order them front left, front right, rear left, rear"
+                    " right (Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are"
+                    " they commands, or speeds?"
+                )
+
+    def _single_columns(self) -> None:
+        for group in self._open(1):
+            middle = float(np.nanmedian(group.values))
+            if group.matches("battery"):
+                units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
+                for unit in units:
+                    if _PACK[0] < middle * UNITS[unit][1] < _PACK[1]:
+                        why = f"a middle of {middle:.4g}: a pack in {unit}"
+                        self._take("battery_voltage", group, unit, why)
+            elif group.matches("angle") and "quat_wb" not in self._made:
+                unit = _angle_unit(group)
+                why = f"an angle, by its name; a middle of {middle:.3g}"
+                if self._take("angle", group, unit, why) and not group.unit:
+                    self.questions.append(
+                        f"angle '{group.stem}': '{unit}' is taken by its reach: deg or rad?"
+                    )
+
+    def _thrust(self) -> None:
+        """Take the collective thrust, a command before what else bears its name, a word before a
+        letter, which may be of a temperature.
+        """
+        groups = [
+            g
+            for g in self._open(1, targets=True)
+            if PATTERNS["thrust"].search(split_unit(g.stem)[0])
+        ]
+        groups.sort(key=lambda group: (len(group.stem) == 1, not group.matches("target")))
+        for group in groups:
+            middle = float(np.nanmedian(group.values))
+            if middle <= _LARGEST_THRUST and not rises(group.values[:, 0]):
+                unit = group.unit if group.unit in THRUSTS else "N"
+                self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
+
+    def _ask_what_is_open(self) -> None:
+        if "quat_wb" in self._made and not self._made.keys() & {"pos_w", "rate_b"}:
+            group = self._group("quat_wb")
+            if self._made["quat_wb"][0].kind == "euler" and not group.unit:
+                self.questions.append(
+                    f"are {group.listed} angles, as taken, or body rates? Nothing in the motion"
+                    " says"
+                )
+        if "pos_w" in self._made and not self._made.keys() & _MOTIONS:
+            self.questions.append(
+                "nothing but pos_w moves: if that is a payload or a ball, call it payload_pos_w"
+            )
+        for group in [g for g in self._open(1) if g.matches("split")]:
+            values = np.unique(group.values[np.isfinite(group.values)])
+            if 1 < len(values) <= 64 and np.all(values == np.round(values)):
+                self.questions.append(
+                    f"'{group.stem}' has {len(values)} values: one log for each? [table.split]"
+                    f' column = "{group.stem}"'
+                )
+
+
+def _lengths(group: Group) -> tuple[str, ...]:
+    """Units that a path may be in: as named, or all."""
+    return (group.unit,) if group.unit in LENGTHS else LENGTHS
+
+
+def _angle_unit(group: Group) -> str:
+    """Return the unit of angles, as named, else by how far they reach."""
+    if group.unit in ("deg", "rad"):
+        return group.unit
+    return "deg" if np.nanpercentile(np.abs(group.values), 99) > _TURN else "rad"
+
+
+def _lettered(group: Group) -> bool:
+    """Whether the names of a quaternion's columns say which is w."""
+    return any("w" in split_unit(column)[0].lower()[-3:] for column in group.columns)
+
+
+def _normalised(values: np.ndarray) -> np.ndarray:
+    """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
+    centred = (values - np.mean(values, axis=0)).ravel()
+    return centred / max(float(np.linalg.norm(centred)), 1e-300)
+
+
+def _on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+    """Return a group's values at times of a grid, zeros where too few are known."""
+    time, values = rising(time, values)
+    return relations.on_grid(time, values, grid) if len(time) >= 100 else np.zeros((len(grid), 3))
