@@ -130,6 +130,13 @@ class TableMap:
                 hint = suggest(channel.clock, self.clocks or {})
                 raise ConfigError(f"channel '{channel.name}': no clock '{channel.clock}'; {hint}")
 
+    @property
+    def columns(self) -> set[str]:
+        """Columns that are read, of clocks and channels."""
+        clocks = [self.time, *(self.clocks or {}).values()]
+        channels = [column for channel in self.channels for column in channel.columns]
+        return {clock.column for clock in clocks} | set(channels)
+
     def entry(self, name: str) -> ChannelMap | None:
         """Return the mapping of a channel; None where it has none."""
         return next((channel for channel in self.channels if channel.name == name), None)

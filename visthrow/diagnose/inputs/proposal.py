@@ -52,7 +52,34 @@ def propose(
     if not any(moves(cells[:, None]) for cells in numbers.values()):
         raise LogError(f"{source}: none of its {len(table)} columns holds numbers that change")
     proposal = MappingProposal()
-    settings = getattr(table, "settings", {})
+    proposal.mapping = _mapping(numbers, proposal, getattr(table, "settings", {}), time_unit)
+    mapped = proposal.mapping.columns if proposal.mapping is not None else set()
+    proposal.left_out = [name for name in table if name not in mapped]
+    proposal.left_out += getattr(table, "left_out", [])
+    if proposal.mapping is None:
+        proposal.questions.append(
+            "no column looks like a position, an attitude, rates, forces or motors: which columns"
+            " are they?"
+        )
+        return proposal
+    log = _corrected(table, source, proposal)
+    corrected = proposal.mapping
+    _judge_thrust(log, proposal, mass)
+    if proposal.mapping is not corrected:
+        log = _log(table, source, proposal.mapping)
+    proposal.flyer = _flyer(log, proposal, mass)
+    if mass is not None and proposal.flyer is None:
+        proposal.questions.append(
+            "--mass is not used: a flying model needs a thrust or motors, an attitude and a"
+            " position; not all are found"
+        )
+    return proposal
+
+
+def _mapping(
+    numbers: Table, proposal: MappingProposal, settings: dict[str, str], time_unit: str | None
+) -> TableMap | None:
+    """Map the columns of numbers, and say why and ask in a proposal; None without a channel."""
     channels = {}
     clocks = {}
     for topic, part in _tables(numbers).items():
@@ -75,32 +102,11 @@ def propose(
             channels[entry.name] = replace(entry, clock="" if first else topic)
             proposal.why[entry.name] = recognition.why[entry.name]
         proposal.questions += recognition.questions
-    used = {column for entry in channels.values() for column in entry.columns}
-    used |= {clock.column for clock in clocks.values()}
-    proposal.left_out = [name for name in table if name not in used]
-    proposal.left_out += getattr(table, "left_out", [])
     if not channels:
-        proposal.questions.append(
-            "no column looks like a position, an attitude, rates, forces or motors: which columns"
-            " are they?"
-        )
-        return proposal
+        return None
     main, *further = clocks
-    proposal.mapping = TableMap(
-        clocks[main], tuple(channels.values()), {name: clocks[name] for name in further} or None
-    )
-    log = _corrected(table, source, proposal)
-    corrected = proposal.mapping
-    _judge_thrust(log, proposal, mass)
-    if proposal.mapping is not corrected:
-        log = _log(table, source, proposal.mapping)
-    proposal.flyer = _flyer(log, proposal, mass)
-    if mass is not None and proposal.flyer is None:
-        proposal.questions.append(
-            "--mass is not used: a flying model needs a thrust or motors, an attitude and a"
-            " position; not all are found"
-        )
-    return proposal
+    others = {name: clocks[name] for name in further} or None
+    return TableMap(clocks[main], tuple(channels.values()), others)
 
 
 def _tables(numbers: Table) -> dict[str, Table]:

@@ -4,6 +4,7 @@ thrust carries.
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -33,6 +34,8 @@ _SCATTER = 0.17
 # over which a path is differentiated: noise of motion capture of 1 mm makes 0.05 m/s^2, a lean of
 # 0.3 deg [s]
 _SPAN = 0.2
+_DECADES = 0.5  # half of the least step between two lengths
+_LEANS = 0.02  # least acceleration of a lean that says something: 0.1 deg [m/s^2]
 _FALLS = 0.15  # of gravity, that a fall may be off by: drag of a light ball
 # of a path, that falls where things are thrown: 0.18 and 0.21 of two recorded ones, at most 0.05 of
 # 13 flights in any unit
@@ -91,14 +94,22 @@ def readings(
     reach = float(np.nanmax(np.abs(path)))
     fall = by_fall(time, path)
     attitudes = list(attitudes)
-    leans = [(0.0, 0.0) if way is None else _by_lean(time, path, way) for way in attitudes]
+    leans = [(0.0,) * 3 if way is None else _by_lean(time, path, way) for way in attitudes]
     together: dict[tuple[str, str] | None, float] = {}  # angles in whatever unit
-    for way, (_, nats) in zip(attitudes, leans):
+    for way, (_, _, nats) in zip(attitudes, leans):
         kind = way.kind if way is not None else None
         together[kind] = max(together.get(kind, 0.0), nats)
-    leaning = max(together.values(), default=0.0) > SURE
+    nearest = min(
+        (
+            abs(np.log10(UNITS[unit][1] * times))
+            for (_, times, _), unit in product(leans, units)
+            if times > 0.0
+        ),
+        default=np.inf,
+    )
+    leaning = nearest < _DECADES and max(size for size, *_ in leans) > _LEANS
     listed = []
-    for attitude, (times, _) in zip(attitudes, leans):
+    for attitude, (_, times, _) in zip(attitudes, leans):
         nats = together[attitude.kind if attitude is not None else None] if leaning else 0.0
         for unit in units:
             size = UNITS[unit][1]
@@ -116,26 +127,26 @@ def readings(
     return sorted(listed, key=lambda reading: reading.doubt)
 
 
-def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> tuple[float, float]:
-    """Return how many times what its lean makes a path accelerates by, in its own unit, and the
-    nats for their going together; 0 where nothing leans.
+def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> tuple[float, float, float]:
+    """Return what its lean accelerates a path by [m/s^2], how many times that it accelerates by in
+    its own unit, and the nats for their going together; 0 where that is not known.
     """
     time_q, quat = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
     stamps, acc = physics.accelerations(*rising(time, turned), "m", _SPAN)
     if min(len(stamps), len(time_q)) < 50:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
     lean = relations.mean_over(stamps, GRAVITY * up[:, :2], stamps, _SPAN)
     lean = lean - np.mean(lean, axis=0)
     acc = acc[:, :2] - np.mean(acc[:, :2], axis=0)
     size, moves = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (lean, acc))
     if size <= 0.0 or moves <= 0.0:
-        return 0.0, 0.0
+        return 0.0, 0.0, 0.0
     correlation = float(np.mean(np.sum(lean * acc, axis=1))) / (size * moves)
     independent = float(np.ptp(stamps)) / _SPAN
     correlation = min(max(correlation, 0.0), 0.999)
-    return moves / size, -0.5 * independent * float(np.log(1.0 - correlation**2))
+    return size, moves / size, -0.5 * independent * float(np.log(1.0 - correlation**2))
 
 
 def _huber(deviations: float) -> float:

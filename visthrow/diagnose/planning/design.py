@@ -95,10 +95,11 @@ class Limits:
         """Largest share of a further way, 1 at most, with which a path keeps within them."""
         if self.hold(path + added):
             return 1.0
-        share, step = 0.0, 0.5
-        for _ in range(HALVINGS):
-            share += step * self.hold(path + (share + step) * added)
-            step /= 2.0
+        share = 0.0
+        for halving in range(1, HALVINGS + 1):
+            further = share + 0.5**halving
+            if self.hold(path + further * added):
+                share = further
         return share
 
     def around(self, path: np.ndarray) -> "Limits":
@@ -119,9 +120,11 @@ def _extremes(path: np.ndarray) -> tuple[np.ndarray, float, float, float, float]
     acceleration [m/s^2] of a path.
     """
     vel = np.gradient(path, PERIOD, axis=0)
-    sizes = [np.linalg.norm(rows, axis=1) for rows in (vel, np.gradient(vel, PERIOD, axis=0))]
+    acc = np.gradient(vel, PERIOD, axis=0)
+    speed = np.linalg.norm(vel, axis=1).max()
+    push = np.linalg.norm(acc, axis=1).max()
     height = path[:, 2]
-    return np.abs(path[:, :2]).max(0), height.min(), height.max(), *(x.max() for x in sizes)
+    return np.abs(path[:, :2]).max(0), height.min(), height.max(), speed, push
 
 
 @dataclass(frozen=True)
@@ -137,8 +140,9 @@ class Sweep:
         """Values at times after its start [s], with the amplitude that ``limit`` gives for a
         frequency [Hz].
         """
-        frequency = self.low + (self.high - self.low) * t / self.seconds
-        turned = 2.0 * np.pi * (self.low + 0.5 * (self.high - self.low) * t / self.seconds) * t
+        slope = (self.high - self.low) / self.seconds
+        frequency = self.low + slope * t
+        turned = 2.0 * np.pi * (self.low + 0.5 * slope * t) * t
         fade = rise(t, 0.0, FADE) * (1.0 - rise(t, self.seconds - FADE, FADE))
         return limit(frequency) * fade * np.sin(turned + self.phase)
 
@@ -172,11 +176,13 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     def swept(axis: str, t: np.ndarray) -> np.ndarray:
         reach, speed, acceleration = most[axis]
-        low, high = (SLOWEST * (FASTEST / SLOWEST) ** x[f"{end}_{axis}"] for end in ("from", "to"))
+        low = SLOWEST * (FASTEST / SLOWEST) ** x[f"from_{axis}"]
+        high = SLOWEST * (FASTEST / SLOWEST) ** x[f"to_{axis}"]
 
         def farthest(frequency: np.ndarray) -> np.ndarray:
             turned = 2.0 * np.pi * frequency
-            return np.minimum(np.minimum(reach, speed / turned), acceleration / turned**2)
+            within = np.minimum(reach, speed / turned)
+            return np.minimum(within, acceleration / turned**2)
 
         return x[f"share_{axis}"] * Sweep(low, high, seconds).at(t, farthest)
 
@@ -194,7 +200,8 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     def rates(t: np.ndarray) -> np.ndarray:
         sweeps = [x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)]
-        return x["kept"] * base.rates(t) + limits.rate * np.column_stack(sweeps)
+        swept_rates = limits.rate * np.column_stack(sweeps)
+        return x["kept"] * base.rates(t) + swept_rates
 
     def thrust(t: np.ndarray) -> np.ndarray:
         kept = 1.0 + x["kept"] * (base.thrust(t) - 1.0)

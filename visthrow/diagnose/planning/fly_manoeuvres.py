@@ -110,18 +110,19 @@ def _(model: ThrowModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
 
     def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
         log = flight.log(noise)
-        carries = flight.manoeuvre.payload
-        effects = effects_for(
-            model.setting, set(log.channels), carries, np.isfinite(flight.manoeuvre.release)
-        )
+        manoeuvre = flight.manoeuvre
+        carries = manoeuvre.payload
+        setting = model.setting
+        releases = np.isfinite(manoeuvre.release)
+        effects = effects_for(setting, set(log.channels), carries, releases)
         return ThrowModel(
             [log],
-            model.setting.plant,
-            sensing=model.setting.sensing,
-            camera=model.setting.camera,
+            setting.plant,
+            sensing=setting.sensing,
+            camera=setting.camera,
             device=model.device,
             substep=COARSE * model.substep,
-            only=[n for n in effects if n in requested],
+            only=[name for name in effects if name in requested],
             carries=carries,
         )
 
@@ -181,9 +182,12 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
     """Deviation of each channel, as stated by the model times the scale that was found."""
     point = diagnosis.work.after
-    channels = diagnosis.work.problem.model.channels
-    noise = {name: point.sigma(c) * float(point.noise.scale[c]) for c, name in enumerate(channels)}
-    return {name: sigma for name, sigma in noise.items() if np.isfinite(sigma)}
+    noise = {}
+    for c, name in enumerate(diagnosis.work.problem.model.channels):
+        sigma = point.sigma(c) * float(point.noise.scale[c])
+        if np.isfinite(sigma):
+            noise[name] = sigma
+    return noise
 
 
 @dataclass(frozen=True)
@@ -224,7 +228,8 @@ class SimulatedFlight:
         """
         if not self.manoeuvre.payload:
             return 0.0
-        hanging = self.time < np.min(self.reference.time[self.reference.release], initial=np.inf)
+        released = self.reference.time[self.reference.release]
+        hanging = self.time < np.min(released, initial=np.inf)
         hangs = (self.truth["payload_pos_w"] - self.truth["pos_w"])[hanging]
         axes = -matrix_of_quat(self.truth["quat_wb"][hanging])[:, :, 2]
         cosine = np.einsum("ni,ni->n", hangs, axes) / np.linalg.norm(hangs, axis=1)

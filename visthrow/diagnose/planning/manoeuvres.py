@@ -63,20 +63,12 @@ class Reference:
             "time [s],x_w [m],y_w [m],z_w [m],vx_w [m/s],vy_w [m/s],vz_w [m/s],yaw [rad],added"
             " rate_x_b [rad/s],added rate_y_b [rad/s],added rate_z_b [rad/s],thrust factor,release"
         )
-        rows = np.column_stack(
-            (
-                self.time,
-                self.pos_w,
-                self.vel_w,
-                self.yaw,
-                self.rates_b,
-                self.thrust_factor,
-                self.release,
-            )
-        )
-        return (
-            "\n".join([header, *(",".join(f"{value:.5g}" for value in row) for row in rows)]) + "\n"
-        )
+        columns = (self.time, self.pos_w, self.vel_w, self.yaw, self.rates_b)
+        rows = np.column_stack((*columns, self.thrust_factor, self.release))
+        lines = [header]
+        for row in rows:
+            lines.append(",".join(f"{value:.5g}" for value in row))
+        return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ the truth, the smaller of both."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, log_evidence
-from visthrow.diagnose.likelihood.marginal import Noise, correlated, gram_of
+from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
@@ -66,21 +67,20 @@ class PlanningGoal:
         self.names = [e.name for e in work.problem.model.effects]
         expect_known(names, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
         number = self.names.index
-        classes = [
-            f for f in diagnosis.findings if f.verdict == result.CLASS and f.name in diagnosis.theta
-        ]
-        self.pairs = [
-            (number(f.name), number(partner))
-            for f in classes
-            for partner in f.partners
-            if not names or {f.name, partner} & set(names)
-        ]
-        unclear = [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
-        graded = [
-            e.name
-            for e, visible in zip(work.problem.model.effects, self.priors.visible)
-            if visible and not e.switch
-        ]
+        self.pairs = []
+        unclear = []
+        for f in diagnosis.findings:
+            if f.verdict == result.NOT_IDENTIFIABLE:
+                unclear.append(f.name)
+            if f.verdict != result.CLASS or f.name not in diagnosis.theta:
+                continue
+            for partner in f.partners:
+                if not names or {f.name, partner} & set(names):
+                    self.pairs.append((number(f.name), number(partner)))
+        graded = []
+        for effect, visible in zip(work.problem.model.effects, self.priors.visible):
+            if visible and not effect.switch:
+                graded.append(effect.name)
         self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
     def information(self, model: Model) -> np.ndarray:
@@ -101,13 +101,12 @@ class PlanningGoal:
         """Pairs apart, or effects that can be named, after the fewest flights that settle the most;
         and the number of these.
         """
+
+        def apart(count: int) -> list[tuple[int, ...]]:
+            return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
+
         if self.pairs:
-            return _fewest_flights(
-                lambda count: [
-                    pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE
-                ],
-                len(self.pairs),
-            )
+            return _fewest_flights(apart, len(self.pairs))
         able = self.priors.slab[self.vague] * NAMEABLE
         unknown = able < self._deviations(0.0 * new)
         # a name is confirmed by so many flights that tell of it
@@ -140,10 +139,9 @@ class PlanningGoal:
                 theta[j] = self.diagnosis.findings[j].estimate / priors.floor[j]
             after = score + new @ theta
             total = information + new
-            gaps.append(
-                log_evidence(total, after, priors, [*remaining, truth])
-                - log_evidence(total, after, priors, [*remaining, rival])
-            )
+            right = log_evidence(total, after, priors, [*remaining, truth])
+            wrong = log_evidence(total, after, priors, [*remaining, rival])
+            gaps.append(right - wrong)
         return float(min(gaps))
 
     def _deviations(self, new: np.ndarray) -> np.ndarray:
@@ -151,13 +149,11 @@ class PlanningGoal:
         information.
         """
         total = self.base.information + new
-        active = self.diagnosis.work.active
-        return np.array(
-            [
-                np.sqrt(covariance(total, self.priors.deviation([*active, j]))[j, j])
-                for j in self.vague
-            ]
-        )
+        deviations = []
+        for j in self.vague:
+            prior = self.priors.deviation([*self.diagnosis.work.active, j])
+            deviations.append(np.sqrt(covariance(total, prior)[j, j]))
+        return np.array(deviations)
 
     def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> FlightProposal:
         """Return the promise of a manoeuvre of this information."""
@@ -181,11 +177,8 @@ def propose(
     """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
     the expected information of each.
     """
-    return sorted(
-        [*(aim.proposal(*manoeuvre) for manoeuvre in informed), *_measured(aim)],
-        key=_worth,
-        reverse=True,
-    )
+    flights = [aim.proposal(manoeuvre, new) for manoeuvre, new in informed]
+    return sorted(flights + _measured(aim), key=_worth, reverse=True)
 
 
 def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
@@ -205,57 +198,46 @@ def _worth(p: FlightProposal) -> tuple[float, float]:
     """Return the sort key of a proposal: settling most comes first, soonest; one that settles
     nothing counts by its nats a second.
     """
-    return len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1)), p.nats / np.sqrt(p.seconds)
+    settles = len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1))
+    return settles, p.nats / np.sqrt(p.seconds)
 
 
 def _measured(aim: PlanningGoal) -> list[FlightProposal]:
     """Measurements on the ground that settle members of classes."""
-    diagnosis = aim.diagnosis
     names = aim.names
-    pairs = aim.pairs
-    findings = {f.name: f for f in diagnosis.findings}
-    out = []
+    findings = {f.name: f for f in aim.diagnosis.findings}
+    proposals = []
     for m in MEASUREMENTS:
-        pairs_of = [(a, b) for a, b in pairs if m.effect in (names[a], names[b])]
-        if not pairs_of:
+        pairs = [(a, b) for a, b in aim.pairs if m.effect in (names[a], names[b])]
+        if not pairs:
             continue
         j = names.index(m.effect)
-        information = (
-            0.5 * (findings[m.effect].estimate / m.sd) ** 2
-        )  # if it is the cause, the measurement shows it
-        gaps = [min(information, _denied(diagnosis, j, a + b - j, m)) for a, b in pairs_of]
-        separated = tuple(
-            (names[a], names[b]) for (a, b), gap in zip(pairs_of, gaps) if gap > DECISIVE
+        # if it is the cause, the measurement shows it
+        shown = 0.5 * (findings[m.effect].estimate / m.sd) ** 2
+        gaps = [min(shown, _denied(aim.diagnosis, j, a + b - j, m)) for a, b in pairs]
+        separated = []
+        for (a, b), gap in zip(pairs, gaps):
+            if gap > DECISIVE:
+                separated.append((names[a], names[b]))
+        repeats = int(bool(separated))
+        why = f"settles {m.effect}"
+        proposals.append(
+            FlightProposal(m.name, why, m.seconds, min(gaps), tuple(separated), repeats, "")
         )
-        out.append(
-            FlightProposal(
-                m.name,
-                f"settles {m.effect}",
-                m.seconds,
-                min(gaps),
-                separated,
-                int(bool(separated)),
-                "",
-            )
-        )
-    return out
+    return proposals
 
 
 def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
     """Nats by which the other member is ahead once the measurement has found the configured value
     right.
     """
-    work = diagnosis.work
-    problem = work.problem
-    priors = Priors.of(
-        narrowed(problem.model.effects, {m.effect: m.sd}), tuple(problem.model.channels)
-    )
-    remaining = [k for k in work.active if k not in (j, truth)]
-    sets = ([*remaining, truth], [*remaining, j])
-    true_nats, other_nats = (
-        log_evidence(work.after.information, work.after.score, priors, s) for s in sets
-    )
-    return true_nats - other_nats
+    point = diagnosis.work.after
+    model = diagnosis.work.problem.model
+    effects = narrowed(model.effects, {m.effect: m.sd})
+    priors = Priors.of(effects, tuple(model.channels))
+    remaining = [k for k in diagnosis.work.active if k not in (j, truth)]
+    right = log_evidence(point.information, point.score, priors, [*remaining, truth])
+    return right - log_evidence(point.information, point.score, priors, [*remaining, j])
 
 
 def expected_information(
@@ -264,40 +246,30 @@ def expected_information(
     """Information of simulated flights about the diagnosis' effects, in its floors, shape (K, K); 0
     for what they hide.
     """
-    flown = {e.name for e in model.effects}
+    flown = {e.name: i for i, e in enumerate(model.effects)}
     windows = model.windows({name: value for name, value in theta.items() if name in flown})
     floors = np.array([e.floor for e in model.effects])
-    places = np.array([names.index(e.name) for e in model.effects if e.name in names])
-    columns = np.array([i for i, e in enumerate(model.effects) if e.name in names])
+    grams = grams_of(windows, floors, len(model.channels))
+    grams = correlated_of(grams, windows, noise.correlation_time)
+    loudest: dict[int, float] = {}
+    for (block, _), level in noise.latent_sd.items():
+        loudest[block] = max(level, loudest.get(block, 0.0))
+    # of a payload that has not been flown: as strongly as the vehicle [N]
+    usual = loudest.get(0, 1.0)
+    levels = {}
+    for block, phase in product(range(len(LATENT_BLOCKS)), {w.phase for w in windows}):
+        level = loudest.get(block, usual)
+        levels[block, phase] = noise.latent_sd.get((block, phase), level)
+    alike = np.ones((len(windows), len(LATENT_BLOCKS)))
+    expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
+    parts = integrals(grams, expected).shares(grams, expected)
+    information = np.sum([part.information for part in parts], axis=0)
+    rows = [i for i, name in enumerate(names) if name in flown]
+    columns = [flown[names[i]] for i in rows]
+    ratio = priors.floor[rows] / floors[columns]  # both catalogues name the same effects
     total = np.zeros((len(names), len(names)))
-    loudest = {
-        block: max(v for (b, _), v in noise.latent_sd.items() if b == block)
-        for block, _ in noise.latent_sd
-    }
-    pushed = loudest.get(
-        0, 1.0
-    )  # of a payload that has not been flown: as strongly as the vehicle [N]
-    for window in windows:
-        gram = correlated(
-            gram_of(window, floors, len(model.channels)), window, noise.correlation_time
-        )
-        levels = {
-            (int(b), window.phase): noise.latent_sd.get(
-                (int(b), window.phase), loudest.get(int(b), pushed)
-            )
-            for b in np.unique(gram.latent_block)
-        }
-        alike = np.ones((1, len(LATENT_BLOCKS)))
-        expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
-        part = integrals([gram], expected).shares([gram], expected)[0].information
-        total[np.ix_(places, places)] += part[np.ix_(columns, columns)]
-    floor = {
-        e.name: e.floor for e in model.effects
-    }  # both catalogues name the same effect, the floors may differ
-    ratio = np.array(
-        [priors.floor[i] / floor[name] if name in floor else 1.0 for i, name in enumerate(names)]
-    )
-    return total * np.outer(ratio, ratio)
+    total[np.ix_(rows, rows)] = information[np.ix_(columns, columns)] * np.outer(ratio, ratio)
+    return total
 
 
 def _fewest_flights(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:

@@ -107,12 +107,11 @@ def landing_gain(
     if plain is None:
         return None
     named = model.landings(theta, flown) if theta else plain
-    parts = (
-        [model.landings(trained[int(f)], [int(f)]) for f in plain.flights] if trained else [named]
-    )
-    held_landings = PredictedLandings(
-        *(np.concatenate(column) for column in zip(*(vars(part).values() for part in parts)))
-    )
+    held_landings = named
+    if trained:
+        parts = [model.landings(trained[int(f)], [int(f)]) for f in plain.flights]
+        columns = zip(*(vars(part).values() for part in parts))
+        held_landings = PredictedLandings(*map(np.concatenate, columns))
     good = np.isfinite(plain.errors) & np.isfinite(held_landings.errors)
     if not good.any():
         return None
@@ -120,17 +119,15 @@ def landing_gain(
     for name in theta:
         remaining = {effect: size for effect, size in theta.items() if effect != name}
         without = model.landings(remaining, flown) if remaining else plain
-        moved[name] = float(
-            np.nanmean(np.linalg.norm((named.predicted - without.predicted)[good, :2], axis=1))
-        )
+        level = (named.predicted - without.predicted)[good, :2]
+        moved[name] = float(np.nanmean(np.linalg.norm(level, axis=1)))
     after = mean(held_landings.errors[good], seed=seed)
-    released = [
-        float(np.nanmean(prediction.released_errors[good])) for prediction in (plain, held_landings)
-    ]
-    off = [
-        tuple(map(tuple, (x.predicted - x.measured)[good, :2].tolist()))
-        for x in (plain, held_landings)
-    ]
+    released = []
+    off = []
+    for prediction in (plain, held_landings):
+        released.append(float(np.nanmean(prediction.released_errors[good])))
+        level = (prediction.predicted - prediction.measured)[good, :2]
+        off.append(tuple(map(tuple, level.tolist())))
     return LandingGain(
         int(good.sum()),
         bool(trained),
@@ -193,21 +190,14 @@ def on_others(
             weight = (plain.sigma / window.sigma) ** 2
             outliers += int((weight < 1.0).sum())
             squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2
-            predicts = horizon >= 0
-            added = np.array(
-                [
-                    np.bincount(window.channel[predicts], values, channels)
-                    for values in (weight * squares)[:, predicts]
-                ]
-            )
+            weighted = np.where(horizon >= 0, weight * squares, 0.0)
+            added = np.array([np.bincount(window.channel, row, channels) for row in weighted])
             added[1] = np.where(added[1] > FAR_ABOVE * added[0], added[0], added[1])
             sums += added
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
-    errors = {
-        name: tuple(map(float, row))
-        for name, row in zip(after.channels, np.column_stack((plain, named, floor)))
-    }
+    rows = np.column_stack((plain, named, floor)).tolist()
+    errors = {name: tuple(row) for name, row in zip(after.channels, rows)}
     samples = sum(len(w.residual) for w in windows)
     return Tested(errors, len({w.flight for w in windows}), len(windows), samples, outliers)
 
@@ -232,10 +222,10 @@ def _blackbox(
         training = np.setdiff1d(np.arange(len(weights)), fold)
         weights[fold] = trained.weights(training) if len(training) else 0.0
     weights_of = weights[np.searchsorted(trained.groups, groups)]
-    residuals = [
-        w.residual - w.latent @ (table.columns(w) @ size)
-        for w, size in zip(before.windows, weights_of)
-    ]
+    residuals = []
+    for window, size in zip(before.windows, weights_of):
+        force = table.columns(window) @ size
+        residuals.append(window.residual - window.latent @ force)
     return errors(before.windows, groups, after.noise, residuals, channels).square
 
 

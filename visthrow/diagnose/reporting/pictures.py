@@ -48,22 +48,23 @@ def _figure(rows: int, columns: int, height: float, **options):
     )
 
 
+def _with_legend(figure) -> bytes:
+    """Return the PNG of a figure, the labels of its first axes above it."""
+    labelled = figure.axes[0].get_legend_handles_labels()
+    figure.legend(*labelled, loc="outside upper center", ncol=4, markerscale=2)
+    return png_of(figure)
+
+
 def plain_ticks(low: float, high: float, count: int) -> list[float]:
     """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no
     choice of them fits.
     """
-    reach = max(abs(low), abs(high))
     for digits in STEPS_OF_TICKS:
-        sizes = [
-            digit * 10.0**power
-            for power in range(-4, 7)
-            for digit in digits
-            if digit * 10.0**power <= reach
-        ]
+        sizes = np.outer(10.0 ** np.arange(-4, 7), digits).ravel()
         if low <= 0.0 <= high:
-            sizes = [size for size in sizes if size >= 1.0]
-            sizes = [*(-size for size in sizes[::-1]), 0.0, *sizes]
-        ticks = [tick for tick in sizes if low <= tick <= high]
+            sizes = sizes[sizes >= 1.0]
+            sizes = np.concatenate((-sizes[::-1], [0.0], sizes))
+        ticks = sizes[(sizes >= low) & (sizes <= high)].tolist()
         if 2 <= len(ticks) <= count:
             return ticks
     return []
@@ -101,7 +102,6 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
         for axis, label, values in zip(axes.flat, REFERENCE, columns):
             axis.plot(r.time, values, color=colour, lw=1.0, label=manoeuvre.name)
             axis.set(ylabel=label, xlabel="time [s]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
     best = sorted(rates, key=rates.get)[-6:]
     axes[2, 2].barh(
         best,
@@ -110,7 +110,7 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
     )
     axes[2, 2].tick_params(axis="y", labelsize=6)
     axes[2, 2].set(xlabel="expected nats a second")
-    return png_of(figure)
+    return _with_legend(figure)
 
 
 def residuals(work: Work, channel: int) -> bytes:
@@ -123,24 +123,13 @@ def residuals(work: Work, channel: int) -> bytes:
     for before, after in zip(work.before.windows, work.after.windows):
         rows = before.channel == channel
         if rows.any():
-            pairs.append(
-                (
-                    before,
-                    after,
-                    rows,
-                    left_over(before, work.after.noise)[rows],
-                    left_over(after, work.after.noise)[rows],
-                )
-            )
-    gained = np.argsort([np.mean(b**2) - np.mean(a**2) for *_, b, a in pairs])[::-1]
-    chosen = (
-        [*gained[: SHOWN_WINDOWS - 1], gained[len(gained) // 2]]
-        if len(gained) >= SHOWN_WINDOWS
-        else list(gained)
-    )
+            old, new = (left_over(w, work.after.noise)[rows] for w in (before, after))
+            pairs.append((np.mean(old**2) - np.mean(new**2), before, rows, old, new))
+    pairs.sort(key=lambda pair: -pair[0])
+    usual = pairs[len(pairs) // 2]
+    chosen = [*pairs[: SHOWN_WINDOWS - 1], usual] if len(pairs) >= SHOWN_WINDOWS else pairs
     figure, axes = _figure(1, len(chosen), 2.9, sharey=True)
-    for axis, i in zip(axes[0], chosen):
-        before, _, rows, old, new = pairs[i]
+    for axis, (_, before, rows, old, new) in zip(axes[0], chosen):
         time = before.time[rows]
         noise = factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
         axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
@@ -148,10 +137,7 @@ def residuals(work: Work, channel: int) -> bytes:
         axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
         axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
     axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3, markerscale=4
-    )
-    return png_of(figure)
+    return _with_legend(figure)
 
 
 def ladder(diagnosis: Diagnosis) -> bytes:
@@ -170,16 +156,10 @@ def ladder(diagnosis: Diagnosis) -> bytes:
         screened = [max(step.screened[n], 0.0) for n in names]
         labels = [textwrap.fill(name, NAMES_ACROSS) for name in names]
         axis.barh(labels, screened, height=0.62, color=style.FAINT)
-        for y, name in enumerate(names):
-            if name in step.refitted:
-                won = name == step.named
-                axis.plot(
-                    max(step.refitted[name], 0.0),
-                    y,
-                    marker="o" if won else "^",
-                    ms=6,
-                    color=AFTER if won else style.QUIET,
-                )
+        for name in step.refitted.keys() & set(names):
+            marker, colour = ("o", AFTER) if name == step.named else ("^", style.QUIET)
+            height = names.index(name)
+            axis.plot(max(step.refitted[name], 0.0), height, marker=marker, ms=6, color=colour)
         axis.axvline(step.least, color=BEFORE, lw=1)
         several = f"{step.named.count(', ') + 1} causes"
         axis.set(
@@ -208,24 +188,14 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     labelled = set()
     axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
     for y, f in enumerate(findings):
+        colour = colours[f.verdict]
         label = None if f.verdict in labelled else f.verdict
         labelled.add(f.verdict)
         middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
-        axis.plot(
-            np.array([f.low, f.high]) / f.floor,
-            [y, y],
-            color=colours[f.verdict],
-            lw=2.4,
-            solid_capstyle="butt",
-        )
-        axis.plot(
-            middle / f.floor,
-            y,
-            "o" if f.estimate else "|",
-            color=colours[f.verdict],
-            ms=6,
-            label=label,
-        )
+        ends = np.array([f.low, f.high]) / f.floor
+        axis.plot(ends, [y, y], color=colour, lw=2.4, solid_capstyle="butt")
+        marker = "o" if f.estimate else "|"
+        axis.plot(middle / f.floor, y, marker, color=colour, ms=6, label=label)
     axis.axvline(0.0, color=style.QUIET, lw=0.8)
     axis.set(
         xlabel="size in floors (grey: within the floor)",
@@ -236,8 +206,7 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
     _plain(axis.xaxis, MOST_TICKS)
     axis.tick_params(axis="x", top=True, labeltop=True)
-    figure.legend(loc="outside upper center", ncol=4)
-    return png_of(figure)
+    return _with_legend(figure)
 
 
 def horizons(gain: Gain) -> bytes:
@@ -253,8 +222,7 @@ def horizons(gain: Gain) -> bytes:
         axis.minorticks_off()
         _plain(axis.yaxis, MOST_TICKS // 2)
     axes[0, 0].set_ylabel("error [sigma of the sensor]")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncol=3)
-    return png_of(figure)
+    return _with_legend(figure)
 
 
 def landings(landing: LandingGain) -> bytes:
@@ -270,8 +238,7 @@ def landings(landing: LandingGain) -> bytes:
         axis.plot(*(1e3 * np.array((before, after)).T), color=style.FAINT, lw=1, zorder=0)
     axis.plot(0.0, 0.0, "+", color=style.INK, ms=12, label="measured")
     axis.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    figure.legend(loc="outside upper center", ncol=3)
-    return png_of(figure)
+    return _with_legend(figure)
 
 
 def confusion(diagnosis: Diagnosis) -> bytes:
@@ -280,16 +247,13 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     """
     work = diagnosis.work
     visible = np.flatnonzero(work.problem.priors.visible)
-    sigma = covariance(work.after.information, work.problem.priors.deviation(visible))[
-        np.ix_(visible, visible)
-    ]
+    prior = work.problem.priors.deviation(visible)
+    sigma = covariance(work.after.information, prior)[np.ix_(visible, visible)]
     deviation = np.sqrt(np.diag(sigma))
     correlation = sigma / np.outer(deviation, deviation)
-    strongest = np.where(
-        np.isin(visible, work.active),
-        2.0,
-        np.abs(correlation - np.eye(len(visible))).max(axis=1, initial=0.0),
-    )
+    others = np.abs(correlation - np.eye(len(visible)))
+    strongest = others.max(axis=1, initial=0.0)
+    strongest[np.isin(visible, work.active)] = 2.0
     strongest_effects = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
     names = [work.problem.model.effects[j].name for j in visible[strongest_effects]]
     figure, axes = _figure(1, 1, 1.6 + 0.3 * len(strongest_effects))

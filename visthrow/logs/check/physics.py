@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back
-from visthrow.logs.axes import EXCHANGES, MATRICES, OURS, is_mirror
+from visthrow.logs.axes import MATRICES, is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -39,6 +39,7 @@ DELAY_KNOWN = 0.012  # deviation of a delay, below which it counts as measured [
 _UNTOLD = 0.15  # deviation of a delay, above which it says nothing [s]
 _PERIOD = (2e-4, 2.0)  # between two positions, median [s]
 _NATS = 10.0  # of evidence, from which other axes count as found: e^-10 of good logs would fail
+_SHARED = 3.0  # accelerations that share their samples: as many times fewer are independent
 # RMS acceleration that shows beside the noise of accelerometers and the pull of draughts [m/s^2]
 _PUSHED = 0.2
 _LONGER = 0.05  # of the model's length: markers sit off the ends
@@ -190,19 +191,12 @@ def _compared(
                 "frames",
                 channels,
                 "bad",
-                f"go together {_better(relation)}",
+                f"go together as {_better(relation)}",
                 figures | {"axes": relation.axes, "nats": relation.nats},
             )
         ]
-    rows = [
-        Row(
-            "frames",
-            channels,
-            "ok",
-            f"go together as they are, correlation {relation.correlation:.2f}",
-            figures,
-        )
-    ]
+    together = f"go together as they are, correlation {relation.correlation:.2f}"
+    rows = [Row("frames", channels, "ok", together, figures)]
     if not 0.67 < relation.scale < 1.5:
         hint = relations.unit_hint(relation.scale) or "no unit explains it"
         weak = abs(relation.correlation) < 0.7 and 0.4 < relation.scale < 1.5
@@ -227,9 +221,9 @@ def _turned(relation: relations.Relation) -> bool:
     return relation.nats > _NATS and relation.axes_correlation > relation.correlation + CLEARLY
 
 
-def _better(relation: relations.Relation) -> str:
+def _better(relation: relations.Relation, whose: str = "") -> str:
     """Words about an exchange of axes that beats those as they are."""
-    text = f"as ({relation.axes}), {relation.nats:.0f} nats better: {_kind(relation.axes)} "
+    text = f"({relation.axes}){whose}, {relation.nats:.0f} nats better: {_kind(relation.axes)} "
     return text + f"(correlation {relation.axes_correlation:.2f}, not {relation.correlation:.2f})"
 
 
@@ -349,7 +343,7 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     if relation is None:
         return []
     channels = f"d({path})/dt, {quat} acc_b"
-    wrong = _exchanged(time, acc, pushed, turn, relation.axes_delay, channels, True)
+    wrong = _exchanged(relation, channels)
     if wrong is None:
         expected_b = rotate_back(turn, acc + gravity)
         wrong = _exchanged_body(time, expected_b, time_a, force_b, channels)
@@ -402,7 +396,7 @@ def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str)
     relation = relations.relate(time, acc * level, time, pushed)
     if relation is None:
         return []
-    wrong = _exchanged(time, acc * level, pushed, turn, relation.axes_delay, channels, False)
+    wrong = _exchanged(relation, channels)
     return [wrong] if wrong is not None else _pushed(relation, acc * level, pushed, channels, False)
 
 
@@ -432,7 +426,7 @@ def _exchanged_body(
         "frames",
         channels,
         "bad",
-        f"acc_b fits {_better(relation)}",
+        f"acc_b fits as {_better(relation)}",
         {"axes": relation.axes, "of": "acc_b", "nats": relation.nats},
     )
 
@@ -471,26 +465,14 @@ def _pushed(
             " attitude or accelerometer of another flight, or noise"
         )
         return [Row("frames", channels, verdict, text, figures)]
-    rows = [
-        Row(
-            "frames",
-            channels,
-            "ok",
-            f"go together as they are, correlation {relation.correlation:.2f}",
-            figures,
-        )
-    ]
+    together = f"go together as they are, correlation {relation.correlation:.2f}"
+    rows = [Row("frames", channels, "ok", together, figures)]
     if not 0.5 < relation.scale < 2.0:
-        hint = relations.unit_hint(relation.scale) or "no unit explains it"
-        rows.append(
-            Row(
-                "units",
-                channels,
-                "bad" if hint else "warn",
-                f"the second is {relation.scale:.4g} times the first: {hint}",
-                figures,
-            )
+        hint = relations.unit_hint(relation.scale)
+        text = (
+            f"the second is {relation.scale:.4g} times the first: {hint or 'no unit explains it'}"
         )
+        rows.append(Row("units", channels, "bad", text, figures))
     if sensed:
         rows.append(_late(relation, channels, figures, False))
         if np.linalg.norm(off) > _OFFSET:
@@ -502,44 +484,14 @@ def _pushed(
     return rows
 
 
-def _exchanged(
-    time: np.ndarray,
-    acc: np.ndarray,
-    pushed: np.ndarray,
-    turn: np.ndarray,
-    delay: float,
-    channels: str,
-    sensed: bool,
-) -> Row | None:
-    """Which exchange of axes, of the path or of the accelerometer, or which turn of the attitude,
-    makes both fit.
-    """
-    overlap = (time + delay > time[0]) & (time + delay < time[-1])
-    acc = acc[overlap]
-    turn = turn[overlap]
-    pushed = relations.on_grid(time, pushed, time[overlap] + delay)
-    tried = {"path": np.einsum("kij,nj->kni", MATRICES, acc) - pushed}
-    if sensed:
-        gravity = np.array([0.0, 0.0, GRAVITY])
-        force_b = rotate_back(turn, pushed + gravity)
-        turned = np.einsum("nij,kjm,nm->kni", matrix_of_quat(turn), MATRICES, force_b)
-        tried["acc_b"] = acc - (turned - gravity)
-    errors = {
-        (what, EXCHANGES[k]): float(np.mean(e**2))
-        for what, error in tried.items()
-        for k, e in enumerate(error)
-    }
-    plain = errors["path", OURS]
-    (what, axes), smallest = min(errors.items(), key=lambda item: item[1])
-    independent = max(float(np.ptp(time)) / (3.0 * relations.INDEPENDENT), 10.0)
-    nats = 0.5 * independent * np.log(plain / smallest) - np.log(len(errors))
-    strength = float(np.mean(np.var(acc, axis=0)))
-    if axes == OURS or nats < _NATS or smallest > 0.5 * (1.0 if what == "acc_b" else strength):
+def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
+    """Report a path that goes with the push in other axes."""
+    firm = relation.axes_correlation > _CORRELATED and relation.nats > _SHARED * _NATS
+    if not firm or not _turned(relation):
         return None
-    whose = "positions and velocities" if what == "path" else "the accelerometer"
-    text = f"fit with ({axes}) of {whose}, {nats:.0f} nats better: {_kind(axes)}"
-    text += f" (error {np.sqrt(plain):.2f} -> {np.sqrt(smallest):.2f} m/s^2)"
-    return Row("frames", channels, "bad", text, {"axes": axes, "of": what, "nats": nats})
+    text = f"fit with {_better(relation, ' of positions and velocities')}"
+    figures = {"axes": relation.axes, "of": "path", "nats": relation.nats}
+    return Row("frames", channels, "bad", text, figures)
 
 
 def _still_gravity(log: FlightLog) -> list[Row]:
@@ -629,7 +581,7 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
         )
         return [Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)]
     if _turned(relation):
-        text = f"the rates follow the commands {_better(relation)}"
+        text = f"the rates follow the commands as {_better(relation)}"
         return [
             Row(
                 "frames",

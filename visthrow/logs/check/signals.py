@@ -214,12 +214,11 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
     same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
     if not np.any(same):
         return []
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
-    starts = edges[::2]
-    ends = edges[1::2]
-    lengths = time[np.minimum(ends, len(time) - 1)] - time[starts]
+    changes = np.flatnonzero(~same)
+    firsts = np.append(0, changes + 1)
+    lengths = time[np.append(changes, len(same))] - time[firsts]
     longest = float(np.max(lengths))
-    start = float(time[starts[np.argmax(lengths)]])
+    start = float(time[firsts[np.argmax(lengths)]])
     total = float(np.sum(lengths[lengths > _STUCK_TIME]))
     share = float(np.mean(same))
     figures = {"longest_s": longest, "at_s": start, "stuck_s": total, "repeated_share": share}
@@ -227,15 +226,8 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
         return [Row("values", name, "bad", "one value from beginning to end", figures)]
     if longest > _STUCK_TIME:
         verdict = "bad" if total > 0.3 * float(np.ptp(time)) else "warn"
-        return [
-            Row(
-                "values",
-                name,
-                verdict,
-                f"stands still to the last digit for {longest:.2f} s at {start:.2f} s",
-                figures,
-            )
-        ]
+        text = f"stands still to the last digit for {longest:.2f} s at {start:.2f} s"
+        return [Row("values", name, verdict, text, figures)]
     if share > 0.2:
         text = (
             f"{100 * share:.0f} % of the samples repeat the one before: measured more slowly than"
@@ -246,31 +238,18 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
 
 
 def _railed(name: str, values: np.ndarray) -> list[Row]:
-    worst = 0.0
-    where = ""
+    rails = [(0.0, "")]
+    stops = any(word in name for word in _STOPS_AT_ZERO)  # switched off is no rail
     for column in values.T:
-        low = np.min(column)
-        high = np.max(column)
-        if high == low:
-            continue
-        for rail, words in ((low, "lowest"), (high, "highest")):
-            if rail == low and any(word in name for word in _STOPS_AT_ZERO):
-                continue  # switched off is no rail
-            share = float(np.sum(column == rail) - 1) / len(column)  # one is always the least
-            if share > worst:
-                worst = share
-                where = f"its {words} value {rail:.6g}"
+        for rail, words in ((np.min(column), "lowest"), (np.max(column), "highest")):
+            if np.ptp(column) > 0.0 and not (stops and words == "lowest"):
+                share = float(np.sum(column == rail) - 1) / len(column)  # one always is
+                rails.append((share, f"its {words} value {rail:.6g}"))
+    worst, where = max(rails)
     if worst <= _RAIL_SHARE:
         return []
-    return [
-        Row(
-            "values",
-            name,
-            "warn",
-            f"{100 * worst:.1f} % of the samples at {where}: saturated",
-            {"share": worst},
-        )
-    ]
+    text = f"{100 * worst:.1f} % of the samples at {where}: saturated"
+    return [Row("values", name, "warn", text, {"share": worst})]
 
 
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
@@ -288,16 +267,9 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[R
         index = int(np.argmax(np.where(jumped, size, 0.0)))
         count = int(np.sum(jumped))
         largest = f"{size[index]:.3g}{unit_word} at {time[index]:.2f} s"
+        verdict = "warn" if np.mean(jumped) < 0.02 else "bad"
         text = f"{count} jumps, the largest {largest}"
-        rows.append(
-            Row(
-                "values",
-                name,
-                "warn" if np.mean(jumped) < 0.02 else "bad",
-                text,
-                {"jumps": int(np.sum(jumped))},
-            )
-        )
+        rows.append(Row("values", name, verdict, text, {"jumps": count}))
     if unit == "m":
         return rows + _jumps_across(name, values, time, np.flatnonzero(~adjacent))
     return rows
@@ -313,14 +285,9 @@ def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndar
         after = slice(i + 1, i + 10)
         if min(len(time[before]), len(time[after])) < 5:
             continue
-        expected = [
-            np.polyfit(time[part] - middle, values[part], 1)[1]
-            for part, middle in (
-                (before, 0.5 * (time[i] + time[i + 1])),
-                (after, 0.5 * (time[i] + time[i + 1])),
-            )
-        ]
-        distance = float(np.linalg.norm(expected[1] - expected[0]))
+        middle = 0.5 * (time[i] + time[i + 1])
+        ends = [np.polyfit(time[part] - middle, values[part], 1)[1] for part in (before, after)]
+        distance = float(np.linalg.norm(ends[1] - ends[0]))
         width = float(time[i + 1] - time[i])
         if distance > 0.05 + 0.25 * _HARDEST * width**2:
             off.append((distance, float(time[i]), width))
