@@ -1,20 +1,12 @@
-"""A camera's keypoints: the worlds' camera against the package's, and what the diagnosis takes from
-a detector's marks.
-"""
+"""What the diagnosis takes from the keypoints of a world's camera."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
-import torch
 from pytest import approx, fixture, mark
 
 from bench.diagnose.sealed import flight_log
-from bench.worlds.camera import CENTRE, FOCAL, HALF_VIEW, marks
-from bench.worlds.numbers import hide
-from bench.worlds.turns import matrix
 from bench.worlds.world import CAMERA_FLOORS, Recipe, fly_recipe, recorded
-from camera.keypoints import KeypointCamera, keypoints
 from sim.effects.setting import Setting
 from tests.configs import load_experiment
 from visthrow.config.effects import catalogue
@@ -23,8 +15,6 @@ from visthrow.diagnose.throw.direct import CameraView
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.task import plant_of
 
-BOX = 0.5
-"""Largest error of the package's box, which takes the ball's outline to second order [px]."""
 SIZE = 5.0
 """Of what is hidden [floors]."""
 RECIPE = Recipe(21, "rod", free=2, free_seconds=6.0, throws=2, camera=True)
@@ -71,31 +61,6 @@ class Eyes:
 def flown():
     """Flights; no effect of a camera changes them."""
     return fly_recipe(RECIPE)
-
-
-def test_the_worlds_camera_sees_what_the_packages_sees():
-    rng, count = np.random.default_rng(0), 300
-    quat = rng.normal(size=(count, 4)) * [0.0, 0.3, 0.3, 0.8] + [1.0, 0.0, 0.0, 0.0]
-    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
-    pos = rng.uniform(-1.0, 1.0, (count, 3)) + [0.0, 0.0, 2.0]
-    ball = pos + rng.normal(size=(count, 3)) * 0.1 + [0.0, 0.0, -0.38]
-    goal = np.array([1.0, 0.5, 0.0])
-    flight = SimpleNamespace(
-        time=np.arange(count) * 1e-3, pos=pos[None], quat=quat[None], ball=ball[None]
-    )
-    found, seen = marks(flight, 0, flight.time, goal, hide({}))
-
-    lens = KeypointCamera(load_experiment("state").camera, dtype=torch.float64)
-    arrays = pos, matrix(quat), np.tile(goal, (count, 1)), ball
-    points, valid = (
-        x.numpy()
-        for x in keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(x)) for x in arrays])
-    )
-    pixels = points * FOCAL * HALF_VIEW + CENTRE
-    np.testing.assert_array_equal(seen[:, :4], valid[:, :4])
-    np.testing.assert_allclose(pixels[:, :4][seen[:, :4]], found[:, :4][seen[:, :4]], atol=1e-9)
-    assert seen[:, 4:].mean() > 0.9
-    assert 1e-6 < np.abs(pixels[:, 4:] - found[:, 4:])[seen[:, 4:]].max() < BOX
 
 
 @mark.parametrize("name", ["camera_tilt_x", "camera_latency", "camera_focal"])

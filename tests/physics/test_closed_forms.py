@@ -278,17 +278,3 @@ def test_external_wrench():
     assert_allclose(sim.get("pos_w")[0], expected * time / 2.0, atol=1e-12)
     spun = [0.0, 0.0, 1e-4 / vehicle.body.inertia[2] * time]
     assert_allclose(sim.get("rate_b"), [np.zeros(3), spun], atol=1e-12)
-
-
-def test_a_rope_does_not_keep_a_wrench_from_acting():
-    """The same push on vehicle, rope and payload: all of their mass is accelerated."""
-    plant = replace(plain_plant(), sim=numerics(precision="float64"))
-    pushed, free = (HybridSim(plant, 1, extensions=frozenset({"push"})) for _ in range(2))
-    pushed.set_wrench([[0.2, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
-    totals = []
-    for sim in (pushed, free):
-        advance(sim, 1)
-        masses, _, _, velocities, _ = rods(sim)
-        vehicle = plant.vehicle.body.mass * sim.get("vel_w")[0, 0]
-        totals.append(vehicle + np.sum(masses * velocities[0, :, 0]))
-    assert totals[0] - totals[1] == approx(0.2 * 0.02, rel=1e-2)

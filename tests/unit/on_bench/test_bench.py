@@ -2,16 +2,13 @@
 is judged.
 """
 
-import argparse
 import importlib
-import json
 import shlex
 from pathlib import Path
 
 from pytest import fixture, mark, raises
 
 from bench import report, start
-from bench.diagnose.two_checkouts import compare
 from tests.configs import load_experiment
 from visthrow import cli
 from visthrow.common.errors import StorageError
@@ -85,16 +82,3 @@ def test_records_refuse_what_they_are_not(kept):
 
 def test_mistakes_are_told(refused):
     refused("bench records no_such_record", said="no record")
-
-
-def test_an_answer_that_is_an_error_is_no_right_null(tmp_path, capsys):
-    right = {"named": [], "overall": "NO EFFECT", "seconds": 2.0, "error": "", "errors": []}
-    failed = right | {"overall": "ERROR", "error": "TypeError: f() takes 3 arguments"}
-    world = {"bank": "sealed", "kind": "null", "recipe": {"effects": {}}}
-    ledger = tmp_path / "two.jsonl"
-    ledger.write_text(json.dumps(world | {"old": right, "new": failed}))
-    compare(argparse.Namespace(ledgers=[ledger], list=False))
-    lines = capsys.readouterr().out.splitlines()
-    old, new = (line for line in lines if line.startswith("nulls without a name"))
-    assert "1 of    1" in old
-    assert "0 of    1" in new

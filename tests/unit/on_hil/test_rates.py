@@ -5,10 +5,9 @@ Betaflight's curves at known points, their inverse, and which way is which.
 
 import math
 
-from pytest import approx, mark, raises
+from pytest import approx, mark
 
 from hil.links.backends.rates import RatesParams, Sticks
-from visthrow.common.errors import ConfigError
 
 LINEAR = RatesParams("actual", (60, 60, 30), (60, 60, 30), (0, 0, 0))
 ACTUAL = RatesParams("actual", (7, 20, 10), (67, 90, 40), (0, 54, 100))
@@ -59,16 +58,3 @@ def test_which_way_is_which():
     assert sticks.position(2, 1.0) < 1500
     assert [sticks.position(axis, 0.0) for axis in range(3)] == [1500] * 3
     assert sticks.position(0, 1e3) == 2000, "beyond the end is the end"
-
-
-@mark.parametrize(
-    ("change", "message"),
-    [
-        ((300, 1, 1), "rc_rates is .*; expected 1 to 255"),
-        ((0, 60, 60), "1 to 255"),
-        ((-1, 60, 60), "1 to 255"),
-    ],
-)
-def test_profiles_that_are_none(change, message):
-    with raises(ConfigError, match=message):
-        RatesParams("actual", change, (60, 60, 60), (0, 0, 0))

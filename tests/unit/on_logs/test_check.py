@@ -634,7 +634,7 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
     (tmp_path / "mine.toml").write_text(f'about = "a table"\n{mapping}')
     (tmp_path / "t.csv").write_text("t,i\n" + "".join(f"{0.01 * n},{n % 7}\n" for n in range(200)))
     check_with = ["diagnose", "check", "--no-pictures", "--config"]
-    refused = "is not used: it says how the columns of a table are read"
+    unused = "is not used: it says how the columns of a table are read"
     for files, setup in (
         ("a.npz", "mine.toml"),
         ("a.npz+b.npz", "mine.toml"),
@@ -647,8 +647,8 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(tmp_path, c
             )
             == 2
         )
-        assert refused in capsys.readouterr().err
-    refused(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml", said=refused)
+        assert unused in capsys.readouterr().err
+    refused(f"diagnose explain {tmp_path}/a.npz --config {tmp_path}/mine.toml", said=unused)
     refused(
         f"diagnose explain {tmp_path}/t.csv --config {tmp_path}/mine.toml",
         said="where that holds a model, such as [flyer]",

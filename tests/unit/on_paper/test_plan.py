@@ -39,14 +39,6 @@ def test_the_release_lands_on_the_target():
     assert release.fall_time == approx(time)
 
 
-def test_landing_by_hand():
-    """Upwards at 2 m/s from 1 m to the ground: 4.905 t^2 - 2 t - 1 = 0, t = 0.69925 s."""
-    point, time = landing_point(np.array([0.5, 0.1, 1.0]), np.array([3.0, -1.0, 2.0]), 0.0)
-    assert time == approx((2.0 + np.sqrt(4.0 + 19.62)) / 9.81)
-    assert point == approx([0.5 + 3.0 * time, 0.1 - time])
-    assert np.isnan(landing_point(np.array([0.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.5]), 1.0)[1])
-
-
 def test_release_is_read_off_a_flight():
     recorder = FlightRecorder({"times": {"separation": 0.5}})
     for time, height, speed in ((0.4, 1.0, 2.0), (0.6, 1.2, 3.0)):

@@ -1,12 +1,4 @@
-"""Units of work: keys, files, records, and that a killed run loses and repeats nothing."""
-
-import json
-import os
-import signal
-import subprocess
-import sys
-import time
-from pathlib import Path
+"""Units of work: keys, files and records."""
 
 import numpy as np
 from pytest import approx, mark, raises
@@ -92,43 +84,3 @@ def test_work_does_only_what_is_missing(tmp_path):
     assert [found[results.key_of(unit(n))].of("error")[1] for n in range(3)] == approx(
         [0.1235, 1.1235, 2.1235], abs=1e-4
     )
-
-
-def test_killed_and_started_again_it_loses_and_repeats_nothing(tmp_path):
-    """SIGKILL in the middle: what was finished is not done again, only the unit in hand is."""
-    folder, log = tmp_path / "units", tmp_path / "log"
-    command = [sys.executable, "-c", WORKER, str(folder), str(log)]
-    first = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE)
-    deadline = time.monotonic() + 60.0
-    while time.monotonic() < deadline and len(list(folder.glob("*.json"))) < 3:
-        time.sleep(0.01)
-    os.kill(first.pid, signal.SIGKILL)
-    first.wait()
-    first.stdout.close()
-    finished = {json.loads(path.read_text())["unit"]["seed"] for path in folder.glob("*.json")}
-    assert 3 <= len(finished) < 12
-    before = log.read_text().split()
-    again = subprocess.run(
-        command, cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
-    )
-    assert float(again.stdout) == sum(range(12))
-    after = [int(x) for x in log.read_text().split()[len(before) :]]
-    assert not finished & set(after)
-    assert finished | set(after) == set(range(12))
-
-
-ROOT = Path(__file__).resolve().parents[3]
-
-
-WORKER = """
-import sys, time, numpy as np
-from visthrow.throws import results
-def function(u):
-    with open(sys.argv[2], "a") as log:
-        log.write(f"{u['seed']}\\n")
-    time.sleep(0.1)
-    return {"success": np.ones(1, bool), "error": np.array([float(u["seed"])])}, {}
-units = [results.policy_unit("state", "ab", "state", "hybrid", 2.0, 1, n) for n in range(12)]
-found = results.work(units, sys.argv[1], function)
-print(sum(r.of("error")[0] for r in found.values()))
-"""

@@ -103,12 +103,6 @@ def test_missing_file_names_its_neighbours(write):
         config.load(Outer, path.parent / "papr.toml")
 
 
-def test_a_string_for_a_table_includes_a_file_beside_it(write):
-    write("parts/inner.toml", 'kind = "b"\ngain = [3, 4]')
-    path = write("a.toml", 'name = "x"\ncount = 1\nmass = 1.5\ninner = "parts/inner.toml"')
-    assert config.load(Outer, path).inner == Inner("b", (3.0, 4.0))
-
-
 def test_an_include_falls_back_to_the_configs_folder(write, monkeypatch, tmp_path):
     write("root/inner/x.toml", 'kind = "b"\ngain = [3, 4]')
     monkeypatch.setattr(config, "configs_root", lambda: tmp_path / "root")
@@ -116,12 +110,6 @@ def test_an_include_falls_back_to_the_configs_folder(write, monkeypatch, tmp_pat
     assert config.load(Outer, path).inner.kind == "b"
     with raises(ConfigError, match=r"no file 'inner/y.toml'.*did you mean 'inner/x.toml'"):
         config.load(Outer, write("b.toml", path.read_text().replace("x.toml", "y.toml")))
-
-
-def test_a_base_lies_under_the_file_table_by_table(write):
-    write("base.toml", GOOD)
-    path = write("sub/a.toml", 'base = "../base.toml"\ncount = 7\n[inner]\ngain = [9, 9]')
-    assert config.load(Outer, path) == Outer("x", 7, 2.0, Inner("a", (9.0, 9.0)))
 
 
 def test_a_base_s_include_is_resolved_beside_the_base_before_merging(write):

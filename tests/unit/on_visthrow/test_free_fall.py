@@ -1,7 +1,6 @@
 """Free fall: one closed form for arrays and tensors, equal to the simulator's."""
 
 import numpy as np
-import torch
 from numpy.testing import assert_allclose
 from pytest import approx, mark
 
@@ -32,15 +31,6 @@ def test_the_closed_form_is_the_simulators():
     foreseen = {k: st.fetched(getattr(sim.foreseen, k)) for k in ("time_to_impact", "landing_w")}
     assert_allclose(foreseen["time_to_impact"], time, rtol=FLOAT32)
     assert_allclose(foreseen["landing_w"], landing_w, rtol=FLOAT32, atol=FLOAT32)
-
-
-def test_a_body_lands_at_the_ground_and_a_tensor_gives_the_same():
-    time = fall_time(HEIGHT, CLIMB)
-    start = np.column_stack([HEIGHT, HEIGHT, HEIGHT])
-    velocity = np.column_stack([CLIMB, CLIMB, CLIMB])
-    assert_allclose(free_flight(start, velocity, time[:, None])[:, 2], 0.0, atol=1e-12)
-    tensor = fall_time(torch.from_numpy(HEIGHT), torch.from_numpy(CLIMB))
-    np.testing.assert_array_equal(tensor.numpy(), time)
 
 
 @mark.parametrize(("floor", "expected"), [(0.0, 1.0 / 9.81), (-np.inf, np.nan)])

@@ -109,17 +109,20 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
     room = max(WINDOW_LIMIT - len(cuts) + len(plain), WINDOW_LIMIT // 4)
     if len(plain) <= room:
         return cuts
-    variation = {i: _variation(flights[cuts[i].flight], cuts[i]) for i in plain}
+    whole = {k: np.var(flights[k].command, axis=0) for k in {cuts[i].flight for i in plain}}
+    variation = {
+        i: _variation(flights[cuts[i].flight], cuts[i], whole[cuts[i].flight]) for i in plain
+    }
     chosen = {max(part, key=variation.__getitem__) for part in np.array_split(plain, room)}
     dropped = set(plain) - chosen
     return [c for i, c in enumerate(cuts) if i not in dropped]
 
 
-def _variation(flight: RecordedFlight, c: Cut) -> float:
-    """Variance of a window's commands, against that of the flight's."""
+def _variation(flight: RecordedFlight, c: Cut, whole: np.ndarray) -> float:
+    """Variance of a window's commands, against that of the whole flight's."""
     acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
     variance = np.var(flight.command[acts], axis=0)
-    return float(np.sum(variance / np.maximum(np.var(flight.command, axis=0), TINY)))
+    return float(np.sum(variance / np.maximum(whole, TINY)))
 
 
 def around_slack(c: Cut, first: float, last: float, separation: float) -> list[Cut]:
