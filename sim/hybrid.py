@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim import solvers
 from sim.cores import cores, in_pieces
@@ -322,12 +323,12 @@ class HybridSim:
 
     def place(
         self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray | None = None,
-        vel_w: np.ndarray | None = None,
-        rate_b: np.ndarray | None = None,
-        cable_dir_w: np.ndarray | None = None,
-        cable_vel_w: np.ndarray | None = None,
+        pos_w: ndarray,
+        quat_wb: ndarray | None = None,
+        vel_w: ndarray | None = None,
+        rate_b: ndarray | None = None,
+        cable_dir_w: ndarray | None = None,
+        cable_vel_w: ndarray | None = None,
         battery_used: float = 0.0,
     ) -> None:
         """Put every plant into a stated pose, actuators at hover, command queue filled with hover.
@@ -389,7 +390,7 @@ class HybridSim:
 
         in_pieces(launch, [count * i // pieces for i in range(pieces + 1)], self.threads)
 
-    def plants(self) -> tuple[np.ndarray, np.ndarray]:
+    def plants(self) -> tuple[ndarray, ndarray]:
         """Parameters of vehicle and rope of every environment as the kernels read them: structured
         arrays, shape (E,).
         """
@@ -398,7 +399,7 @@ class HybridSim:
         rows = np.arange(self.count)
         return vehicles[rows % len(vehicles)], ropes[rows % len(ropes)]
 
-    def set_command(self, command: np.ndarray, release: np.ndarray | None = None) -> None:
+    def set_command(self, command: ndarray, release: ndarray | None = None) -> None:
         """Copy commands [N, rad/s], shape (E, 4), and release requests, shape (E,), to the device.
 
         Raises ValueError: another shape.
@@ -409,7 +410,7 @@ class HybridSim:
         st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
         self.release.assign(release_input.astype(np.int32))
 
-    def set_wrench(self, force_w: np.ndarray, torque_b: np.ndarray) -> None:
+    def set_wrench(self, force_w: ndarray, torque_b: ndarray) -> None:
         """Copy a wrench from outside [N], [N m], shapes (E, 3), to the device; it acts until the
         next one.
 
@@ -420,7 +421,7 @@ class HybridSim:
         wrench = {"force_w": (force_w, zero), "torque_b": (torque_b, zero)}
         st.put(self.types, self.state, wrench, self.count)
 
-    def get(self, name: str) -> np.ndarray:
+    def get(self, name: str) -> ndarray:
         """Copy of a state or output array by name, environment first: shape (E, ...) or (E, L,
         ...).
         """
@@ -432,7 +433,7 @@ class HybridSim:
             f"no array {name!r}; there are {sorted(st.STATE_FIELDS | st.OUTPUT_FIELDS)}"
         )
 
-    def cable_points_w(self) -> np.ndarray:
+    def cable_points_w(self) -> ndarray:
         """Joints of the rope from the mount to its lower end [m], shape (E, L + 1, 3),
         world frame.
         """

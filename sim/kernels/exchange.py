@@ -14,8 +14,9 @@ import warp as wp
 
 from sim.kernels import state as st
 from sim.kernels.quadrotor.queue import command_at, push, split_delay
-from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration
+from sim.kernels.quadrotor.rigid_body import angular_acceleration
 from sim.kernels.rope.payload import LOADS
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.step import StepKernels
 from sim.kernels.structs import Types
 from sim.params import PlantParams
@@ -106,12 +107,11 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
     load = parts.load
     coupled = parts.coupled
     rope_of = parts.rope_of
-    Ints = wp.array(dtype=wp.int32)
     Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     load_bodies, store_bodies = build_body_access(t, L)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def show_kernel(
         # Params:
         first: int,
@@ -135,7 +135,7 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
         wrench.pull_w[env] = vec3()
         wrench.twist_b[env] = vec3()
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def payload_kernel(
         # Params:
         first: int,
@@ -178,8 +178,7 @@ def build_exchange(
     bodies_access = build_bodies(t, parts, L)
     load_bodies = bodies_access.load_bodies
     flow = parts.flow
-    rate = parts.rate
-    motor_advance = parts.motor_advance
+    advance = parts.advance
     laws = parts.laws
     coupled = parts.coupled
     depart = parts.depart
@@ -192,13 +191,12 @@ def build_exchange(
     hazards = parts.hazards
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
-    Ints = wp.array(dtype=wp.int32)
     Plants = t.Plants
     Wrench = bodies_access.Wrench
     Bodies = bodies_access.Bodies
     tiny = real(1.0e-6)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def begin_kernel(
         # Params:
         first: int,
@@ -228,7 +226,7 @@ def build_exchange(
         if release[env] != 0 and state.release_timer[env] < real(0.0) and state.attached[env] != 0:
             state.release_timer[env] = release_of(plants, env).lag
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def wrench_kernel(
         # Params:
         first: int,
@@ -275,25 +273,24 @@ def build_exchange(
                 moves[env] = 0
             return
         f = flow(p, law_factors, s, active)
-        acc = (wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]) / p.body.mass + g
-        turn = angular_acceleration(p, s.rate_b, f.torque_b + wrench.twist_b[env])
-        middle = advance(s, rate(p, s, f, acc, turn), half)
-        middle.motor_speed = motor_advance(middle.motor_speed, f.motor_speed)
+        f.vel_w = (wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]) / p.body.mass + g
+        f.rate_b = angular_acceleration(p, s.rate_b, f.torque_b + wrench.twist_b[env])
+        middle = advance(s, f, half)
         f = flow(p, law_factors, middle, active)
         wrench.force_b[env] = f.force_b
         wrench.torque_b[env] = f.torque_b
         if wp.static(loaded):
             jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
             wrench.load_w[env] = hanging(rope, law_factors, out.payload_vel_w[env], n[L - 1], jet)
-        after = advance(s, rate(p, middle, f, vec3(), vec3()), h)
-        state.motor_speed[env] = motor_advance(after.motor_speed, f.motor_speed)
+        after = advance(s, f, h)
+        state.motor_speed[env] = after.motor_speed
         state.integral[env] = after.integral
         state.setpoint[env] = after.setpoint
         state.gyro[env] = after.gyro
         state.charge_used[env] = after.charge_used
         state.voltage[env] = after.voltage
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def take_kernel(
         # Params:
         first: int,
@@ -363,7 +360,7 @@ def build_exchange(
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def end_kernel(
         # Params:
         first: int,

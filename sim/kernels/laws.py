@@ -17,7 +17,7 @@ from typing import Any
 import warp as wp
 
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
-from sim.kernels.structs import Types, make_struct
+from sim.kernels.structs import Types
 from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
 
@@ -302,7 +302,7 @@ def build_laws(
             return vec3()
 
         return SimpleNamespace(on=nothing, in_flight=no_force)
-    Around = make_struct("Around", {name: getattr(t, kind) for name, kind in AROUND.items()})
+    Around = t.from_names("Around", AROUND)
 
     @wp.func
     def one(a: Around):
@@ -360,8 +360,8 @@ def build_laws(
         a.rate_b = s.rate_b
         a.quat_wb = s.quat_wb
         f = flow(p, air, s, command)
-        f0 = rotor_thrust_scaled(p, f.motor_speed, s.voltage)
-        f1 = rotor_thrust_scaled(p, f.motor_speed + real(1.0e-3) * f.motor_rate, s.voltage)
+        f0 = rotor_thrust_scaled(p, f.acting, s.voltage)
+        f1 = rotor_thrust_scaled(p, f.acting + real(1.0e-3) * f.motor_speed, s.voltage)
         for i in range(4):
             a.thrust = a.thrust + f0[i]
             a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import warp as wp
 
 from sim.kernels.quadrotor.start import build_start
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import Types
 from sim.params import PlantParams
 
@@ -69,21 +70,21 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         state.attached[env] = attached
         state.status[env] = 0
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def place_kernel(
         # Params:
         plants: Plants,
         # State in:
         state: State,
         # In:
-        mask: wp.array(dtype=wp.int32),
+        mask: Ints,
         used: Reals,
     ):
         env = wp.tid()
         if mask[env] != 0:
             settle(plants, state, env, used[env])
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def randomize_kernel(
         # Params:
         first: int,
@@ -92,9 +93,9 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         seed: int,
         # State in:
         state: State,
-        episode: wp.array(dtype=wp.int32),
+        episode: Ints,
         # In:
-        mask: wp.array(dtype=wp.int32),
+        mask: Ints,
         # Out:
         goal_w: Vectors,
     ):

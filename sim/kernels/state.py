@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim.kernels.structs import QUAD_STATE, Types, make_struct
 
@@ -72,7 +73,7 @@ def allocate(struct: Any, count: int, device: str, rows: Mapping[str, int] = Map
 
 
 def put(
-    t: Types, struct, initial: Mapping[str, tuple[np.ndarray | None, np.ndarray]], count: int
+    t: Types, struct, initial: Mapping[str, tuple[ndarray | None, ndarray]], count: int
 ) -> None:
     """Copy host arrays, environment first, into arrays of a struct, where the rope's stand segment
     first.
@@ -102,7 +103,7 @@ def put(
         )
 
 
-def fetched(array: wp.array) -> np.ndarray:
+def fetched(array: wp.array) -> ndarray:
     """Copy of a device array, environment first."""
     value = array.numpy()  # on the CPU a view of the simulator's memory
     return np.array(np.swapaxes(value, 0, 1) if array.ndim == 2 else value)

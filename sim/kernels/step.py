@@ -18,6 +18,7 @@ from sim.kernels.rope import release as rel
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.payload import build_flight, build_payload
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import Types
 from sim.params import PlantParams
 
@@ -45,7 +46,7 @@ def build_parts(
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
-    ``flow``, ``rate`` and ``motor_advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
+    ``flow`` and ``advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
     ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and
     ``hazards``; ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an
     environment; ``depart``, which writes what follows when the payload separates with a stated
@@ -62,14 +63,12 @@ def build_parts(
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
     Output = st.array_struct(t, "Output", st.OUTPUT_FIELDS)
-    flow, rate, motor_advance = build_flow(t, params.vehicle, extensions, motors)
+    flow, advance = build_flow(t, params.vehicle, extensions, motors)
     if direct:
         flow = build_direct_flow(t)
     chain = build_chain(t, L, extensions)
     payload = build_payload(t, extensions)
-    coupled = build_coupled_step(
-        t, flow, rate, motor_advance, chain, payload, extensions, integrator
-    )
+    coupled = build_coupled_step(t, flow, advance, chain, payload, extensions, integrator)
     laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
     through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(
         law.block == "payload force" for law in params.laws
@@ -161,8 +160,7 @@ def build_parts(
         State=State,
         Output=Output,
         flow=flow,
-        rate=rate,
-        motor_advance=motor_advance,
+        advance=advance,
         chain=chain,
         payload=payload,
         coupled=coupled,
@@ -254,7 +252,7 @@ def build_step(
         vel = leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
         depart(rope, r, air, s, pos, vel, n[L - 1], gravity, out, env, elapsed)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def step_kernel(
         # Params:
         first: int,
@@ -263,8 +261,8 @@ def build_step(
         state: State,
         # In:
         command: wp.array(dtype=vec4),
-        release: wp.array(dtype=wp.int32),
-        mask: wp.array(dtype=wp.int32),
+        release: Ints,
+        mask: Ints,
         # Out:
         out: Output,
     ):
@@ -355,7 +353,7 @@ def build_step(
             status = status | hazards(p, rope, s, n, pos)
         state.status[env] = status
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def payload_kernel(
         # Params:
         first: int,
@@ -378,7 +376,7 @@ def build_step(
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def foresee_kernel(
         # Params:
         first: int,

@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim import params as P
 
@@ -62,18 +63,8 @@ QUAD_STATE = {
     "voltage": "real",
 }
 """State of a quadrotor: name -> type."""
-FLOW = {
-    "force_b": "vec3",
-    "torque_b": "vec3",
-    "motor_speed": "vec4",
-    "motor_rate": "vec4",
-    "integral_rate": "vec3",
-    "setpoint_rate": "vec3",
-    "gyro_rate": "vec3",
-    "charge_rate": "real",
-    "voltage_rate": "real",
-}
-"""What the blocks make of it: wrench and derivatives of their own states."""
+QUAD_RATE = QUAD_STATE | {"acting": "vec4", "force_b": "vec3", "torque_b": "vec3"}
+"""Its time derivative, with the motor speeds that act and the wrench of the blocks."""
 
 
 class Types:
@@ -92,7 +83,7 @@ class Types:
         Plants: a batch's parameters: arrays of ``vehicles``, ``ropes``, ``releases`` and ``airs``,
             an entry for one environment or all, and the numerics. rows: types of these arrays.
         Vectors, Reals: arrays of ``vec3`` and ``real``, for annotations.
-        QuadState, QuadRate: state of the quadrotor alone and its time derivative.
+        QuadState, QuadRate: state of the quadrotor alone, and :data:`QUAD_RATE`.
     """
 
     def __init__(self, real: type):
@@ -123,14 +114,12 @@ class Types:
         self.Plants = make_struct("Plants", arrays | dict.fromkeys((*NUMERICS, "gravity"), real))
         self.Vectors = wp.array(dtype=self.vec3)
         self.Reals = wp.array(dtype=real)
-        self.QuadState, self.QuadRate, self.Flow = (
-            make_struct(name, {k: getattr(self, kind) for k, kind in fields.items()})
-            for name, fields in (
-                ("QuadState", QUAD_STATE),
-                ("QuadRate", QUAD_STATE),
-                ("Flow", FLOW),
-            )
-        )
+        self.QuadState = self.from_names("QuadState", QUAD_STATE)
+        self.QuadRate = self.from_names("QuadRate", QUAD_RATE)
+
+    def from_names(self, name: str, fields: dict[str, str]) -> type:
+        """Return a struct of fields of the types that this class has by these names."""
+        return make_struct(name, {field: getattr(self, kind) for field, kind in fields.items()})
 
     def _field_type(self, annotation) -> type | None:
         if annotation is float:
@@ -233,7 +222,7 @@ def extensions_of(
 
 def pack_vehicle(
     t: Types, vehicles: list[P.VehicleParams], kinds: tuple[str, str, str, str]
-) -> np.ndarray:
+) -> ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Vehicle)``, for a kernel of
     blocks of these kinds.
 
@@ -266,7 +255,7 @@ def pack_vehicle(
     return rows
 
 
-def pack(struct: type, *values) -> np.ndarray:
+def pack(struct: type, *values) -> ndarray:
     """Structured array for ``wp.array(dtype=struct)``, a row filled from each of the dataclasses it
     was derived from.
     """
@@ -276,7 +265,7 @@ def pack(struct: type, *values) -> np.ndarray:
     return rows
 
 
-def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> np.ndarray:
+def pack_air(t: Types, airs: list[P.AirParams], laws: list[tuple[P.LawParams, ...]]) -> ndarray:
     """Structured array for ``wp.array(dtype=t.Air)``: a row for each air, with the coefficients of
     its plant's laws.
     """
@@ -307,7 +296,7 @@ def ropes_on(vehicles: list[P.VehicleParams], ropes: list[P.RopeParams]) -> list
     ]
 
 
-def pack_rope(t: Types, ropes: list[P.RopeParams]) -> np.ndarray:
+def pack_rope(t: Types, ropes: list[P.RopeParams]) -> ndarray:
     """Structured array of shape (1,) or (E,) for ``wp.array(dtype=t.Rope)``.
 
     The last rod carries the payload: its mass, centre and transverse inertia about its upper joint
@@ -340,7 +329,7 @@ def pack_plants(
     airs: list[P.AirParams],
     releases: list[P.ReleaseParams],
     laws: list[tuple[P.LawParams, ...]] | None = None,
-) -> dict[str, np.ndarray]:
+) -> dict[str, ndarray]:
     """Return structured arrays for :func:`plants_on`, for a kernel of the blocks of ``like``;
     ``laws``: of the airs' plants, those of ``like`` without.
     """
@@ -353,7 +342,7 @@ def pack_plants(
 
 
 def plants_on(
-    t: Types, rows: dict[str, np.ndarray], sim: P.SimParams, gravity: float, device: str
+    t: Types, rows: dict[str, ndarray], sim: P.SimParams, gravity: float, device: str
 ) -> typing.Any:
     """Return a struct ``t.Plants`` on a device with these rows and numerics; gravity [m/s^2]."""
     plants = t.Plants()

@@ -8,6 +8,7 @@ samples fall on step edges exactly."""
 from dataclasses import MISSING, fields, replace
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY, PlantParams
 from sim.reference import vehicle_blocks
@@ -37,17 +38,6 @@ LARGEST_DECAY = 2.2
 """Decay rate times step that the plant allows itself [-]; RK4 is stable to 2.78 on the real axis.
 """
 
-
-SAMPLED = (
-    "pos_w",
-    "quat_wb",
-    "vel_w",
-    "rate_b",
-    "payload_pos_w",
-    "payload_vel_w",
-    "cable_points_w",
-)
-"""What a sample of the motion capture keeps of a state."""
 
 KNOWN_EXTENSIONS = {
     "body.com",
@@ -127,12 +117,12 @@ class ReferencePlant:
 
     def reset(
         self,
-        pos_w: np.ndarray,
-        quat_wb: np.ndarray,
-        vel_w: np.ndarray,
-        rate_b: np.ndarray,
-        cable_dir_w: np.ndarray | None = None,
-        cable_vel_w: np.ndarray | None = None,
+        pos_w: ndarray,
+        quat_wb: ndarray,
+        vel_w: ndarray,
+        rate_b: ndarray,
+        cable_dir_w: ndarray | None = None,
+        cable_vel_w: ndarray | None = None,
     ) -> None:
         """Draw new vehicles and ropes and put them at a state; rotors, battery and command queue in
         hover.
@@ -178,7 +168,7 @@ class ReferencePlant:
             self._state[:, -2] = self._payload_mass * GRAVITY / self.extras.stretch_stiffness
         self._begin(weight)
 
-    def _begin(self, weight: np.ndarray) -> None:
+    def _begin(self, weight: ndarray) -> None:
         """Set clock and queue to hover at this weight [N], shape (E,); nothing is released."""
         count = self.count
         hover = np.zeros((count, 4))
@@ -219,7 +209,7 @@ class ReferencePlant:
         ):
             self._build_ropes(length, com)
 
-    def _build_ropes(self, length: np.ndarray, com: np.ndarray) -> None:
+    def _build_ropes(self, length: ndarray, com: ndarray) -> None:
         """Build ropes of these lengths [m], shape (E,), on vehicles with these centres of mass [m],
         shape (E, 3), and choose a step that bears them.
         """
@@ -253,10 +243,10 @@ class ReferencePlant:
             self._step = min(self.step_size, LARGEST_DECAY / fastest)
 
     @property
-    def _mean_wind(self) -> np.ndarray:
+    def _mean_wind(self) -> ndarray:
         return np.array(self.params.air.wind_w) + np.array(self.extras.wind_mean_w)
 
-    def _rope_of(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    def _rope_of(self, state: ndarray) -> tuple[ndarray, ndarray, ndarray, ndarray]:
         """Directions, their derivatives, elongation and its rate."""
         n, n_dot = (state[:, columns].reshape(len(state), -1, 3) for columns in self._rope_columns)
         return n, n_dot, state[:, -2], state[:, -1]
@@ -267,8 +257,8 @@ class ReferencePlant:
         return slice(FREE.stop, middle), slice(middle, 2 * middle - FREE.stop)
 
     def _upper_end(
-        self, state: np.ndarray, rotation: np.ndarray | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, state: ndarray, rotation: ndarray | None = None
+    ) -> tuple[ndarray, ndarray]:
         """Position and velocity of the rope's upper end: the mount while attached; ``rotation`` of
         the vehicles, where it is known.
         """
@@ -280,13 +270,11 @@ class ReferencePlant:
         pos = np.where(on, state[:, POS] + arm, free[:, :3])
         return pos, np.where(on, state[:, VEL] + arm_dot, free[:, 3:])
 
-    def _points(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _points(self, state: ndarray) -> tuple[ndarray, ndarray, ndarray]:
         """Joints of the ropes, position and velocity of the payloads."""
         return self._ropes.points(*self._upper_end(state), self._rope_of(state))
 
-    def _rates(
-        self, state: np.ndarray, command: np.ndarray, wind_w: np.ndarray, moving: np.ndarray
-    ) -> np.ndarray:
+    def _rates(self, state: ndarray, command: ndarray, wind_w: ndarray, moving: ndarray) -> ndarray:
         """Time derivative of the whole state; ropes that have landed and environments not
         ``moving`` stand still.
         """
@@ -336,15 +324,15 @@ class ReferencePlant:
 
     def _rope_rates(
         self,
-        rates: np.ndarray,
-        body: np.ndarray,
-        rotation: np.ndarray,
-        wrench: tuple[np.ndarray, np.ndarray],
+        rates: ndarray,
+        body: ndarray,
+        rotation: ndarray,
+        wrench: tuple[ndarray, ndarray],
         rope: tuple,
         root: tuple,
-        drag_w: np.ndarray,
-        moving: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray]:
+        drag_w: ndarray,
+        moving: ndarray,
+    ) -> tuple[ndarray, ndarray]:
         """Write the rates of bodies that ropes pull or that fall with one into ``rates``; return
         the second derivatives of the ropes' directions and of their stretch.
         """
@@ -354,7 +342,7 @@ class ReferencePlant:
         if len(ids):
             picked = tuple(part[ids] for part in rope)
             pulled = (wrench[0][ids], wrench[1][ids])
-            rates[ids, VEL], rates[ids, RATE], second[ids], stretch_dot[ids] = self._ropes.attached(
+            rates[ids, VEL.start : RATE.stop], second[ids], stretch_dot[ids] = self._ropes.attached(
                 ids, body[ids], rotation[ids], pulled, picked, drag_w[ids]
             )
         flying = np.flatnonzero(~self._attached & ~self._landed & moving)
@@ -366,7 +354,7 @@ class ReferencePlant:
             rates[flying, FREE] = np.hstack((root[1][flying], acceleration))
         return second, stretch_dot
 
-    def _pull(self) -> np.ndarray:
+    def _pull(self) -> ndarray:
         """Force of the rope along its first segment on the mount [N], shape (E,); of the vehicles'
         acceleration.
         """
@@ -380,7 +368,7 @@ class ReferencePlant:
         force_w = self.params.vehicle.body.mass * (with_rope - without)
         return np.sum(force_w * self._rope_of(self._state)[0][:, 0], axis=1)
 
-    def step(self, command: np.ndarray, release: np.ndarray | bool = False) -> None:
+    def step(self, command: ndarray, release: ndarray | bool = False) -> None:
         """Give a command now and advance one control period.
 
         Args:
@@ -410,28 +398,36 @@ class ReferencePlant:
         sigma = np.sqrt(1 - decay**2) * np.array(extras.wind_sigma_w)
         gust = sigma * rng.standard_normal((self.count, 3))
         self._next_wind = mean + decay * (self._wind - mean) + gust
-        self._advance(start, end)
+        self._advance(end)
         self._wind = self._next_wind
         self.time = end
         self._prune(end)
 
-    def _advance(self, start: float, end: float) -> None:
-        """Integrate one period, from event to event in each environment."""
-        sample = end - self.extras.mocap_latency % (end - start)
+    def _advance(self, end: float) -> None:
+        """Integrate one period; keep the state of which the motion capture tells at its end."""
+        sample = end - self.extras.mocap_latency % (end - self.time)
+        self._integrate(self.time, sample, end)
+        self._samples.append((sample, replace(self.state, time=sample)))
+        self._integrate(sample, end, end)
+        self._separate(np.full(self.count, end))
+
+    def _integrate(self, start: float, stop: float, end: float) -> None:
+        """Integrate a part of the period up to ``end``, from event to event in each
+        environment.
+        """
         times = np.array(self._queue_times)
         commands = np.array(self._queue_commands)
         edges = []
         for e in range(self.count):
-            events = (*times[1:, e], self._separation[e], sample)
-            edges.append([start, *(t for t in events if start < t < end), end])
+            events = (*times[1:, e], self._separation[e])
+            edges.append([start, *(t for t in events if start < t < stop), stop])
         steps = segments_of_period(edges, self._step)
         clock = np.full(self.count, start)
         for column in steps.T:
             self._separate(clock)
-            moving = column > 0.0
             middle = clock + 0.5 * column
             command = vehicle_blocks.command_queue(times, commands, middle)
-            share = ((middle - start) / (end - start))[:, None]
+            share = ((middle - self.time) / (end - self.time))[:, None]
             wind_w = self._wind + share * (self._next_wind - self._wind)
             before = self._state
             self._state = halving_rk4(
@@ -443,12 +439,8 @@ class ReferencePlant:
             self._normalise()
             self._land(before, clock, column)
             clock = clock + column
-            reached = moving & (np.abs(clock - sample) < vehicle_blocks.TIME_TOLERANCE)
-            if np.any(reached):
-                self._keep_sample(sample, reached)
-        self._separate(clock)
 
-    def _separate(self, clock: np.ndarray) -> None:
+    def _separate(self, clock: ndarray) -> None:
         """Open the loop of the ropes whose time has come: their upper ends fly on with the mount's
         velocity.
         """
@@ -466,7 +458,7 @@ class ReferencePlant:
         n /= np.linalg.norm(n, axis=-1, keepdims=True)
         n_dot -= np.sum(n * n_dot, -1, keepdims=True) * n
 
-    def _land(self, before: np.ndarray, clock: np.ndarray, step: np.ndarray) -> None:
+    def _land(self, before: ndarray, clock: ndarray, step: ndarray) -> None:
         """Record payloads that pass the landing height within this step."""
         flying = ~self._attached & ~self._landed & (step > 0.0)
         if not np.any(flying):
@@ -479,21 +471,6 @@ class ReferencePlant:
             self._landed[e] = True
             self._landing_time[e] = clock[e] + share * step[e]
             self._landing_point[e] = point
-
-    def _keep_sample(self, time: float, reached: np.ndarray) -> None:
-        """Keep the state for the motion capture; environments reach the same instant in different
-        columns.
-        """
-        state = self.state
-        if self._samples[-1][0] == time:
-            older = self._samples.pop()[1]
-            keep = {}
-            for name in SAMPLED:
-                new = getattr(state, name)
-                rows = reached.reshape(-1, *[1] * (new.ndim - 1))
-                keep[name] = np.where(rows, new, getattr(older, name))
-            state = replace(older, **keep)
-        self._samples.append((time, replace(state, time=time)))
 
     def _prune(self, time: float) -> None:
         while len(self._queue_times) > 1 and np.all(self._queue_times[1] <= time):
@@ -571,7 +548,7 @@ class ReferencePlant:
         )
 
 
-def _array(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _array(name: str, value: ndarray, shape: tuple[int, ...]) -> ndarray:
     array = np.array(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"plant: {name} has shape {array.shape}, expected {shape}")

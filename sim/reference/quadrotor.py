@@ -5,6 +5,7 @@ takes while the rope is on.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY, VehicleParams
 from sim.reference import vehicle_blocks
@@ -30,8 +31,8 @@ BLOCKS = 15
 class VehicleErrors:
     """Errors of E built vehicles against their parameters."""
 
-    thrust_gain: np.ndarray  # of each motor, 1 for none, shape (E, 4)
-    com_offset: np.ndarray  # centre of mass from the frame's origin, body frame [m], shape (E, 3)
+    thrust_gain: ndarray  # of each motor, 1 for none, shape (E, 4)
+    com_offset: ndarray  # centre of mass from the frame's origin, body frame [m], shape (E, 3)
 
     @classmethod
     def none(cls, count: int) -> "VehicleErrors":
@@ -39,7 +40,7 @@ class VehicleErrors:
         return cls(np.ones((count, 4)), np.zeros((count, 3)))
 
 
-def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
+def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> ndarray:
     """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""
     rotors = vehicle.rotors
     hubs = np.array((rotors.x, rotors.y, (rotors.z,) * 4)).T
@@ -47,8 +48,8 @@ def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> np.ndarray:
 
 
 def initial_blocks(
-    vehicle: VehicleParams, rate_b: np.ndarray, weight: np.ndarray, used: np.ndarray
-) -> np.ndarray:
+    vehicle: VehicleParams, rate_b: ndarray, weight: ndarray, used: ndarray
+) -> ndarray:
     """Return block states in steady hover, shape (E, 15).
 
     Filters of set-point and gyro settled on the present rate, no integral, rotors at the speed that
@@ -87,12 +88,12 @@ def initial_blocks(
 def vehicle_rates(
     vehicle: VehicleParams,
     errors: VehicleErrors,
-    state: np.ndarray,
-    command: np.ndarray,
-    air_velocity_b: np.ndarray,
-    rate_b: np.ndarray,
-    near_ground: np.ndarray | float = 1.0,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    state: ndarray,
+    command: ndarray,
+    air_velocity_b: ndarray,
+    rate_b: ndarray,
+    near_ground: ndarray | float = 1.0,
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Run the seven blocks.
 
     Args:
@@ -142,8 +143,8 @@ def vehicle_rates(
 
 
 def rigid_body_rates(
-    vehicle: VehicleParams, body: np.ndarray, force_w: np.ndarray, torque_b: np.ndarray
-) -> np.ndarray:
+    vehicle: VehicleParams, body: ndarray, force_w: ndarray, torque_b: ndarray
+) -> ndarray:
     """Return the time derivative of free bodies, shape (E, 13), under world force [N], gravity and
     torque [N m].
     """

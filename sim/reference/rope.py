@@ -9,6 +9,7 @@ Joint damping is applied as couples ``-d (w_i - w_(i-1))`` between neighbours. A
 across its axis."""
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import BodyParams, RopeParams
 from sim.reference.batch import Batch
@@ -56,87 +57,22 @@ class RopeDynamics:
         self.mount = np.array([rope.mount for rope in ropes])
         self.damping = np.array([rope.joint_damping for rope in ropes])
         self.mount_damping = mount_damping
-        self._attached_models = [
-            build_attached(body, rope, "ball", stretch=stretch) for rope in ropes
-        ]
-        self._free_models = [build_free(rope, stretch=stretch) for rope in ropes]
-        self._attached = Batch(self._attached_models[0], self.count, nthread=1)
-        self._attached.set_models(self._attached_models)
-        self._free = Batch(self._free_models[0], self.count, nthread=1)
-        self._free.set_models(self._free_models)
-        names = "qpos", "qvel", "xfrc_applied", "qacc"  # of these qacc is copied after each call
-        self._bound = {
-            batch: [batch.bind(name) for name in names] for batch in (self._attached, self._free)
-        }
+        attached = [build_attached(body, rope, "ball", stretch=stretch) for rope in ropes]
+        self._attached = _bound_batch(attached)
+        self._free = _bound_batch([build_free(rope, stretch=stretch) for rope in ropes])
         # The payload is the last body; with stretch it is its own, else its force acts on the last
         # rod by its arm.
-        self._centre = np.array([-model.body_ipos[-1, 2] for model in self._attached_models])
-
-    def _rod_couples(
-        self, ids: np.ndarray, relative: np.ndarray, n: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Damping couples on the rods [N m], shape (e, L, 3), and the one on the body above, shape
-        (e, 3); of their relative rates.
-        """
-        couples = -self.damping[ids][:, None, None] * relative
-        couples[:, 0] -= self.mount_damping * relative[:, 0]
-        on_above = -couples[:, 0]
-        couples[:, :-1] -= couples[:, 1:].copy()
-        couples -= np.sum(couples * n, -1, keepdims=True) * n
-        return couples, on_above
-
-    def _applied(
-        self,
-        batch: Batch,
-        ids: np.ndarray,
-        first_rod: int,
-        n: np.ndarray,
-        couples: np.ndarray,
-        force_w: np.ndarray,
-    ) -> np.ndarray:
-        """Wrenches on all bodies: damping couples on the rods and a force at the
-        payload's centre.
-        """
-        applied = np.zeros((len(ids), *self._bound[batch][2].shape[1:]))
-        applied[:, first_rod : first_rod + self.segments, 3:] = couples
-        applied[:, -1, :3] = force_w
-        if self.stretch is None:
-            arm = (self.length + self.offset)[ids] - self._centre[ids]
-            applied[:, -1, 3:] += arm[:, None] * cross(n[:, -1], force_w)
-        return applied
-
-    def _unpack(
-        self,
-        alpha: np.ndarray,
-        frames: np.ndarray,
-        qacc: np.ndarray,
-        local: np.ndarray,
-        rates: np.ndarray,
-        n: np.ndarray,
-    ) -> np.ndarray:
-        """Second derivatives of the directions from relative angular accelerations, shape (e, L,
-        3).
-        """
-        relative = turned(frames, qacc) + cross(rates, turned(frames, local))
-        alpha = alpha[:, None] + np.cumsum(relative, axis=1)
-        n_dot = cross(rates, n)
-        return cross(alpha, n) + cross(rates, n_dot)
-
-    def _directions(
-        self, n: np.ndarray, n_dot: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        n = n / length(n)
-        return n, cross(n, n_dot), rotation_from_direction(n)
+        self._centre = np.array([-model.body_ipos[-1, 2] for model in attached])
 
     def attached(
         self,
-        ids: np.ndarray,
-        body: np.ndarray,
-        rotation: np.ndarray,
-        wrench: tuple[np.ndarray, np.ndarray],
-        rope: tuple[np.ndarray, ...],
-        force_w: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        ids: ndarray,
+        body: ndarray,
+        rotation: ndarray,
+        wrench: tuple[ndarray, ndarray],
+        rope: tuple[ndarray, ...],
+        force_w: ndarray,
+    ) -> tuple[ndarray, ndarray, ndarray]:
         """Return accelerations of quadrotors with their ropes.
 
         Args:
@@ -151,34 +87,23 @@ class RopeDynamics:
 
         Returns:
             Acceleration [m/s^2], world frame, and angular acceleration [rad/s^2], body frame,
-            shapes (e, 3); second derivatives of directions [1/s^2], shape (e, L, 3), and elongation
+            shape (e, 6); second derivatives of directions [1/s^2], shape (e, L, 3), and elongation
             [m/s^2], shape (e,).
         """
-        n, rates, frames = self._directions(rope[0], rope[1])
-        above = turned(rotation, body[:, 10:13])
-        relative_rates = _from_above(rates, above)
-        couples, on_vehicle = self._rod_couples(ids, relative_rates, n)
-        parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
-        local = turned_back(frames, relative_rates)
-        joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames).reshape(len(ids), -1)
-        qpos = [body[:, 0:3], body[:, [6, 3, 4, 5]] / length(body[:, 3:7]), joints]
-        qvel = [body[:, 7:13], local.reshape(len(ids), -1)]
-        applied = self._applied(self._attached, ids, 2, n, couples, force_w)
-        applied[:, 1, :3] = wrench[0]
-        applied[:, 1, 3:] = on_vehicle + turned(rotation, wrench[1])
-        qacc = self._forward(self._attached, ids, qpos, qvel, rope, applied)
-        alpha = turned(rotation, qacc[:, 3:6])
-        relative = qacc[:, 6 : 6 + 3 * self.segments].reshape(len(ids), -1, 3)
-        second = self._unpack(alpha, frames, relative, local, rates, n)
-        return qacc[:, :3], qacc[:, 3:6], second, self._elongation(qacc)
+        pose = np.hstack((body[:, :3], body[:, [6, 3, 4, 5]] / length(body[:, 3:7])))
+        wrench_w = np.hstack((wrench[0], turned(rotation, wrench[1])))
+        above = (rotation, turned(rotation, body[:, 10:13]), wrench_w)
+        upper_damping = self.damping[ids] + self.mount_damping
+        root = (pose, body[:, 7:13])
+        return self._solve(self._attached, ids, root, above, upper_damping, rope, force_w)
 
     def free(
         self,
-        ids: np.ndarray,
-        root: tuple[np.ndarray, np.ndarray],
-        rope: tuple[np.ndarray, ...],
-        force_w: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        ids: ndarray,
+        root: tuple[ndarray, ndarray],
+        rope: tuple[ndarray, ...],
+        force_w: ndarray,
+    ) -> tuple[ndarray, ndarray, ndarray]:
         """Return accelerations of ropes alone: of the upper end, of the directions and of the
         elongation.
 
@@ -188,44 +113,74 @@ class RopeDynamics:
             rope: as in ``attached``.
             force_w: on the payload's centre [N], shape (e, 3).
         """
-        n, rates, frames = self._directions(rope[0], rope[1])
-        couples, _ = self._rod_couples(ids, _from_above(rates, rates[:, 0]), n)
-        relative_rotation = frames.copy()
-        relative_rotation[:, 1:] = np.swapaxes(frames[:, :-1], -1, -2) @ frames[:, 1:]
-        local = turned_back(frames, _from_above(rates, np.zeros((len(ids), 3))))
-        qpos = [root[0], quat_wxyz_from_matrix(relative_rotation).reshape(len(ids), -1)]
-        qvel = [root[1], local.reshape(len(ids), -1)]
-        applied = self._applied(self._free, ids, 1, n, couples, force_w)
-        qacc = self._forward(self._free, ids, qpos, qvel, rope, applied)
-        relative = qacc[:, 3 : 3 + 3 * self.segments].reshape(len(ids), -1, 3)
-        second = self._unpack(np.zeros((len(ids), 3)), frames, relative, local, rates, n)
-        return qacc[:, :3], second, self._elongation(qacc)
+        count = len(ids)
+        world = (np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.zeros((count, 6)))
+        return self._solve(self._free, ids, root, world, np.zeros(count), rope, force_w)
 
-    def _elongation(self, qacc: np.ndarray) -> np.ndarray:
-        return np.zeros(len(qacc)) if self.stretch is None else qacc[:, -1]
-
-    def _forward(
+    def _solve(
         self,
-        batch: Batch,
-        ids: np.ndarray,
-        qpos: list[np.ndarray],
-        qvel: list[np.ndarray],
-        rope: tuple[np.ndarray, ...],
-        applied: np.ndarray,
-    ) -> np.ndarray:
-        if self.stretch is not None:
-            qpos = [*qpos, rope[2][:, None]]
-            qvel = [*qvel, rope[3][:, None]]
-        positions, velocities, wrenches, accelerations = self._bound[batch]
-        positions[ids] = np.concatenate(qpos, 1)
-        velocities[ids] = np.concatenate(qvel, 1)
+        bound: tuple,
+        ids: ndarray,
+        root: tuple[ndarray, ndarray],
+        above: tuple[ndarray, ndarray, ndarray],
+        upper_damping: ndarray,
+        rope: tuple[ndarray, ...],
+        force_w: ndarray,
+    ) -> tuple[ndarray, ndarray, ndarray]:
+        """Return the accelerations of root, directions and elongation from a batch of models.
+
+        Args:
+            bound: of :func:`_bound_batch`.
+            ids: environments.
+            root: MuJoCo's coordinates and velocities above the rods.
+            above: rotation, angular velocity and wrench of the body above the first rod, world
+                frame; MuJoCo ignores a wrench on the world.
+            upper_damping: of the first joint [N m s], shape (e,).
+            rope: as in ``attached``.
+            force_w: on the payload's centre [N], shape (e, 3).
+        """
+        batch, positions, velocities, wrenches, accelerations = bound
+        rotation, rate_above, wrench_w = above
+        n = rope[0] / length(rope[0])
+        rates = cross(n, rope[1])
+        frames = rotation_from_direction(n)
+        relative = rates - np.concatenate((rate_above[:, None], rates[:, :-1]), 1)
+        local = turned_back(frames, relative)
+        parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
+        joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames)
+        damping = np.tile(self.damping[ids, None], self.segments)
+        damping[:, 0] = upper_damping
+        couples = -damping[..., None] * relative
+        applied = np.zeros((len(ids), *wrenches.shape[1:]))
+        elongations = [] if self.stretch is None else [part[:, None] for part in rope[2:]]
+        rods = applied[:, applied.shape[1] - self.segments - bool(elongations) :]
+        applied[:, -len(rods[0]) - 1] = wrench_w
+        applied[:, -len(rods[0]) - 1, 3:] -= couples[:, 0]
+        couples[:, :-1] -= couples[:, 1:].copy()
+        rods[:, : self.segments, 3:] = couples - np.sum(couples * n, -1, keepdims=True) * n
+        applied[:, -1, :3] = force_w
+        if self.stretch is None:
+            arm = (self.length + self.offset)[ids] - self._centre[ids]
+            applied[:, -1, 3:] += arm[:, None] * cross(n[:, -1], force_w)
+        rows = len(ids), -1
+        positions[ids] = np.hstack((root[0], joints.reshape(rows), *elongations[:1]))
+        velocities[ids] = np.hstack((root[1], local.reshape(rows), *elongations[1:]))
         wrenches[ids] = applied
         batch.forward(ids if len(ids) < self.count else None)
-        return accelerations[ids]
+        qacc = accelerations[ids]
+        head = root[1].shape[1]
+        rod_acc = qacc[:, head : head + 3 * self.segments].reshape(local.shape)
+        turning = turned(frames, rod_acc) + cross(rates, turned(frames, local))
+        alpha = np.cumsum(turning, axis=1)
+        if head == 6:
+            alpha += turned(rotation, qacc[:, 3:6])[:, None]
+        second = cross(alpha, n) + cross(rates, cross(rates, n))
+        elongation = qacc[:, -1] if elongations else np.zeros(len(ids))
+        return qacc[:, :head], second, elongation
 
     def points(
-        self, root_pos: np.ndarray, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        self, root_pos: ndarray, root_vel: ndarray, rope: tuple[ndarray, ...]
+    ) -> tuple[ndarray, ndarray, ndarray]:
         """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and
         velocity of the payload.
 
@@ -241,7 +196,7 @@ class RopeDynamics:
         pos = points[:, -1] + (self.offset + elongation)[:, None] * n[:, -1]
         return points, pos, self.payload_velocity(root_vel, rope)
 
-    def payload_velocity(self, root_vel: np.ndarray, rope: tuple[np.ndarray, ...]) -> np.ndarray:
+    def payload_velocity(self, root_vel: ndarray, rope: tuple[ndarray, ...]) -> ndarray:
         """Return the velocity of the payload's centre [m/s], world frame, shape (E, 3); arguments
         as of :meth:`points`.
         """
@@ -251,9 +206,11 @@ class RopeDynamics:
         return root_vel + turning + elongation_dot[:, None] * n[:, -1]
 
 
-def _from_above(rates: np.ndarray, above: np.ndarray) -> np.ndarray:
-    """Rates of the rods less those of what they hang on, shape (e, L, 3)."""
-    relative = rates.copy()
-    relative[:, 0] -= above
-    relative[:, 1:] -= rates[:, :-1]
-    return relative
+def _bound_batch(models: list) -> tuple:
+    """Return a batch of models and its arrays of coordinates, velocities, wrenches and
+    accelerations; the last are written by each call of ``forward``.
+    """
+    batch = Batch(models[0], len(models), nthread=1)
+    batch.set_models(models)
+    names = ("qpos", "qvel", "xfrc_applied", "qacc")
+    return batch, *[batch.bind(name) for name in names]

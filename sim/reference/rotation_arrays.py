@@ -1,86 +1,53 @@
 """Rotations in float64 NumPy: small functions over any leading axes."""
 
 import numpy as np
+from numpy import ndarray
 
 _SUCCESSOR = np.array([1, 2, 0])
 _LAST = np.array([2, 0, 1])
 
 
-def _from_products() -> np.ndarray:
-    """Coefficients of the products of two components xyzw in the entries of ``R - 1``, shape (16,
-    9).
-    """
-    x, y, z, w = range(4)
-    out = np.zeros((4, 4, 3, 3))
-    for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
-        out[j, j, i, i] = out[k, k, i, i] = -2.0
-        out[i, j, i, j] = out[i, j, j, i] = 2.0
-        out[k, w, i, j] = -2.0
-        out[k, w, j, i] = 2.0
-    return out.reshape(16, 9)
-
-
-_FROM_PRODUCTS = _from_products()
-
-
-def _half_of_products() -> np.ndarray:
-    """Coefficients of a component xyzw times one of a rate in ``1/2 q (rate, 0)``,
-    shape (12, 4).
-    """
-    x, y, z, w = range(4)
-    out = np.zeros((4, 3, 4))
-    for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
-        out[w, i, i] = 0.5
-        out[j, k, i] = 0.5
-        out[k, j, i] = -0.5
-        out[i, i, w] = -0.5
-    return out.reshape(12, 4)
-
-
-_HALF_OF_PRODUCTS = _half_of_products()
-
-
-def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def cross(a: ndarray, b: ndarray) -> ndarray:
     """Return the cross product over the last axis; ``np.cross`` takes many times as long on a few
     vectors.
     """
     return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
-def length(vectors: np.ndarray) -> np.ndarray:
+def length(vectors: ndarray) -> ndarray:
     """Return the norm over the last axis, which stays; ``np.linalg.norm`` takes twice as long on a
     few vectors.
     """
     return np.sqrt(np.add.reduce(vectors * vectors, -1, keepdims=True))
 
 
-def turned(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def turned(rotations: ndarray, vectors: ndarray) -> ndarray:
     """Return ``R v`` over the leading axes."""
     return (rotations @ vectors[..., None])[..., 0]
 
 
-def turned_back(rotations: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def turned_back(rotations: ndarray, vectors: ndarray) -> ndarray:
     """Return ``R^T v`` over the leading axes."""
     return (np.swapaxes(rotations, -1, -2) @ vectors[..., None])[..., 0]
 
 
-def rotation_from_quat(quat: np.ndarray) -> np.ndarray:
+def rotation_from_quat(quat: ndarray) -> ndarray:
     """Return rotation matrices of quaternions xyzw of any length, shape (..., 3, 3)."""
     unit = quat / length(quat)
-    leading = quat.shape[:-1]
-    products = (unit[..., :, None] * unit[..., None, :]).reshape(*leading, 16)
-    return np.eye(3) + (products @ _FROM_PRODUCTS).reshape(*leading, 3, 3)
+    turn = -cross(unit[..., None, :3], np.eye(3))  # v -> xyz x v
+    return np.eye(3) + 2.0 * (unit[..., 3:, None] * turn + turn @ turn)
 
 
-def quat_dot(quat: np.ndarray, rate_b: np.ndarray) -> np.ndarray:
+def quat_dot(quat: ndarray, rate_b: ndarray) -> ndarray:
     """Return the time derivative of quaternions xyzw under a body rate [rad/s], ``1/2 q (rate,
     0)``.
     """
-    products = quat[..., :, None] * rate_b[..., None, :]
-    return products.reshape(*quat.shape[:-1], 12) @ _HALF_OF_PRODUCTS
+    axis = quat[..., :3]
+    real = -np.sum(axis * rate_b, axis=-1, keepdims=True)
+    return 0.5 * np.concatenate((quat[..., 3:] * rate_b + cross(axis, rate_b), real), -1)
 
 
-def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
+def rotation_from_direction(direction_w: ndarray) -> ndarray:
     """Return rotations whose -z axis is ``direction_w``, shape (..., 3, 3), turned as little as
     possible from hanging.
 
@@ -105,7 +72,7 @@ def rotation_from_direction(direction_w: np.ndarray) -> np.ndarray:
     return out
 
 
-def _products(m: np.ndarray) -> np.ndarray:
+def _products(m: ndarray) -> ndarray:
     """Four times the products of the components wxyz of the quaternions of rotation matrices, shape
     (..., 4, 4).
     """
@@ -132,7 +99,7 @@ _OF_ENTRIES = _products(np.eye(9).reshape(9, 3, 3)).reshape(9, 16) - _OF_NONE
 """The same as one product of matrices, which a few rotations take a tenth of the time for."""
 
 
-def quat_wxyz_from_matrix(matrix: np.ndarray) -> np.ndarray:
+def quat_wxyz_from_matrix(matrix: ndarray) -> ndarray:
     """Return unit quaternions wxyz of rotation matrices, shape (..., 4), by the largest of the four
     squares.
     """

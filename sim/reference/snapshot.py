@@ -5,7 +5,7 @@ payloads came down.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
+from numpy import ndarray
 
 
 @dataclass(frozen=True)
@@ -16,33 +16,33 @@ class Snapshot:
     """
 
     time: float  # [s]
-    pos_w: np.ndarray  # [m], shape (E, 3)
-    quat_wb: np.ndarray  # shape (E, 4)
-    vel_w: np.ndarray  # [m/s], shape (E, 3)
-    rate_b: np.ndarray  # [rad/s], shape (E, 3)
-    payload_pos_w: np.ndarray  # its centre [m], shape (E, 3); where it landed after landing
-    payload_vel_w: np.ndarray  # [m/s], shape (E, 3)
-    cable_points_w: np.ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
-    motor_speed: np.ndarray  # [rad/s], shape (E, 4)
-    battery_voltage: np.ndarray  # [V], shape (E,)
-    attached: np.ndarray  # shape (E,), bool
-    latched: np.ndarray  # shape (E,), bool
+    pos_w: ndarray  # [m], shape (E, 3)
+    quat_wb: ndarray  # shape (E, 4)
+    vel_w: ndarray  # [m/s], shape (E, 3)
+    rate_b: ndarray  # [rad/s], shape (E, 3)
+    payload_pos_w: ndarray  # its centre [m], shape (E, 3); where it landed after landing
+    payload_vel_w: ndarray  # [m/s], shape (E, 3)
+    cable_points_w: ndarray  # joints of the rope, mount end first [m], shape (E, L + 1, 3)
+    motor_speed: ndarray  # [rad/s], shape (E, 4)
+    battery_voltage: ndarray  # [V], shape (E,)
+    attached: ndarray  # shape (E,), bool
+    latched: ndarray  # shape (E,), bool
 
 
 @dataclass(frozen=True)
 class PayloadLandings:
     """Landing places and times of the payloads, on the plant's clock; NaN before the landing."""
 
-    landed: np.ndarray  # shape (E,), bool
-    point_w: np.ndarray  # of the payload's centre [m], shape (E, 3)
-    time: np.ndarray  # [s], shape (E,)
-    separation_time: np.ndarray  # [s], shape (E,)
+    landed: ndarray  # shape (E,), bool
+    point_w: ndarray  # of the payload's centre [m], shape (E, 3)
+    time: ndarray  # [s], shape (E,)
+    separation_time: ndarray  # [s], shape (E,)
 
 
 class Root(NamedTuple):
     """Kinematics of E vehicles' centres of mass; world frame, quaternions xyzw."""
 
-    pos_w: np.ndarray  # [m], shape (E, 3)
-    quat_wb: np.ndarray  # shape (E, 4)
-    vel_w: np.ndarray  # [m/s], shape (E, 3)
-    rate_b: np.ndarray  # [rad/s], body frame, shape (E, 3)
+    pos_w: ndarray  # [m], shape (E, 3)
+    quat_wb: ndarray  # shape (E, 4)
+    vel_w: ndarray  # [m/s], shape (E, 3)
+    rate_b: ndarray  # [rad/s], body frame, shape (E, 3)

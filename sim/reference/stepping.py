@@ -8,6 +8,7 @@ turned; environments beyond the limits repeat the step as two halves."""
 from collections.abc import Callable
 
 import numpy as np
+from numpy import ndarray
 
 from sim.reference.rotation_arrays import length
 from sim.reference.vehicle_blocks import TIME_TOLERANCE
@@ -21,13 +22,13 @@ MOST_HALVINGS = 6
 
 
 def halving_rk4(
-    rates: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    state: np.ndarray,
-    step: np.ndarray,
+    rates: Callable[[ndarray, ndarray], ndarray],
+    state: ndarray,
+    step: ndarray,
     direction: slice,
     velocity: slice,
     depth: int = 0,
-) -> np.ndarray:
+) -> ndarray:
     """Take one step of order 4 in each environment, in halves, quarters .. where the rope asks for
     it.
 
@@ -63,7 +64,7 @@ def halving_rk4(
     return after
 
 
-def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
+def segments_of_period(edges: list[list[float]], step: float) -> ndarray:
     """Cut the spans between events into equal steps.
 
     Args:
@@ -88,13 +89,13 @@ def segments_of_period(edges: list[list[float]], step: float) -> np.ndarray:
 
 
 def crossing(
-    pos_0: np.ndarray,
-    vel_0: np.ndarray,
-    pos_1: np.ndarray,
-    vel_1: np.ndarray,
+    pos_0: ndarray,
+    vel_0: ndarray,
+    pos_1: ndarray,
+    vel_1: ndarray,
     step: float,
     height: float,
-) -> tuple[float, np.ndarray]:
+) -> tuple[float, ndarray]:
     """Find where a path passes a height going down, by the cubic through both ends of a step.
 
     Args:
@@ -109,7 +110,7 @@ def crossing(
         Share of the step, 0 to 1, and the point [m], shape (3,).
     """
 
-    def path(s: float) -> np.ndarray:
+    def path(s: float) -> ndarray:
         early = (1.0 - s) * (step * vel_0 - way)
         late = s * (step * vel_1 - way)
         return pos_0 + s * way + s * (1.0 - s) * (early - late)

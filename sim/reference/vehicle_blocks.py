@@ -8,6 +8,8 @@ it shares the equations, not the code."""
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
+from numpy.polynomial.polynomial import polyval
 
 from sim.params import (
     GRAVITY,
@@ -30,7 +32,7 @@ _QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 TIME_TOLERANCE = 1e-10
 
 
-def command_queue(times: np.ndarray, commands: np.ndarray, time: np.ndarray) -> np.ndarray:
+def command_queue(times: ndarray, commands: ndarray, time: ndarray) -> ndarray:
     """Return the command that acts at ``time``: the latest whose time has come.
 
     Args:
@@ -44,33 +46,27 @@ def command_queue(times: np.ndarray, commands: np.ndarray, time: np.ndarray) -> 
 
 
 @lru_cache(maxsize=8)
-def _layout(rotors: RotorParams) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4); spins; motors that
-    turn clockwise, and the others.
-    """
+def _tilting(rotors: RotorParams) -> ndarray:
+    """Thrust of each motor for one of roll and of pitch [1/m], shape (2, 4)."""
     x = np.array(rotors.x)
     y = np.array(rotors.y)
-    spin = np.array(rotors.spin)
-    tilting = np.stack((y / np.sum(y**2), -x / np.sum(x**2)))
-    return tilting, spin, np.flatnonzero(spin > 0.0), np.flatnonzero(spin < 0.0)
+    return np.stack((y / np.sum(y**2), -x / np.sum(x**2)))
 
 
-def _motor_shares(
-    torque: np.ndarray, rotors: RotorParams, torque_ratio: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Thrust of each motor for roll and pitch, and for yaw [N], shapes (E, 4)."""
-    tilting, spin, _, _ = _layout(rotors)
-    return torque[:, :2] @ tilting, torque[:, 2:] * (spin / (4.0 * torque_ratio))
+def _motor_shares(torque: ndarray, rotors: RotorParams, torque_ratio: float) -> ndarray:
+    """Thrust of each motor for roll, pitch and yaw [N], shape (E, 4)."""
+    yaw = np.array(rotors.spin) / (4.0 * torque_ratio)
+    return torque[:, :2] @ _tilting(rotors) + torque[:, 2:] * yaw
 
 
 def mixer(
-    thrust: np.ndarray,
-    torque: np.ndarray,
+    thrust: ndarray,
+    torque: ndarray,
     rotors: RotorParams,
     torque_ratio: float,
     f_min: float,
-    f_max: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    f_max: ndarray,
+) -> tuple[ndarray, ndarray, ndarray]:
     """Share collective thrust and torque out to the motors; yaw gives way first, then roll and
     pitch.
 
@@ -88,16 +84,16 @@ def mixer(
 
     Convention: yaw takes the largest part of what is asked for that keeps the spread of the four
     within the limits."""
-    tilting, spin, clockwise, layout_order = _layout(rotors)
-    tilt = torque[:, :2] @ tilting
+    spin = np.array(rotors.spin)
+    tilt = torque[:, :2] @ _tilting(rotors)
     room = f_max - f_min
     extent = tilt.max(axis=1) - tilt.min(axis=1)
     scale = np.minimum(room / np.maximum(extent, 1e-300), 1.0)
     tilt = tilt * scale[:, None]
     # Yaw y lifts the motors of one sense by y and lowers the others; a spread grows by 2 y between
     # the two kinds only.
-    rising = tilt.take(clockwise, 1)
-    falling = tilt.take(layout_order, 1)
+    rising = tilt[:, spin > 0.0]
+    falling = tilt[:, spin < 0.0]
     highest = (room - (rising.max(axis=1) - falling.min(axis=1))) / 2.0
     lowest = -(room - (falling.max(axis=1) - rising.min(axis=1))) / 2.0
     amount = torque[:, 2] / (4.0 * torque_ratio)
@@ -111,15 +107,27 @@ def mixer(
     return demand + (raise_by - lower_by)[:, None], scale, yaw_share
 
 
+def _pid_torque(
+    gains: ControllerParams,
+    error: ndarray,
+    integral: ndarray,
+    gyro_dot: ndarray,
+    setpoint_dot: ndarray,
+) -> ndarray:
+    """Add up P, I, D and feed-forward [N m], shape (E, 3)."""
+    torque = gains.p_gain * error + integral - gains.d_gain * gyro_dot
+    return torque + gains.feedforward_gain * setpoint_dot
+
+
 def betaflight(
     vehicle: VehicleParams,
-    setpoint: np.ndarray,
-    gyro: np.ndarray,
-    integral: np.ndarray,
-    command: np.ndarray,
-    rate: np.ndarray,
-    voltage: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    setpoint: ndarray,
+    gyro: ndarray,
+    integral: ndarray,
+    command: ndarray,
+    rate: ndarray,
+    voltage: ndarray,
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro,
     feed-forward and mixer.
 
@@ -136,21 +144,19 @@ def betaflight(
         Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro
         and integral.
     """
-    gains: ControllerParams = vehicle.controller
+    gains = vehicle.controller
     setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
     error = setpoint - rate
-    torque = np.array(gains.p_gain) * error + integral
-    torque = torque - np.array(gains.d_gain) * gyro_dot
-    torque = torque + np.array(gains.feedforward_gain) * setpoint_dot
+    torque = _pid_torque(gains, error, integral, gyro_dot, setpoint_dot)
     relative = voltage / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
     thrusts, tilt_share, yaw_share = mixer(
         command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
     )
-    integral_dot = np.array(gains.i_gain) * error
+    integral_dot = gains.i_gain * error
     growing = integral_dot * integral > 0.0
-    full = np.abs(integral) >= np.array(gains.integral_limit)
+    full = np.abs(integral) >= gains.integral_limit
     delivered = np.where(full, 0.0, np.array((tilt_share, tilt_share, yaw_share)).T)
     integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
@@ -160,32 +166,30 @@ def betaflight(
 
 def motor_mixing(
     vehicle: VehicleParams,
-    low: np.ndarray,
-    gyro: np.ndarray,
-    integral: np.ndarray,
-    command: np.ndarray,
-    rate: np.ndarray,
-    voltage: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    low: ndarray,
+    gyro: ndarray,
+    integral: ndarray,
+    command: ndarray,
+    rate: ndarray,
+    voltage: ndarray,
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Rate controller that mixes motor commands and relaxes its integral; arguments and result as
     of :func:`betaflight`.
 
     ``low``: the low-pass of the command's rates [rad/s], shape (E, 3).
     """
-    gains: ControllerParams = vehicle.controller
+    gains = vehicle.controller
     rate_command = command[:, 1:]
     low_dot = (rate_command - low) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
-    error = rate_command - rate - np.array(gains.gyro_share) * (gyro - rate)
-    torque = np.array(gains.p_gain) * error + integral
-    torque = torque - np.array(gains.d_gain) * gyro_dot
-    torque = torque + np.array(gains.feedforward_gain) * low_dot
+    error = rate_command - rate - gains.gyro_share * (gyro - rate)
+    torque = _pid_torque(gains, error, integral, gyro_dot, low_dot)
     relaxed = np.clip(1.0 - np.abs(rate_command - low) / gains.relax_threshold, 0.0, None)
     relaxed[:, 2] = 1.0
-    integral_dot = np.array(gains.i_gain) * error * relaxed
-    windup = (np.abs(integral) >= np.array(gains.integral_limit)) & (integral_dot * integral > 0.0)
-    tilt, yaw = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
-    added = (tilt + yaw) * 0.5 / np.sqrt(gains.mix_thrust * gains.max_thrust)
+    integral_dot = gains.i_gain * error * relaxed
+    windup = (np.abs(integral) >= gains.integral_limit) & (integral_dot * integral > 0.0)
+    shares = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
+    added = shares * 0.5 / np.sqrt(gains.mix_thrust * gains.max_thrust)
     idle = np.sqrt(gains.min_thrust / gains.max_thrust)
     added = added / np.maximum(np.ptp(added, axis=1) / (1.0 - idle), 1.0)[:, None]
     throttle = np.sqrt(np.maximum(command[:, :1], 0.0) / 4.0 / gains.max_thrust)
@@ -198,17 +202,17 @@ def motor_mixing(
     return speed, low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)
 
 
-def geometric(vehicle: VehicleParams, command: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def geometric(vehicle: VehicleParams, command: ndarray, rate: ndarray) -> ndarray:
     """Return the motor-speed set-points of the simple rate controller [rad/s], shape (E, 4)."""
     gains = vehicle.controller
     inertia = np.array(vehicle.body.inertia)
     torque = gains.geometric_gain * inertia * (command[:, 1:] - rate) + cross(rate, inertia * rate)
-    tilt, yaw = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
-    thrusts = np.clip(command[:, :1] / 4.0 + tilt + yaw, gains.min_thrust, gains.max_thrust)
+    shares = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
+    thrusts = np.clip(command[:, :1] / 4.0 + shares, gains.min_thrust, gains.max_thrust)
     return np.sqrt(thrusts / vehicle.thrust.k_f)
 
 
-def motor(params: MotorParams, speed: np.ndarray, setpoint: np.ndarray) -> np.ndarray:
+def motor(params: MotorParams, speed: ndarray, setpoint: ndarray) -> ndarray:
     """Return the acceleration of the rotors [rad/s^2], shape (E, 4); zero where they follow at
     once.
     """
@@ -218,25 +222,23 @@ def motor(params: MotorParams, speed: np.ndarray, setpoint: np.ndarray) -> np.nd
     return (setpoint - speed) / np.where(setpoint < speed, slowing, params.time_constant)
 
 
-def open_circuit_voltage(params: BatteryParams, used: np.ndarray) -> np.ndarray:
+def open_circuit_voltage(params: BatteryParams, used: ndarray) -> ndarray:
     """Return the voltage without load [V], shape (E,)."""
-    return params.ocv[0] + used * (params.ocv[1] + used * (params.ocv[2] + used * params.ocv[3]))
+    return polyval(used, params.ocv)
 
 
-def electrical_power(
-    params: BatteryParams, speed: np.ndarray, rotor_torque: np.ndarray
-) -> np.ndarray:
+def electrical_power(params: BatteryParams, speed: ndarray, rotor_torque: ndarray) -> ndarray:
     """Return the power that the vehicle draws [W], shape (E,)."""
     return params.idle_power + np.sum(np.abs(rotor_torque) * speed, axis=1) / params.efficiency
 
 
 def battery(
     params: BatteryParams,
-    used: np.ndarray,
-    voltage: np.ndarray,
-    speed: np.ndarray,
-    rotor_torque: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    used: ndarray,
+    voltage: ndarray,
+    speed: ndarray,
+    rotor_torque: ndarray,
+) -> tuple[ndarray, ndarray]:
     """Return the rates of used fraction [1/s] and terminal voltage [V/s], shapes (E,)."""
     if params.kind == "ideal":
         return np.zeros_like(used), np.zeros_like(voltage)
@@ -248,10 +250,10 @@ def battery(
 def thrust_map(
     params: ThrustParams,
     reference_voltage: float,
-    speed: np.ndarray,
-    voltage: np.ndarray,
-    gain: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray]:
+    speed: ndarray,
+    voltage: ndarray,
+    gain: ndarray,
+) -> tuple[ndarray, ndarray]:
     """Return thrust [N] and aerodynamic torque [N m] of the rotors, shapes (E, 4).
 
     Args:
@@ -263,7 +265,7 @@ def thrust_map(
     """
     factor = 1.0 + params.voltage_coefficient * (voltage - reference_voltage)
     thrust = (params.k_f * speed**2 + params.k_1 * speed) * factor[:, None]
-    thrust = thrust * np.array(params.gain) * gain
+    thrust = thrust * params.gain * gain
     return thrust, drag_torque_ratio(params) * thrust
 
 
@@ -274,7 +276,7 @@ def drag_torque_ratio(params: ThrustParams) -> float:
     return params.torque_ratio * params.torque_gain
 
 
-def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarray:
+def near_ground(strength: float, radius: float, height: ndarray) -> ndarray:
     """Return the factor on the rotors' thrust at heights of the centre of mass [m], shapes (E,).
 
     See ``AirParams``.
@@ -287,12 +289,12 @@ def near_ground(strength: float, radius: float, height: np.ndarray) -> np.ndarra
 
 def aerodynamics(
     params: AeroParams,
-    arms: np.ndarray,
+    arms: ndarray,
     torque_ratio: float,
-    thrust: np.ndarray,
-    air_velocity_b: np.ndarray,
-    rate: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    thrust: ndarray,
+    air_velocity_b: ndarray,
+    rate: ndarray,
+) -> tuple[ndarray, ndarray, ndarray, ndarray]:
     """Return what the relative air adds.
 
     Args:
@@ -312,8 +314,7 @@ def aerodynamics(
         unchanged = np.zeros_like(thrust)
         return none, none, unchanged, unchanged
     v = air_velocity_b
-    force = -np.array([params.drag_x, params.drag_y, params.drag_z]) * v
-    force = force - params.parasitic * length(v) * v
+    force = (-params.drag_x, -params.drag_y, -params.drag_z) * v - params.parasitic * length(v) * v
     hub = v[:, None, :] + cross(rate[:, None, :], arms)
     inwards = hub[..., 2]
     lift = params.translational_lift * (hub[..., 0] ** 2 + hub[..., 1] ** 2)
@@ -326,45 +327,42 @@ def aerodynamics(
 
 def composer(
     rotors: RotorParams,
-    arms: np.ndarray,
-    thrust: np.ndarray,
-    rotor_torque: np.ndarray,
-    speed: np.ndarray,
-    speed_dot: np.ndarray,
-    rate: np.ndarray,
-    aero: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> tuple[np.ndarray, np.ndarray]:
+    arms: ndarray,
+    thrust: ndarray,
+    rotor_torque: ndarray,
+    speed: ndarray,
+    speed_dot: ndarray,
+    rate: ndarray,
+    aero: tuple[ndarray, ndarray, ndarray, ndarray],
+) -> tuple[ndarray, ndarray]:
     """Add up the body wrench about the centre of mass.
 
     Returns the force [N] and torque [N m], body frame, shapes (E, 3).
 
     Convention: the change of thrust by inflow enters the force as well as the torque.
     """
-    spin = np.array(rotors.spin)
     drag, flapping, thrust_change, torque_change = aero
     lift = thrust + thrust_change
     force = drag.copy()
     force[:, 2] += lift.sum(axis=1)
-    torque = flapping.copy()
-    torque[:, 0] += np.sum(arms[..., 1] * lift, axis=1)
-    torque[:, 1] -= np.sum(arms[..., 0] * lift, axis=1)
     yaw = rotor_torque + torque_change + rotors.inertia * speed_dot
-    torque[:, 2] += np.sum(spin * yaw, axis=1)
-    momentum = -rotors.inertia * np.sum(spin * speed, axis=1)
-    torque[:, 0] -= rate[:, 1] * momentum
-    torque[:, 1] += rate[:, 0] * momentum
+    momentum = -rotors.inertia * np.sum(rotors.spin * speed, axis=1)
+    torque = flapping.copy()
+    torque[:, 0] += np.sum(arms[..., 1] * lift, axis=1) - rate[:, 1] * momentum
+    torque[:, 1] -= np.sum(arms[..., 0] * lift, axis=1) - rate[:, 0] * momentum
+    torque[:, 2] += np.sum(rotors.spin * yaw, axis=1)
     return force, torque
 
 
 def payload_force(
     rope: RopeParams,
     drag: float,
-    velocity_w: np.ndarray,
-    wind_w: np.ndarray,
-    along_w: np.ndarray,
-    lift_w: np.ndarray,
-    hanging: np.ndarray,
-) -> np.ndarray:
+    velocity_w: ndarray,
+    wind_w: ndarray,
+    along_w: ndarray,
+    lift_w: ndarray,
+    hanging: ndarray,
+) -> ndarray:
     """Return the force on the payload [N], world frame, shape (E, 3).
 
     Args:
@@ -383,13 +381,13 @@ def payload_force(
     return total - hanging[:, None] * (friction + rope.downwash * lift_w)
 
 
-def release_lag(params: ReleaseParams, pull: np.ndarray, payload_mass: np.ndarray) -> np.ndarray:
+def release_lag(params: ReleaseParams, pull: ndarray, payload_mass: ndarray) -> ndarray:
     """Return the time from the latch to the separation [s], shape (E,), from the rope's pull at the
     latch [N].
     """
     return params.lag + params.lag_tension * (pull - payload_mass * GRAVITY)
 
 
-def release_kick(params: ReleaseParams, along_w: np.ndarray) -> np.ndarray:
+def release_kick(params: ReleaseParams, along_w: ndarray) -> ndarray:
     """Return the speed that the mechanism gives [m/s], shape (E, 3); the rope shares it."""
-    return np.array(params.kick_w) + params.kick_along * along_w
+    return params.kick_w + params.kick_along * along_w

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim.kernels import state as st
 from sim.kernels.exchange import ExchangeKernels
@@ -81,7 +82,7 @@ class World:
         s = self.params.sim
         return math.ceil(s.control_period / s.substep - 1e-3)
 
-    def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], np.ndarray]:
+    def models(self) -> tuple[list[tuple[VehicleParams, RopeParams]], ndarray]:
         """Different pairs of vehicle and rope, and which of them each environment has."""
         period = math.lcm(len(self.vehicles), len(self.ropes))
         rows = range(min(period, self.count))

@@ -5,9 +5,10 @@ from types import SimpleNamespace
 import warp as wp
 
 from sim.kernels.exchange import build_body_access
-from sim.kernels.quadrotor.rigid_body import build_flow
+from sim.kernels.quadrotor.rigid_body import advance, quat_rate
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
+from sim.kernels.runtime import unique_kernel
 from sim.kernels.structs import extensions_of
 from sim.solvers import World
 
@@ -43,7 +44,7 @@ def _kernel(world: World) -> wp.Kernel:
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    Flow = t.Flow
+    QuadRate = t.QuadRate
     State = world.kernels.State
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
@@ -53,12 +54,13 @@ def _kernel(world: World) -> wp.Kernel:
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
         """The wrench that was given: here the air carries its force in the body frame."""
-        out = Flow()
+        out = QuadRate()
+        out.pos_w = s.vel_w
+        out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
         out.force_b = air.push_w
         out.torque_b = air.twist_b
         return out
 
-    _, rate, motor_advance = build_flow(t, world.params.vehicle)
     chain = build_chain(t, L, extensions)
 
     @wp.func
@@ -66,10 +68,10 @@ def _kernel(world: World) -> wp.Kernel:
         return air.payload_push_w
 
     payload = SimpleNamespace(hanging=hanging)
-    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, extensions)
+    coupled = build_coupled_step(t, flow, advance, chain, payload, extensions)
 
-    @wp.kernel(module="unique", enable_backward=False)
-    def advance(
+    @unique_kernel
+    def advance_kernel(
         # Params:
         vehicle: wp.array(dtype=Vehicle),
         ropes: wp.array(dtype=Rope),
@@ -119,4 +121,4 @@ def _kernel(world: World) -> wp.Kernel:
         pos, vel = coupled.payload(rope, s, n, u)
         store_bodies(bodies, env, s, n, u, pos, vel)
 
-    return advance
+    return advance_kernel

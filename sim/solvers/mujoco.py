@@ -9,7 +9,9 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
+from sim.kernels.runtime import unique_kernel
 from sim.solvers import World
 from sim.solvers.payloads import compile_model
 from sim.solvers.rods import Ints, Table, build_place, quat, vec3
@@ -100,7 +102,7 @@ class MujocoSolver:
         wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
 
 
-def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tuple:
+def _on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
     """Batch of MuJoCo's C library: arrays of coordinates, controls and masses, functions that step
     and that take over what was placed where a mask is not 0.
     """
@@ -130,7 +132,7 @@ def _on_cpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tupl
     return qpos, qvel, ctrl, masses, step, placed
 
 
-def _on_gpu(model, wide: dict[str, np.ndarray], count: int, device: str) -> tuple:
+def _on_gpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:
     """MuJoCo Warp's worlds: see :func:`_on_cpu`."""
     import mujoco_warp
 
@@ -179,7 +181,7 @@ def _kernels(world: World) -> dict[str, Callable]:
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def pack(
         # Params:
         ropes: wp.array(dtype=Rope),
@@ -217,7 +219,7 @@ def _kernels(world: World) -> dict[str, Callable]:
                 qpos[env, 7 + i] = 0.0
                 qvel[env, 6 + i] = 0.0
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def push(
         # In:
         wrench: Wrench,
@@ -232,7 +234,7 @@ def _kernels(world: World) -> dict[str, Callable]:
             ctrl[env, 3 + k] = wrench.torque_b[env][k]
             ctrl[env, 6 + k] = load[k]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def show(
         # Params:
         ropes: wp.array(dtype=Rope),

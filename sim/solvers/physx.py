@@ -13,6 +13,7 @@ import numpy as np
 import warp as wp
 
 from sim.kernels.rope.payload import LOADS
+from sim.kernels.runtime import unique_kernel
 from sim.kernels.structs import extensions_of
 from sim.params import RopeParams, VehicleParams
 from sim.solvers import World
@@ -243,7 +244,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
     Bodies = world.kernels.Bodies
     loaded = bool(extensions_of(world.vehicles, world.ropes) & LOADS) or bool(world.params.laws)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def push(
         # In:
         wrench: Wrench,
@@ -274,7 +275,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
                 out[row, L, k] = load[k]
                 out[row, L, 6 + k] = anchor[k]
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def show(
         # Params:
         ropes: wp.array(dtype=Rope),

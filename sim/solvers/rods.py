@@ -2,11 +2,11 @@
 
 import warp as wp
 
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.solvers import World
 
 vec3 = wp.vec3f
 quat = wp.quatf
-Ints = wp.array(dtype=wp.int32)
 Table = wp.array2d(dtype=float)
 
 AXIAL_INERTIA = 1e-8
@@ -42,7 +42,7 @@ def build_place(world: World, hinges: bool) -> wp.Kernel:
             axis = wp.normalize(axis)
             return axis[0] * angle, axis[1] * angle, wp.quat_from_axis_angle(axis, angle)
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def place(
         # In:
         state: State,

@@ -43,14 +43,13 @@ class BareScene:
         )
         wrench = (turned(rotation, force_b[None]), torque_b[None])
         rope = (n, n_dot, np.zeros(1), np.zeros(1))
-        acc, rate_dot, second, _ = self._ropes.attached(
+        acc, second, _ = self._ropes.attached(
             np.arange(1), body, rotation, wrench, rope, np.zeros((1, 3))
         )
         parts = (
             body[:, 7:10],
             quat_dot(body[:, 3:7], body[:, 10:13]),
             acc,
-            rate_dot,
             n_dot.reshape(1, -1),
             second.reshape(1, -1),
         )

@@ -1,7 +1,7 @@
 """Motor model. Equations: :class:`sim.params.MotorParams`.
 
-``motor_rate`` gives the speed that acts now and its derivative; ``motor_advance`` the speed after a
-step of two derivatives (first-order motor) or the set-point itself (instantaneous motor)."""
+``motor_rate`` gives the speed that acts now and its derivative. An instantaneous motor has none: a
+step ends with the speed that acted last."""
 
 from typing import Any
 
@@ -30,15 +30,3 @@ def motor_rate_asymmetric(p: Any, speed: Any, target: Any):
 def motor_rate_instant(p: Any, speed: Any, target: Any):
     """Speed [rad/s] and its derivative, each of shape (4,): the set-point, at once."""
     return target, target - target
-
-
-@wp.func
-def motor_advance_first_order(integrated: Any, acting: Any):
-    """Speed [rad/s] after a step: the integrated one."""
-    return integrated
-
-
-@wp.func
-def motor_advance_instant(integrated: Any, acting: Any):
-    """Speed [rad/s] after a step: the one that acted last."""
-    return acting

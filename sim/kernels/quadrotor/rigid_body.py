@@ -17,9 +17,9 @@ CONTROLLERS = {
     "geometric": controller.rate_controller_geometric,
 }
 MOTORS = {
-    "first_order": (motor.motor_rate_first_order, motor.motor_advance_first_order),
-    "instant": (motor.motor_rate_instant, motor.motor_advance_instant),
-    "asymmetric": (motor.motor_rate_asymmetric, motor.motor_advance_first_order),
+    "first_order": motor.motor_rate_first_order,
+    "instant": motor.motor_rate_instant,
+    "asymmetric": motor.motor_rate_asymmetric,
 }
 BATTERIES = {"sag": battery.battery_sag, "ideal": battery.battery_ideal}
 AEROS = {"rotor_drag": aero.aero_rotor_drag, "none": aero.aero_none}
@@ -61,8 +61,16 @@ def advance(s: Any, r: Any, h: Any):
 
 
 @wp.func
+def advance_instant(s: Any, r: Any, h: Any):
+    """:func:`advance` with motors that reach their set-points at once."""
+    out = advance(s, r, h)
+    out.motor_speed = r.acting
+    return out
+
+
+@wp.func
 def blend(a: Any, wa: Any, b: Any, wb: Any):
-    """Weighted sum of two derivatives."""
+    """Weighted sum of two derivatives, with the motor speeds and the wrench of the first."""
     out = a
     out.pos_w = wa * a.pos_w + wb * b.pos_w
     out.quat_wb = a.quat_wb * wa + b.quat_wb * wb
@@ -89,12 +97,11 @@ def build_flow(
         motors: in place of the vehicle's controller, commands are motor-speed set-points.
 
     Returns:
-        ``flow(p, air, state, command) -> t.Flow`` (body wrench and the derivatives of all internal
-        states), ``rate(p, state, flow, acc_w, angular_acc_b) -> t.QuadRate``, and
-        ``motor_advance``.
+        ``flow(p, air, state, command) -> t.QuadRate``, whose accelerations are left at zero, and
+        ``advance(state, rate, h) -> state``.
     """
     rate_controller = controller.motor_speeds if motors else CONTROLLERS[vehicle.controller.kind]
-    motor_rate, motor_advance = MOTORS[vehicle.motor.kind]
+    motor_rate = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
     rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
@@ -102,13 +109,11 @@ def build_flow(
     Air = t.Air
     QuadState = t.QuadState
     QuadRate = t.QuadRate
-    Flow = t.Flow
-    vec3 = t.vec3
     vec4 = t.vec4
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
-        out = Flow()
+        out = QuadRate()
         target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
@@ -126,33 +131,20 @@ def build_flow(
         if wp.static("push" in extensions):
             force += wp.quat_rotate_inv(s.quat_wb, air.push_w)
             torque += air.twist_b
-        out.force_b = force
-        out.torque_b = torque
-        out.motor_speed = speed
-        out.motor_rate = speed_rate
-        out.integral_rate = integral_rate
-        out.setpoint_rate = setpoint_rate
-        out.gyro_rate = gyro_rate
-        out.charge_rate = charge_rate
-        out.voltage_rate = voltage_rate
-        return out
-
-    @wp.func
-    def rate(p: Vehicle, s: QuadState, f: Flow, acc_w: vec3, angular_acc_b: vec3):
-        out = QuadRate()
         out.pos_w = s.vel_w
         out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
-        out.vel_w = acc_w
-        out.rate_b = angular_acc_b
-        out.motor_speed = f.motor_rate
-        out.integral = f.integral_rate
-        out.setpoint = f.setpoint_rate
-        out.gyro = f.gyro_rate
-        out.charge_used = f.charge_rate
-        out.voltage = f.voltage_rate
+        out.motor_speed = speed_rate
+        out.integral = integral_rate
+        out.setpoint = setpoint_rate
+        out.gyro = gyro_rate
+        out.charge_used = charge_rate
+        out.voltage = voltage_rate
+        out.acting = speed
+        out.force_b = force
+        out.torque_b = torque
         return out
 
-    return flow, rate, motor_advance
+    return flow, advance_instant if vehicle.motor.kind == "instant" else advance
 
 
 def build_direct_flow(t: Types):
@@ -164,14 +156,16 @@ def build_direct_flow(t: Types):
     Vehicle = t.Vehicle
     Air = t.Air
     QuadState = t.QuadState
-    Flow = t.Flow
+    QuadRate = t.QuadRate
     vec3 = t.vec3
     vec4 = t.vec4
     real = t.real
 
     @wp.func
     def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
-        out = Flow()
+        out = QuadRate()
+        out.pos_w = s.vel_w
+        out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
         out.force_b = vec3(real(0.0), real(0.0), command[0])
         out.torque_b = vec3(command[1], command[2], command[3])
         return out

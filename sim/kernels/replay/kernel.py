@@ -19,6 +19,7 @@ from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
 from sim.kernels.rope.payload import build_payload
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
@@ -271,10 +272,10 @@ def build_replay(
     Data = st.array_struct(t, "Recorded", DATA_FIELDS)
     Sensing = t.from_dataclass(SensingParams, {})
     Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
-    flow, rate, motor_advance = build_flow(t, vehicle, EVERYTHING)
+    flow, advance = build_flow(t, vehicle, EVERYTHING)
     chain = build_chain(t, L, EVERYTHING)
     payload = build_payload(t, EVERYTHING)
-    coupled = build_coupled_step(t, flow, rate, motor_advance, chain, payload, EVERYTHING)
+    coupled = build_coupled_step(t, flow, advance, chain, payload, EVERYTHING)
     extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
     load_quad, store_quad = st.build_access(t, State)
     load_rope, store_rope = st.build_rope_access(t, L)
@@ -313,7 +314,7 @@ def build_replay(
         knots.payload_vel_w[row] = m.pay_vel
         knots.tension[row] = pull
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @unique_kernel
     def replay_kernel(
         # Params:
         plants: t.Plants,
@@ -325,7 +326,7 @@ def build_replay(
         windows: Windows,
         lanes: Lanes,
         data: Data,
-        order: wp.array(dtype=wp.int32),
+        order: Ints,
         first_lane: int,
         # State out:
         ends: State,

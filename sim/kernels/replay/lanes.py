@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim.cores import cores, in_pieces
 from sim.kernels import runtime  # noqa: F401  starts Warp
@@ -28,11 +29,11 @@ class Replayed:
     (rotation vector [rad]) in turns, payload [m], rate [rad/s]. The rest is undefined. ``ends`` and
     ``knots`` are empty where no lane keeps."""
 
-    seen: np.ndarray  # shape (rows, lanes, 3)
+    seen: ndarray  # shape (rows, lanes, 3)
     # states at the end of the windows of lanes that keep, as ``starts``; others undefined
-    ends: dict[str, np.ndarray]
+    ends: dict[str, ndarray]
     # fields of KNOT_FIELDS at the knots of lanes that keep, by the rows of ``keep``
-    knots: dict[str, np.ndarray]
+    knots: dict[str, ndarray]
 
 
 class Recording:
@@ -40,7 +41,7 @@ class Recording:
     must not change.
     """
 
-    def __init__(self, windows: Mapping[str, np.ndarray], data: Mapping[str, np.ndarray]):
+    def __init__(self, windows: Mapping[str, ndarray], data: Mapping[str, ndarray]):
         """Keep them.
 
         Args:
@@ -89,7 +90,7 @@ class Replay:
         plants: Sequence[PlantParams],
         sensings: Sequence[SensingParams],
         device: str = "cpu",
-        download: Callable[[wp.array], np.ndarray] = wp.array.numpy,
+        download: Callable[[wp.array], ndarray] = wp.array.numpy,
     ):
         first = plants[0]
         if len(sensings) != len(plants) or {p.rope.segments for p in plants} != {
@@ -132,9 +133,9 @@ class Replay:
 
     def run(
         self,
-        starts: Mapping[str, np.ndarray],
+        starts: Mapping[str, ndarray],
         recording: Recording,
-        lanes: Mapping[str, np.ndarray],
+        lanes: Mapping[str, ndarray],
         knot_spacing: float,
         knots: int = 1,
     ) -> Replayed:
@@ -190,9 +191,7 @@ class Replay:
             return Replayed(self._download(out), {}, {})
         return Replayed(self._download(out), _read(ends, k.State), _read(knot_states, k.Knots))
 
-    def _launch(
-        self, device: str, begin: int, costs: np.ndarray, before: list, after: list
-    ) -> None:
+    def _launch(self, device: str, begin: int, costs: ndarray, before: list, after: list) -> None:
         """Some of the lanes, in one launch or a few for each core: on the CPU it runs on one thread
         and leaves the others free.
 
@@ -225,12 +224,12 @@ class Replay:
         in_pieces(launch, _shared_out(costs, PIECES * cores()), cores())
 
 
-def _read(struct: Any, kind: Any) -> dict[str, np.ndarray]:
+def _read(struct: Any, kind: Any) -> dict[str, ndarray]:
     """Arrays of a struct on the host, lane first."""
     return {name: st.fetched(getattr(struct, name)) for name in kind.vars}
 
 
-def _struct(struct: Any, values: Mapping[str, np.ndarray], device: str) -> Any:
+def _struct(struct: Any, values: Mapping[str, ndarray], device: str) -> Any:
     """Arrays of the values, float64 or int32, in an instance of a struct."""
     out = struct()
     for name, field in struct.vars.items():
@@ -241,7 +240,7 @@ def _struct(struct: Any, values: Mapping[str, np.ndarray], device: str) -> Any:
     return out
 
 
-def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
+def _shared_out(costs: ndarray, pieces: int) -> list[int]:
     """Bounds of at most so many runs of lanes that cost about the same, each of at
     least one lane.
     """
@@ -250,7 +249,7 @@ def _shared_out(costs: np.ndarray, pieces: int) -> list[int]:
     return np.unique([0, *cuts.tolist(), len(costs)]).tolist()
 
 
-def _in_order(shared: np.ndarray, resumed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _in_order(shared: ndarray, resumed: ndarray) -> tuple[ndarray, ndarray]:
     """Lanes that fly, those from a start and those that leave another lane on its way; the rest
     ride along.
     """

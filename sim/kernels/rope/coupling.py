@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import warp as wp
 
 from sim.kernels.quadrotor.integrators import build_quad_step
-from sim.kernels.quadrotor.rigid_body import advance, angular_acceleration, blend
+from sim.kernels.quadrotor.rigid_body import angular_acceleration, blend
 from sim.kernels.rope.payload import LOADS
 from sim.kernels.structs import Types
 
@@ -67,8 +67,7 @@ def build_root(t: Types):
 def build_coupled_step(
     t: Types,
     flow,
-    rate,
-    motor_advance,
+    advance,
     chain: SimpleNamespace,
     payload: SimpleNamespace,
     extensions: frozenset[str],
@@ -93,7 +92,7 @@ def build_coupled_step(
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    Flow = t.Flow
+    QuadRate = t.QuadRate
     vec2 = chain.vec2
     L = chain.segments
     loaded = bool(extensions & LOADS)
@@ -115,7 +114,7 @@ def build_coupled_step(
             rope: Rope,
             air: Air,
             s: QuadState,
-            f: Flow,
+            f: QuadRate,
             n: Vectors,
             u: Vectors,
             k1: Vectors,
@@ -188,11 +187,11 @@ def build_coupled_step(
         )
         torque = f1.torque_b + damping_torque(rope, s, rate_w, n[0], u[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s, f1.force_b, torque, d, o, b, gravity)
+        f1.vel_w = acc_w
+        f1.rate_b = alpha_b
         fastest = chain.down_first(rope, n, u, mount_acc, gamma, h, c1, c2, hs, n2, k1)
-        r1 = rate(p, s, f1, acc_w, alpha_b)
         push1 = wp.quat_rotate(s.quat_wb, f1.force_b)
-        s2 = advance(s, r1, h)
-        s2.motor_speed = motor_advance(s2.motor_speed, f1.motor_speed)
+        s2 = advance(s, f1, h)
         fell_back = fastest * h * h > max_turn * max_turn
         if fell_back:
             chain.fall_back(n, u, h, n2, k1)
@@ -210,12 +209,12 @@ def build_coupled_step(
         )
         torque = f2.torque_b + damping_torque(rope, s2, rate_w, n2[0], u[0] + h * k1[0])
         acc_w, alpha_b, mount_acc, pull = root(p, rope, s2, f2.force_b, torque, d, o, b, gravity)
+        f2.vel_w = acc_w
+        f2.rate_b = alpha_b
         relative = chain.down_second(
             rope, n, u, stiffness, mount_acc, pull, gravity, load2, gamma, h, c1, c2, hs, n2, k1
         )
-        r2 = rate(p, s2, f2, acc_w, alpha_b)
-        out = advance(s, blend(r1, half, r2, half), h)
-        out.motor_speed = motor_advance(out.motor_speed, f2.motor_speed)
+        out = advance(s, blend(f2, half, f1, half), h)
         new_total = (
             total + (half * h) * (push1 + wp.quat_rotate(s2.quat_wb, f2.force_b)) + h * weight
         )
@@ -226,7 +225,7 @@ def build_coupled_step(
 
     return SimpleNamespace(
         step=step,
-        step_alone=build_quad_step(t, flow, rate, motor_advance, integrator),
+        step_alone=build_quad_step(t, flow, advance, integrator),
         mount_velocity=mount_velocity,
         momentum=momentum,
         payload=payload_state,
