@@ -84,16 +84,15 @@ def tether_lengths(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]
     """
     if z.tether_variants < 1:
         raise ValueError(f"tether_variants {z.tether_variants}; expected 1 or more")
-    if z.tether_variants == 1:
-        factors = [1.0]
-    else:
-        factors = list(np.linspace(1 - z.tether_spread, 1 + z.tether_spread, z.tether_variants))
     return [
-        dataclasses.replace(
-            rope, length=rope.length * float(f), rope_mass=rope.rope_mass * float(f)
-        )
-        for f in factors
+        dataclasses.replace(rope, length=rope.length * f, rope_mass=rope.rope_mass * f)
+        for f in _factors(z.tether_spread, z.tether_variants)
     ]
+
+
+def _factors(spread: float, count: int) -> list[float]:
+    """Return so many factors that span 1 +- a spread; 1 alone is in the middle."""
+    return np.linspace(1 - spread, 1 + spread, count).tolist() if count > 1 else [1.0]
 
 
 def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
@@ -110,19 +109,14 @@ def rope_variants(rope: RopeParams, z: RandomizationParams) -> list[RopeParams]:
             " below 1"
         )
     masses, drags = (
-        (
-            [1.0]
-            if spread == 0.0 or z.payload_variants == 1
-            else np.linspace(1 - spread, 1 + spread, z.payload_variants)
-        )
-        for spread in spreads.values()
+        _factors(spread, z.payload_variants if spread else 1) for spread in spreads.values()
     )
     return [
         dataclasses.replace(
             r,
-            payload_mass=r.payload_mass * float(m),
-            payload_inertia=r.payload_inertia * float(m),
-            payload_drag=r.payload_drag * float(d),
+            payload_mass=r.payload_mass * m,
+            payload_inertia=r.payload_inertia * m,
+            payload_drag=r.payload_drag * d,
         )
         for d in drags
         for m in masses
@@ -245,8 +239,7 @@ class HybridSim:
             "types": self.types,
             "vehicles": self.vehicles,
             "ropes": ropes,
-            "packed": (self._plants.vehicles, self._plants.ropes),
-            "gravity": self.gravity,
+            "plants": self._plants,
             "state": self.state,
         }
         return solvers.Exchange(kernels, world, build)
@@ -286,7 +279,7 @@ class HybridSim:
         """
         mask = self._all if mask is None else mask
         if self._exchange is not None:
-            self._exchange.step(self._launch, self, self._plants, mask)
+            self._exchange.step(self._launch, self, mask)
             return
         inputs = [self._plants, self.state, self.command, self.release, mask, self.out]
         self._launch(self._step.step, inputs, block_dim=64)
@@ -368,7 +361,7 @@ class HybridSim:
             self._launch(self._step.payload, [self._plants, self.state, self.out], work=LOOK)
         else:
             mask = self._all if mask is None else mask
-            self._exchange.place(self._launch, self, self._plants, mask)
+            self._exchange.place(self._launch, self, mask)
 
     def _launch(
         self, kernel: wp.Kernel, arguments: list[Any], block_dim: int = 256, work: float = 1.0
@@ -404,11 +397,11 @@ class HybridSim:
 
         Raises ValueError: another shape.
         """
-        release_input = np.zeros(self.count) if release is None else np.asarray(release)
-        if release_input.shape != (self.count,):
-            raise ValueError(f"release of shape {release_input.shape}; expected {(self.count,)}")
+        asked = np.zeros(self.count) if release is None else np.asarray(release)
+        if asked.shape != (self.count,):
+            raise ValueError(f"release of shape {asked.shape}; expected {(self.count,)}")
         st.put(self.types, self, {"command": (command, np.zeros(4))}, self.count)
-        self.release.assign(release_input.astype(np.int32))
+        self.release.assign(asked.astype(np.int32))
 
     def set_wrench(self, force_w: ndarray, torque_b: ndarray) -> None:
         """Copy a wrench from outside [N], [N m], shapes (E, 3), to the device; it acts until the

@@ -251,7 +251,6 @@ def build_exchange(
         p = vehicle_of(plants, state, env)
         rope = rope_of(plants, env)
         half = real(0.5) * h
-        g = vec3(real(0.0), real(0.0), -plants.gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
@@ -265,7 +264,7 @@ def build_exchange(
             p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
-            s = coupled.step_alone(p, law_factors, s, active, g, h)
+            s = coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
             if st.size(s) < limit:
                 store(state, env, s)
             else:
@@ -273,7 +272,8 @@ def build_exchange(
                 moves[env] = 0
             return
         f = flow(p, law_factors, s, active)
-        f.vel_w = (wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]) / p.body.mass + g
+        force_w = wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]
+        f.vel_w = force_w / p.body.mass + plants.gravity_w
         f.rate_b = angular_acceleration(p, s.rate_b, f.torque_b + wrench.twist_b[env])
         middle = advance(s, f, half)
         f = flow(p, law_factors, middle, active)
@@ -325,8 +325,8 @@ def build_exchange(
         body = vehicle_of(plants, state, env).body
         mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
         body_force_w = wp.quat_rotate(state.quat_wb[env], wrench.force_b[env])
-        fall = vec3(real(0.0), real(0.0), plants.gravity)
-        wrench.pull_w[env] = body.mass * ((s.vel_w - state.vel_w[env]) / h + fall) - body_force_w
+        acc = (s.vel_w - state.vel_w[env]) / h - plants.gravity_w
+        wrench.pull_w[env] = body.mass * acc - body_force_w
         momentum = wp.cw_mul(body.inertia, (s.rate_b - state.rate_b[env]) / h)
         gyroscopic = wp.cross(mean_b, wp.cw_mul(body.inertia, mean_b))
         wrench.twist_b[env] = momentum + gyroscopic - wrench.torque_b[env]

@@ -281,27 +281,6 @@ def build_laws(
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    if not laws:
-
-        @wp.func
-        def nothing(
-            p: Vehicle,
-            rope: Rope,
-            air: Air,
-            s: QuadState,
-            n: Vectors,
-            u: Vectors,
-            stiffness: Reals,
-            command: vec4,
-            attached: int,
-        ):
-            return air
-
-        @wp.func
-        def no_force(air: Air, vel_w: vec3):
-            return vec3()
-
-        return SimpleNamespace(on=nothing, in_flight=no_force)
     Around = t.from_names("Around", AROUND)
 
     @wp.func
@@ -354,31 +333,32 @@ def build_laws(
         command: vec4,
         attached: int,
     ):
-        a = Around()
-        a.pos_w = s.pos_w
-        a.vel_w = s.vel_w
-        a.rate_b = s.rate_b
-        a.quat_wb = s.quat_wb
-        f = flow(p, air, s, command)
-        f0 = rotor_thrust_scaled(p, f.acting, s.voltage)
-        f1 = rotor_thrust_scaled(p, f.acting + real(1.0e-3) * f.motor_speed, s.voltage)
-        for i in range(4):
-            a.thrust = a.thrust + f0[i]
-            a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])
-        if attached != 0:
-            pos, vel = chain.payload(rope, vec3(), mount_velocity(rope, s), n, u)
-            a.payload_pos_w = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount) + pos
-            a.payload_vel_w = vel
-            a.cable_dir_w = wp.normalize(pos)
-            a.mount_b = rope.mount
-            a.tension = chain.pull(rope, stiffness, u)
         out = air
-        out.push_w = air.push_w + force(a, air.laws)
-        out.twist_b = air.twist_b + torque(a, air.laws)
-        if attached != 0:
-            out.payload_push_w = air.payload_push_w + payload_force(a, air.laws)
-            if wp.static(in_joint):
-                out = act_in_joint(a, out)
+        if wp.static(len(laws) > 0):
+            a = Around()
+            a.pos_w = s.pos_w
+            a.vel_w = s.vel_w
+            a.rate_b = s.rate_b
+            a.quat_wb = s.quat_wb
+            f = flow(p, air, s, command)
+            f0 = rotor_thrust_scaled(p, f.acting, s.voltage)
+            f1 = rotor_thrust_scaled(p, f.acting + real(1.0e-3) * f.motor_speed, s.voltage)
+            for i in range(4):
+                a.thrust = a.thrust + f0[i]
+                a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])
+            if attached != 0:
+                pos, vel = chain.payload(rope, vec3(), mount_velocity(rope, s), n, u)
+                a.payload_pos_w = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount) + pos
+                a.payload_vel_w = vel
+                a.cable_dir_w = wp.normalize(pos)
+                a.mount_b = rope.mount
+                a.tension = chain.pull(rope, stiffness, u)
+            out.push_w = air.push_w + force(a, air.laws)
+            out.twist_b = air.twist_b + torque(a, air.laws)
+            if attached != 0:
+                out.payload_push_w = air.payload_push_w + payload_force(a, air.laws)
+                if wp.static(in_joint):
+                    out = act_in_joint(a, out)
         return out
 
     @wp.func

@@ -2,7 +2,7 @@
 randomisation.
 
 The release's lag is not drawn here: it is constant in a plant, and drawn with each vehicle of a
-fleet (:mod:`sim.vehicle_class`).
+fleet (:mod:`sim.scaling.vehicle_class`).
 
 Random numbers are counter-based: they depend on the seed, the environment and how often it was
 reset, so a masked reset leaves all others untouched and a batch draws what its members alone would
@@ -10,6 +10,7 @@ draw."""
 
 from dataclasses import dataclass
 
+import numpy as np
 import warp as wp
 
 from sim.kernels.quadrotor.start import build_start
@@ -32,12 +33,12 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     vec3 = t.vec3
     Vectors = t.Vectors
     Reals = t.Reals
-    quat = t.quat
     Plants = t.Plants
     Randomization = t.Randomization
     L = params.rope.segments
     start = build_start(t, params.vehicle, State)
     attached = int(hangs)
+    x_axis, y_axis, z_axis = (vec3(*row) for row in np.eye(3))
 
     @wp.func
     def uniform(size: vec3, rng: wp.uint32):
@@ -105,32 +106,28 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
             rng = wp.rand_init(seed * 9781 + episode[env], env)
             episode[env] = episode[env] + 1
             degree = real(0.017453292519943295)
-            home = vec3(real(0.0), real(0.0), z.spawn_height)
             offset, rng = uniform(z.position, rng)
-            state.pos_w[env] = home + offset
+            state.pos_w[env] = z.spawn_height * z_axis + offset
             vel, rng = uniform(z.velocity, rng)
             state.vel_w[env] = vel
             angles, rng = uniform(z.attitude_deg, rng)
-            x_axis = vec3(real(1.0), real(0.0), real(0.0))
-            y_axis = vec3(real(0.0), real(1.0), real(0.0))
-            z_axis = vec3(real(0.0), real(0.0), real(1.0))
-            roll = angles[0] * degree
-            pitch = angles[1] * degree
-            yaw = angles[2] * degree
-            q = quat(wp.quat_from_axis_angle(z_axis, yaw)) * wp.quat_from_axis_angle(y_axis, pitch)
-            q = q * wp.quat_from_axis_angle(x_axis, roll)
+            about_x = wp.quat_from_axis_angle(x_axis, angles[0] * degree)
+            about_y = wp.quat_from_axis_angle(y_axis, angles[1] * degree)
+            about_z = wp.quat_from_axis_angle(z_axis, angles[2] * degree)
+            q = about_z * about_y * about_x
             state.quat_wb[env] = q
             rates, rng = uniform(z.rate_deg, rng)
             rate = rates * degree
             state.rate_b[env] = rate
             state.mass_scale[env] = real(1.0) + z.mass * real(wp.randf(rng, -1.0, 1.0))
-            azimuth = z.cable_yaw_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
-            tilt = z.cable_angle_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
-            azimuth_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
+            swings = vec3(z.cable_yaw_deg, z.cable_angle_deg, z.cable_rate_deg)
+            cable, rng = uniform(swings, rng)
             tilt_rate = z.cable_rate_deg * real(wp.randf(rng, -1.0, 1.0)) * degree
-            turn = wp.quat_from_axis_angle(z_axis, azimuth)
-            down_b = wp.quat_rotate(turn * wp.quat_from_axis_angle(x_axis, tilt), -z_axis)
-            rate_b = rate + azimuth_rate * z_axis + tilt_rate * wp.quat_rotate(turn, x_axis)
+            turn = wp.quat_from_axis_angle(z_axis, cable[0] * degree)
+            tilt = wp.quat_from_axis_angle(x_axis, cable[1] * degree)
+            down_b = wp.quat_rotate(turn * tilt, -z_axis)
+            azimuth_rate_b = (cable[2] * degree) * z_axis
+            rate_b = rate + azimuth_rate_b + tilt_rate * wp.quat_rotate(turn, x_axis)
             direction = wp.quat_rotate(q, down_b)
             swing = wp.quat_rotate(q, wp.cross(rate_b, down_b))
             for i in range(L):

@@ -275,7 +275,6 @@ def build_step(
         air = air_of(plants, state, env)
         period = plants.control_period
         gravity = plants.gravity
-        g = vec3(real(0.0), real(0.0), -gravity)
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
@@ -321,7 +320,7 @@ def build_step(
                         n,
                         u,
                         stiffness,
-                        g,
+                        plants.gravity_w,
                         plants.gamma,
                         plants.max_turn,
                         h,
@@ -329,7 +328,7 @@ def build_step(
                     if fell_back:
                         status = status | fallback
                 else:
-                    s = coupled.step_alone(p, law_factors, s, active, g, h)
+                    s = coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
             time = until
             if attached != 0 and timer >= real(0.0) and time > timer - tiny:
                 separate(rope, r, air, s, n, u, gravity, out, env, time)

@@ -6,7 +6,7 @@ the kernels under the same name."""
 
 import dataclasses
 import typing
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -111,7 +111,10 @@ class Types:
             "airs": self.Air,
         }
         arrays = {name: wp.array(dtype=row) for name, row in self.rows.items()}
-        self.Plants = make_struct("Plants", arrays | dict.fromkeys((*NUMERICS, "gravity"), real))
+        self.Plants = make_struct(
+            "Plants",
+            arrays | dict.fromkeys((*NUMERICS, "gravity"), real) | {"gravity_w": self.vec3},
+        )
         self.Vectors = wp.array(dtype=self.vec3)
         self.Reals = wp.array(dtype=real)
         self.QuadState = self.from_names("QuadState", QUAD_STATE)
@@ -173,25 +176,22 @@ def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
 
 
 EXTENSIONS = {
-    "gain": "thrust gains of single rotors",
-    "wind": "wind",
-    "ground_effect": "thrust near the ground",
-    "payload_drag": "air drag of the payload",
-    "mount_damping": "friction of the rope's mount",
-    "swing_damping": "friction across the rope",
-    "downwash": "the rotors' jet on the payload",
-    "payload_spin": "side force and lift of a payload in flight",
-    "compliance": "rope that gives",
-    "lag_tension": "release lag that depends on the rope's pull",
-    "kick": "speed given to the payload at the release",
-    "rope_tail": "rope that leaves with the payload",
-    "push": "forces from outside",
+    "gain": "",  # thrust gains of single rotors
+    "wind": "wind_w",
+    "ground_effect": "ground_effect",  # thrust near the ground
+    "payload_drag": "payload_drag",  # air drag of the payload
+    "mount_damping": "mount_damping",  # friction of the rope's mount
+    "swing_damping": "swing_damping",  # friction across the rope
+    "downwash": "downwash",  # the rotors' jet on the payload
+    "payload_spin": "payload_side payload_lift",  # side force and lift of a payload in flight
+    "compliance": "compliance",  # rope that gives
+    "lag_tension": "lag_tension",  # release lag that depends on the rope's pull
+    "kick": "kick_w kick_along",  # speed given to the payload at the release
+    "rope_tail": "rope_tail",  # rope that leaves with the payload
+    "push": "",  # forces from outside
 }
-"""Parts of the blocks that a kernel holds only if it was built for them, and what they are."""
-
-
-ROPE_EXTENSIONS = ("payload_drag", "mount_damping", "swing_damping", "downwash", "compliance")
-"""Those that are fields of :class:`sim.params.RopeParams` of the same name."""
+"""Parts of the blocks that a kernel holds only if it was built for them -> fields of rope, air or
+release that need them where they are not zero."""
 
 
 def extensions_of(
@@ -199,24 +199,19 @@ def extensions_of(
     ropes: Iterable[P.RopeParams] = (),
     airs: Iterable[P.AirParams] = (),
     releases: Iterable[P.ReleaseParams] = (),
-    laws: Iterable[P.LawParams] = (),
+    laws: Sequence[P.LawParams] = (),
 ) -> frozenset[str]:
     """Names of :data:`EXTENSIONS` without which one of these plants would not be
     simulated in full.
     """
-    needed = {"push"} if any(True for _ in laws) else set()
-    for v in vehicles:
-        needed |= {"gain"} if any(g != 1.0 for g in v.thrust.gain) else set()
-    for r in ropes:
-        needed |= {name for name in ROPE_EXTENSIONS if getattr(r, name) != 0.0}
-        needed |= {"payload_spin"} if r.payload_side or r.payload_lift else set()
-    for a in airs:
-        needed |= ({"wind"} if any(a.wind_w) else set()) | (
-            {"ground_effect"} if a.ground_effect else set()
-        )
-    for x in releases:
-        needed |= {name for name in ("lag_tension", "rope_tail") if getattr(x, name) != 0.0}
-        needed |= {"kick"} if any(x.kick_w) or x.kick_along else set()
+    needed = {"push"} if laws else set()
+    if any(v.thrust.gain != (1.0,) * 4 for v in vehicles):
+        needed.add("gain")
+    for part in (*ropes, *airs, *releases):
+        for name, fields in EXTENSIONS.items():
+            values = [getattr(part, field, 0.0) for field in fields.split()]
+            if any(value not in (0.0, (0.0, 0.0, 0.0)) for value in values):
+                needed.add(name)
     return frozenset(needed)
 
 
@@ -351,4 +346,5 @@ def plants_on(
     for name in NUMERICS:
         setattr(plants, name, getattr(sim, name))
     plants.gravity = gravity
+    plants.gravity_w = t.vec3(0.0, 0.0, -gravity)
     return plants

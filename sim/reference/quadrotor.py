@@ -10,6 +10,7 @@ from numpy import ndarray
 from sim.params import GRAVITY, VehicleParams
 from sim.reference import vehicle_blocks
 from sim.reference.rotation_arrays import cross, quat_dot
+from sim.reference.vehicle_blocks import BLOCKS, GYRO, INTEGRAL, MOTORS, SETPOINT, USED, VOLTAGE
 
 # columns of a body: position, quaternion xyzw, velocity (world, centre of mass), rate (body)
 POS = slice(0, 3)
@@ -17,14 +18,6 @@ QUAT = slice(3, 7)
 VEL = slice(7, 10)
 RATE = slice(10, 13)
 BODY = 13
-# columns of the blocks: set-point, gyro, integral, motor speed, used fraction, voltage
-SETPOINT = slice(0, 3)
-GYRO = slice(3, 6)
-INTEGRAL = slice(6, 9)
-MOTORS = slice(9, 13)
-USED = 13
-VOLTAGE = 14
-BLOCKS = 15
 
 
 @dataclass(frozen=True)
@@ -111,17 +104,8 @@ def vehicle_rates(
     """
     voltage = state[:, VOLTAGE]
     rates = np.zeros_like(state)
-    kind = vehicle.controller.kind
-    if kind == "geometric":
-        setpoint = vehicle_blocks.geometric(vehicle, command, rate_b)
-    else:
-        control = {
-            "betaflight": vehicle_blocks.betaflight,
-            "motor_mixing": vehicle_blocks.motor_mixing,
-        }[kind]
-        filters = (state[:, part] for part in (SETPOINT, GYRO, INTEGRAL))
-        setpoint, *slopes = control(vehicle, *filters, command, rate_b, voltage)
-        rates[:, SETPOINT], rates[:, GYRO], rates[:, INTEGRAL] = slopes
+    control = vehicle_blocks.CONTROLLERS[vehicle.controller.kind]
+    setpoint, rates[:, : INTEGRAL.stop] = control(vehicle, state, command, rate_b)
     speed = setpoint if vehicle.motor.kind == "instant" else state[:, MOTORS]
     rates[:, MOTORS] = vehicle_blocks.motor(vehicle.motor, speed, setpoint)
     thrust, torque = vehicle_blocks.thrust_map(

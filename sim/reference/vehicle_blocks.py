@@ -28,6 +28,15 @@ from sim.reference.rotation_arrays import cross, length
 # of a row vector about z, without its z
 _QUARTER_TURN = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
+# columns of the blocks' state
+SETPOINT = slice(0, 3)
+GYRO = slice(3, 6)
+INTEGRAL = slice(6, 9)
+MOTORS = slice(9, 13)
+USED = 13  # fraction
+VOLTAGE = 14
+BLOCKS = 15
+
 # times closer than this are one event [s]; a control period of 20 ms has no finer structure
 TIME_TOLERANCE = 1e-10
 
@@ -120,36 +129,28 @@ def _pid_torque(
 
 
 def betaflight(
-    vehicle: VehicleParams,
-    setpoint: ndarray,
-    gyro: ndarray,
-    integral: ndarray,
-    command: ndarray,
-    rate: ndarray,
-    voltage: ndarray,
-) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
+) -> tuple[ndarray, ndarray]:
     """Rate controller with set-point filter, P, I with anti-windup, D on a filtered gyro,
     feed-forward and mixer.
 
     Args:
         vehicle: parameters.
-        setpoint: filtered set-point [rad/s], shape (E, 3).
-        gyro: filtered rate [rad/s], shape (E, 3).
-        integral: [N m], shape (E, 3).
+        state: of the blocks, shape (E, 15).
         command: acting command, shape (E, 4).
         rate: true body rate [rad/s], shape (E, 3).
-        voltage: of the battery [V], shape (E,).
 
     Returns:
         Motor-speed set-points [rad/s], shape (E, 4), and the time derivatives of set-point, gyro
-        and integral.
+        and integral, shape (E, 9).
     """
     gains = vehicle.controller
+    setpoint, gyro, integral = np.hsplit(state[:, : INTEGRAL.stop], 3)
     setpoint_dot = (command[:, 1:] - setpoint) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
     error = setpoint - rate
     torque = _pid_torque(gains, error, integral, gyro_dot, setpoint_dot)
-    relative = voltage / vehicle.battery.reference_voltage
+    relative = state[:, VOLTAGE] / vehicle.battery.reference_voltage
     f_max = gains.max_thrust * relative**2
     thrusts, tilt_share, yaw_share = mixer(
         command[:, 0], torque, vehicle.rotors, vehicle.thrust.torque_ratio, gains.min_thrust, f_max
@@ -161,24 +162,18 @@ def betaflight(
     integral_dot = np.where(growing, delivered * integral_dot, integral_dot)
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
     speed = np.sqrt(thrusts / vehicle.thrust.k_f) * correction[:, None]
-    return speed, setpoint_dot, gyro_dot, integral_dot
+    return speed, np.hstack((setpoint_dot, gyro_dot, integral_dot))
 
 
 def motor_mixing(
-    vehicle: VehicleParams,
-    low: ndarray,
-    gyro: ndarray,
-    integral: ndarray,
-    command: ndarray,
-    rate: ndarray,
-    voltage: ndarray,
-) -> tuple[ndarray, ndarray, ndarray, ndarray]:
+    vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
+) -> tuple[ndarray, ndarray]:
     """Rate controller that mixes motor commands and relaxes its integral; arguments and result as
     of :func:`betaflight`.
 
-    ``low``: the low-pass of the command's rates [rad/s], shape (E, 3).
-    """
+    The filtered set-point is the low-pass of the command's rates."""
     gains = vehicle.controller
+    low, gyro, integral = np.hsplit(state[:, : INTEGRAL.stop], 3)
     rate_command = command[:, 1:]
     low_dot = (rate_command - low) / gains.setpoint_time_constant
     gyro_dot = (rate - gyro) / gains.gyro_time_constant
@@ -195,21 +190,26 @@ def motor_mixing(
     throttle = np.sqrt(np.maximum(command[:, :1], 0.0) / 4.0 / gains.max_thrust)
     throttle = np.minimum(throttle, 1.0 - added.max(axis=1, keepdims=True))
     throttle = np.maximum(throttle, idle - added.min(axis=1, keepdims=True))
-    relative = voltage / gains.calibration_voltage
+    relative = state[:, VOLTAGE] / gains.calibration_voltage
     correction = 1.0 + (1.0 - gains.voltage_compensation) * (relative - 1.0)
     factor = np.sqrt(gains.max_thrust / vehicle.thrust.k_f) * correction
     speed = factor[:, None] * np.maximum(throttle + added, 0.0)
-    return speed, low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)
+    return speed, np.hstack((low_dot, gyro_dot, np.where(windup, 0.0, integral_dot)))
 
 
-def geometric(vehicle: VehicleParams, command: ndarray, rate: ndarray) -> ndarray:
-    """Return the motor-speed set-points of the simple rate controller [rad/s], shape (E, 4)."""
+def geometric(
+    vehicle: VehicleParams, state: ndarray, command: ndarray, rate: ndarray
+) -> tuple[ndarray, float]:
+    """Simple rate controller, whose filters stand still; arguments as of :func:`betaflight`."""
     gains = vehicle.controller
     inertia = np.array(vehicle.body.inertia)
     torque = gains.geometric_gain * inertia * (command[:, 1:] - rate) + cross(rate, inertia * rate)
     shares = _motor_shares(torque, vehicle.rotors, vehicle.thrust.torque_ratio)
     thrusts = np.clip(command[:, :1] / 4.0 + shares, gains.min_thrust, gains.max_thrust)
-    return np.sqrt(thrusts / vehicle.thrust.k_f)
+    return np.sqrt(thrusts / vehicle.thrust.k_f), 0.0
+
+
+CONTROLLERS = {"betaflight": betaflight, "motor_mixing": motor_mixing, "geometric": geometric}
 
 
 def motor(params: MotorParams, speed: ndarray, setpoint: ndarray) -> ndarray:

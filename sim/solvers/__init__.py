@@ -64,8 +64,7 @@ class World:
     types: Types
     vehicles: Sequence[VehicleParams]  # of environment e: e % len(vehicles)
     ropes: Sequence[RopeParams]  # likewise; mounts are stated from the centre of mass
-    packed: tuple[Any, Any]  # the same on the device: arrays of types.Vehicle and types.Rope
-    gravity: float  # [m/s^2]
+    plants: Any  # the same on the device, with the numerics: types.Plants
     state: Any  # arrays of sim.kernels.state.STATE_FIELDS
     kernels: ExchangeKernels  # whose structs the arrays are in
     wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
@@ -118,15 +117,13 @@ class Exchange:
             bodies=st.allocate(kernels.Bodies, count, device, rows),
         )
         self.solver = build(self.world)
-        self.kernels = kernels
         self._moves, self._again = (wp.zeros(count, dtype=wp.int32, device=device) for _ in "ma")
 
-    def step(
-        self, launch: Callable[..., None], sim: Any, plants: Any, mask: "wp.array[Any]"
-    ) -> None:
-        """Advance by one control period; ``plants``: a struct ``types.Plants``."""
+    def step(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
+        """Advance by one control period."""
         h = self.world.substep
-        k = self.kernels
+        k = self.world.kernels
+        plants = self.world.plants
         flags = [self._moves, self._again]
         launch(k.begin, [plants, sim.state, sim.command, sim.release, mask, *flags, sim.out])
         for i in range(self.world.substeps):
@@ -136,16 +133,14 @@ class Exchange:
             taken = [sim.state, *flags, self.world.wrench, self.world.bodies, sim.out]
             launch(k.take, [plants, (i + 1) * h, h, *taken])
         launch(k.end, [plants, sim.state, mask, sim.out])
-        self.place(launch, sim, plants, self._again)
+        self.place(launch, sim, self._again)
 
-    def place(
-        self, launch: Callable[..., None], sim: Any, plants: Any, mask: "wp.array[Any]"
-    ) -> None:
+    def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
-        shared = [self.world.bodies, self.world.wrench]
-        launch(self.kernels.show, [plants, sim.state, mask, *shared])
+        w = self.world
+        launch(w.kernels.show, [w.plants, sim.state, mask, w.bodies, w.wrench])
         self.solver.place(mask)
-        launch(self.kernels.payload, [sim.state, self.world.bodies, sim.out])
+        launch(w.kernels.payload, [sim.state, w.bodies, sim.out])
 
 
 def solver_class(name: str) -> type[Solver]:

@@ -27,9 +27,7 @@ class ChainSolver:
 
     def advance(self, duration: float) -> None:
         w = self.world
-        s = self.world.params.sim
-        numbers = [s.gamma, s.max_turn, w.gravity, duration]
-        inputs = [*w.packed, *numbers, w.state, w.bodies, w.wrench]
+        inputs = [w.plants, duration, w.state, w.bodies, w.wrench]
         wp.launch(self._kernel, w.count, inputs, device=w.device, block_dim=64)
 
 
@@ -73,11 +71,7 @@ def _kernel(world: World) -> wp.Kernel:
     @unique_kernel
     def advance_kernel(
         # Params:
-        vehicle: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        gamma: real,
-        max_turn: real,
-        gravity: real,
+        plants: t.Plants,
         h: real,
         # State in:
         state: State,
@@ -86,9 +80,9 @@ def _kernel(world: World) -> wp.Kernel:
         wrench: Wrench,
     ):
         env = wp.tid()
-        p = vehicle[env % vehicle.shape[0]]
+        p = plants.vehicles[env % plants.vehicles.shape[0]]
         p.body.mass = p.body.mass * state.mass_scale[env]
-        rope = ropes[env % ropes.shape[0]]
+        rope = plants.ropes[env % plants.ropes.shape[0]]
         air = Air()
         air.push_w = wrench.force_b[env]
         air.twist_b = wrench.torque_b[env]
@@ -99,7 +93,6 @@ def _kernel(world: World) -> wp.Kernel:
         s = load_bodies(bodies, env, QuadState(), n, u)
         for i in range(L):
             k[i] = state.stiffness[i, env]
-        g = vec3(real(0.0), real(0.0), -gravity)
         s, _total, _fell_back = coupled.step(
             p,
             rope,
@@ -110,9 +103,9 @@ def _kernel(world: World) -> wp.Kernel:
             n,
             u,
             k,
-            g,
-            gamma,
-            max_turn,
+            plants.gravity_w,
+            plants.gamma,
+            plants.max_turn,
             h,
         )
         for i in range(L):

@@ -14,7 +14,7 @@ from numpy import ndarray
 from sim.kernels.runtime import unique_kernel
 from sim.solvers import World
 from sim.solvers.payloads import compile_model
-from sim.solvers.rods import Ints, Table, build_place, quat, vec3
+from sim.solvers.rods import Ints, Table, build_place, quat, read, vec3, write
 
 RK4_STEP = 5e-4
 """Largest substep of RK4 [s]: half of it moves a hard throw's end by less than a micrometre."""
@@ -83,7 +83,7 @@ class MujocoSolver:
         place = [w.state, mask, self._rows, *root, *rope]
         wp.launch(self._kernels["place"], w.count, place, device=device)
         masses = [self._nominal, self._vehicle, self._masses]
-        pack = [w.packed[1], w.state, mask, *masses, self.qpos, self.qvel]
+        pack = [w.plants.ropes, w.state, mask, *masses, self.qpos, self.qvel]
         wp.launch(self._kernels["pack"], w.count, pack, device=device)
         self._placed(mask)
         self._show()
@@ -98,7 +98,7 @@ class MujocoSolver:
 
     def _show(self) -> None:
         w = self.world
-        outputs = [w.packed[1], self.qpos, self.qvel, w.bodies, self._payload_quat]
+        outputs = [w.plants.ropes, self.qpos, self.qvel, w.bodies, self._payload_quat]
         wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
 
 
@@ -208,10 +208,9 @@ def _kernels(world: World) -> dict[str, Callable]:
             pos = state.pos_w[env] + arm + rope.segment_length * state.cable_dir_w[0, env]
             vel = state.vel_w[env] + wp.cross(w, arm)
             vel += rope.segment_length * state.cable_vel_w[0, env]
-            for k in range(3):
-                qpos[env, 7 + k] = pos[k]
-                qvel[env, 6 + k] = vel[k]
-                qvel[env, 9 + k] = state.rate_b[env][k]
+            write(qpos, env, 7, pos)
+            write(qvel, env, 6, vel)
+            write(qvel, env, 9, state.rate_b[env])
             for k in range(4):
                 qpos[env, 10 + k] = qpos[env, 3 + k]
         elif wp.static(box):
@@ -229,10 +228,9 @@ def _kernels(world: World) -> dict[str, Callable]:
     ):
         env = wp.tid()
         load = wp.quat_rotate_inv(payload_quat[env], wrench.load_w[env])
-        for k in range(3):
-            ctrl[env, k] = wrench.force_b[env][k]
-            ctrl[env, 3 + k] = wrench.torque_b[env][k]
-            ctrl[env, 6 + k] = load[k]
+        write(ctrl, env, 0, wrench.force_b[env])
+        write(ctrl, env, 3, wrench.torque_b[env])
+        write(ctrl, env, 6, load)
 
     @unique_kernel
     def show(
@@ -248,11 +246,11 @@ def _kernels(world: World) -> dict[str, Callable]:
         env = wp.tid()
         rope = ropes[env % ropes.shape[0]]
         q = quat(qpos[env, 4], qpos[env, 5], qpos[env, 6], qpos[env, 3])
-        rate = vec3(qvel[env, 3], qvel[env, 4], qvel[env, 5])
+        rate = read(qvel, env, 3)
         w = wp.quat_rotate(q, rate)
         arm = wp.quat_rotate(q, rope.mount)
-        pos = vec3(qpos[env, 0], qpos[env, 1], qpos[env, 2])
-        vel = vec3(qvel[env, 0], qvel[env, 1], qvel[env, 2])
+        pos = read(qpos, env, 0)
+        vel = read(qvel, env, 0)
         bodies.pos_w[env] = pos
         bodies.quat_wb[env] = q
         bodies.vel_w[env] = vel
@@ -261,9 +259,9 @@ def _kernels(world: World) -> dict[str, Callable]:
         vel += wp.cross(w, arm)
         if wp.static(cables):
             turn = quat(qpos[env, 11], qpos[env, 12], qpos[env, 13], qpos[env, 10])
-            spin = wp.quat_rotate(turn, vec3(qvel[env, 9], qvel[env, 10], qvel[env, 11]))
-            box = vec3(qpos[env, 7], qpos[env, 8], qpos[env, 9])
-            box_vel = vec3(qvel[env, 6], qvel[env, 7], qvel[env, 8])
+            spin = wp.quat_rotate(turn, read(qvel, env, 9))
+            box = read(qpos, env, 7)
+            box_vel = read(qvel, env, 6)
             top = wp.quat_rotate(turn, vec3(0.0, 0.0, rope.payload_offset))
             gap = box + top - pos
             n = wp.normalize(gap)

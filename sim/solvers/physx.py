@@ -117,7 +117,7 @@ class PhysxSolver:
         name = "env{:06d}".format
         usd = [environment(name(e), *model) for e, model in zip(first, models)]
         head = SCENE.format(
-            gravity=world.gravity, gpu=self._gpu, broadphase="GPU" if self._gpu else "MBP"
+            gravity=world.plants.gravity, gpu=self._gpu, broadphase="GPU" if self._gpu else "MBP"
         )
         self._physx = _instance(ovphysx, world.device)
         stage = ovstage.Stage()
@@ -199,7 +199,7 @@ class PhysxSolver:
         self._physx.step_sync(duration)
         for name in ("links", "link_velocities"):
             tensors[name].read(arrays[name])
-        outputs = [w.packed[1], self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
+        outputs = [w.plants.ropes, self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
         wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
 
 

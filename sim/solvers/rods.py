@@ -14,6 +14,19 @@ AXIAL_INERTIA = 1e-8
 not load the vehicle; 1e-9 and 1e-10 move nothing more."""
 
 
+@wp.func
+def read(table: Table, row: int, column: int):
+    """Vector from three columns of a row."""
+    return vec3(table[row, column], table[row, column + 1], table[row, column + 2])
+
+
+@wp.func
+def write(table: Table, row: int, column: int, vector: vec3):
+    """Put a vector into three columns of a row."""
+    for k in range(3):
+        table[row, column + k] = vector[k]
+
+
 def build_place(world: World, hinges: bool) -> wp.Kernel:
     """Build the kernel that turns state arrays into an engine's coordinates where a mask is not 0.
 
@@ -64,10 +77,9 @@ def build_place(world: World, hinges: bool) -> wp.Kernel:
         spin_root = w
         if wp.static(hinges):
             spin_root = rate_b
-        for k in range(3):
-            pose[row, k] = state.pos_w[env][k]
-            velocity[row, k] = state.vel_w[env][k]
-            velocity[row, 3 + k] = spin_root[k]
+        write(pose, row, 0, state.pos_w[env])
+        write(velocity, row, 0, state.vel_w[env])
+        write(velocity, row, 3, spin_root)
         for k in range(4):
             pose[row, 3 + (k + first) % 4] = q[k]
         for i in range(L):

@@ -10,7 +10,7 @@ from pytest import approx, mark, raises
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
-from sim.units import Units, in_units
+from sim.scaling.units import Units, in_units
 from tests.configs import load_experiment
 from tests.plants import EVERYTHING
 from visthrow.task import TaskParams, plant_of

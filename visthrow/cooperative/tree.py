@@ -84,7 +84,7 @@ class TreeSolver:
     def advance(self, duration: float) -> None:
         w = self.world
         state = [w.state, self.load_pos_w, self.load_vel_w, w.bodies, w.wrench]
-        inputs = [*w.packed, w.gravity, duration, *state]
+        inputs = [w.plants, duration, *state]
         wp.launch(self._advance, self.worlds, inputs, device=w.device, block_dim=64)
 
 
@@ -96,8 +96,6 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
     N = V * L
     real = t.real
     vec3 = t.vec3
-    Vehicle = t.Vehicle
-    Rope = t.Rope
     State = world.kernels.State
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
@@ -129,9 +127,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
     @wp.kernel(module="unique", enable_backward=False, module_options={"max_unroll": 1})
     def advance(
         # Params:
-        vehicles: wp.array(dtype=Vehicle),
-        ropes: wp.array(dtype=Rope),
-        gravity: real,
+        plants: t.Plants,
         h: real,
         # State in:
         state: State,
@@ -142,7 +138,8 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
         wrench: Wrench,
     ):
         world = wp.tid()
-        g = vec3(real(0.0), real(0.0), -gravity)
+        ropes = plants.ropes
+        g = plants.gravity_w
         half = real(0.5) * h
         first = world * V
         load_mass = real(0.0)
@@ -171,7 +168,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 row = first + k
                 if state.attached[row] == 0:
                     continue
-                p = vehicle_of(vehicles, state, row)
+                p = vehicle_of(plants.vehicles, state, row)
                 rope = ropes[row % ropes.shape[0]]
                 m = rope.segment_mass
                 length = rope.segment_length
@@ -233,7 +230,7 @@ def _kernels(world: World, team: int) -> tuple[wp.Kernel, wp.Kernel]:
                 row = first + k
                 if state.attached[row] == 0:
                     continue
-                p = vehicle_of(vehicles, state, row)
+                p = vehicle_of(plants.vehicles, state, row)
                 rope = ropes[row % ropes.shape[0]]
                 a = acc
                 for j in range(L):

@@ -23,7 +23,7 @@ from sim.params import (
     SimParams,
     VehicleParams,
 )
-from sim.vehicle_class import FleetParams
+from sim.scaling.vehicle_class import FleetParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 

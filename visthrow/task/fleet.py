@@ -2,7 +2,7 @@
 
 The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of
 ``fleet.total_mass``. Every vehicle is flown in units in which its own have these numbers
-(:mod:`sim.units`): the same task for all, targets, fence and rewards too, and control steps that
+(:mod:`sim.scaling.units`): the same task for all, targets, fence and rewards too, and control steps that
 are as long as the square root of the rope. What stays different is what makes vehicles different.
 
 A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import torch
 
 from sim.params import GRAVITY, PlantParams, changed
-from sim.units import PLANT, Units, dimensions_of, in_units
-from sim.vehicle_class import draw
+from sim.scaling.units import PLANT, Units, dimensions_of, in_units
+from sim.scaling.vehicle_class import draw
 from visthrow import config
 from visthrow.common.errors import PolicyError
 from visthrow.common.toml_text import tables_beside

@@ -346,7 +346,7 @@ def build_replay(
         air = plants.airs[row]
         x = sensings[row]
         gravity = plants.gravity
-        g = vec3(real(0.0), real(0.0), -gravity)
+        g = plants.gravity_w
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)

@@ -10,7 +10,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, mark, raises
 
 from sim.params import GRAVITY
-from sim.vehicle_class import draw
+from sim.scaling.vehicle_class import draw
 from tests.configs import QUIET, load_experiment
 from visthrow import config
 from visthrow.common.errors import PolicyError

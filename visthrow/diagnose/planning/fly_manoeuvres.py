@@ -10,7 +10,7 @@ import numpy as np
 
 from sim.effects.effect import apply
 from sim.params import PlantParams, changed
-from sim.units import Units, in_units
+from sim.scaling.units import Units, in_units
 from visthrow import config
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError

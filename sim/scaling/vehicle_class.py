@@ -3,21 +3,29 @@ random about that.
 
 Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the
 cube root of the mass, thrust as the mass, inertia as mass times arm squared, and times as the
-square root of the arm: this is :class:`sim.units.Units` applied to the known vehicle. Every factor
+square root of the arm: this is :class:`sim.scaling.units.Units` applied to the known vehicle. Every factor
 multiplies what that gives. What does not follow size, links and sensors, stays in seconds."""
 
 import math
+import tomllib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from operator import attrgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from camera.field_bounds import BoundedFields, Positive
-from sim.params import GRAVITY, PlantParams, RopeParams, VehicleParams, changed
-from sim.units import Units, in_units
+from sim.params import GRAVITY, PlantParams, VehicleParams, changed
+from sim.scaling.units import Units, in_units
 
 Range = tuple[float, float]
+
+SCALES: dict[str, dict[str, str]] = tomllib.loads(
+    Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")
+)
+"""Table -> path of a number -> factors that it is multiplied by."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +118,7 @@ def draw(fleet: FleetParams, nominal: PlantParams, number: int) -> PlantParams:
     return replace(
         nominal,
         vehicle=vehicle,
-        rope=_rope(rope, x),
+        rope=replace(rope, **_multiplied(rope, "rope", x)),
         release=replace(nominal.release, lag=x["lag"]),
     )
 
@@ -137,64 +145,32 @@ def _calm(v: VehicleParams, share: float) -> VehicleParams:
     return changed(v, {f"controller.{name}": gain for name, gain in gains.items()})
 
 
+def _product(factors: str, x: Mapping[str, float]) -> float:
+    """Return the product of factors such as ``arm^2 inertia``."""
+    product = 1.0
+    for factor in factors.split():
+        name, _, power = factor.partition("^")
+        product *= x[name] ** int(power or 1)
+    return product
+
+
+def _multiplied(owner: Any, table: str, x: Mapping[str, float]) -> dict[str, Any]:
+    """Return the numbers of a dataclass that a table of :data:`SCALES` names, times its factors."""
+    values: dict[str, Any] = {}
+    for path, factors in SCALES[table].items():
+        value = attrgetter(path)(owner)
+        factor = _product(factors, x)
+        many = isinstance(value, tuple)
+        values[path] = tuple(factor * v for v in value) if many else factor * value
+    return values
+
+
 def _vehicle(v: VehicleParams, x: dict[str, float]) -> VehicleParams:
     """Return a vehicle with the factors drawn."""
-    arm = x["arm"]
-    blade = x["arm"] * x["propeller"]
-    lag = x["motor_lag"]
-    stiff = x["inertia"] * arm**2
-    turn = np.array([stiff, stiff, stiff * x["yaw_inertia"]])
-
-    def scaled(gains: tuple[float, ...], factor: float) -> tuple[float, ...]:
-        return tuple((np.array(gains) * turn * factor).tolist())
-
-    c = v.controller
-    fast = x["p_gain"] / lag  # a rate loop is tuned to what its motors follow
-    values: dict[str, Any] = {
-        "body.inertia": scaled(v.body.inertia, 1.0),
-        "queue.delay": x["delay"],
-        "controller.p_gain": scaled(c.p_gain, fast),
-        "controller.i_gain": scaled(c.i_gain, fast * x["i_gain"]),
-        "controller.d_gain": scaled(c.d_gain, x["d_gain"]),
-        "controller.feedforward_gain": scaled(c.feedforward_gain, x["feedforward"]),
-        "controller.integral_limit": scaled(c.integral_limit, 1.0),
-        "controller.voltage_compensation": x["compensation"],
-    }
-    factors = {
-        "rotors.z": arm,
-        "rotors.radius": blade,
-        "rotors.inertia": blade**2 * x["rotor_inertia"],
-        "controller.setpoint_time_constant": x["filters"],
-        "controller.gyro_time_constant": x["filters"],
-        "controller.min_thrust": x["thrust"],
-        "controller.max_thrust": x["thrust"],
-        "motor.time_constant": lag,
-        "motor.time_constant_down": lag,
-        "battery.resistance": x["resistance"],
-        "thrust.k_f": x["thrust"],
-        "thrust.torque_ratio": blade * x["torque_ratio"],
-        "collision_radius": arm,
-        **{f"aero.{f.name}": x["drag"] for f in fields(v.aero) if f.name != "kind"},
-    }
-    for path, factor in factors.items():
-        values[path] = factor * attrgetter(path)(v)
-    for name in ("x", "y"):
-        values[f"rotors.{name}"] = tuple(arm * a for a in getattr(v.rotors, name))
+    values = _multiplied(v, "vehicle", x)
+    for path, factors in SCALES["yaw"].items():
+        *level, about_z = values[path]
+        values[path] = (*level, about_z * _product(factors, x))
+    values["queue.delay"] = x["delay"]
+    values["controller.voltage_compensation"] = x["compensation"]
     return changed(v, values)
-
-
-def _rope(r: RopeParams, x: dict[str, float]) -> RopeParams:
-    """Return a rope and its payload with the factors drawn."""
-    length = r.length * x["rope"]
-    size = x["payload_size"]
-    mass = x["payload"]
-    return replace(
-        r,
-        length=length,
-        rope_mass=r.rope_mass * x["rope"] * x["rope_mass"],
-        payload_mass=r.payload_mass * mass,
-        payload_inertia=r.payload_inertia * mass * size**2,
-        payload_offset=r.payload_offset * size,
-        payload_radius=r.payload_radius * size,
-        mount=tuple(x["mount"] * a for a in r.mount),
-    )
