@@ -3,8 +3,9 @@ random about that.
 
 Vehicles of one shape and density whose motion looks alike (equal Froude number) have arms as the
 cube root of the mass, thrust as the mass, inertia as mass times arm squared, and times as the
-square root of the arm: this is :class:`sim.scaling.units.Units` applied to the known vehicle. Every factor
-multiplies what that gives. What does not follow size, links and sensors, stays in seconds."""
+square root of the arm: this is :class:`sim.scaling.units.Units` applied to the known vehicle. Every
+factor multiplies what that gives. What does not follow size, links and sensors, stays in
+seconds."""
 
 import math
 import tomllib

@@ -2,8 +2,9 @@
 
 The task of such an experiment is stated for a rope of ``fleet.rope_length`` and a total mass of
 ``fleet.total_mass``. Every vehicle is flown in units in which its own have these numbers
-(:mod:`sim.scaling.units`): the same task for all, targets, fence and rewards too, and control steps that
-are as long as the square root of the rope. What stays different is what makes vehicles different.
+(:mod:`sim.scaling.units`): the same task for all, targets, fence and rewards too, and control steps
+that are as long as the square root of the rope. What stays different is what makes vehicles
+different.
 
 A vision policy's camera is stated in these units too: on a vehicle with a rope twice as long the
 lens is twice as far from its middle, and the square on the ground twice as wide. The ball has its

@@ -41,36 +41,33 @@ def vector_of_rotation(like: Any, quat: Any):
     return axis * scale
 
 
-def build_sensing(t: Types, Sensing: type):
-    """Warp functions of the measurement model.
+@wp.func
+def cubic(a: Any, rate_a: Any, b: Any, rate_b: Any, s: Any, h: Any):
+    """Cubic through two states, h seconds apart, with their derivatives.
 
-    Returns ``pose(sensing, com, pos_w, quat_wb, reference)`` -> measured position of the marker
-    body [m] and its attitude against the quaternion ``reference`` as a rotation vector [rad];
-    ``point(sensing, pos_w)`` -> measured position of the payload [m]; ``rate(sensing, rate_b)``
-    [rad/s]."""
-    vec3 = t.vec3
-    quat = t.quat
-    real = t.real
+    ``s``: 0 at the first, 1 at the second."""
+    way = b - a
+    rest = type(s)(1.0) - s
+    return a + way * s + ((rate_a * h - way) * rest - (rate_b * h - way) * s) * (s * rest)
 
-    @wp.func
-    def pose(x: Sensing, com: vec3, pos_w: vec3, quat_wb: quat, reference: quat):
-        frame = rotation_of_vector(quat_wb, x.frame_tilt)
-        point = pos_w + wp.quat_rotate(quat_wb, x.marker_offset - com)
-        quat_seen = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
-        turn = wp.quat_inverse(reference) * quat_seen
-        return (real(1.0) + x.scale) * wp.quat_rotate(frame, point), vector_of_rotation(pos_w, turn)
 
-    @wp.func
-    def point(x: Sensing, like: quat, pos_w: vec3):
-        return (real(1.0) + x.scale) * wp.quat_rotate(
-            rotation_of_vector(like, x.frame_tilt), pos_w + x.payload_offset
-        )
+@wp.func
+def see_pose(x: Any, com: Any, pos_w: Any, quat_wb: Any, reference: Any):
+    """Measured position [m] of the marker body of a vehicle with its centre of mass at ``com``, and
+    its attitude against the quaternion ``reference`` as a rotation vector [rad].
+    """
+    frame = rotation_of_vector(quat_wb, x.frame_tilt)
+    point = pos_w + wp.quat_rotate(quat_wb, x.marker_offset - com)
+    quat_seen = frame * quat_wb * rotation_of_vector(quat_wb, x.marker_rotation)
+    turn = vector_of_rotation(pos_w, wp.quat_inverse(reference) * quat_seen)
+    return (type(x.scale)(1.0) + x.scale) * wp.quat_rotate(frame, point), turn
 
-    @wp.func
-    def rate(x: Sensing, rate_b: vec3):
-        return rate_b + x.gyro_bias
 
-    return pose, point, rate
+@wp.func
+def see_point(x: Any, like: Any, pos_w: Any):
+    """Measured position of the payload [m]."""
+    frame = rotation_of_vector(like, x.frame_tilt)
+    return (type(x.scale)(1.0) + x.scale) * wp.quat_rotate(frame, pos_w + x.payload_offset)
 
 
 @dataclass(frozen=True)
@@ -95,9 +92,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
     """
     real = t.real
     vec3 = t.vec3
-    quat = t.quat
     Vehicle = t.Vehicle
-    see_pose, see_point, see_rate = build_sensing(t, Sensing)
     Pointers = make_struct(
         "Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real}
     )
@@ -107,20 +102,6 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
     times = dict.fromkeys(("time", "separation", "slack_first", "slack_last"), real)
     flags = dict.fromkeys(("mode", "latched", "knot", "slack"), wp.int32)
     Moment = make_struct("Moment", body | release | times | flags)
-
-    @wp.func
-    def blend_vec(a: vec3, va: vec3, b: vec3, vb: vec3, s: real, h: real):
-        """Cubic through two points with their derivatives."""
-        d = b - a
-        bend = s * (real(1.0) - s)
-        return a + s * d + bend * ((real(1.0) - s) * (h * va - d) - s * (h * vb - d))
-
-    @wp.func
-    def blend_quat(a: quat, va: quat, b: quat, vb: quat, s: real, h: real):
-        d = b - a
-        bend = s * (real(1.0) - s)
-        q = a + d * s + ((va * h - d) * (real(1.0) - s) - (vb * h - d) * s) * bend
-        return wp.normalize(q)
 
     @wp.func
     def late(x: Sensing, windows: Windows, w: int, stamp: real, delay: real):
@@ -156,43 +137,27 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
                 pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
-            pos = blend_vec(k.quad.pos_w, k.quad.vel_w, m.quad.pos_w, m.quad.vel_w, s, span)
-            q = blend_quat(
-                k.quad.quat_wb,
-                quat_rate(k.quad.quat_wb, k.quad.rate_b),
-                m.quad.quat_wb,
-                quat_rate(m.quad.quat_wb, m.quad.rate_b),
-                s,
-                span,
-            )
-            quat_seen, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
-            out[2 * pointers_after.vehicle, lane] = quat_seen
+            pos = cubic(k.quad.pos_w, k.quad.vel_w, m.quad.pos_w, m.quad.vel_w, s, span)
+            rate = quat_rate(k.quad.quat_wb, k.quad.rate_b)
+            next_rate = quat_rate(m.quad.quat_wb, m.quad.rate_b)
+            q = wp.normalize(cubic(k.quad.quat_wb, rate, m.quad.quat_wb, next_rate, s, span))
+            place, turn = see_pose(x, p.body.com, pos, q, data.vehicle_quat[i])
+            out[2 * pointers_after.vehicle, lane] = place
             out[2 * pointers_after.vehicle + 1, lane] = turn
             pointers_after.vehicle = pointers_after.vehicle + 1
         while pointers_after.payload < payloads:
-            time = late(
-                x,
-                windows,
-                w,
-                data.payload_time[windows.payload_first[w] + pointers_after.payload],
-                x.payload_delay,
-            )
+            stamp = data.payload_time[windows.payload_first[w] + pointers_after.payload]
+            time = late(x, windows, w, stamp, x.payload_delay)
             if time > k.t1 and not last:
                 pointers_after.due = wp.min(pointers_after.due, time)
                 break
             s = (time - k.t0) / span
-            out[2 * vehicles + pointers_after.payload, lane] = see_point(
-                x, k.quad.quat_wb, blend_vec(k.pay, k.pay_vel, m.pay, m.pay_vel, s, span)
-            )
+            pos = cubic(k.pay, k.pay_vel, m.pay, m.pay_vel, s, span)
+            out[2 * vehicles + pointers_after.payload, lane] = see_point(x, k.quad.quat_wb, pos)
             pointers_after.payload = pointers_after.payload + 1
         while pointers_after.gyro < windows.gyro_count[w]:
-            time = late(
-                x,
-                windows,
-                w,
-                data.gyro_time[windows.gyro_first[w] + pointers_after.gyro],
-                x.gyro_delay,
-            )
+            stamp = data.gyro_time[windows.gyro_first[w] + pointers_after.gyro]
+            time = late(x, windows, w, stamp, x.gyro_delay)
             if time > k.t1 and not last:
                 pointers_after.due = wp.min(pointers_after.due, time)
                 break
@@ -201,7 +166,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
             change = m.quad.rate_b - old
             bend = change - (old - m.before)  # a parabola through three ends of steps
             turning = old + s * change - real(0.5) * s * (real(1.0) - s) * bend
-            out[2 * vehicles + payloads + pointers_after.gyro, lane] = see_rate(x, turning)
+            out[2 * vehicles + payloads + pointers_after.gyro, lane] = turning + x.gyro_bias
             pointers_after.gyro = pointers_after.gyro + 1
         return pointers_after
 
