@@ -153,7 +153,7 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
 
 
 def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], second: bool):
-    """Build ``up`` and ``speed`` of the state or, with ``second``, of the predicted state."""
+    """Build ``up`` of the state or, with ``second``, of the predicted state."""
     L = rods.segments
     real = t.real
     vec3 = t.vec3
@@ -278,21 +278,7 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             ui = u_above
         return d, o, b
 
-    @wp.func
-    def speed(
-        rope: Rope,
-        mount_vel_w: vec3,
-        u: Vectors,
-        k1: Vectors,
-        h: real,
-    ):
-        """Velocity of the payload's centre [m/s], world frame."""
-        vel = mount_vel_w
-        for i in range(L):
-            vel += rope.segment_length * rate(u, k1, h, i)
-        return vel + rope.payload_offset * rate(u, k1, h, L - 1)
-
-    return up, speed
+    return up
 
 
 def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
@@ -426,8 +412,9 @@ def build_chain(
         force of the whole chain at the mount, at the state and at the predicted state),
         ``down_first`` (root to leaf: first stage k1 and predicted directions n2), ``down_second``
         (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
-        alone), ``payload`` (position and velocity of the payload's centre), ``momentum`` (linear
-        momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
+        alone), ``payload`` (position and velocity of the payload's centre), ``speed`` (that
+        velocity [m/s] as ``k1`` predicts it; k1 is zero before the first stage), ``momentum``
+        (linear momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
         under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
     """
     L = segments
@@ -438,8 +425,8 @@ def build_chain(
     Rope = t.Rope
     giving = "compliance" in extensions
     rods = build_rods(t, segments, extensions)
-    up_first, speed_first = build_stage(t, rods, extensions, second=False)
-    up_second, speed_second = build_stage(t, rods, extensions, second=True)
+    up_first = build_stage(t, rods, extensions, second=False)
+    up_second = build_stage(t, rods, extensions, second=True)
     down_first, down_second, fall_back = build_descent(t, rods, extensions)
 
     @wp.func
@@ -458,6 +445,13 @@ def build_chain(
             if wp.static(giving):
                 vel += (rope.strain_rate * rope.segment_length) * n[i]
         return pos + rope.payload_offset * n[L - 1], vel + rope.payload_offset * u[L - 1]
+
+    @wp.func
+    def speed(rope: Rope, mount_vel_w: vec3, u: Vectors, k1: Vectors, h: real):
+        vel = mount_vel_w
+        for i in range(L):
+            vel += rope.segment_length * (u[i] + h * k1[i])
+        return vel + rope.payload_offset * (u[L - 1] + h * k1[L - 1])
 
     @wp.func
     def momentum(rope: Rope, u: Vectors):
@@ -530,8 +524,7 @@ def build_chain(
         down_second=down_second,
         fall_back=fall_back,
         payload=payload,
-        speed_first=speed_first,
-        speed_second=speed_second,
+        speed=speed,
         momentum=momentum,
         upper_damping=rods.upper_damping,
         com_velocity=com_velocity,

@@ -108,31 +108,24 @@ def build_coupled_step(
             rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u
         )
 
-    def build_load(speed):
-        @wp.func
-        def load(
-            rope: Rope,
-            air: Air,
-            s: QuadState,
-            f: QuadRate,
-            n: Vectors,
-            u: Vectors,
-            k1: Vectors,
-            h: real,
-        ):
-            """Force on the payload [N], world frame."""
-            if wp.static(loaded):
-                jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
-                return payload.hanging(
-                    rope, air, speed(rope, mount_velocity(rope, s), u, k1, h), n[L - 1], jet
-                )
-            else:
-                return vec3()
-
-        return load
-
-    load_first = build_load(chain.speed_first)
-    load_second = build_load(chain.speed_second)
+    @wp.func
+    def load(
+        rope: Rope,
+        air: Air,
+        s: QuadState,
+        f: QuadRate,
+        n: Vectors,
+        u: Vectors,
+        k1: Vectors,
+        h: real,
+    ):
+        """Force on the payload [N], world frame."""
+        if wp.static(loaded):
+            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+            vel = chain.speed(rope, mount_velocity(rope, s), u, k1, h)
+            return payload.hanging(rope, air, vel, n[L - 1], jet)
+        else:
+            return vec3()
 
     @wp.func
     def momentum(p: Vehicle, rope: Rope, s: QuadState, u: Vectors):
@@ -181,7 +174,7 @@ def build_coupled_step(
 
         f1 = flow(p, air, s, command)
         rate_w = wp.quat_rotate(s.quat_wb, s.rate_b)
-        load1 = load_first(rope, air, s, f1, n, u, k1, h)
+        load1 = load(rope, air, s, f1, n, u, k1, h)
         d, o, b = chain.up_first(
             rope, n, u, n2, k1, stiffness, rate_w, gravity, load1, gamma, h, c1, c2, hs
         )
@@ -203,7 +196,7 @@ def build_coupled_step(
 
         f2 = flow(p, air, s2, command)
         rate_w = wp.quat_rotate(s2.quat_wb, s2.rate_b)
-        load2 = load_second(rope, air, s2, f2, n2, u, k1, h)
+        load2 = load(rope, air, s2, f2, n2, u, k1, h)
         d, o, b = chain.up_second(
             rope, n, u, n2, k1, stiffness, rate_w, gravity, load2, gamma, h, c1, c2, hs
         )

@@ -53,7 +53,7 @@ def build_loose_step(t: Types, chain, payload):
         hs = wp.zeros(shape=(L,), dtype=vec2)
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
-        load1 = payload.free(rope, air, chain.speed_first(rope, vel_w, u, k1, h))
+        load1 = payload.free(rope, air, chain.speed(rope, vel_w, u, k1, h))
         # a root that turns with the first rod rubs on nothing
         d, o, b = chain.up_first(
             rope,
@@ -79,7 +79,7 @@ def build_loose_step(t: Types, chain, payload):
             vel = (total + h * (weight + load1) - chain.momentum(rope, u)) / rope.total_mass
             return pos_w + (half * h) * (vel_w + vel), vel
         predicted = vel_w + h * acc
-        load2 = payload.free(rope, air, chain.speed_second(rope, predicted, u, k1, h))
+        load2 = payload.free(rope, air, chain.speed(rope, predicted, u, k1, h))
         turn = wp.cross(n2[0], u[0] + h * k1[0])
         d, o, b = chain.up_second(
             rope, n, u, n2, k1, stiffness, turn, gravity, load2, gamma, h, c1, c2, hs
