@@ -11,7 +11,6 @@ Convention: pixel (0, 0) is the centre of the top left pixel, x right, y down, z
 which their own readers ignore. A file without it gets the ``fov_deg`` of the call [deg] or, that
 left out, the angle that the farthest corner of the image sees."""
 
-import json
 import math
 import re
 import tomllib
@@ -99,6 +98,8 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
 
     Convention: the IMU sits at the centre of mass, its axes are the body's (x forward, y left, z
     up). Raises ValueError: no 4 x 4 matrix with a rotation."""
+    from scipy.spatial.transform import Rotation
+
     _, node, _ = _chosen(_cameras_of(path), camera)
     key = next((key for key in ("T_cam_imu", "T_imu_cam") if key in node), None)
     if key is None:
@@ -115,13 +116,10 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     if key == "T_imu_cam":
         rot_cb = matrix[:3, :3].T
         position_b = place_c
-    turn = (rot_cb.T @ np.array(DOWNWARD_ROT_CB)).tolist()
-    roll = math.atan2(turn[2][1], turn[2][2])
-    pitch = math.asin(max(-1.0, min(1.0, -turn[2][0])))
-    yaw = math.atan2(turn[1][0], turn[0][0])
-    x, y, z = position_b.tolist()
-    roll, pitch, yaw = map(math.degrees, (roll, pitch, yaw))
-    return MountParams((x, y, z), (roll, pitch, yaw))
+    turn = Rotation.from_matrix(rot_cb.T @ DOWNWARD_ROT_CB)
+    return MountParams(
+        tuple(position_b.tolist()), tuple(turn.as_euler("xyz", degrees=True).tolist())
+    )
 
 
 def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
@@ -144,7 +142,7 @@ def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[st
 
 
 def _tree(path: str | Path) -> Any:
-    """Mappings and lists of a YAML, JSON or XML file, or of OCamCalib's text."""
+    """Mappings and lists of a YAML or XML file, or of OCamCalib's text; JSON is YAML too."""
     if not Path(path).is_file():
         raise ValueError("not a file; expected a calibration file")
     try:
@@ -153,11 +151,6 @@ def _tree(path: str | Path) -> Any:
         raise ValueError(f"no text ({error}); expected a calibration file") from error
     if text.startswith("<"):
         return _tree_of_xml(text)
-    if text.startswith("{"):
-        try:
-            return json.loads(text)
-        except json.JSONDecodeError:
-            pass  # YAML's mappings may begin with a brace too
     lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
     if lines and all(re.fullmatch(r"[-+.\deE\s]+", line) for line in lines):
         return {"ocam_lines": [line.split() for line in lines]}

@@ -7,7 +7,7 @@ FEEDFORWARD_SCALE, PID_MIXER_SCALING), pid.c (applyItermRelax), pid_init.c, mixe
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from sim.params import ControllerParams, VehicleParams
 
@@ -101,8 +101,10 @@ def _torques(vehicle: VehicleParams, thrust: float) -> list[float]:
     return [arm * thrust / MIXER_SCALE * DEGREE for arm in arms]
 
 
-def _gains(torques: list[float], scale: float, values: list[float]) -> tuple[float, float, float]:
-    """Return the gains of the axes [N m]."""
+def _gains(
+    torques: list[float], scale: float, values: Sequence[float]
+) -> tuple[float, float, float]:
+    """Return the gains of the axes, or their limits [N m]."""
     x, y, z = (scale * value * torque for value, torque in zip(values, torques, strict=True))
     return x, y, z
 
@@ -132,7 +134,7 @@ def controller_of(
     idle = numbers(settings, "motor_idle")[0] * 1e-4
     thrust = 2.0 * math.sqrt(mix_thrust * full) * (1.0 - idle)  # for an output of 1 [N]
     torques = _torques(vehicle, thrust)
-    axes = [numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")]
+    p, i, d, *_ = zip(*[numbers(settings, f"{axis}PID") for axis in ("roll", "pitch", "yaw")])
     forward = numbers(settings, "ff_weight")
     extremes = [
         numbers(settings, name, settings["pidsum_limit"])[0]
@@ -146,17 +148,14 @@ def controller_of(
         (gyro + filtering) / whole if whole > 0.0 else 1.0
         for filtering in (0.0, _lag(settings, "yaw_lowpass_hz"))
     )
-    x, y, z = (windup * limit * torque for limit, torque in zip(extremes, torques, strict=True))
     return dataclasses.replace(
         c,
         kind="motor_mixing",
-        p_gain=_gains(torques, P_SCALE, [a[0] for a in axes]),
-        i_gain=_gains(
-            torques, I_SCALE, [times * a[1] for times, a in zip((1.0, 1.0, YAW_I), axes)]
-        ),
-        d_gain=_gains(torques, D_SCALE, [a[2] for a in axes]),
+        p_gain=_gains(torques, P_SCALE, p),
+        i_gain=_gains(torques, I_SCALE, (*i[:2], YAW_I * i[2])),
+        d_gain=_gains(torques, D_SCALE, d),
         feedforward_gain=_gains(torques, F_SCALE, forward),
-        integral_limit=(x, y, z),
+        integral_limit=_gains(torques, windup, extremes),
         setpoint_time_constant=_lag(settings, "iterm_relax_cutoff"),
         gyro_time_constant=whole,
         gyro_share=(share, share, yaw_share),

@@ -174,21 +174,16 @@ def build_exchange(
     Output = step.Output
     load = parts.load
     store = parts.store
-    load_rope = parts.load_rope
     bodies_access = build_bodies(t, parts, L)
     load_bodies = bodies_access.load_bodies
     flow = parts.flow
     advance = parts.advance
-    laws = parts.laws
     coupled = parts.coupled
-    depart = parts.depart
     hanging = parts.payload.hanging
-    rope_size = parts.rope_size
     vehicle_of = parts.vehicle_of
     rope_of = parts.rope_of
     release_of = parts.release_of
     air_of = parts.air_of
-    hazards = parts.hazards
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Plants = t.Plants
@@ -254,13 +249,13 @@ def build_exchange(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        load_rope(state, env, n, u, stiffness)
+        parts.load_rope(state, env, n, u, stiffness)
         whole, switch = split_delay(p, plants.control_period)
         active, _until = command_at(
             state.queue, env, whole, switch, time + half, plants.control_period
         )
         s = load(state, env)
-        law_factors = laws.on(
+        law_factors = parts.laws.on(
             p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
@@ -316,7 +311,7 @@ def build_exchange(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         s = load_bodies(bodies, env, load(state, env), n, u)
-        size = st.size(s) + rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
+        size = st.size(s) + parts.rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite
             moves[env] = 0
@@ -342,7 +337,7 @@ def build_exchange(
             # backwards from the end with the acceleration between the ends
             remaining_time = (one - part) * h
             acc = (vel - before) / h
-            depart(
+            parts.depart(
                 rope_of(plants, env),
                 release_of(plants, env),
                 air_of(plants, state, env),
@@ -384,7 +379,7 @@ def build_exchange(
             for i in range(L):
                 n[i] = state.cable_dir_w[i, env]
             p = vehicle_of(plants, state, env)
-            hazard_bits = hazards(p, rope_of(plants, env), s, n, out.payload_pos_w[env])
+            hazard_bits = parts.hazards(p, rope_of(plants, env), s, n, out.payload_pos_w[env])
             state.status[env] = state.status[env] | hazard_bits
 
     return ExchangeKernels(

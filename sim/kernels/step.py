@@ -218,7 +218,6 @@ def build_step(
     chain = parts.chain
     coupled = parts.coupled
     laws = parts.laws
-    leaving = parts.leaving
     load = parts.load
     store = parts.store
     load_rope = parts.load_rope
@@ -228,8 +227,6 @@ def build_step(
     rope_of = parts.rope_of
     release_of = parts.release_of
     air_of = parts.air_of
-    hazards = parts.hazards
-    depart = parts.depart
     limit = real(st.SPEED_LIMIT)
 
     @wp.func
@@ -249,8 +246,8 @@ def build_step(
         mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
         mount_vel = coupled.mount_velocity(rope, s)
         pos, vel = chain.payload(rope, mount, mount_vel, n, u)
-        vel = leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
-        depart(rope, r, air, s, pos, vel, n[L - 1], gravity, out, env, elapsed)
+        vel = parts.leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
+        parts.depart(rope, r, air, s, pos, vel, n[L - 1], gravity, out, env, elapsed)
 
     @unique_kernel
     def step_kernel(
@@ -287,7 +284,7 @@ def build_step(
         timer = state.release_timer[env]
         attached = state.attached[env]
         if release[env] != 0 and timer < real(0.0) and attached != 0:
-            timer = leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
+            timer = parts.leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
         tiny = real(1.0e-6)
         status = int(0)
         if not taken:
@@ -349,7 +346,7 @@ def build_step(
             pos, vel = coupled.payload(rope, s, n, u)
             out.payload_pos_w[env] = pos
             out.payload_vel_w[env] = vel
-            status = status | hazards(p, rope, s, n, pos)
+            status = status | parts.hazards(p, rope, s, n, pos)
         state.status[env] = status
 
     @unique_kernel

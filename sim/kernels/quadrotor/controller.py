@@ -9,17 +9,11 @@ import warp as wp
 
 
 @wp.func
-def speed_of_thrust(p: Any, thrust: Any):
-    """Motor speed that gives a thrust by the quadratic map [N] -> [rad/s]."""
-    return wp.sqrt(wp.max(thrust, thrust - thrust) / p.thrust.k_f)
-
-
-@wp.func
 def speeds_of_thrusts(p: Any, f: Any):
-    """Motor speeds [rad/s], shape (4,), of thrusts [N], shape (4,)."""
+    """Motor speeds [rad/s], shape (4,), that give thrusts [N], shape (4,), by the quadratic map."""
     speed = f
     for i in range(4):
-        speed[i] = speed_of_thrust(p, f[i])
+        speed[i] = wp.sqrt(wp.max(f[i], f[i] - f[i]) / p.thrust.k_f)
     return speed
 
 

@@ -414,8 +414,8 @@ def build_chain(
         (new n, u and stiffness in place, and the new momentum), ``fall_back`` (the first stage
         alone), ``payload`` (position and velocity of the payload's centre), ``speed`` (that
         velocity [m/s] as ``k1`` predicts it; k1 is zero before the first stage), ``momentum``
-        (linear momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)`` (the rope
-        under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
+        (linear momentum relative to the mount), ``stretched(natural, before, stiffness, u, h)``
+        (the rope under its pull, ``before`` what it was h seconds before; with h 0 it is at rest).
     """
     L = segments
     real = t.real
