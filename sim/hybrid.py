@@ -211,7 +211,7 @@ class HybridSim:
         self.seed = seed
         self.gravity = gravity
         self.threads = threads or cores()
-        self.extensions = extensions_of(vehicles, ropes, airs, releases, params.laws) | extensions
+        self.extensions = extensions_of(ropes, airs, releases, params.laws) | extensions
         kernels = _kernels(params, direct, motors, self.extensions, without_rope)
         self.types, self._step, self._reset = kernels
         ropes = ropes_on(vehicles, ropes)

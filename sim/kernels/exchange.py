@@ -15,8 +15,9 @@ import warp as wp
 from sim.kernels import state as st
 from sim.kernels.quadrotor.queue import command_at, push, split_delay
 from sim.kernels.quadrotor.rigid_body import angular_acceleration
-from sim.kernels.rope.payload import LOADS
+from sim.kernels.rope.payload import LOADS, hanging_force
 from sim.kernels.runtime import Ints, unique_kernel
+from sim.kernels.state import air_of, release_of, rope_of, vehicle_of
 from sim.kernels.step import StepKernels
 from sim.kernels.structs import Types
 from sim.params import PlantParams
@@ -106,7 +107,6 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
     State = parts.State
     load = parts.load
     coupled = parts.coupled
-    rope_of = parts.rope_of
     Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     load_bodies, store_bodies = build_body_access(t, L)
@@ -179,11 +179,6 @@ def build_exchange(
     flow = parts.flow
     advance = parts.advance
     coupled = parts.coupled
-    hanging = parts.payload.hanging
-    vehicle_of = parts.vehicle_of
-    rope_of = parts.rope_of
-    release_of = parts.release_of
-    air_of = parts.air_of
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Plants = t.Plants
@@ -276,7 +271,9 @@ def build_exchange(
         wrench.torque_b[env] = f.torque_b
         if wp.static(loaded):
             jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
-            wrench.load_w[env] = hanging(rope, law_factors, out.payload_vel_w[env], n[L - 1], jet)
+            wrench.load_w[env] = hanging_force(
+                rope, law_factors, out.payload_vel_w[env], n[L - 1], jet
+            )
         after = advance(s, f, h)
         state.motor_speed[env] = after.motor_speed
         state.integral[env] = after.integral

@@ -16,6 +16,7 @@ from typing import Any
 
 import warp as wp
 
+from sim.kernels.quadrotor.rigid_body import mount_position, mount_velocity
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
 from sim.kernels.structs import Types
 from sim.law_factors import LAW_FACTORS
@@ -264,9 +265,7 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
             )
 
 
-def build_laws(
-    t: Types, laws: tuple[LawParams, ...], flow, chain, mount_velocity
-) -> SimpleNamespace:
+def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleNamespace:
     """Compose the laws of a plant.
 
     Returns a namespace of Warp functions ``on(p, rope, air, state, n, u, stiffness, command,
@@ -348,7 +347,7 @@ def build_laws(
                 a.thrust_rate = a.thrust_rate + real(1.0e3) * (f1[i] - f0[i])
             if attached != 0:
                 pos, vel = chain.payload(rope, vec3(), mount_velocity(rope, s), n, u)
-                a.payload_pos_w = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount) + pos
+                a.payload_pos_w = mount_position(rope, s) + pos
                 a.payload_vel_w = vel
                 a.cable_dir_w = wp.normalize(pos)
                 a.mount_b = rope.mount

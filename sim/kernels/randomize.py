@@ -15,6 +15,7 @@ import warp as wp
 
 from sim.kernels.quadrotor.start import build_start
 from sim.kernels.runtime import Ints, unique_kernel
+from sim.kernels.state import rope_of, vehicle_of
 from sim.kernels.structs import Types
 from sim.params import PlantParams
 
@@ -51,10 +52,10 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     @wp.func
     def settle(plants: Plants, state: State, env: int, used: real):
         """Motors, controller, battery and queue as in hover; nothing of the last episode stays."""
-        p = plants.vehicles[env % plants.vehicles.shape[0]]
-        rope = plants.ropes[env % plants.ropes.shape[0]]
+        p = vehicle_of(plants, state, env)
+        rope = rope_of(plants, env)
         gravity = plants.gravity
-        mass = p.body.mass * state.mass_scale[env]
+        mass = p.body.mass
         if wp.static(hangs):
             mass = mass + rope.total_mass
         start(p, state, env, mass * gravity, used)

@@ -131,6 +131,35 @@ def size(s: Any):
     )
 
 
+@wp.func
+def vehicle_of(plants: Any, state: Any, env: int):
+    """Parameters of an environment's vehicle, with its mass."""
+    p = plants.vehicles[env % plants.vehicles.shape[0]]
+    p.body.mass = p.body.mass * state.mass_scale[env]
+    return p
+
+
+@wp.func
+def rope_of(plants: Any, env: int):
+    """Parameters of an environment's rope."""
+    return plants.ropes[env % plants.ropes.shape[0]]
+
+
+@wp.func
+def release_of(plants: Any, env: int):
+    """Parameters of an environment's release."""
+    return plants.releases[env % plants.releases.shape[0]]
+
+
+@wp.func
+def air_of(plants: Any, state: Any, env: int):
+    """Air about an environment, with the wrench from outside."""
+    air = plants.airs[env % plants.airs.shape[0]]
+    air.push_w = air.push_w + state.force_w[env]
+    air.twist_b = air.twist_b + state.torque_b[env]
+    return air
+
+
 def build_access(t: Types, State: type):
     """Return Warp functions ``load(state, env) -> t.QuadState`` and ``store(state, env, s)`` for a
     struct of arrays.

@@ -13,12 +13,18 @@ import warp as wp
 from sim.kernels import state as st
 from sim.kernels.laws import build_laws
 from sim.kernels.quadrotor.queue import command_at, push, split_delay
-from sim.kernels.quadrotor.rigid_body import build_direct_flow, build_flow
+from sim.kernels.quadrotor.rigid_body import (
+    build_direct_flow,
+    build_flow,
+    mount_position,
+    mount_velocity,
+)
 from sim.kernels.rope import release as rel
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
-from sim.kernels.rope.payload import build_flight, build_payload
+from sim.kernels.rope.payload import build_flight
 from sim.kernels.runtime import Ints, unique_kernel
+from sim.kernels.state import air_of, release_of, rope_of, vehicle_of
 from sim.kernels.structs import Types
 from sim.params import PlantParams
 
@@ -46,11 +52,9 @@ def build_parts(
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
     Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
-    ``flow`` and ``advance``; ``chain``, ``payload``, ``coupled``, ``laws`` and
-    ``leaving`` with theirs; ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and
-    ``hazards``; ``vehicle_of``, ``rope_of``, ``release_of`` and ``air_of``, the parameters of an
-    environment; ``depart``, which writes what follows when the payload separates with a stated
-    velocity."""
+    ``flow`` and ``advance``; ``chain``, ``coupled`` and ``laws`` with theirs; ``load``, ``store``,
+    ``load_rope``, ``store_rope``, ``rope_size`` and ``hazards``; ``depart``, which writes what
+    follows when the payload separates with a stated velocity."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
@@ -58,7 +62,6 @@ def build_parts(
     Rope = t.Rope
     Release = t.Release
     Air = t.Air
-    Plants = t.Plants
     QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
@@ -67,14 +70,12 @@ def build_parts(
     if direct:
         flow = build_direct_flow(t)
     chain = build_chain(t, L, extensions)
-    payload = build_payload(t, extensions)
-    coupled = build_coupled_step(t, flow, advance, chain, payload, extensions, integrator)
-    laws = build_laws(t, params.laws, flow, chain, coupled.mount_velocity)
+    coupled = build_coupled_step(t, flow, advance, chain, extensions, integrator)
+    laws = build_laws(t, params.laws, flow, chain)
     through_air = bool({"payload_drag", "payload_spin"} & extensions) or any(
         law.block == "payload force" for law in params.laws
     )
-    ballistic = rel.build_ballistic(t, build_flight(t, payload, laws), through_air)
-    leaving = rel.build_letting_go(t, extensions)
+    ballistic = rel.build_ballistic(t, build_flight(t, laws), through_air)
     load, store = st.build_access(t, State)
     load_rope, store_rope = st.build_rope_access(t, L)
 
@@ -85,30 +86,6 @@ def build_parts(
         for i in range(L):
             total += wp.length(u[i]) * real(1.0e-1) + wp.length(n[i])
         return total
-
-    @wp.func
-    def vehicle_of(plants: Plants, state: State, env: int):
-        """Parameters of an environment's vehicle, with its mass."""
-        p = plants.vehicles[env % plants.vehicles.shape[0]]
-        p.body.mass = p.body.mass * state.mass_scale[env]
-        return p
-
-    @wp.func
-    def rope_of(plants: Plants, env: int):
-        return plants.ropes[env % plants.ropes.shape[0]]
-
-    @wp.func
-    def release_of(plants: Plants, env: int):
-        return plants.releases[env % plants.releases.shape[0]]
-
-    @wp.func
-    def air_of(plants: Plants, state: State, env: int):
-        """The air about an environment, with the wrench from outside."""
-        air = plants.airs[env % plants.airs.shape[0]]
-        if wp.static("push" in extensions):
-            air.push_w = air.push_w + state.force_w[env]
-            air.twist_b = air.twist_b + state.torque_b[env]
-        return air
 
     @wp.func
     def hazards(p: Vehicle, rope: Rope, s: QuadState, n: Vectors, payload_pos: vec3):
@@ -143,7 +120,7 @@ def build_parts(
         elapsed: real,
     ):
         """Write what follows from the payload's state at separation, without the kick."""
-        vel = leaving.kick(r, vel, direction_w)
+        vel = rel.kick(r, vel, direction_w)
         time = ballistic.time_to_height(rope, air, pos, vel, r.landing_height, gravity)
         out.payload_pos_w[env] = pos
         out.payload_vel_w[env] = vel
@@ -162,19 +139,13 @@ def build_parts(
         flow=flow,
         advance=advance,
         chain=chain,
-        payload=payload,
         coupled=coupled,
         laws=laws,
-        leaving=leaving,
         load=load,
         store=store,
         load_rope=load_rope,
         store_rope=store_rope,
         rope_size=rope_size,
-        vehicle_of=vehicle_of,
-        rope_of=rope_of,
-        release_of=release_of,
-        air_of=air_of,
         hazards=hazards,
         depart=depart,
     )
@@ -223,10 +194,6 @@ def build_step(
     load_rope = parts.load_rope
     store_rope = parts.store_rope
     rope_size = parts.rope_size
-    vehicle_of = parts.vehicle_of
-    rope_of = parts.rope_of
-    release_of = parts.release_of
-    air_of = parts.air_of
     limit = real(st.SPEED_LIMIT)
 
     @wp.func
@@ -243,10 +210,10 @@ def build_step(
         elapsed: real,
     ):
         """Write what follows from the payload's state at separation."""
-        mount = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
-        mount_vel = coupled.mount_velocity(rope, s)
+        mount = mount_position(rope, s)
+        mount_vel = mount_velocity(rope, s)
         pos, vel = chain.payload(rope, mount, mount_vel, n, u)
-        vel = parts.leaving.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
+        vel = rel.tail(r, vel, chain.com_velocity(rope, mount_vel, u))
         parts.depart(rope, r, air, s, pos, vel, n[L - 1], gravity, out, env, elapsed)
 
     @unique_kernel
@@ -284,7 +251,7 @@ def build_step(
         timer = state.release_timer[env]
         attached = state.attached[env]
         if release[env] != 0 and timer < real(0.0) and attached != 0:
-            timer = parts.leaving.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
+            timer = rel.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
         tiny = real(1.0e-6)
         status = int(0)
         if not taken:

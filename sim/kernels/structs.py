@@ -176,27 +176,22 @@ def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
 
 
 EXTENSIONS = {
-    "gain": "",  # thrust gains of single rotors
-    "wind": "wind_w",
-    "ground_effect": "ground_effect",  # thrust near the ground
     "payload_drag": "payload_drag",  # air drag of the payload
-    "mount_damping": "mount_damping",  # friction of the rope's mount
     "swing_damping": "swing_damping",  # friction across the rope
     "downwash": "downwash",  # the rotors' jet on the payload
     "payload_spin": "payload_side payload_lift",  # side force and lift of a payload in flight
     "compliance": "compliance",  # rope that gives
     "lag_tension": "lag_tension",  # release lag that depends on the rope's pull
-    "kick": "kick_w kick_along",  # speed given to the payload at the release
     "rope_tail": "rope_tail",  # rope that leaves with the payload
     "push": "",  # forces from outside
 }
 """Parts of the blocks that a kernel holds only if it was built for them -> fields of rope, air or
-release that need them where they are not zero."""
+release that need them where they are not zero. Those of the release, which cost nothing, are in
+every kernel."""
 
 
 def extensions_of(
-    vehicles: Iterable[P.VehicleParams],
-    ropes: Iterable[P.RopeParams] = (),
+    ropes: Iterable[P.RopeParams],
     airs: Iterable[P.AirParams] = (),
     releases: Iterable[P.ReleaseParams] = (),
     laws: Sequence[P.LawParams] = (),
@@ -205,8 +200,6 @@ def extensions_of(
     simulated in full.
     """
     needed = {"push"} if laws else set()
-    if any(v.thrust.gain != (1.0,) * 4 for v in vehicles):
-        needed.add("gain")
     for part in (*ropes, *airs, *releases):
         for name, fields in EXTENSIONS.items():
             values = [getattr(part, field, 0.0) for field in fields.split()]

@@ -1,7 +1,5 @@
 """The chain of :mod:`sim.kernels.rope` behind the exchange: what the exchange itself costs."""
 
-from types import SimpleNamespace
-
 import warp as wp
 
 from sim.kernels.exchange import build_body_access
@@ -9,6 +7,7 @@ from sim.kernels.quadrotor.rigid_body import advance, quat_rate
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.runtime import unique_kernel
+from sim.kernels.state import rope_of, vehicle_of
 from sim.kernels.structs import extensions_of
 from sim.solvers import World
 
@@ -46,7 +45,7 @@ def _kernel(world: World) -> wp.Kernel:
     State = world.kernels.State
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
-    extensions = extensions_of(world.vehicles, world.ropes) | {"push"}
+    extensions = extensions_of(world.ropes) | {"push"}
     load_bodies, store_bodies = build_body_access(t, L)
 
     @wp.func
@@ -65,8 +64,7 @@ def _kernel(world: World) -> wp.Kernel:
     def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
         return air.payload_push_w
 
-    payload = SimpleNamespace(hanging=hanging)
-    coupled = build_coupled_step(t, flow, advance, chain, payload, extensions)
+    coupled = build_coupled_step(t, flow, advance, chain, extensions, hanging=hanging)
 
     @unique_kernel
     def advance_kernel(
@@ -80,9 +78,8 @@ def _kernel(world: World) -> wp.Kernel:
         wrench: Wrench,
     ):
         env = wp.tid()
-        p = plants.vehicles[env % plants.vehicles.shape[0]]
-        p.body.mass = p.body.mass * state.mass_scale[env]
-        rope = plants.ropes[env % plants.ropes.shape[0]]
+        p = vehicle_of(plants, state, env)
+        rope = rope_of(plants, env)
         air = Air()
         air.push_w = wrench.force_b[env]
         air.twist_b = wrench.torque_b[env]

@@ -242,7 +242,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
     Rope = t.Rope
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
-    loaded = bool(extensions_of(world.vehicles, world.ropes) & LOADS) or bool(world.params.laws)
+    loaded = bool(extensions_of(world.ropes) & LOADS) or bool(world.params.laws)
 
     @unique_kernel
     def push(

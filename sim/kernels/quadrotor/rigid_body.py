@@ -42,6 +42,18 @@ def angular_acceleration(p: Any, rate_b: Any, torque_b: Any):
 
 
 @wp.func
+def mount_position(rope: Any, s: Any):
+    """Position of the rope's mount [m], world frame."""
+    return s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+
+
+@wp.func
+def mount_velocity(rope: Any, s: Any):
+    """Velocity of the rope's mount [m/s], world frame."""
+    return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
+
+
+@wp.func
 def advance(s: Any, r: Any, h: Any):
     """State after moving along the derivative ``r`` for ``h`` seconds; the attitude is
     normalised.
@@ -104,7 +116,6 @@ def build_flow(
     motor_rate = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
-    rotor_thrust = thrust.rotor_thrust_scaled if "gain" in extensions else thrust.rotor_thrust
     Vehicle = t.Vehicle
     Air = t.Air
     QuadState = t.QuadState
@@ -118,12 +129,10 @@ def build_flow(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
-        f = rotor_thrust(p, speed, s.voltage)
-        if wp.static("ground_effect" in extensions):
-            f = thrust.near_ground(p, air, s.pos_w[2], f)
+        still = thrust.rotor_thrust_scaled(p, speed, s.voltage)
+        f = thrust.near_ground(p, air, s.pos_w[2], still)
         charge_rate, voltage_rate = battery_rate(p, s.charge_used, s.voltage, speed, f)
-        through_air = s.vel_w - air.wind_w if wp.static("wind" in extensions) else s.vel_w
-        vel_b = wp.quat_rotate_inv(s.quat_wb, through_air)
+        vel_b = wp.quat_rotate_inv(s.quat_wb, s.vel_w - air.wind_w)
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)
         force, torque = composer.compose(
             p, s.rate_b, f, thrust.rotor_torque(p, f), speed, speed_rate, aero_force, aero_torque

@@ -18,7 +18,7 @@ from sim.kernels.replay.sampling import build_sampling
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
-from sim.kernels.rope.payload import build_payload
+from sim.kernels.rope.release import lag
 from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
@@ -210,7 +210,7 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace) -> S
         if m.mode == attached_code:
             if latch <= m.time + tiny and m.latched == 0:
                 pull = blocks.chain.pull(m.rope, stiffness, u)
-                out.separation = latch + blocks.loose.lag(r, m.rope, pull, gravity)
+                out.separation = latch + lag(r, m.rope, pull, gravity)
                 out.latched = 1
             if out.separation <= m.time + tiny:
                 out.ball = blocks.loose.let_go(r, m.rope, m.quad, n, u)
@@ -274,12 +274,11 @@ def build_replay(
     Ropes = st.array_struct(t, "Ropes", st.ROPE_FIELDS)
     flow, advance = build_flow(t, vehicle, EVERYTHING)
     chain = build_chain(t, L, EVERYTHING)
-    payload = build_payload(t, EVERYTHING)
-    coupled = build_coupled_step(t, flow, advance, chain, payload, EVERYTHING)
-    extra = build_laws(t, laws, flow, chain, coupled.mount_velocity)
+    coupled = build_coupled_step(t, flow, advance, chain, EVERYTHING)
+    extra = build_laws(t, laws, flow, chain)
     load_quad, store_quad = st.build_access(t, State)
     load_rope, store_rope = st.build_rope_access(t, L)
-    loose = build_loose(t, chain, payload, extra, coupled.mount_velocity)
+    loose = build_loose(t, chain, extra)
     sampling = build_sampling(t, Sensing, Windows, Data, loose.Ball)
     Steps = sampling.Steps
     Moment = sampling.Moment

@@ -56,6 +56,14 @@ def sym_mul(d: Any, o: Any, v: Any):
 
 
 @wp.func
+def symmetric(d: Any, o: Any):
+    """Symmetric matrix with diagonal ``d`` and off-diagonals ``o = (xy, xz, yz)``."""
+    x = type(d)(d[0], o[0], o[1])
+    y = type(d)(o[0], d[1], o[2])
+    return wp.matrix_from_rows(x, y, type(d)(o[1], o[2], d[2]))
+
+
+@wp.func
 def tangent_basis(n: Any):
     """Two unit vectors that complete the unit vector n. Source: Duff et al., JCGT 6(1), 2017."""
     one = type(n[0])(1.0)
@@ -89,7 +97,6 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
     Rope = t.Rope
     last = L - 1
     loaded = bool(extensions & LOADS)
-    rubbing = "mount_damping" in extensions
     giving = "compliance" in extensions
 
     @wp.func
@@ -107,9 +114,8 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
         """Damping of the upper joint of rod i [N m s], with the mount's friction in the
         uppermost.
         """
-        if wp.static(rubbing):
-            if i == 0:
-                return rope.joint_damping + rope.mount_damping
+        if i == 0:
+            return rope.joint_damping + rope.mount_damping
         return rope.joint_damping
 
     @wp.func
@@ -161,7 +167,6 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
     Reals = t.Reals
     Rope = t.Rope
     vec2 = rods.vec2
-    rubbing = "mount_damping" in extensions
     giving = "compliance" in extensions
 
     @wp.func
@@ -228,9 +233,8 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             else:
                 g += -gh * stiffness[i] * ui
             g = rods.with_load(i, g, rope.payload_arm, load)
-            if wp.static(rubbing):
-                if i == 0:
-                    g += rope.mount_damping * above
+            if i == 0:
+                g += rope.mount_damping * above
             if wp.static(giving):
                 if rope.compliance != real(0.0):  # lanes of a replay differ in it
                     growth = growing(rope, ui)
@@ -526,7 +530,6 @@ def build_chain(
         payload=payload,
         speed=speed,
         momentum=momentum,
-        upper_damping=rods.upper_damping,
         com_velocity=com_velocity,
         pull=pull,
         stretched=stretched,

@@ -3,65 +3,48 @@ momentum, fall-back.
 """
 
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
 from sim.kernels.quadrotor.integrators import build_quad_step
-from sim.kernels.quadrotor.rigid_body import angular_acceleration, blend
-from sim.kernels.rope.payload import LOADS
+from sim.kernels.quadrotor.rigid_body import (
+    angular_acceleration,
+    blend,
+    mount_position,
+    mount_velocity,
+)
+from sim.kernels.rope.chain import symmetric
+from sim.kernels.rope.payload import LOADS, hanging_force
 from sim.kernels.structs import Types
 
 
-def build_root(t: Types):
+@wp.func
+def root(
+    p: Any, rope: Any, s: Any, force_b: Any, torque_b: Any, d: Any, o: Any, b: Any, gravity: Any
+):
     """Solve for the root's acceleration, given what the chain asks for
     (``sim.kernels.rope.chain``).
 
-    Returns a Warp function ``root(p, rope, state, force_b, torque_b, d, o, b, gravity)`` ->
-    acceleration of the centre of mass [m/s^2, world], angular acceleration [rad/s^2, body],
-    acceleration of the mount [world], force on the chain [N, world]."""
-    vec3 = t.vec3
-    mat33 = t.mat33
-    Vehicle = t.Vehicle
-    Rope = t.Rope
-    QuadState = t.QuadState
-    real = t.real
-
-    @wp.func
-    def root(
-        p: Vehicle,
-        rope: Rope,
-        s: QuadState,
-        force_b: vec3,
-        torque_b: vec3,
-        d: vec3,
-        o: vec3,
-        b: vec3,
-        gravity: vec3,
-    ):
-        r = rope.mount
-        rot = wp.quat_to_matrix(s.quat_wb)
-        inv_mass = real(1.0) / p.body.mass
-        alpha = angular_acceleration(p, s.rate_b, torque_b)
-        acc = inv_mass * (rot * force_b) + gravity
-        free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
-        arm = rot * wp.skew(r)
-        inv_inertia = vec3(
-            real(1.0) / p.body.inertia[0],
-            real(1.0) / p.body.inertia[1],
-            real(1.0) / p.body.inertia[2],
-        )
-        mobility = wp.diag(vec3(inv_mass, inv_mass, inv_mass)) + arm * wp.diag(
-            inv_inertia
-        ) * wp.transpose(arm)
-        mass = mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])
-        eye = wp.diag(vec3(real(1.0), real(1.0), real(1.0)))
-        mount_acc = wp.inverse(eye + mobility * mass) * (free - mobility * b)
-        pull = mass * mount_acc + b
-        reaction_b = -(wp.transpose(rot) * pull)
-        alpha = alpha + wp.cw_mul(inv_inertia, wp.cross(r, reaction_b))
-        return acc - inv_mass * pull, alpha, mount_acc, pull
-
-    return root
+    Returns the acceleration of the centre of mass [m/s^2, world], the angular acceleration
+    [rad/s^2, body], the acceleration of the mount [world] and the force on the chain [N, world]."""
+    one = type(p.body.mass)(1.0)
+    r = rope.mount
+    rot = wp.quat_to_matrix(s.quat_wb)
+    inv_mass = one / p.body.mass
+    alpha = angular_acceleration(p, s.rate_b, torque_b)
+    acc = inv_mass * (rot * force_b) + gravity
+    free = acc + rot * (wp.cross(alpha, r) + wp.cross(s.rate_b, wp.cross(s.rate_b, r)))
+    arm = rot * wp.skew(r)
+    ones = type(r)(one, one, one)
+    inv_inertia = wp.cw_div(ones, p.body.inertia)
+    mobility = wp.diag(inv_mass * ones) + arm * wp.diag(inv_inertia) * wp.transpose(arm)
+    mass = symmetric(d, o)
+    mount_acc = wp.inverse(wp.diag(ones) + mobility * mass) * (free - mobility * b)
+    pull = mass * mount_acc + b
+    reaction_b = -(wp.transpose(rot) * pull)
+    alpha = alpha + wp.cw_mul(inv_inertia, wp.cross(r, reaction_b))
+    return acc - inv_mass * pull, alpha, mount_acc, pull
 
 
 def build_coupled_step(
@@ -69,9 +52,9 @@ def build_coupled_step(
     flow,
     advance,
     chain: SimpleNamespace,
-    payload: SimpleNamespace,
     extensions: frozenset[str],
     integrator: str = "heun",
+    hanging=hanging_force,
 ):
     """One step of h seconds of vehicle and chain.
 
@@ -81,8 +64,8 @@ def build_coupled_step(
     stage alone (linearly implicit Euler) is kept. Returns a namespace of Warp functions ``step``
     (new state, new total momentum, whether it fell back; the arrays n, u and stiffness change in
     place), ``step_alone`` (the vehicle without the rope, by the ``integrator``), ``momentum``
-    (total linear momentum [N s]), ``mount_velocity`` [m/s] and ``payload`` (position and velocity
-    of its centre, world frame)."""
+    (total linear momentum [N s]) and ``payload`` (position and velocity of its centre, world
+    frame)."""
     vec3 = t.vec3
     Vectors = t.Vectors
     Reals = t.Reals
@@ -96,17 +79,10 @@ def build_coupled_step(
     vec2 = chain.vec2
     L = chain.segments
     loaded = bool(extensions & LOADS)
-    root = build_root(t)
-
-    @wp.func
-    def mount_velocity(rope: Rope, s: QuadState):
-        return s.vel_w + wp.quat_rotate(s.quat_wb, wp.cross(s.rate_b, rope.mount))
 
     @wp.func
     def payload_state(rope: Rope, s: QuadState, n: Vectors, u: Vectors):
-        return chain.payload(
-            rope, s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount), mount_velocity(rope, s), n, u
-        )
+        return chain.payload(rope, mount_position(rope, s), mount_velocity(rope, s), n, u)
 
     @wp.func
     def load(
@@ -123,7 +99,7 @@ def build_coupled_step(
         if wp.static(loaded):
             jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
             vel = chain.speed(rope, mount_velocity(rope, s), u, k1, h)
-            return payload.hanging(rope, air, vel, n[L - 1], jet)
+            return hanging(rope, air, vel, n[L - 1], jet)
         else:
             return vec3()
 
@@ -146,7 +122,8 @@ def build_coupled_step(
     @wp.func
     def damping_torque(rope: Rope, s: QuadState, rate_w: vec3, n: vec3, u: vec3):
         """Couple of the uppermost joint on the vehicle [N m], body frame."""
-        return chain.upper_damping(rope, 0) * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
+        damping = rope.joint_damping + rope.mount_damping
+        return damping * wp.quat_rotate_inv(s.quat_wb, wp.cross(n, u) - rate_w)
 
     @wp.func
     def step(
@@ -219,7 +196,6 @@ def build_coupled_step(
     return SimpleNamespace(
         step=step,
         step_alone=build_quad_step(t, flow, advance, integrator),
-        mount_velocity=mount_velocity,
         momentum=momentum,
         payload=payload_state,
     )

@@ -6,12 +6,14 @@ from types import SimpleNamespace
 
 import warp as wp
 
-from sim.kernels.rope.payload import build_flight
-from sim.kernels.rope.release import build_letting_go, build_step_in_flight
-from sim.kernels.structs import EXTENSIONS, Types, make_struct
+from sim.kernels.quadrotor.rigid_body import mount_position, mount_velocity
+from sim.kernels.rope.chain import symmetric
+from sim.kernels.rope.payload import build_flight, free_force
+from sim.kernels.rope.release import build_step_in_flight, kick
+from sim.kernels.structs import Types, make_struct
 
 
-def build_loose_step(t: Types, chain, payload):
+def build_loose_step(t: Types, chain):
     """One ROS2 step of a rope that nothing holds.
 
     The root's acceleration a follows from ``A a + b = 0``: nothing pulls at the upper end. As in
@@ -21,7 +23,6 @@ def build_loose_step(t: Types, chain, payload):
     vec3 = t.vec3
     Vectors = t.Vectors
     Reals = t.Reals
-    mat33 = t.mat33
     real = t.real
     Rope = t.Rope
     Air = t.Air
@@ -30,7 +31,7 @@ def build_loose_step(t: Types, chain, payload):
 
     @wp.func
     def free_root(d: vec3, o: vec3, b: vec3):
-        return -(wp.inverse(mat33(d[0], o[0], o[1], o[0], d[1], o[2], o[1], o[2], d[2])) * b)
+        return -(wp.inverse(symmetric(d, o)) * b)
 
     @wp.func
     def step(
@@ -53,7 +54,7 @@ def build_loose_step(t: Types, chain, payload):
         hs = wp.zeros(shape=(L,), dtype=vec2)
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
-        load1 = payload.free(rope, air, chain.speed(rope, vel_w, u, k1, h))
+        load1 = free_force(rope, air, chain.speed(rope, vel_w, u, k1, h))
         # a root that turns with the first rod rubs on nothing
         d, o, b = chain.up_first(
             rope,
@@ -79,7 +80,7 @@ def build_loose_step(t: Types, chain, payload):
             vel = (total + h * (weight + load1) - chain.momentum(rope, u)) / rope.total_mass
             return pos_w + (half * h) * (vel_w + vel), vel
         predicted = vel_w + h * acc
-        load2 = payload.free(rope, air, chain.speed(rope, predicted, u, k1, h))
+        load2 = free_force(rope, air, chain.speed(rope, predicted, u, k1, h))
         turn = wp.cross(n2[0], u[0] + h * k1[0])
         d, o, b = chain.up_second(
             rope, n, u, n2, k1, stiffness, turn, gravity, load2, gamma, h, c1, c2, hs
@@ -97,15 +98,13 @@ def build_loose_step(t: Types, chain, payload):
 def build_loose(
     t: Types,
     chain: SimpleNamespace,
-    payload: SimpleNamespace,
     laws: SimpleNamespace,
-    mount_velocity,
 ) -> SimpleNamespace:
     """Build the flight of a payload and of a rope that may leave with it, all extensions built in.
 
-    Returns a namespace of the struct ``Ball``, of the Warp functions ``lag`` of
-    :func:`sim.kernels.rope.release.build_letting_go`, ``let_go(r, rope, quad, n, u)`` -> ball at
-    the separation, ``hang_below(rope, pos, vel, n, u)`` -> ball with a rope in line,
+    Returns a namespace of the struct ``Ball`` and of the Warp functions
+    ``let_go(r, rope, quad, n, u)`` -> ball at the separation,
+    ``hang_below(rope, pos, vel, n, u)`` -> ball with a rope in line,
     ``fly(ball, rope, r, air, n, u, stiffness, gravity, gamma, max_turn, h)`` -> ball after h
     seconds, and ``payload(r, ball)`` -> its position and velocity, with the rope's share."""
     vec3 = t.vec3
@@ -119,18 +118,17 @@ def build_loose(
     last = chain.segments - 1
     names = ("pos", "vel", "root", "root_vel", "tail", "tail_vel")
     Ball = make_struct("Ball", dict.fromkeys(names, vec3))
-    leaving = build_letting_go(t, frozenset(EXTENSIONS))
-    step = build_loose_step(t, chain, payload)
-    fly_ball = build_step_in_flight(t, build_flight(t, payload, laws))
+    step = build_loose_step(t, chain)
+    fly_ball = build_step_in_flight(t, build_flight(t, laws))
 
     @wp.func
     def let_go(r: Release, rope: Rope, s: QuadState, n: Vectors, u: Vectors):
         ball = Ball()
-        ball.root = s.pos_w + wp.quat_rotate(s.quat_wb, rope.mount)
+        ball.root = mount_position(rope, s)
         ball.root_vel = mount_velocity(rope, s)
         pos, vel = chain.payload(rope, ball.root, ball.root_vel, n, u)
         ball.pos = pos
-        ball.vel = leaving.kick(r, vel, n[last])
+        ball.vel = kick(r, vel, n[last])
         ball.root_vel = ball.root_vel + (ball.vel - vel)
         ball.tail = pos
         ball.tail_vel = ball.vel
@@ -184,7 +182,6 @@ def build_loose(
 
     return SimpleNamespace(
         Ball=Ball,
-        lag=leaving.lag,
         let_go=let_go,
         hang_below=hang_below,
         fly=fly,

@@ -1,7 +1,7 @@
 """Release and ballistic flight: closed-form landing, time to impact, clearance to the vehicle.
 
 Source: the paper, Sec. III-B (projectile without drag) and Eq. 5 (clearance at K fractions of the
-flight)."""
+flight). Equations of the release: :class:`sim.params.ReleaseParams`."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -62,40 +62,25 @@ def clearance(
     return nearest
 
 
-def build_letting_go(t: Types, extensions: frozenset[str]) -> SimpleNamespace:
-    """Parameters of the payload's release. Equations: :class:`sim.params.ReleaseParams`.
+@wp.func
+def lag(r: Any, rope: Any, pull: Any, gravity: Any):
+    """Time [s] from the latch to the separation, by the rope's pull at the latch [N]."""
+    excess = pull - rope.payload_mass * gravity
+    return wp.max(r.lag + r.lag_tension * excess, gravity - gravity)
 
-    Returns a namespace of Warp functions ``lag(r, rope, pull, gravity)`` [s] from the rope's pull
-    at the latch [N], and the payload's velocity [m/s] after ``kick(r, vel_w, along_w)`` with the
-    last segment's direction and after ``tail(r, vel_w, com_vel_w)`` with the velocity of the common
-    centre of mass of payload and rope. Each does only what ``extensions`` name."""
-    real = t.real
-    vec3 = t.vec3
-    Rope = t.Rope
-    Release = t.Release
 
-    @wp.func
-    def lag(r: Release, rope: Rope, pull: real, gravity: real):
-        if wp.static("lag_tension" in extensions):
-            return wp.max(r.lag + r.lag_tension * (pull - rope.payload_mass * gravity), real(0.0))
-        else:
-            return r.lag
+@wp.func
+def kick(r: Any, vel_w: Any, along_w: Any):
+    """Velocity of the payload after the release, with the last segment's direction."""
+    return vel_w + r.kick_w + r.kick_along * along_w
 
-    @wp.func
-    def kick(r: Release, vel_w: vec3, along_w: vec3):
-        return (
-            vel_w + r.kick_w + r.kick_along * along_w if wp.static("kick" in extensions) else vel_w
-        )
 
-    @wp.func
-    def tail(r: Release, vel_w: vec3, com_vel_w: vec3):
-        return (
-            vel_w + r.rope_tail * (com_vel_w - vel_w)
-            if wp.static("rope_tail" in extensions)
-            else vel_w
-        )
-
-    return SimpleNamespace(lag=lag, kick=kick, tail=tail)
+@wp.func
+def tail(r: Any, vel_w: Any, com_vel_w: Any):
+    """Velocity of a payload that takes a share of the rope with it, with that of the centre of mass
+    of both.
+    """
+    return vel_w + r.rope_tail * (com_vel_w - vel_w)
 
 
 def build_step_in_flight(t: Types, acceleration):
