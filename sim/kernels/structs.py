@@ -71,7 +71,7 @@ class Types:
     """Scalar, vector and struct types of one precision.
 
     Attributes:
-        real, vec3, vec4, mat33, quat: Warp types.
+        real, vec3, vec4, quat: Warp types.
         Vehicle: struct of :class:`sim.params.VehicleParams`, with the mixer's columns added under
             ``mixer``.
         Rope: struct of :class:`sim.params.RopeParams` per segment (``segment_length``,
@@ -90,7 +90,6 @@ class Types:
         self.real = real
         self.vec3 = wp.types.vector(3, real)
         self.vec4 = wp.types.vector(4, real)
-        self.mat33 = wp.types.matrix((3, 3), real)
         self.quat = wp.types.quaternion(real)
         self.Mixer = make_struct("Mixer", {"roll": self.vec4, "pitch": self.vec4, "yaw": self.vec4})
         self.Vehicle = self.from_dataclass(P.VehicleParams, {"mixer": self.Mixer})

@@ -7,6 +7,7 @@ a lane, no atomics."""
 
 from dataclasses import dataclass
 from types import SimpleNamespace
+from typing import Any
 
 import warp as wp
 
@@ -120,38 +121,65 @@ class ReplayKernel:
     Pointers: type
 
 
-def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace) -> SimpleNamespace:
-    """Build Warp functions of what happens to a lane between two steps."""
+@wp.func
+def push_at(air: Any, axis: int, size: Any, share: Any):
+    """The latent force of a lane at a share of its peak."""
+    out = air
+    force = air.push_w - air.push_w
+    if axis >= 0:
+        force[axis % 3] = size * wp.max(share, share - share)
+    if axis >= 6:
+        out.payload_push_w = force
+    elif axis >= 3:
+        out.twist_b = force
+    else:
+        out.push_w = force
+    return out
+
+
+@wp.func
+def next_event(m: Any, windows: Any, w: int, data: Any, command: int, delay: Any):
+    """Time at which the next command acts, the latch trips or the payload separates, or of the
+    window's end.
+    """
+    until = windows.end[w]
+    if command + 1 < windows.command_last[w]:
+        until = wp.min(until, data.command_time[command + 1] + delay)
+    if m.mode == ATTACHED:
+        if windows.latch[w] > m.time + type(delay)(TINY):
+            until = wp.min(until, windows.latch[w])
+        until = wp.min(until, m.separation)
+    return until
+
+
+@wp.func
+def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
+    """A lane that knows whether its rope is slack after a step, and since when."""
+    out = m
+    if pull < type(pull)(SLACK) * weight:
+        out.slack = 1
+        if m.slack_first < begins:
+            out.slack_first = t0
+    elif m.slack != 0:
+        out.slack = 0
+        out.slack_last = t1
+    return out
+
+
+def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
+    """Return Warp functions ``begin`` and ``latch_or_separate`` of a lane between two steps."""
     real = t.real
-    vec3 = t.vec3
     Vectors = t.Vectors
     Reals = t.Reals
     Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
-    Air = t.Air
     State = structs.State
     Windows = structs.Windows
-    Data = structs.Data
     Moment = structs.Moment
     attached_code = ATTACHED
     loose_code = LOOSE
     tiny = real(TINY)
-
-    @wp.func
-    def push_at(air: Air, axis: int, size: real, share: real):
-        """The latent force of a lane at a share of its peak."""
-        out = air
-        force = vec3()
-        if axis >= 0:
-            force[axis % 3] = size * wp.max(share, real(0.0))
-        if axis >= 6:
-            out.payload_push_w = force
-        elif axis >= 3:
-            out.twist_b = force
-        else:
-            out.push_w = force
-        return out
 
     @wp.func
     def begin(
@@ -220,40 +248,7 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace) -> S
                 out.pay_vel = out.ball.vel
         return out
 
-    @wp.func
-    def next_event(m: Moment, windows: Windows, w: int, data: Data, command: int, delay: real):
-        """Time at which the next command acts, the latch trips or the payload separates, or of the
-        window's end.
-        """
-        until = windows.end[w]
-        if command + 1 < windows.command_last[w]:
-            until = wp.min(until, data.command_time[command + 1] + delay)
-        if m.mode == attached_code:
-            if windows.latch[w] > m.time + tiny:
-                until = wp.min(until, windows.latch[w])
-            until = wp.min(until, m.separation)
-        return until
-
-    @wp.func
-    def note_slack(m: Moment, pull: real, weight: real, begins: real, t0: real, t1: real):
-        """A lane that knows whether its rope is slack after a step, and since when."""
-        out = m
-        if pull < real(SLACK) * weight:
-            out.slack = 1
-            if m.slack_first < begins:
-                out.slack_first = t0
-        elif m.slack != 0:
-            out.slack = 0
-            out.slack_last = t1
-        return out
-
-    return SimpleNamespace(
-        push_at=push_at,
-        begin=begin,
-        latch_or_separate=latch_or_separate,
-        next_event=next_event,
-        note_slack=note_slack,
-    )
+    return begin, latch_or_separate
 
 
 def build_replay(
@@ -296,7 +291,7 @@ def build_replay(
     blocks = SimpleNamespace(
         chain=chain, coupled=coupled, loose=loose, load_quad=load_quad, load_rope=load_rope
     )
-    between = build_lane(t, structs, blocks)
+    begin, latch_or_separate = build_lane(t, structs, blocks)
     attached_code = ATTACHED
     loose_code = LOOSE
     tiny = real(TINY)
@@ -349,7 +344,7 @@ def build_replay(
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
-        m = between.begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
+        m = begin(p, natural, r, windows, w, starts, lanes.state[lane], n, u, stiffness)
         for e in range(lane + 1, lane + 1 + lanes.shared[lane]):
             marks[e] = m.at
         resume = lanes.resume[lane]
@@ -366,8 +361,8 @@ def build_replay(
                 and data.command_time[command + 1] + delay <= m.time + tiny
             ):
                 command = command + 1
-            m = between.latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
-            until = between.next_event(m, windows, w, data, command, delay)
+            m = latch_or_separate(m, natural, r, windows.latch[w], n, u, stiffness, gravity)
+            until = next_event(m, windows, w, data, command, delay)
             if m.knot < windows.knots[w]:
                 knot_time = windows.first_knot[w] + real(float(m.knot)) * knot_spacing
                 if knot_time <= m.time + tiny:
@@ -398,9 +393,7 @@ def build_replay(
                 if m.mode == attached_code:
                     hanging = 1
                     m.rope = chain.stretched(natural, m.rope, stiffness, u, h)
-                pushed = between.push_at(
-                    air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance
-                )
+                pushed = push_at(air, lanes.axis[lane], lanes.size[lane], real(1.0) - distance)
                 pushed = extra.on(p, m.rope, pushed, k.quad, n, u, stiffness, active, hanging)
                 if hanging != 0:
                     quad, total, _fell_back = coupled.step(
@@ -425,7 +418,7 @@ def build_replay(
                     m.pay_vel = vel
                     pull = chain.pull(m.rope, stiffness, u)
                     weight = m.rope.payload_mass * gravity
-                    m = between.note_slack(m, pull, weight, windows.start[w], k.t0, k.t1)
+                    m = note_slack(m, pull, weight, windows.start[w], k.t0, k.t1)
                 else:
                     m.quad = coupled.step_alone(p, pushed, k.quad, active, g, h)
                     if m.mode == loose_code:
