@@ -46,10 +46,9 @@ class Fisheye:
         self.params = params
         self.half_fov = params.half_fov
         self._equidistant = not any(params.coefficients)
-        k1, k2, k3, k4 = params.coefficients
-        t2 = self.half_fov**2
-        self.edge_radius = self.half_fov * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-        self._edge_slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+        edge = torch.tensor(self.half_fov, dtype=torch.float64)
+        self._edge_slope = self.slope_from_angle(edge).item()
+        self.edge_radius = self.radius_from_angle(edge).item()
         reach_x = params.fx * self.edge_radius
         reach_y = params.fy * self.edge_radius
         slack = 1e-9

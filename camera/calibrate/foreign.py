@@ -135,9 +135,8 @@ def project(model: str, values: Values, rays: Array) -> Array:
 
 def _kb4_radius(values: Values, theta: Array) -> Array:
     """Kannala and Brandt's, as :class:`camera.params.FisheyeParams` says."""
-    t2 = theta * theta
-    k1, k2, k3, k4 = (values[f"k{i}"] for i in range(1, 5))
-    return theta * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    powers = np.array([1.0, *[values[f"k{i}"] for i in range(1, 5)]])
+    return np.asarray(theta * polyval(theta * theta, powers))
 
 
 def _polyfisheye_radius(values: Values, theta: Array) -> Array:

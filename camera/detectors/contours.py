@@ -216,11 +216,11 @@ class Detector:
         """
         best = None
         for _ in range(2):
-            edge = polar_edge(level, centre, radius)
-            if len(edge.points) < 8:
+            points, seen = polar_edge(level, centre, radius)
+            if len(points) < 8:
                 return None
-            ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, edge.points))
-            score = edge.share * share
+            ray, half_angle, misfit, share = cone_fit(rays_of(self.lens, points))
+            score = seen * share
             if score < 0.5 * self.params.coverage or not half_angle > 0.0:
                 return None
             if score >= self.params.coverage:
@@ -231,7 +231,7 @@ class Detector:
             if misfit > self.params.misfit or not bool(visible):
                 return None
             centre = middle[0].numpy()
-            radius = float(np.median(np.linalg.norm(edge.points - centre, axis=1)))
+            radius = float(np.median(np.linalg.norm(points - centre, axis=1)))
         return best
 
     def _in_place(self, ray: ndarray, half_angle: float, prior: Prior) -> bool:

@@ -124,20 +124,15 @@ def circles_of(mask: ndarray) -> list[tuple[ndarray, float]]:
     return single + pairs
 
 
-@dataclass(frozen=True)
-class Edge:
-    """Points of an edge."""
-
-    points: ndarray  # [px], shape (N, 2)
-    share: float  # of the places where it was looked for
-
-
-def polar_edge(level: ndarray, centre: ndarray, radius: float) -> Edge:
+def polar_edge(level: ndarray, centre: ndarray, radius: float) -> tuple[ndarray, float]:
     """Edge of a disc, looked for outwards from its centre.
 
     Args:
         level: of the colour, shape (H, W).
         centre: [px], about. radius: [px], about.
+
+    Returns:
+        Points of the edge [px], shape (N, 2), and their share of the directions.
     """
     reach = np.arange(0.3 * radius, 1.5 * radius + 4.0, STEP)
     angle = 2.0 * math.pi * np.arange(ANGLES) / ANGLES
@@ -145,7 +140,7 @@ def polar_edge(level: ndarray, centre: ndarray, radius: float) -> Edge:
     u, v = (centre[i] + way[:, i, None] * reach for i in range(2))
     hit, distance = _last_crossing(_sample(level, u, v), reach)
     points = centre + way * distance[:, None]
-    return Edge(points[hit], float(hit.mean()))
+    return points[hit], float(hit.mean())
 
 
 def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:

@@ -3,7 +3,6 @@ payloads came down.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from numpy import ndarray
 
@@ -37,12 +36,3 @@ class PayloadLandings:
     point_w: ndarray  # of the payload's centre [m], shape (E, 3)
     time: ndarray  # [s], shape (E,)
     separation_time: ndarray  # [s], shape (E,)
-
-
-class Root(NamedTuple):
-    """Kinematics of E vehicles' centres of mass; world frame, quaternions xyzw."""
-
-    pos_w: ndarray  # [m], shape (E, 3)
-    quat_wb: ndarray  # shape (E, 4)
-    vel_w: ndarray  # [m/s], shape (E, 3)
-    rate_b: ndarray  # [rad/s], body frame, shape (E, 3)

@@ -3,6 +3,8 @@
 Source: Hairer, Norsett, Wanner, *Solving Ordinary Differential Equations I*, II.1 (Heun's method,
 and the classical method of order 4)."""
 
+from typing import Any
+
 import warp as wp
 
 from sim.kernels.quadrotor.rigid_body import angular_acceleration, blend
@@ -11,15 +13,10 @@ from sim.kernels.structs import Types
 
 def build_quad_step(t: Types, flow, advance, integrator: str = "heun"):
     """Return ``step(p, air, s, command, gravity, h) -> state`` of one integrator."""
-    Vehicle = t.Vehicle
-    Air = t.Air
-    QuadState = t.QuadState
-    vec3 = t.vec3
-    vec4 = t.vec4
     real = t.real
 
     @wp.func
-    def slope(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3):
+    def slope(p: Any, air: Any, s: Any, command: Any, gravity: Any):
         """Derivative of the state."""
         r = flow(p, air, s, command)
         inv_mass = real(1.0) / p.body.mass
@@ -28,18 +25,18 @@ def build_quad_step(t: Types, flow, advance, integrator: str = "heun"):
         return r
 
     @wp.func
-    def euler(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
+    def euler(p: Any, air: Any, s: Any, command: Any, gravity: Any, h: real):
         return advance(s, slope(p, air, s, command, gravity), h)
 
     @wp.func
-    def heun(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
+    def heun(p: Any, air: Any, s: Any, command: Any, gravity: Any, h: real):
         half = real(0.5)
         r1 = slope(p, air, s, command, gravity)
         r2 = slope(p, air, advance(s, r1, h), command, gravity)
         return advance(s, blend(r2, half, r1, half), h)
 
     @wp.func
-    def rk4(p: Vehicle, air: Air, s: QuadState, command: vec4, gravity: vec3, h: real):
+    def rk4(p: Any, air: Any, s: Any, command: Any, gravity: Any, h: real):
         half = real(0.5)
         one = real(1.0)
         r1 = slope(p, air, s, command, gravity)

@@ -116,14 +116,10 @@ def build_flow(
     motor_rate = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
-    Vehicle = t.Vehicle
-    Air = t.Air
-    QuadState = t.QuadState
     QuadRate = t.QuadRate
-    vec4 = t.vec4
 
     @wp.func
-    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
+    def flow(p: Any, air: Any, s: Any, command: Any):
         out = QuadRate()
         target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
@@ -162,16 +158,12 @@ def build_direct_flow(t: Types):
 
     What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
     """
-    Vehicle = t.Vehicle
-    Air = t.Air
-    QuadState = t.QuadState
     QuadRate = t.QuadRate
     vec3 = t.vec3
-    vec4 = t.vec4
     real = t.real
 
     @wp.func
-    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
+    def flow(p: Any, air: Any, s: Any, command: Any):
         out = QuadRate()
         out.pos_w = s.vel_w
         out.quat_wb = quat_rate(s.quat_wb, s.rate_b)

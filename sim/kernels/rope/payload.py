@@ -45,14 +45,11 @@ def build_flight(t: Types, laws: SimpleNamespace):
     """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws
     on it included.
     """
-    Rope = t.Rope
-    Air = t.Air
-    vec3 = t.vec3
     real = t.real
     in_flight = laws.in_flight
 
     @wp.func
-    def flight_acceleration(rope: Rope, air: Air, vel_w: vec3, gravity: vec3):
+    def flight_acceleration(rope: Any, air: Any, vel_w: Any, gravity: Any):
         return gravity + (free_force(rope, air, vel_w) + in_flight(air, vel_w)) * (
             real(1.0) / rope.payload_mass
         )

@@ -92,12 +92,9 @@ def build_step_in_flight(t: Types, acceleration):
         acceleration: ``(rope, air, vel_w, gravity_w)`` -> [m/s^2], world frame.
     """
     real = t.real
-    vec3 = t.vec3
-    Rope = t.Rope
-    Air = t.Air
 
     @wp.func
-    def step(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity_w: vec3, h: real):
+    def step(rope: Any, air: Any, pos_w: Any, vel_w: Any, gravity_w: Any, h: real):
         half = real(0.5) * h
         a1 = acceleration(rope, air, vel_w, gravity_w)
         v2 = vel_w + half * a1
