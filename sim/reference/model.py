@@ -96,41 +96,32 @@ def build_attached(
         Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
     spec = new_spec()
-    add_chain(
-        spec,
-        rope,
-        add_vehicle(spec, body),
-        list(rope.mount),
-        joints,
-        armature,
-        stretch,
-        free_root=False,
-    )
+    add_chain(rope, add_vehicle(spec, body), joints, armature, stretch)
     return spec.compile()
 
 
 def build_free(rope: RopeParams, stretch: tuple[float, float] | None = None) -> "mujoco.MjModel":
     """Build the rope and the payload alone: first rod on a free joint, ball joints below."""
     spec = new_spec()
-    add_chain(spec, rope, spec.worldbody, [0.0, 0.0, 0.0], "ball", 0.0, stretch, free_root=True)
+    add_chain(rope, spec.worldbody, "ball", stretch=stretch, free_root=True)
     return spec.compile()
 
 
 def add_chain(
-    spec: "mujoco.MjSpec",
     rope: RopeParams,
     parent: "mujoco.MjsBody",
-    anchor: list[float],
     joints: str,
-    armature: float,
-    stretch: tuple[float, float] | None,
-    free_root: bool,
+    armature: float = 0.0,
+    stretch: tuple[float, float] | None = None,
+    free_root: bool = False,
     load: bool = True,
 ) -> "mujoco.MjsBody":
-    """Rods, the last with the payload (``load``) or without; returns the last body.
+    """Rods from the mount on a body, or with ``free_root`` from the world's origin, the last with
+    the payload (``load``) or without; returns the last body.
 
     See :func:`build_attached`.
     """
+    anchor = [0.0, 0.0, 0.0] if free_root else list(rope.mount)
     for i in range(rope.segments):
         rod = parent.add_body(name=f"rod{i}", pos=anchor)
         mass, centre, transverse = rope.rod(i == rope.segments - 1 and load and stretch is None)
@@ -144,15 +135,13 @@ def add_chain(
             _add_joints(rod, i, joints, rope.joint_damping, armature)
         parent = rod
         anchor = [0.0, 0.0, -rope.segment_length]
-    if stretch is None and load:
-        parent.add_site(name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset])
+    below = [0.0, 0.0, -rope.segment_length - rope.payload_offset]
     if stretch is not None:
-        payload = parent.add_body(
-            name="payload", pos=[0.0, 0.0, -rope.segment_length - rope.payload_offset]
-        )
+        payload = parent.add_body(name="payload", pos=below)
         _set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
         slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
-        slide.stiffness[0] = stretch[0]
-        slide.damping[0] = stretch[1]
+        slide.stiffness[0], slide.damping[0] = stretch
         return payload
+    if load:
+        parent.add_site(name="payload", pos=below)
     return parent

@@ -20,10 +20,7 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
         _add_two_cables(spec, vehicle, rope)
     else:
         ball = not any(rope.payload_sides)
-        mount = list(rope.mount)
-        last = add_chain(
-            spec, rope, vehicle, mount, "universal", 0.0, None, free_root=False, load=ball
-        )
+        last = add_chain(rope, vehicle, "universal", load=ball)
         end = [0.0, 0.0, -rope.segment_length]
         if not ball:
             box = last.add_body(name="box", pos=end)

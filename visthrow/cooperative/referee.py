@@ -132,8 +132,6 @@ def _vehicle(body, rope: RopeParams) -> "mujoco.MjSpec":
     """A vehicle with its cable and the site ``end`` at the cable's lower end."""
     spec = new_spec(constraints=True)
     vehicle = add_vehicle(spec, body)
-    mount = list(rope.mount)
-    how = {"free_root": False, "load": False}
-    last = add_chain(spec, rope, vehicle, mount, "universal", 0.0, None, **how)
+    last = add_chain(rope, vehicle, "universal", load=False)
     last.add_site(name="end", pos=[0.0, 0.0, -rope.segment_length])
     return spec
