@@ -27,18 +27,20 @@ from sim.params import GRAVITY, BodyParams, RopeParams
 AXIAL_INERTIA = 1e-12
 
 
-def _set_inertial(
+def set_inertial(
     body: "mujoco.MjsBody", mass: float, centre_z: float, inertia: tuple[float, float, float]
 ) -> None:
+    """Give a body its mass [kg], centre [m] and inertia [kg m^2]."""
     body.mass = mass
     body.ipos = [0.0, 0.0, centre_z]
     body.inertia = list(inertia)
     body.explicitinertial = True
 
 
-def _add_joints(
-    body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float
+def add_joints(
+    body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float = 0.0
 ) -> None:
+    """Hang a body on the one above by the joints of rod ``index``."""
     if joints == "ball":
         body.add_joint(name=f"ball{index}", type=mujoco.mjtJoint.mjJNT_BALL)
         return
@@ -64,15 +66,20 @@ def add_vehicle(spec: "mujoco.MjSpec", body: BodyParams) -> "mujoco.MjsBody":
     """Add the quadrotor on a free joint, with actuators for force and torque in its body frame."""
     vehicle = spec.worldbody.add_body(name="vehicle")
     vehicle.add_freejoint(name="root")
-    _set_inertial(vehicle, body.mass, 0.0, body.inertia)
+    set_inertial(vehicle, body.mass, 0.0, body.inertia)
     vehicle.add_site(name="centre")
     # Forces in the body frame as actuators on a site: MuJoCo turns them with the body in every
     # stage of RK4, an applied world force it would hold for the whole step.
-    for i, name in enumerate(("fx", "fy", "fz", "tx", "ty", "tz")):
+    add_pushes(spec, "centre", ("fx", "fy", "fz", "tx", "ty", "tz"))
+    return vehicle
+
+
+def add_pushes(spec: "mujoco.MjSpec", site: str, names: tuple[str, ...]) -> None:
+    """Add actuators for force, then torque, in a site's frame."""
+    for i, name in enumerate(names):
         gear = [0.0] * 6
         gear[i] = 1.0
-        spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target="centre", gear=gear)
-    return vehicle
+        spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target=site, gear=gear)
 
 
 def build_attached(
@@ -128,17 +135,17 @@ def add_chain(
         # Without twist in ball joints the axial inertia enters nothing; theirs keeps the mass
         # matrix well scaled.
         axial = transverse if joints == "ball" else AXIAL_INERTIA
-        _set_inertial(rod, mass, -centre, (transverse, transverse, axial))
+        set_inertial(rod, mass, -centre, (transverse, transverse, axial))
         if i == 0 and free_root:
             rod.add_freejoint(name="root")
         else:
-            _add_joints(rod, i, joints, rope.joint_damping, armature)
+            add_joints(rod, i, joints, rope.joint_damping, armature)
         parent = rod
         anchor = [0.0, 0.0, -rope.segment_length]
     below = [0.0, 0.0, -rope.segment_length - rope.payload_offset]
     if stretch is not None:
         payload = parent.add_body(name="payload", pos=below)
-        _set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
+        set_inertial(payload, rope.payload_mass, 0.0, (rope.payload_inertia,) * 3)
         slide = payload.add_joint(name="stretch", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=[0, 0, -1])
         slide.stiffness[0], slide.damping[0] = stretch
         return payload

@@ -5,7 +5,14 @@ A ball on the rope; a box on it; a box on two cables; a gripper at the end of ro
 import mujoco
 
 from sim.params import BodyParams, RopeParams
-from sim.reference.model import add_chain, add_vehicle, new_spec
+from sim.reference.model import (
+    add_chain,
+    add_joints,
+    add_pushes,
+    add_vehicle,
+    new_spec,
+    set_inertial,
+)
 
 
 def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
@@ -24,19 +31,12 @@ def compile_model(body: BodyParams, rope: RopeParams) -> "mujoco.MjModel":
         end = [0.0, 0.0, -rope.segment_length]
         if not ball:
             box = last.add_body(name="box", pos=end)
-            for name, axis in (("box_y", [0, 1, 0]), ("box_x", [1, 0, 0])):
-                hinge = box.add_joint(name=name, type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
-                hinge.damping[0] = rope.joint_damping
+            add_joints(box, rope.segments, "universal", rope.joint_damping)
             _as_box(box, rope, -rope.payload_offset)
         if rope.gripper_mass > 0.0:
             gripper = last.add_body(name="gripper", pos=end)
-            gripper.mass = rope.gripper_mass
-            gripper.explicitinertial = True
-            gripper.inertia = [GRIPPER_INERTIA] * 3
-    for i, name in enumerate(("px", "py", "pz")):
-        gear = [0.0] * 6
-        gear[i] = 1.0
-        spec.add_actuator(name=name, trntype=mujoco.mjtTrn.mjTRN_SITE, target="payload", gear=gear)
+            set_inertial(gripper, rope.gripper_mass, 0.0, (GRIPPER_INERTIA,) * 3)
+    add_pushes(spec, "payload", ("px", "py", "pz"))
     return spec.compile()
 
 
@@ -69,8 +69,6 @@ def _as_box(body: "mujoco.MjsBody", rope: RopeParams, centre_z: float) -> None:
     """
     a, b, c = (side * side for side in rope.payload_sides)
     twelfth = rope.payload_mass / 12.0
-    body.mass = rope.payload_mass
-    body.ipos = [0.0, 0.0, centre_z]
-    body.explicitinertial = True
-    body.inertia = [twelfth * (b + c), twelfth * (a + c), twelfth * (a + b)]
+    inertia = (twelfth * (b + c), twelfth * (a + c), twelfth * (a + b))
+    set_inertial(body, rope.payload_mass, centre_z, inertia)
     body.add_site(name="payload", pos=[0.0, 0.0, centre_z])
