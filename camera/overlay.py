@@ -49,10 +49,7 @@ def draw_overlay(
         raise ValueError(
             f"image of shape {image.shape} and type {image.dtype} came; expected {shape} and uint8"
         )
-    if image is None:
-        canvas = np.zeros(shape, np.uint8)
-    else:
-        canvas = image.copy()
+    canvas = np.zeros(shape, np.uint8) if image is None else image.copy()
     thick = max(1, round(min(shape[:2]) / 320))
     _draw_field_of_view(canvas, lens, thick)
     _draw_body_axes(canvas, camera, thick)

@@ -18,14 +18,8 @@ SEEN_AT_LEAST = math.radians(1.0)
 def monotonic_limit(coefficients: tuple[float, ...]) -> float:
     """Angle off the axis at which theta_d stops growing, ``inf`` where it never does [rad]."""
     slope = [(2 * i + 3) * k for i, k in enumerate(coefficients)][::-1] + [1.0]
-    if any(slope[:-1]):
-        roots = np.roots(np.trim_zeros(slope, "f"))
-    else:
-        roots = np.zeros(0)
-    if roots.size:
-        real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real
-    else:
-        real = roots
+    roots = np.roots(slope)
+    real = roots[np.abs(roots.imag) < 1e-12 * np.abs(roots)].real
     positive = real[real > 0.0]
     if positive.size:
         return float(np.sqrt(positive.min()))

@@ -113,10 +113,7 @@ def find_board(image: ndarray, board: BoardParams) -> View | None:
     """
     import cv2
 
-    if image.ndim == 2:
-        grey = image
-    else:
-        grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+    grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
     if board.pattern == "charuco":
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco()).detectBoard(grey)
         if ids is None or len(ids) < VIEW_AT_LEAST:

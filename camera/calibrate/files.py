@@ -124,10 +124,7 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
 
 def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
     names = [name for *_, name in entries]
-    if str(camera).isdigit():
-        number = int(camera)
-    else:
-        number = -1
+    number = int(camera) if str(camera).isdigit() else -1
     if camera in names:
         return entries[names.index(str(camera))]
     if 0 <= number < len(entries):
@@ -221,10 +218,7 @@ def _uniform(tree: Node) -> Node:
     lenses = tree.get("intrinsics") if "resolution" in tree else None
     if isinstance(lenses, list) and lenses and isinstance(lenses[0], dict):
         sizes = tree["resolution"]
-        if isinstance(sizes, list):
-            sizes = sizes[: len(lenses)]
-        else:
-            sizes = [sizes]
+        sizes = sizes[: len(lenses)] if isinstance(sizes, list) else [sizes]
         pairs = zip_longest(lenses, sizes)
         return {f"cam{i}": {**lens, "resolution": size} for i, (lens, size) in enumerate(pairs)}
     return {re.sub(r"^Camera1\.", "Camera.", str(key)): entry for key, entry in tree.items()}
@@ -266,10 +260,7 @@ def _any(node: Node, names: str) -> Any:
 
 def _floats(value: Any, name: str, count: int | None = None) -> list[float]:
     """Return so many numbers from a list, a list of lists, or the ``data`` of a matrix."""
-    if isinstance(value, dict):
-        flat = value.get("data", value)
-    else:
-        flat = value
+    flat = value.get("data", value) if isinstance(value, dict) else value
     if isinstance(flat, list) and all(isinstance(row, list) for row in flat):
         flat = list(chain.from_iterable(flat))
     try:
@@ -289,10 +280,7 @@ def _number(node: Node, place: str) -> float:
     if place.replace(".", "").isdigit():
         return float(place)
     name = place.removesuffix("?")
-    if name != place:
-        value = _find(node, name)
-    else:
-        value = _any(node, name)
+    value = _find(node, name) if name != place else _any(node, name)
     if value is None:
         return 0.0
     return _floats([value], name)[0]
@@ -521,7 +509,7 @@ def _contradictions(
     model: str, values: Values, size: tuple[int, int], labelled: bool
 ) -> tuple[str, list[str]]:
     """The model that a file's numbers are of, and what they say against their label."""
-    names = values.keys() & set(["k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"])
+    names = values.keys() & {"k1", "k2", "k3", "k4", "p1", "p2", "k5", "k6", "w"}
     remarks = []
     if names and not any(values[k] for k in names):
         if math.isclose(values["fx"], size[0] / math.pi, rel_tol=1e-4):

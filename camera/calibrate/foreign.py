@@ -194,10 +194,7 @@ def _sample(model: str, values: Values, width: int, height: int) -> _Samples:
     last = np.sum(visible, axis=0)  # the first angle of each direction that is not seen
     last_angle = np.minimum(last, ANGLES - 1)
     folds = ~one_to_one[last_angle, np.arange(TURNS)] & (last < ANGLES)
-    if np.any(folds):
-        fold = float(theta[last_angle[folds]].min())
-    else:
-        fold = math.pi
+    fold = float(theta[last_angle[folds]].min()) if np.any(folds) else math.pi
     index = np.nonzero(visible)
     return _Samples(theta[index[0]], direction[index[1]], pixels[index], fold)
 
@@ -224,10 +221,7 @@ def fit_fisheye(
         image sees and to where either model folds back: nothing is extrapolated.
     """
     samples = _sample(model, values, width, height)
-    if fov_deg is None:
-        limit = samples.fold
-    else:
-        limit = min(math.radians(fov_deg) / 2.0, samples.fold)
+    limit = samples.fold if fov_deg is None else min(math.radians(fov_deg) / 2.0, samples.fold)
     used = samples.theta <= limit
     theta = samples.theta[used]
     direction = samples.direction[used]
@@ -246,10 +240,7 @@ def fit_fisheye(
     fov = min(image_fov_deg(narrow), 2.0 * math.degrees(folds))
     off = theta[error > HOLDS_PX]
     step = math.pi / (ANGLES - 1)
-    if len(off):
-        holds = 2.0 * math.degrees(max(float(off.min()) - step, 0.0))
-    else:
-        holds = fov
+    holds = 2.0 * math.degrees(max(float(off.min()) - step, 0.0)) if len(off) else fov
     remarks = []
     if samples.fold < math.pi and limit == samples.fold:
         remarks.append(

@@ -83,10 +83,7 @@ def colour_maps(
     selected = cv2.inRange(colours.hsv, lowest, (high, 255, 255))
     selected = cv2.bitwise_and(selected, in_view)
     mask = cv2.morphologyEx(selected, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    if kind == "yellow":
-        pair = (cv2.min(red, green), blue)
-    else:
-        pair = (green, cv2.max(red, blue))
+    pair = (cv2.min(red, green), blue) if kind == "yellow" else (green, cv2.max(red, blue))
     return mask, cv2.subtract(*pair, dtype=cv2.CV_32F)
 
 
@@ -177,10 +174,7 @@ def cone_fit(rays: ndarray) -> tuple[ndarray, float, float, float]:
         # Seams and what is in front take bites out of the outline; nothing adds to it. So the outer
         # points count.
         inner = off[np.abs(off) < 0.5]
-        if len(inner):
-            outer = np.quantile(inner, OUTER)
-        else:
-            outer = 0.0
+        outer = np.quantile(inner, OUTER) if len(inner) else 0.0
         good = np.abs(off - outer) < width
         if good.sum() < 6:
             return axis, half_angle, math.inf, 0.0
@@ -212,10 +206,7 @@ def fit_goal(
         return None  # as wide as the whole view
     corners = _quadrangle((local[:, :2] / local[:, 2:]).astype(np.float32))
     for _ in range(2):  # the second time from better corners
-        if corners is None:
-            refined = None
-        else:
-            refined = _refined(lens, corners, frame, level)
+        refined = None if corners is None else _refined(lens, corners, frame, level)
         if refined is None:
             return None
         corners, misfit, share = refined
@@ -374,10 +365,7 @@ def _basis(ray: ndarray) -> ndarray:
     """Rotation whose last column is a unit ray, shape (3, 3): from its tangent plane to
     the camera.
     """
-    if abs(ray[0]) < 0.7:
-        helper = np.array([1.0, 0.0, 0.0])
-    else:
-        helper = np.array([0.0, 1.0, 0.0])
+    helper = np.array([1.0, 0.0, 0.0]) if abs(ray[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     x = helper - ray * (helper @ ray)
     x /= np.linalg.norm(x)
     return np.column_stack([x, np.cross(ray, x), ray])

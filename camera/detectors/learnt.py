@@ -105,7 +105,7 @@ class Networks(nn.Module):
         self.search = FrameNetwork()
         self.ball = PatchNetwork(PATCH["ball"], 5)
         self.goal = PatchNetwork(PATCH["goal"], 10)
-        self.calibration = {kind: (1.0, 0.0, 1.0) for kind in KINDS}
+        self.calibration = dict.fromkeys(KINDS, (1.0, 0.0, 1.0))
         self.made_by: dict = {}
 
     def save(self, path: str | Path) -> None:
