@@ -27,11 +27,6 @@ class VehicleErrors:
     thrust_gain: ndarray  # of each motor, 1 for none, shape (E, 4)
     com_offset: ndarray  # centre of mass from the frame's origin, body frame [m], shape (E, 3)
 
-    @classmethod
-    def none(cls, count: int) -> "VehicleErrors":
-        """Return perfect vehicles."""
-        return cls(np.ones((count, 4)), np.zeros((count, 3)))
-
 
 def rotor_arms(vehicle: VehicleParams, errors: VehicleErrors) -> ndarray:
     """Return the rotor hubs from the centre of mass [m], shape (E, 4, 3)."""

@@ -47,7 +47,7 @@ class ReferenceQuadrotor:
 
     def __init__(self, vehicle: VehicleParams, count: int = 1, step: float = 5e-4) -> None:
         self.vehicle, self.count, self.step_size = vehicle, count, step
-        self.errors = VehicleErrors.none(count)
+        self.errors = VehicleErrors(np.ones((count, 4)), np.zeros((count, 3)))
         self.force_w = np.zeros((count, 3))  # external, at the centre of mass [N]
         self.torque_b = np.zeros((count, 3))  # external, about the centre of mass [N m]
         self.reset(
