@@ -153,11 +153,12 @@ class RopeDynamics:
         couples = -damping[..., None] * relative
         applied = np.zeros((len(ids), *wrenches.shape[1:]))
         elongations = [] if self.stretch is None else [part[:, None] for part in rope[2:]]
-        rods = applied[:, applied.shape[1] - self.segments - bool(elongations) :]
-        applied[:, -len(rods[0]) - 1] = wrench_w
-        applied[:, -len(rods[0]) - 1, 3:] -= couples[:, 0]
+        first = applied.shape[1] - self.segments - bool(elongations)
+        applied[:, first - 1] = wrench_w
+        applied[:, first - 1, 3:] -= couples[:, 0]
         couples[:, :-1] -= couples[:, 1:].copy()
-        rods[:, : self.segments, 3:] = couples - np.sum(couples * n, -1, keepdims=True) * n
+        couples -= np.sum(couples * n, -1, keepdims=True) * n
+        applied[:, first : first + self.segments, 3:] = couples
         applied[:, -1, :3] = force_w
         if self.stretch is None:
             arm = (self.length + self.offset)[ids] - self._centre[ids]

@@ -15,11 +15,13 @@ GROUPS = ("Params:", "State in:", "In:", "State out:", "Out:")
 
 
 def is_kernel(node: ast.AST) -> bool:
-    """Tell whether a function is decorated as ``wp.kernel`` or ``wp.kernel(...)``."""
+    """Tell whether a function is decorated as ``wp.kernel``, with or without arguments, or as
+    ``unique_kernel``.
+    """
     if not isinstance(node, ast.FunctionDef):
         return False
     marks = (mark.func if isinstance(mark, ast.Call) else mark for mark in node.decorator_list)
-    return any(isinstance(mark, ast.Attribute) and mark.attr == "kernel" for mark in marks)
+    return any(ast.unparse(mark) in ("wp.kernel", "unique_kernel") for mark in marks)
 
 
 def kernels(text: str) -> list[ast.FunctionDef]:
@@ -85,8 +87,9 @@ def test_there_are_kernels_to_check():
         ("# Params:\n # In:\n a: int,", 1),
     ],
 )
-def test_the_check_itself(arguments, count):
-    text = f"@wp.kernel(module='unique')\ndef k(\n {arguments}\n):\n    pass\n"
+@pytest.mark.parametrize("mark", ["wp.kernel", "wp.kernel(module='unique')", "unique_kernel"])
+def test_the_check_itself(arguments, count, mark):
+    text = f"@{mark}\ndef k(\n {arguments}\n):\n    pass\n"
     (kernel,) = kernels(text)
     assert len(problems(text, kernel)) == count
 

@@ -107,7 +107,8 @@ def long_functions(text: str) -> list[tuple[str, int]]:
 
     def warp(node: ast.AST) -> bool:
         return isinstance(node, ast.FunctionDef) and any(
-            ast.unparse(of).startswith(("wp.func", "wp.kernel")) for of in node.decorator_list
+            ast.unparse(of).startswith(("wp.func", "wp.kernel", "unique_kernel"))
+            for of in node.decorator_list
         )
 
     functions = [
@@ -258,7 +259,7 @@ def test_a_long_function_is_caught_unless_it_builds_a_kernel():
     assert long_functions(
         f"class A:\n    async def f(self):\n{body.replace('    ', '        ')}        y = 2\n"
     ) == [("f", LONGEST + 1)]
-    for of in ("wp.func", "wp.kernel", "wp.kernel(enable_backward=False)"):
+    for of in ("wp.func", "wp.kernel", "wp.kernel(enable_backward=False)", "unique_kernel"):
         assert long_functions(f"def f():\n    @{of}\n    def g():\n        pass\n{body}") == []
     assert long_functions(f"def f():\n    @cache\n    def g():\n        pass\n{body}") == [
         ("f", LONGEST + 3)
