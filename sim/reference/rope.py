@@ -148,9 +148,7 @@ class RopeDynamics:
         local = turned_back(frames, relative)
         parents = np.concatenate((rotation[:, None], frames[:, :-1]), 1)
         joints = quat_wxyz_from_matrix(np.swapaxes(parents, -1, -2) @ frames)
-        damping = np.tile(self.damping[ids, None], self.segments)
-        damping[:, 0] = upper_damping
-        couples = -damping[..., None] * relative
+        couples = self._couples(ids, upper_damping, relative)
         applied = np.zeros((len(ids), *wrenches.shape[1:]))
         elongations = [] if self.stretch is None else [part[:, None] for part in rope[2:]]
         first = applied.shape[1] - self.segments - bool(elongations)
@@ -178,6 +176,14 @@ class RopeDynamics:
         second = cross(alpha, n) + cross(rates, cross(rates, n))
         elongation = qacc[:, -1] if elongations else np.zeros(len(ids))
         return qacc[:, :head], second, elongation
+
+    def _couples(self, ids: ndarray, upper_damping: ndarray, relative: ndarray) -> ndarray:
+        """Return the friction of each joint on the rod below it [N m], shape (e, L, 3), from the
+        rods' rates relative to what they hang on [rad/s].
+        """
+        damping = np.tile(self.damping[ids, None], self.segments)
+        damping[:, 0] = upper_damping
+        return -damping[..., None] * relative
 
     def points(
         self, root_pos: ndarray, root_vel: ndarray, rope: tuple[ndarray, ...]
