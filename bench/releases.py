@@ -22,7 +22,6 @@ from bench import start
 from sim.hybrid import rope_variants
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.paper.commands.sweep_command import DEFAULT_OUT
 from visthrow.paper.sweep.work_units import load_list
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.training.compute_device import resolve
@@ -189,8 +188,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out",
         metavar="FOLDER",
-        default=DEFAULT_OUT,
-        help=f"of the sweep (default: {DEFAULT_OUT})",
+        default="runs/sweep",
+        help="of the sweep (default: runs/sweep)",
     )
     add_common(parser, json=False)
     return start.main(parser, run, argv)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.linalg import norm
 from numpy.random import default_rng
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark, param, skip
 
 from hil.control.recording.playback import replay
@@ -157,7 +157,7 @@ def test_ten_thousand_poses_against_cuda(policy, tmp_path):
     if not torch.cuda.is_available():
         skip("no CUDA device")
     seen, shown = both(policy, 100, 100, tmp_path / "a", "cuda:0")
-    np.testing.assert_allclose(seen, shown, atol=CUDA, rtol=CUDA)
+    assert_allclose(seen, shown, atol=CUDA, rtol=CUDA)
 
 
 def patchy(rng: np.random.Generator):

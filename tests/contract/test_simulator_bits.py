@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import warp as wp
 from numpy.linalg import norm
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
@@ -179,9 +179,7 @@ def test_the_queue_holds_hover_after_a_reset():
     plant = paper_plant()
     load = plant.rope.rope_mass + plant.rope.payload_mass
     weight = 9.81 * (plant.vehicle.body.mass * sim.get("mass_scale") + load)
-    np.testing.assert_allclose(
-        queue[..., 0], np.tile(weight[:, None], (1, queue.shape[1])), rtol=1e-6
-    )
+    assert_allclose(queue[..., 0], np.tile(weight[:, None], (1, queue.shape[1])), rtol=1e-6)
 
 
 @mark.parametrize("seed", [0, 11])

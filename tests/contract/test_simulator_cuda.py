@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import warp as wp
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from sim.hybrid import HybridSim
@@ -41,7 +41,7 @@ def driven(sim: HybridSim, columns: slice = slice(None)) -> dict[str, np.ndarray
 
 def assert_same(a: dict, b: dict) -> None:
     for name, value in a.items():
-        np.testing.assert_array_equal(value, b[name], err_msg=name)
+        assert_array_equal(value, b[name], err_msg=name)
 
 
 def test_graph_equals_launches():

@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, raises
 
 from sim.params import GRAVITY
@@ -94,7 +94,7 @@ def test_stretch_is_weight_over_stiffness_and_holds():
 def test_centre_of_mass_offset_tips_the_vehicle():
     """The reported position stays the frame's; a centre 5 mm ahead pitches it nose down (+y)."""
     reference = start(ReferenceExtras(com_offset=(5e-3, 0.0, 0.0)))
-    np.testing.assert_allclose(reference.state.pos_w, [[0.0, 0.0, 1.5]], atol=1e-15)
+    assert_allclose(reference.state.pos_w, [[0.0, 0.0, 1.5]], atol=1e-15)
     assert hover(reference, 3).rate_b[0, 1] > 0.05
 
 

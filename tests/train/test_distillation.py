@@ -170,10 +170,9 @@ def test_the_pilot_remembers_as_training_does(whole):
             seen = env.carry(action)["actor"]
 
 
-@mark.parametrize("number", [signal.SIGTERM])
-def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled, number):
+def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled):
     folder = tmp_path / "run"
-    signalled(Distillation, words(folder), number)
+    signalled(Distillation, words(folder), signal.SIGTERM)
     one, two = (Policy.load(run / "policy.npz").estimator for run in (whole, folder))
     for name, value in one.parts().items():
         np.testing.assert_array_equal(value.numpy(), two.parts()[name].numpy(), err_msg=name)

@@ -63,10 +63,9 @@ def test_its_policy_is_one_like_any_other(whole):
     assert (action - policy.act(obs)).abs().max() < 1e-6
 
 
-@mark.parametrize("number", [signal.SIGINT])
-def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled, number):
+def test_a_signal_keeps_what_was_done(whole, tmp_path, signalled):
     folder = tmp_path / "run"
-    signalled(FirstOrder, words(folder), number)
+    signalled(FirstOrder, words(folder), signal.SIGINT)
     assert same(whole, folder)
 
 

@@ -13,7 +13,7 @@ from sim.params import LawParams
 from tests.commands import run_command
 from tests.configs import load_experiment
 from tests.unit.on_diagnose.test_models import ball_log
-from visthrow import cli, config
+from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.extend import patch
@@ -99,7 +99,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
         assert " = " not in line or "#" in line or line.startswith("base"), line
 
 
-def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, capsys):
+def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refused):
     """The plant and the overrides that the diagnosis was made with, whatever the shipped one says;
     of another nothing is written.
     """
@@ -111,26 +111,18 @@ def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, caps
         "overrides": ["rope.length=0.5"],
     }
     for plant, option, message in (
-        (str(quick), ["--plant", "state"], "do not count from state"),
-        (None, [], "names no plant"),
+        (str(quick), "--plant state", "do not count from state"),
+        (None, "", "names no plant"),
     ):
-        assert (
-            cli.main(
-                ["diagnose", "apply", diagnosis(plant=plant, **found), *option, "--out", str(out)]
-            )
-            == 2
-        )
-        assert message in capsys.readouterr().err
+        report = diagnosis(plant=plant, **found)
+        refused(f"diagnose apply {report} {option} --out {out}", said=message)
     assert not out.exists()
-    assert (
-        cli.main(["diagnose", "apply", diagnosis(plant=str(quick), **found), "--out", str(out)])
-        == 0
-    )
+    assert run_command(f"diagnose apply {diagnosis(plant=str(quick), **found)} --out {out}") == 0
     after = config.load(Experiment, out)
     assert (after.release.lag, after.rope.length) == approx((0.11, 0.5))
 
 
-def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
+def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys, refused):
     law = {
         "formula": "F_p = c (z x v_p)",
         "block": "payload force",
@@ -142,21 +134,14 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, capsys):
         "nats": 40.0,
     }
     out = tmp_path / "law.toml"
-    arguments = [
-        "diagnose",
-        "apply",
-        diagnosis(theta={}, covariance=[], laws=[law]),
-        "--out",
-        str(out),
-    ]
-    assert cli.main([*arguments, "--laws", "1"]) == 0
+    command = f"diagnose apply {diagnosis(theta={}, covariance=[], laws=[law])} --out {out}"
+    assert run_command(f"{command} --laws 1") == 0
     assert "vertical_cross_vel" in capsys.readouterr().out
     assert config.load(Experiment, out).laws == (
         LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
     )
-    assert cli.main([*arguments, "--laws", "2"]) == 2
-    assert "asks for number 2" in capsys.readouterr().err
-    assert cli.main(arguments) == 0
+    refused(f"{command} --laws 2", said="asks for number 2")
+    assert run_command(command) == 0
     assert "--laws 1 writes it" in capsys.readouterr().out
 
 
@@ -220,26 +205,15 @@ def test_draws_that_share_a_number_keep_to_its_bounds_together():
         ),
     ],
 )
-def test_mistakes_are_told(diagnosis, changes, message, tmp_path, capsys):
+def test_mistakes_are_told(diagnosis, changes, message, tmp_path, refused):
     out = tmp_path / "x.toml"
-    assert cli.main(["diagnose", "apply", diagnosis(**changes), "--out", str(out)]) == 2
-    assert message in capsys.readouterr().err
+    refused(f"diagnose apply {diagnosis(**changes)} --out {out}", said=message)
     assert not out.exists()
 
 
 def test_nothing_named_writes_nothing(diagnosis, tmp_path, capsys):
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "apply",
-                diagnosis(theta={}, covariance=[]),
-                "--out",
-                str(tmp_path / "x.toml"),
-            ]
-        )
-        == 0
-    )
+    nothing = diagnosis(theta={}, covariance=[])
+    assert run_command(f"diagnose apply {nothing} --out {tmp_path}/x.toml") == 0
     assert "nothing was named" in capsys.readouterr().out
 
 
@@ -256,16 +230,9 @@ def test_other_models_have_extended_setups(diagnosis, tmp_path):
     extension, too.
     """
     out, again = tmp_path / "once.toml", tmp_path / "twice.toml"
-    assert (
-        cli.main(["diagnose", "apply", diagnosis(**BALL, config="jugglebot"), "--out", str(out)])
-        == 0
-    )
-    assert (
-        cli.main(
-            ["diagnose", "apply", diagnosis(**BALL), "--config", str(out), "--out", str(again)]
-        )
-        == 0
-    )
+    of_ball = diagnosis(**BALL, config="jugglebot")
+    assert run_command(f"diagnose apply {of_ball} --out {out}") == 0
+    assert run_command(f"diagnose apply {diagnosis(**BALL)} --config {out} --out {again}") == 0
     assert setups.load(out).effects == {"ball_drag": 0.03}
     assert setups.load(again).effects == approx({"ball_drag": 0.06})
     logs = [ball_log(drag=0.03, seed=1)]
@@ -274,25 +241,11 @@ def test_other_models_have_extended_setups(diagnosis, tmp_path):
     assert extended.effects[0].bounds[0] == approx(plain.effects[0].bounds[0] - 0.03)
 
 
-def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, capsys, refused):
+def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused):
     out = tmp_path / "x.toml"
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "apply",
-                diagnosis(**BALL),
-                "--config",
-                "pendulum_encoder",
-                "--out",
-                str(out),
-            ]
-        )
-        == 2
-    )
-    assert (
-        "a diagnosis of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum"
-        in capsys.readouterr().err
+    refused(
+        f"diagnose apply {diagnosis(**BALL)} --config pendulum_encoder --out {out}",
+        said="of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum",
     )
     out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
     for theta, unit, name, message in (
@@ -331,7 +284,7 @@ def test_a_broken_covariance_is_refused():
         drawn_plants(replace(shipped(), diagnosed=bad), 0)
 
 
-def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
+def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, refused):
     """The settings in the header become the block, the delay is as told, and what the block cannot
     say is named.
     """
@@ -360,10 +313,9 @@ def test_a_blackbox_gives_its_firmwares_rate_controller(tmp_path, capsys):
         (text + "".join(f"H {name}:{value}\n" for name, value in header.items())).encode()
         + b"I\x00\x05"
     )
-    command = f"diagnose apply {log} --plant vision --out {out}".split()
-    assert cli.main(command) == 2
-    assert "--hover" in capsys.readouterr().err
-    assert cli.main([*command, *["--hover", "0.3645", "--delay", "0.003"]]) == 0
+    command = f"diagnose apply {log} --plant vision --out {out}"
+    refused(command, said="--hover")
+    assert run_command(f"{command} --hover 0.3645 --delay 0.003") == 0
     after = config.load(Experiment, out)
     assert after.vehicle.controller.kind == "motor_mixing"
     assert after.vehicle.controller.p_gain[0] == approx(0.01748, rel=1e-3)

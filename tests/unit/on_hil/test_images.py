@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.linalg import norm
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
@@ -270,7 +270,7 @@ def test_what_is_not_seen_any_more(reads):
     assert not points[0, :4].any()
     detections.take(Detection(1.5, None, ahead.ball), level)
     again, _ = detections.keypoints(3.03)
-    np.testing.assert_array_equal(again, points, "an older frame changes nothing")
+    assert_array_equal(again, points, "an older frame changes nothing")
 
 
 def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):

@@ -5,8 +5,7 @@ tables beside it.
 import json
 import sys
 
-import numpy as np
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import fixture, importorskip
 
 from tests.commands import run_command
@@ -46,9 +45,7 @@ def test_poses_and_commands_read_back_as_they_were_flown(flown):
     assert {name for name, _, _ in moved} == {"foxglove.FrameTransform"}
     places = [[content["translation"][axis] for axis in "xyz"] for _, _, content in moved]
     assert_array_equal(places, log["pos_w"].values)
-    np.testing.assert_allclose(
-        [1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9
-    )
+    assert_allclose([1e-9 * stamp for _, stamp, _ in moved], log["pos_w"].time - begin, atol=1e-9)
     turned = [[content["rotation"][axis] for axis in "xyzw"] for _, _, content in moved]
     assert_array_equal(turned, log["quat_wb"].values)
     sent = [

@@ -214,6 +214,9 @@ def test_config_mistakes(arguments, said, refused, tmp_path, monkeypatch):
         ("diagnose map a.csv --mass -2", "--mass: '-2'; expected a number above 0"),
         ("fly --seed -1", "--seed: '-1'; expected a whole number of 0 or more"),
         ("hil check --speed 0", "--speed: '0'; expected a number above 0"),
+        ("hil run --seconds 0", "--seconds: '0'; expected a number above 0"),
+        ("hil check --seconds nan", "--seconds: 'nan'; expected a number above 0"),
+        ("hil fake --after -3", "--after: '-3'; expected a number above 0"),
         (
             "hil fake --msp-port 70000",
             "--msp-port: '70000'; expected a port, 1 to 65535",

@@ -5,7 +5,7 @@ import subprocess
 
 import numpy as np
 import torch
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from pytest import mark
 
 from tests.commands import run_command
@@ -134,7 +134,7 @@ def test_a_batch_of_throws_ends_and_starts_anew():
     first, _ = env.reset(seed=3)
     assert first.shape == env.observation_space.shape
     again, _ = env.reset(seed=3)
-    np.testing.assert_array_equal(first, again)
+    assert_array_equal(first, again)
     fall = np.tile(np.float32([-1.0, 0.0, 0.0, 0.0, -1.0]), (8, 1))
     for _ in range(100):
         _, _, terminated, truncated, infos = env.step(fall)
