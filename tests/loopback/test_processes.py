@@ -20,6 +20,7 @@ from pytest import fixture, mark
 
 from bench.processes import free_port
 from hil.control.recording.playback import replay
+from tests.commands import set_words
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
@@ -69,25 +70,10 @@ class Pair:
             self._start_fake(kind, plant)
 
     def _start_fake(self, kind, plant):
+        words = f"fake --kind {KINDS[kind]} --device udpout:{self.device} --msp-port {self.msp}"
+        words += " --seconds 300 --after 1.5 --out"
         self.fake = subprocess.Popen(
-            [
-                *COMMAND,
-                "fake",
-                "--kind",
-                KINDS[kind],
-                "--device",
-                f"udpout:{self.device}",
-                "--msp-port",
-                str(self.msp),
-                *plant,
-                "--seconds",
-                "300",
-                "--after",
-                "1.5",
-                "--out",
-                str(self.folder / "fake.json"),
-                *self.both,
-            ],
+            [*COMMAND, *words.split(), self.folder / "fake.json", *plant, *self.both],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,
@@ -100,18 +86,10 @@ class Pair:
             f'betaflight.device="tcp:127.0.0.1:{self.msp}"',
             f'policy="{policy}"',
         ]
+        words = f"run --config {CONFIGS[kind]} --auto-arm --out".split()
+        more = (*self.both, *set_words((*sets, *overrides)))
         self.runner = subprocess.Popen(
-            [
-                *COMMAND,
-                "run",
-                "--config",
-                CONFIGS[kind],
-                "--auto-arm",
-                "--out",
-                str(self.folder / "run"),
-                *self.both,
-                *(part for text in (*sets, *overrides) for part in ("--set", text)),
-            ],
+            [*COMMAND, *words, self.folder / "run", *more],
             **self._streams(),
             text=True,
         )

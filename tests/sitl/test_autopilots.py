@@ -89,24 +89,18 @@ class Bench:
             time.sleep(PERIOD)
         return until is None
 
+    def stream(self, number: int, interval: float) -> None:
+        """Ask for a message every so many microseconds."""
+        values = mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, number, interval, *[0.0] * 5
+        self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+
     def heard(self) -> bool:
         return self.backend._heartbeat is not None
 
     def connect(self):
         assert self.turn(ANSWER, until=self.heard), "nothing answers"
         for number in (mav.MAVLINK_MSG_ID_ATTITUDE, mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW):
-            values = (
-                mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-                0,
-                number,
-                10_000.0,
-                0.0,
-                0.0,
-                0.0,
-                0.0,
-                0.0,
-            )
-            self.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+            self.stream(number, 10_000.0)
         self.turn(ANSWER, until=lambda: self.backend.audit.done)
         if self.kind == "ardupilot":
             for name, value in WRITTEN.items():
@@ -163,18 +157,7 @@ def flying(desk, placed=False):
     """
     params = getattr(desk.params, desk.kind)
     if placed and desk.kind == "ardupilot":
-        values = (
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-            0,
-            mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
-            100_000.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-            0.0,
-        )
-        desk.link.send(mav.MAVLink_command_long_message(1, 1, *values))
+        desk.stream(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED, 100_000.0)
         assert desk.turn(POSITION, until=lambda: desk.placed), "no position"
     idle = (0.3 * params.thrust.weight, 0.0, 0.0, 0.0)
     desk.turn(30.0, idle, FOLLOW, until=lambda: desk.status.mode == FOLLOW)
