@@ -235,6 +235,14 @@ def test_other_models_have_extended_setups(diagnosis, tmp_path):
     assert run_command(f"diagnose apply {diagnosis(**BALL)} --config {out} --out {again}") == 0
     assert setups.load(out).effects == {"ball_drag": 0.03}
     assert setups.load(again).effects == approx({"ball_drag": 0.06})
+    varies = {"found": True, "name": "drag", "of": ["ball_drag"], "size": 0.01}
+    varies |= {"unit": "1/m", "mean": {"ball_drag": 0.02}}  # whose mean is no finding
+    report = diagnosis(
+        **BALL | {"theta": {}, "covariance": []}, config="jugglebot", scatter=[varies]
+    )
+    assert run_command(f"diagnose apply {report} --out {again}") == 0
+    assert setups.load(again).effects == {"ball_drag": 0.02}
+    assert "+0.02 +- 0.01 1/m" in again.read_text()
     logs = [ball_log(drag=0.03, seed=1)]
     plain, extended = (setups.model_of(setups.load(name), logs) for name in ("jugglebot", out))
     assert_allclose(extended.residuals({})[0], plain.residuals({"ball_drag": 0.03})[0], atol=1e-9)
@@ -249,8 +257,13 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
     )
     out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
     for theta, unit, name, message in (
-        ({"ball_drag": 9.0}, "1/m", "jugglebot", "ball_drag = 9 1/m; the ball has it from"),
-        ({"ball_drag": 0.2}, "1/m", str(out), "ball_drag = 0.6 1/m; the ball has it from"),
+        (
+            {"ball_drag": 9.0},
+            "1/m",
+            "jugglebot",
+            "ball_drag = 9 1/m; expected from 0 to 0.5 in the ball",
+        ),
+        ({"ball_drag": 0.2}, "1/m", str(out), "ball_drag = 0.6 1/m; expected from"),
         (
             {"ball_drag": 0.1},
             "N",
@@ -268,7 +281,7 @@ def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused
     assert run_command(f"diagnose apply {at_bound} --config {out} --out {tmp_path}/bound.toml") == 0
     setups.model_of(setups.load(tmp_path / "bound.toml"), [ball_log(seed=1)])
     for entry, message in (
-        ("ball_drag = 9.0", "ball_drag = 9 1/m; this model has it from"),
+        ("ball_drag = 9.0", "ball_drag = 9 1/m; expected from"),
         ("thrust = 1.0", "no effect 'thrust'"),
     ):
         out.write_text(f'base = "diagnose/jugglebot.toml"\n[effects]\n{entry}\n')

@@ -542,6 +542,43 @@ class TestGimbal:
         )
 
 
+ROUNDING = 1e-8  # relative; of another CPU's sums
+CABLED = replace(FLYER, command_delay=LATE, cable=CableParams(0.5, 0.008, (0.01, 0.0, -0.03)))
+STATISTICS = {
+    "ball": (
+        lambda: BallModel([ball_log(drag=0.04, seed=i, heading=2.1 * i) for i in range(2)], BALL),
+        {"ball_drag": 0.03},
+        [42042317101.00275, 3488237139.379566, 2869172755.7367573],
+        [16426639.571495365, 4414061.982282488, 283401.78238944325],
+    ),
+    "pendulum": (
+        lambda: PendulumModel([swing_log(0.21, 0.05, 0.1, 0.02, 0.01)], SWING),
+        {"pendulum_length": 0.01},
+        [2808315665125.074, 3868150784.357787, 227295531.60605568],
+        [-355210603.529972, 145171945.15606007, 33431184.3111172],
+    ),
+    "cable": (
+        lambda: FlyerModel([fly(4.0, cable=0.5, mount=CABLED.cable.mount, noise=1e-4)], CABLED),
+        {"mass_quad": 1e-4, "attitude_delay": 0.003},
+        [189180991227.69104, 6795517741.165531, 3053205366.3161964],
+        [14637590.064075302, 792422.1219210848, 590005.2052040314],
+    ),
+}
+"""Model, sizes, and what the first three effects' columns gave with themselves and with the
+residuals when it was measured first.
+"""
+
+
+@mark.parametrize("name", STATISTICS)
+def test_a_rewrite_leaves_the_statistics(name):
+    build, theta, information, score = STATISTICS[name]
+    windows = build().windows(theta)
+    columns = [w.effects[:, :3] / w.sigma[:, None] for w in windows]
+    residuals = [w.residual / w.sigma for w in windows]
+    assert sum(np.sum(c**2, axis=0) for c in columns) == approx(information, rel=ROUNDING)
+    assert sum(c.T @ r for c, r in zip(columns, residuals)) == approx(score, rel=ROUNDING)
+
+
 class TestSetups:
     def test_one_model_a_setup(self):
         with raises(ConfigError, match="ball and stand: a setup has one model"):

@@ -122,6 +122,9 @@ def test_training_draws_what_varies():
     theta, covariance = patch.with_scatter({"rope_length": 0.01}, [[1e-8]], report)
     assert theta == {"rope_length": 0.01, "release_lag": 0.0}
     assert_allclose(covariance, np.diag([1e-8, 1e-4]))
+    report["scatter"][0]["mean"] = {"release_lag": 0.005}
+    theta, covariance = patch.with_scatter({}, [], report)
+    assert theta == {"release_lag": 0.005}
     theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
     assert theta == {"release_lag": 0.02}
     assert_allclose(covariance, [[1.01e-4]])

@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if of_throw:
         patch.refuse_strange(report, args.diagnosis, theta)
-        theta, covariance = patch.with_scatter(theta, covariance, report)
+    theta, covariance = patch.with_scatter(theta, covariance, report)
     if not theta and not laws:
         unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         unused = unused if report.get("laws") else ""

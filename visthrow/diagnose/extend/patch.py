@@ -3,7 +3,7 @@ next diagnosis read.
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,9 +20,8 @@ from visthrow.common.toml_text import dumps
 from visthrow.config.effects import catalogue, chosen
 from visthrow.diagnose.inputs.model_arguments import THROW
 from visthrow.diagnose.inputs.setup import Setup
-from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.models.catalogue import beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import term_of
-from visthrow.diagnose.models.numeric import ROUNDED
 from visthrow.diagnose.select.scatter import variances
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
@@ -138,17 +137,17 @@ def _commented(
 
 def with_scatter(
     theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
-) -> tuple[dict[str, float], list[list[float]]]:
-    """Sizes and covariance with what varies from flight to flight: training draws it with the rest
-    of the posterior.
+) -> tuple[dict[str, float], np.ndarray]:
+    """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to flight
+    has the mean of those that were flown, and their scatter.
     """
-    variances_of = variances(report.get("scatter") or [])
-    names = [*theta, *[name for name in variances_of if name not in theta]]
-    whole = np.zeros((len(names), len(names)))
+    rows = [row for row in report.get("scatter") or [] if row["found"]]
+    sizes = {name: float(row.get("mean", {}).get(name, 0.0)) for row in rows for name in row["of"]}
+    sizes = {**theta, **{name: size for name, size in sizes.items() if name not in theta}}
+    whole = np.zeros((len(sizes), len(sizes)))
     whole[: len(theta), : len(theta)] = np.reshape(covariance, (len(theta), len(theta)))
-    for name, variance in variances_of.items():
-        whole[names.index(name), names.index(name)] += variance
-    return {name: theta.get(name, 0.0) for name in names}, whole.tolist()
+    scatter = variances(rows)
+    return sizes, whole + np.diag([scatter.get(name, 0.0) for name in sizes])
 
 
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
@@ -156,16 +155,15 @@ def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
 
     Raises DiagnoseError: it holds fewer.
     """
-    if rank > len(explanations := _explanations(report)):
+    explanations = _explanations(report)
+    if rank > len(explanations):
         raise DiagnoseError(
-            f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws "
-            f"asks for"
-            f" number {rank}"
+            f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks"
+            f" for number {rank}"
         )
-    laws = explanations[rank - 1] if rank else []
     return [
         LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"]))
-        for x in laws
+        for x in (explanations[rank - 1] if rank else [])
     ]
 
 
@@ -182,13 +180,10 @@ def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[l
     try:
         theta = {str(name): float(size) for name, size in report["theta"].items()}
         covariance = [[float(x) for x in row] for row in report["covariance"]]
-    except KeyError as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
         raise DiagnoseError(
-            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: it has no {error}"
-        ) from error
-    except (TypeError, ValueError, AttributeError) as error:
-        raise DiagnoseError(
-            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {error}"
+            f"{path}: no diagnosis that `visthrow diagnose explain` wrote: {reason}"
         ) from error
     if len(covariance) != len(theta) or any(len(row) != len(theta) for row in covariance):
         raise DiagnoseError(
@@ -251,42 +246,38 @@ def of_setup(
         provenance: lines on where it comes from.
         rank: of the explanation whose laws are written, from 1; 0 for none.
     """
-    theta, covariance = read(report, path)
-    if report.get("model", THROW) != setup.model:
-        model_name = setup.model or "none"
+    named, covariance = read(report, path)
+    theta, covariance = with_scatter(named, covariance, report)
+    model = report.get("model", THROW)
+    if model != setup.model:
         raise DiagnoseError(
-            f"{path}: a diagnosis of the model '{report.get('model', THROW)}'; the model of {base}"
-            f" is {model_name}"
+            f"{path}: a diagnosis of the model '{model}'; the model of {base} is"
+            f" {setup.model or 'none'}"
         )
     effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
     refuse_strange(report, path, after, effects, setup.model)
     laws = laws_of(report, path, rank)
-    effects_of_model = (
-        [x.get("covariance") or [x["sd"] ** 2] for x in _explanations(report)[rank - 1]]
-        if rank
-        else []
-    )
+    of_laws = _explanations(report)[rank - 1] if rank else []
     lines = [f"# {line}" for line in provenance]
-    for rows, names in (
-        (covariance, list(theta)),
-        (effects_of_model, [term_of(law).formula for law in laws]),
-    ):
-        lines += [f"# covariance of {', '.join(names)}:"] * bool(names) + [
-            f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in rows
-        ]
+    lines += _rows_of(list(theta), covariance)
+    formulas = [term_of(law).formula for law in laws]
+    lines += _rows_of(formulas, [x.get("covariance") or [x["sd"] ** 2] for x in of_laws])
     lines += dumps({"base": base}).splitlines()
     if laws:
-        lines.append(
-            dumps({"laws": [dataclasses.asdict(law) for law in (*setup.laws, *laws)]}).strip()
-        )
+        tables = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
+        lines.append(dumps({"laws": tables}).strip())
     lines += ["", "[effects]"] * bool(theta)
-    for i, (name, size) in enumerate(theta.items()):
-        lines.append(
-            f"{name} = {after[name]:.9g}  # {size:+.4g} +- {covariance[i][i] ** 0.5:.2g}"
-            f" {effects[name].unit}"
-        )
+    for (name, size), sd in zip(theta.items(), np.sqrt(np.diag(covariance))):
+        unit = effects[name].unit
+        lines.append(f"{name} = {after[name]:.9g}  # {size:+.4g} +- {sd:.2g} {unit}")
     return "\n".join(lines) + "\n"
+
+
+def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:
+    """Return the comment that holds a covariance."""
+    rows = [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
+    return [f"# covariance of {', '.join(names)}:", *rows] if names else []
 
 
 def refuse_strange(
@@ -312,22 +303,16 @@ def refuse_strange(
     strange = [name for name in theta if name not in effects]
     if strange:
         raise DiagnoseError(
-            f"{path}: {', '.join(strange)} are no effects of the {model_name}; "
-            f"{suggest(strange[0], effects)}"
+            f"{path}: {', '.join(strange)} are no effects of the {model_name};"
+            f" {suggest(strange[0], effects)}"
         )
     units = {f["name"]: f["unit"] for f in report.get("findings") or [] if "unit" in f}
     for name, size in theta.items():
         effect = effects[name]
         if units.get(name, effect.unit) != effect.unit:
             raise DiagnoseError(
-                f"{path}: {name} in '{units[name]}'; the {model_name}'s {name} is in "
-                f"'{effect.unit}': of"
-                " another model"
+                f"{path}: {name} in '{units[name]}'; the {model_name}'s {name} is in"
+                f" '{effect.unit}': of another model"
             )
-        low, high = effect.bounds
-        if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
-            raise DiagnoseError(
-                f"{path}: {name} = {size:.4g} {effect.unit}; the {model_name} has it from "
-                f"{low:g} to"
-                f" {high:g}"
-            )
+        if beyond := beyond_bounds(effect, size):
+            raise DiagnoseError(f"{path}: {beyond} in the {model_name}")

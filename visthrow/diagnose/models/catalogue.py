@@ -10,6 +10,9 @@ from typing import Any
 from sim.effects.effect import Effect
 from visthrow import config
 
+# of a prior deviation, by which a size at its bound may lie outside once it was written down
+ROUNDED = 1e-6
+
 
 @dataclass(frozen=True)
 class ModelEffect(Effect):
@@ -60,3 +63,12 @@ def effects_of(model: str, params: Any) -> list[ModelEffect]:
         for e in _tables(model).effects.values()
         if not e.needs or getattr(params, e.needs) is not None
     ]
+
+
+def beyond_bounds(effect: Effect, size: float) -> str:
+    """Return in words that a size lies outside an effect's bounds; empty where it does not."""
+    low, high = effect.bounds
+    rounded = ROUNDED * effect.prior_sd
+    if low - rounded <= size <= high + rounded:
+        return ""
+    return f"{effect.name} = {size:.4g} {effect.unit}; expected from {low + 0.0:g} to {high:g}"

@@ -71,8 +71,6 @@ class Linearised:
 
     theta: Mapping[str, float]  # given to :meth:`Model.windows`
     windows: Mapping[int, Window]  # what came, by number
-    ways: dict[int, Any] = field(default_factory=dict, compare=False)
-    """How each window's initial state follows the effects, as the model finds it once."""
 
 
 LATENT_BLOCKS = ("vehicle force", "vehicle torque", "payload force")

@@ -15,7 +15,7 @@ import numpy as np
 
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
-from visthrow.diagnose.models.catalogue import ModelEffect, effects_of
+from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import carries, term_of
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.logs.check.signals import noise
@@ -30,8 +30,6 @@ SETTLE_STEPS = 5
 # a Gauss-Newton step on the unknowns at the start that promises less than this [nats] is not tried
 SETTLED = 1e-3
 MOST_LANES = 6000  # simulated in one batch
-# of a prior deviation, by which a size at its bound may lie outside once it was written down
-ROUNDED = 1e-6
 
 
 @dataclass(frozen=True)
@@ -161,25 +159,17 @@ class NumericModel(Model, ABC):
         """
         base = self.size(sizes)
         for effect, size in zip(self.effects, base):
-            low, high = effect.bounds
-            if not low - ROUNDED * effect.prior_sd <= size <= high + ROUNDED * effect.prior_sd:
-                raise LogError(
-                    f"{effect.name} = {size:.4g} {effect.unit}; this model has it from {low:g} to"
-                    f" {high:g}"
-                )
-        if laws:
-            first = self.stretches[0]
-            one = self._lanes(base).part([0])
-            quantities = self.knots(first, self.simulate(one)[0]).keys()
-            for term in map(term_of, laws):
-                lacking = sorted(term.needs - quantities) or (
-                    [] if carries(first.latent_block, term.block) else [term.block]
-                )
-                if lacking:
-                    raise LogError(
-                        f"the law {term.formula} cannot act here:"
-                        f" {self.lawless or 'this model has no ' + ', '.join(lacking)}"
-                    )
+            if beyond := beyond_bounds(effect, size):
+                raise LogError(f"{beyond} in this model")
+        first = self.stretches[0]
+        path = self.simulate(self._lanes(base).part([0]))[0] if laws else None
+        for term in map(term_of, laws):
+            lacking = sorted(term.needs - self.knots(first, path).keys())
+            if not lacking and not carries(first.latent_block, term.block):
+                lacking = [term.block]
+            if lacking:
+                reason = self.lawless or f"this model has no {', '.join(lacking)}"
+                raise LogError(f"the law {term.formula} cannot act here: {reason}")
         self._base = base
         self.laws = (*self.laws, *laws)
         self.effects = tuple(
@@ -293,24 +283,18 @@ class NumericModel(Model, ABC):
         """
         out: list[np.ndarray] = [np.empty(0)] * len(lanes.owner)
         for first in range(0, len(lanes.owner), MOST_LANES):
-            rows = np.arange(first, min(first + MOST_LANES, len(lanes.owner)))
-            part = lanes.part(rows)
+            part = lanes.part(slice(first, first + MOST_LANES))
             path = self.simulate(part)
             for i in np.unique(part.owner):
-                lanes_of_stretch = np.flatnonzero(part.owner == i)
-                for row, samples in zip(
-                    rows[lanes_of_stretch],
-                    self.measure(
-                        self.stretches[i], path[lanes_of_stretch], part.part(lanes_of_stretch)
-                    ),
-                ):
-                    out[row] = samples
+                rows = np.flatnonzero(part.owner == i)
+                samples = self.measure(self.stretches[i], path[rows], part.part(rows))
+                for row, of_lane in zip(rows, samples):
+                    out[first + row] = of_lane
         return out
 
     def _off(self, size: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
-        return [
-            s.measured - out for s, out in zip(self.stretches, self._run(self._lanes(size, start)))
-        ]
+        samples = self._run(self._lanes(size, start))
+        return [s.measured - out for s, out in zip(self.stretches, samples)]
 
     def _settle(self, size: np.ndarray, fresh: bool = False) -> list[np.ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
@@ -321,21 +305,21 @@ class NumericModel(Model, ABC):
             self._slopes = self._slopes_by(size, "nuisance")
         costs = self._costs(residuals, self._start)
         for _ in range(SETTLE_STEPS):
-            steps = np.array([self._newton(i, residual) for i, residual in enumerate(residuals)])
+            steps = np.array(list(map(self._newton, range(len(residuals)), residuals)))
             if not np.any(steps):
                 break
-            before = costs.copy()
+            before = costs
             for shrink in (1.0, 0.3):
+                if not np.any(steps):
+                    break
                 trial = self._start + shrink * steps
                 after = self._off(size, trial)
-                new_costs = self._costs(after, trial)
-                better = new_costs < costs
+                costs_after = self._costs(after, trial)
+                better = costs_after < costs
                 self._start = np.where(better[:, None], trial, self._start)
                 residuals = [new if yes else old for new, old, yes in zip(after, residuals, better)]
-                costs = np.where(better, new_costs, costs)
+                costs = np.where(better, costs_after, costs)
                 steps = np.where(better[:, None], 0.0, steps)
-                if np.all(better | (np.max(np.abs(steps), 1) == 0.0)):
-                    break
             if np.max(before - costs) < 2 * SETTLED:
                 break
         return residuals

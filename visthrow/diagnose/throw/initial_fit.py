@@ -6,7 +6,6 @@ used for several steps, as long as each brings what it promised, and may come fr
 whose states were fitted before."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import groupby
 
 import numpy as np
@@ -18,7 +17,7 @@ from visthrow.diagnose.throw.initial_states import (
     MOVED,
     Direction,
     States,
-    concerns,
+    deviations,
     directions,
     moved_along,
     rows_of,
@@ -57,14 +56,112 @@ of a window, and with them a law of the thrust's slope that is none.
 """
 
 
-@dataclass(frozen=True)
-class _Trial:
-    """A step of each of L windows."""
+class _WindowFit:
+    """The fit of one window's state: what was flown last, and how bold its next step is.
 
-    states: States  # where it leads
-    hoped: np.ndarray  # fall of the cost that it promises, shape (L,)
-    cost: np.ndarray  # there, shape (L,)
-    residuals: list[np.ndarray]
+    Attributes:
+        free: directions that are fitted. sd: their prior deviations.
+        sensitive: see :func:`sensitive_samples`.
+        spread: deviation of the samples from a flight without gusts: noise, and how far gusts may
+            have led by then.
+        slopes: of the samples by the free directions, where they were taken last.
+        aged: whether they come from elsewhere. stale: whether new ones are due.
+    """
+
+    def __init__(
+        self, flights: ReplayedFlights, w: int, directions: Sequence[Direction], lag: float
+    ):
+        """Make ready; see :class:`InitialFit`."""
+        sd = deviations(directions, [flights.cuts[w]])[0]
+        self.number = w
+        self.free = [d for d, x in enumerate(directions) if sd[d] and x.field not in TRUSTED]
+        self.sd = sd[self.free]
+        self.sigma = flights.sigma[w]
+        self.drift = drift(flights, w)
+        self.sensitive, self.end = sensitive_samples(flights, w, lag)
+        self.gusts = 1.0  # against the drift that is thought possible
+        self.spread = np.hypot(self.sigma, self.drift)
+        self.slopes: np.ndarray | None = None
+        self.aged = False
+        self.stale = True
+        self.damping = DAMPING
+
+    def begin(self, residual: np.ndarray, slopes: np.ndarray | None) -> None:
+        """Start from a residual, with slopes of another fit if there are any."""
+        self.residual = residual
+        self.cost = self.cost_of(residual)
+        if slopes is not None:
+            self.slopes = slopes
+            self.aged = True
+            self.stale = False
+
+    def cost_of(self, residual: np.ndarray) -> float:
+        """Huber's cost of a residual; infinite where it is not finite."""
+        off = np.abs(residual) / self.spread
+        cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
+        return cost if np.isfinite(cost) else np.inf
+
+    def increment(self, done: np.ndarray) -> tuple[np.ndarray, float]:
+        """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the
+        cost that it promises.
+
+        ``done``: how far the state has been moved, shape (directions,)."""
+        scaled = self.slopes * self.sd / self.spread[:, None]
+        off = self.residual / self.spread
+        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
+        bend = scaled.T @ (scaled * weight[:, None])
+        slope = scaled.T @ (off * weight)
+        diagonal = (1.0 + self.damping) * (bend.diagonal() + 1.0)
+        damped = bend - np.diag(bend.diagonal()) + np.diag(diagonal)
+        step = np.linalg.solve(damped, slope - done[self.free] / self.sd)
+        out = np.zeros(len(done))
+        out[self.free] = step * self.sd
+        return out, step @ slope - 0.5 * step @ bend @ step
+
+    def judge(self, residual: np.ndarray, promised: float) -> bool:
+        """Take a step if it helps; returns whether it did."""
+        cost = self.cost_of(residual)
+        better = cost < self.cost
+        fall = self.cost - cost if better else 0.0
+        lowest = cost if better else self.cost
+        tolerance = max(SETTLED[0], SETTLED[1] * lowest)
+        little = better and fall < tolerance
+        no_hope = promised < tolerance and self.damping <= DAMPING
+        self.settled = (little and not self.aged) or no_hope
+        if better:
+            self.stale = not self.settled and (little or fall <= TRUE * promised)
+            self.damping /= 10.0
+            self.residual = residual
+            self.cost = cost
+        else:
+            self.stale = self.aged and not self.settled
+            self.damping *= 1.0 if self.aged else 10.0
+        self.aged = self.aged or better
+        if self.settled and self._lower_gusts():
+            self.settled = False
+            self.cost = self.cost_of(self.residual)
+        return better
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether another step may help."""
+        return not self.settled and self.damping < DAMPING_MOST
+
+    def _lower_gusts(self) -> bool:
+        """Take gusts for as strong as what is left says, if that is much less than was thought."""
+        square = self.residual**2
+        noise = self.sigma**2
+        drift = self.drift**2
+        samples = np.count_nonzero(self.sensitive)
+        calmer = [
+            g
+            for g in CALMER
+            if g < self.gusts and np.sum(square / (noise + g * g * drift)) < samples
+        ]
+        if calmer:
+            self.gusts = min(calmer)
+            self.spread = np.hypot(self.sigma, self.gusts * self.drift)
+        return bool(calmer)
 
 
 class InitialFit:
@@ -75,180 +172,81 @@ class InitialFit:
         as known [s].
         """
         self.flights = flights
-        self.retained = np.array([w for w, c in enumerate(flights.cuts) if c.retained])
         self.simulation = simulation
         self.directions = directions(simulation.settings[0].plant)
-        self.slopes: dict[
-            int, np.ndarray
-        ] = {}  # of windows' samples by their states, where they were taken last
-        self._free = [
-            [
-                d
-                for d, x in enumerate(self.directions)
-                if concerns(x, cut) and x.field not in TRUSTED
-            ]
-            for cut in flights.cuts
-        ]  # directions in which windows' initial states are fitted
-        self._drift = [drift(flights, w) for w in range(len(flights.cuts))]
-        self._gusts = np.ones(
-            len(flights.cuts)
-        )  # of each window, against the drift that is thought possible
-        # deviation of each window's samples from a flight without gusts: noise, and how far gusts
-        # may have led by then
-        self._spreads = [np.hypot(flights.sigma[w], spread) for w, spread in enumerate(self._drift)]
-        self._sensitive, ends = zip(
-            *[sensitive_samples(flights, w, lag) for w in range(len(flights.cuts))]
-        )
-        self._shortened = flights.ended(ends)
+        windows = range(len(flights.cuts))
+        self._fits = [_WindowFit(flights, w, self.directions, lag) for w in windows]
+        self._shortened = flights.ended([fit.end for fit in self._fits])
+
+    @property
+    def slopes(self) -> dict[int, np.ndarray]:
+        """Return the derivatives of windows' samples by their states, where they were taken
+        last.
+        """
+        return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
     def fit(self, states: States, slopes: Mapping[int, np.ndarray] | None = None) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
         ``states``: to begin with; ``slopes``: of windows' samples by their states, as
         :attr:`slopes` of another fit has them."""
-        count = len(self.flights.cuts)
-        damping = np.full(count, DAMPING)
-        remaining = self.retained
-        self.slopes |= slopes or {}
-        aged = np.isin(np.arange(count), list(self.slopes))  # derivatives come from elsewhere
-        flown = self._residuals(rows_of(states, remaining), remaining)
-        residuals = dict(zip(remaining, flown))
-        cost = np.full(count, np.inf)
-        cost[remaining] = [self._cost(w, residual) for w, residual in residuals.items()]
-        stale = ~aged
+        remaining = [fit for fit in self._fits if self.flights.cuts[fit.number].retained]
+        states = {name: value.copy() for name, value in states.items()}
+        flown = self._residuals(rows_of(states, _numbers(remaining)), remaining)
+        for fit, residual in zip(remaining, flown):
+            fit.begin(residual, (slopes or {}).get(fit.number))
         for _ in range(ROUNDS):
-            self.slopes |= self._slopes(states, remaining[stale[remaining]])
-            aged &= ~stale
-            trial = self._tried(states, remaining, residuals, damping[remaining])
-            helps = trial.cost < cost[remaining]
-            tried = np.full(count, np.inf)
-            hoped = np.zeros(count)
-            tried[remaining] = trial.cost
-            hoped[remaining] = trial.hoped
-            better = tried < cost
-            rows = np.flatnonzero(helps)
-            residuals |= {remaining[row]: trial.residuals[row] for row in rows}
-            states = {name: value.copy() for name, value in states.items()}
+            self._take_slopes(states, [fit for fit in remaining if fit.stale])
+            rows = _numbers(remaining)
+            done = states[MOVED][rows]
+            steps, promised = zip(*parallel_map(_WindowFit.increment, remaining, done))
+            trial = moved_along(rows_of(states, rows), self.directions, np.array(steps))
+            trial[MOVED] = trial[MOVED] + steps
+            flown = self._residuals(trial, remaining)
+            helps = np.array(list(map(_WindowFit.judge, remaining, flown, promised)))
             for name, value in states.items():
-                value[remaining[rows]] = trial.states[name][rows]
-            fall = np.subtract(cost, tried, out=np.zeros(count), where=better)
-            tolerance = np.maximum(SETTLED[0], SETTLED[1] * np.where(better, tried, cost))
-            little = better & (fall < tolerance)
-            settled = little & ~aged | (hoped < tolerance) & (damping <= DAMPING)
-            stale = np.where(better, ~settled & (little | (fall <= TRUE * hoped)), aged & ~settled)
-            raised = np.where(aged, damping, 10.0 * damping)
-            damping = np.where(better, damping / 10.0, raised)
-            aged = aged | better
-            cost = np.where(better, tried, cost)
-            for w in remaining[settled[remaining]]:
-                if self._lower_gusts(w, residuals[w]):
-                    settled[w] = False
-                    cost[w] = self._cost(w, residuals[w])
-            remaining = remaining[~settled[remaining] & (damping[remaining] < DAMPING_MOST)]
-            if not len(remaining):
+                value[rows[helps]] = trial[name][helps]
+            remaining = [fit for fit in remaining if fit.goes_on]
+            if not remaining:
                 break
         return states
 
-    def _tried(
-        self,
-        states: States,
-        windows: np.ndarray,
-        residuals: Mapping[int, np.ndarray],
-        dampings: np.ndarray,
-    ) -> _Trial:
-        """The next step of each window that is left, with its damping."""
-        columns = windows, [residuals[w] for w in windows], states[MOVED][windows], dampings
-        steps, hoped = map(np.array, zip(*parallel_map(self._increment, *columns)))
-        states_moved = moved_along(rows_of(states, windows), self.directions, steps)
-        states_moved[MOVED] = states_moved[MOVED] + steps
-        reached = self._residuals(states_moved, windows)
-        cost = np.array([self._cost(w, residual) for w, residual in zip(windows, reached)])
-        return _Trial(states_moved, hoped, cost, reached)
-
-    def _residuals(self, states: States, which: np.ndarray) -> list[np.ndarray]:
+    def _residuals(self, states: States, fits: Sequence[_WindowFit]) -> list[np.ndarray]:
         """Residuals of windows, of what depends on their initial states; a row of the states for
         each.
         """
         f = self.flights
-        lanes = [Lane(w, 0, row) for row, w in enumerate(which)]
+        lanes = [Lane(fit.number, 0, row) for row, fit in enumerate(fits)]
         measured = f.fly(self.simulation, states, lanes, self._shortened).seen
-        return [self._sensitive[w] * f.residual(measured, w, lane) for lane, w in enumerate(which)]
-
-    def _cost(self, w: int, residual: np.ndarray) -> float:
-        """Huber's cost of a window's residual; infinite where one is not finite."""
-        off = np.abs(residual) / self._spreads[w]
-        cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
-        return cost if np.isfinite(cost) else np.inf
-
-    def _lower_gusts(self, w: int, residual: np.ndarray) -> bool:
-        """Take a window's gusts for as strong as what is left of it says, if that is much less than
-        was thought.
-        """
-        square = residual**2
-        noise = self.flights.sigma[w] ** 2
-        drift = self._drift[w] ** 2
-        samples = np.count_nonzero(self._sensitive[w])
-        calmer = [
-            g
-            for g in CALMER
-            if g < self._gusts[w] and np.sum(square / (noise + g * g * drift)) < samples
+        return [
+            fit.sensitive * f.residual(measured, fit.number, lane) for lane, fit in enumerate(fits)
         ]
-        if not calmer:
-            return False
-        self._gusts[w] = min(calmer)
-        self._spreads[w] = np.hypot(self.flights.sigma[w], self._gusts[w] * self._drift[w])
-        return True
 
-    def _slopes(self, states: States, which: np.ndarray) -> dict[int, np.ndarray]:
-        """Derivatives of windows' samples by their initial states."""
-        if not len(which):
-            return {}
-        count = len(which)
+    def _take_slopes(self, states: States, fits: Sequence[_WindowFit]) -> None:
+        """Take the derivatives of windows' samples by their initial states."""
+        if not fits:
+            return
+        ways = sorted({d for fit in fits for d in fit.free})
         lanes = []
-        first = []
-        ways = {
-            d: 1 + index
-            for index, d in enumerate(sorted({d for w in which for d in self._free[w]}))
-        }
-        for row, w in enumerate(which):
-            first.append(len(lanes))
-            lanes += [
-                Lane(w, 0, row, rough=True),
-                *[Lane(w, 0, ways[d] * count + row, rough=True) for d in self._free[w]],
-            ]
-        states_moved = perturbed(rows_of(states, which), [self.directions[d] for d in ways])
-        measured = self.flights.fly(self.simulation, states_moved, lanes, self._shortened).seen
-        slopes = {}
-        for index, w in zip(first, which):
-            ds = self._free[w]
-            rows = int(self.flights.rows[w])
-            flat = np.swapaxes(measured[:rows, index : index + 1 + len(ds)], 1, 2).reshape(
-                3 * rows, -1
-            )
-            steps = np.array([self.directions[d].step for d in ds])
-            slopes[w] = (flat[:, 1:] - flat[:, :1]) / steps * self._sensitive[w][:, None]
-        return slopes
+        for row, fit in enumerate(fits):
+            rows = [row, *[(1 + ways.index(d)) * len(fits) + row for d in fit.free]]
+            lanes += [Lane(fit.number, 0, row_moved, rough=True) for row_moved in rows]
+        moved = perturbed(rows_of(states, _numbers(fits)), [self.directions[d] for d in ways])
+        measured = self.flights.fly(self.simulation, moved, lanes, self._shortened).seen
+        first = 0
+        for fit in fits:
+            rows = int(self.flights.rows[fit.number])
+            lanes_of = measured[:rows, first : first + 1 + len(fit.free)]
+            flat = np.swapaxes(lanes_of, 1, 2).reshape(3 * rows, -1)
+            steps = np.array([self.directions[d].step for d in fit.free])
+            fit.slopes = (flat[:, 1:] - flat[:, :1]) / steps * fit.sensitive[:, None]
+            fit.aged = False
+            first += 1 + len(fit.free)
 
-    def _increment(
-        self, w: int, residual: np.ndarray, done: np.ndarray, damping: float
-    ) -> tuple[np.ndarray, float]:
-        """Levenberg-Marquardt step of a window's state with its vague prior, shape (directions,),
-        and the fall of the cost that it promises.
 
-        ``done``: how far it has been moved, shape (directions,)."""
-        ds = self._free[w]
-        sd = np.array([self.directions[d].spread(self.flights.cuts[w]) for d in ds])
-        scaled = self.slopes[w] * sd / self._spreads[w][:, None]
-        off = residual / self._spreads[w]
-        weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
-        bend = scaled.T @ (scaled * weight[:, None])
-        slope = scaled.T @ (off * weight)
-        diagonal = (1.0 + damping) * (bend.diagonal() + 1.0)
-        damped = bend - np.diag(bend.diagonal()) + np.diag(diagonal)
-        step = np.linalg.solve(damped, slope - done[ds] / sd)
-        out = np.zeros(len(done))
-        out[ds] = step * sd
-        return out, step @ slope - 0.5 * step @ bend @ step
+def _numbers(fits: Sequence[_WindowFit]) -> np.ndarray:
+    """Return the windows' numbers."""
+    return np.array([fit.number for fit in fits], dtype=int)
 
 
 def drift(flights: ReplayedFlights, w: int) -> np.ndarray:
@@ -273,22 +271,26 @@ def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[np.
 
 
 def following(
-    flights: ReplayedFlights, w: int, window: Window, free: np.ndarray, lag: float
+    flights: ReplayedFlights,
+    w: int,
+    window: Window,
+    free: np.ndarray,
+    change: np.ndarray,
+    lag: float,
 ) -> np.ndarray:
-    """Return how a window's initial state follows its effects, so that the flight stays as near to
-    where it was as it can.
+    """Return how a window's initial state follows a change of the effects, so that the flight stays
+    as near to where it was as it can, in the state's units, shape (D,).
 
-    ``free``: which parts of the state follow, shape (D,), bool; ``lag``: of the release, as far as
-    known [s]. Returns changes in the state's units by the effects' sizes, shape (D, K)."""
+    ``free``: which parts of the state follow, shape (D,), bool; ``change``: of the effects' sizes,
+    shape (K,); ``lag``: of the release, as far as known [s]."""
     samples = len(flights.time[w])  # and those of a camera, which tell nothing of states
-    weight = (
-        sensitive_samples(flights, w, lag)[0] / np.hypot(flights.sigma[w], drift(flights, w))
-    )[:, None]
+    sensitive = sensitive_samples(flights, w, lag)[0]
+    weight = sensitive / np.hypot(flights.sigma[w], drift(flights, w))
     sd = window.nuisance_sd[free]
-    by_state = window.nuisance[:samples, free] * sd * weight
-    by_effect = (by_state * weight).T @ window.effects[:samples]
-    moves = np.zeros((len(free), by_effect.shape[1]))
-    moves[free] = -sd[:, None] * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), by_effect)
+    by_state = window.nuisance[:samples, free] * sd * weight[:, None]
+    shift = by_state.T @ (weight * (window.effects[:samples] @ change))
+    moves = np.zeros(len(free))
+    moves[free] = -sd * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), shift)
     return moves
 
 

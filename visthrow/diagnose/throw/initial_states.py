@@ -76,11 +76,25 @@ class Direction:
         """
         return not self.field.startswith("cable") or self.part == "all"
 
-    def spread(self, c: Cut) -> float:
-        """The prior's deviation in a window."""
-        if self.calm is None or c.after_slack:
-            return self.sd
+    def deviation(self, c: Cut) -> float:
+        """Return its prior's deviation in a window; 0 where its state does not have it: higher
+        bends has only a rope that has just come taut.
+        """
+        if self.field.startswith("cable"):
+            low = self.part in ("all", "last", 1)
+            present = c.payload == ATTACHED and (c.after_slack or low)
+        else:
+            present = c.payload == LOOSE or not self.field.startswith("payload")
+        if self.calm is None or c.after_slack or not present:
+            return self.sd * present
         return HUNG * self.calm if c.at_rest else self.calm
+
+
+def deviations(directions: Sequence[Direction], cuts: Sequence[Cut]) -> np.ndarray:
+    """Return what is not known of windows' initial states, shape (W, directions); 0 where a state
+    does not have a direction.
+    """
+    return np.array([[direction.deviation(c) for direction in directions] for c in cuts])
 
 
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
@@ -100,15 +114,6 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
             listed += [Direction(field, i, sd, step, part, calm) for i in range(2)]
     listed += [Direction("payload_pos_w", i, 0.1, 1e-4) for i in range(3)]
     return (*listed, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
-
-
-def concerns(direction: Direction, c: Cut) -> bool:
-    """Whether the state at the start of a window has the direction: higher bends only a rope that
-    has just come taut.
-    """
-    if direction.field.startswith("cable"):
-        return c.payload == ATTACHED and (c.after_slack or direction.part in ("all", "last", 1))
-    return c.payload == LOOSE if direction.field.startswith("payload") else True
 
 
 def _tangents(n: np.ndarray) -> np.ndarray:

@@ -19,7 +19,7 @@ from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, concerns
+from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
 from visthrow.diagnose.throw.recorded_flight import NEVER
 from visthrow.diagnose.throw.replay import (
     FINENESS,
@@ -117,6 +117,7 @@ class Linearisation:
         self._setting, *perturbed = simulation.settings
         self._steps = steps
         self._directions = directions
+        self._deviations = deviations(directions, flights.cuts)
         self._states = states
         self._exact = np.array([exact(e) for e in effects], dtype=bool)
         self._blocks = [e.block for e in effects]
@@ -159,7 +160,7 @@ class Linearisation:
         alike = self._alike[self._flights.kind(w)]
         whips = c.phase in FINENESS or c.after_slack
         fine = alike | self._exact | whips
-        nuisances = [d for d, x in enumerate(self._directions) if concerns(x, c)]
+        nuisances = np.flatnonzero(self._deviations[w]).tolist()
         axes = range(6 if c.payload == NO_PAYLOAD else 9)
         latents = [(axis, knot) for axis in axes for knot in range(knots)]
         # where the rough nominal lane stands, which latent lanes leave
@@ -225,7 +226,7 @@ class Linearisation:
             f.sigma[w],
             effects,
             states,
-            np.array([self._directions[d].spread(c) for d in plan.nuisances]),
+            self._deviations[w, plan.nuisances],
             latents,
             axes // 3,
             axes % 3,
@@ -244,13 +245,13 @@ def _in_order(
 
     Returns all lanes, the place of the rough one, and of each given lane the place.
     """
-    order = [*np.argsort(~alike, kind="stable"), *range(len(alike), len(lanes))]
-    numbers = [-1, *(i for i in order if not lanes[i].rough)]
-    split = len(numbers)
-    numbers += [-1, *(i for i in order if lanes[i].rough)]
-    flown = [nominal, *(lanes[i] for i in numbers[1:split])]
-    flown += [rough, *(lanes[i] for i in numbers[split + 1 :])]
-    return flown, split, np.argsort(numbers, kind="stable")[2:]  # behind the nominal ones
+    group = np.array([2 if lane.rough else 1 for lane in lanes])
+    group[: len(alike)][alike] = 0
+    order = np.argsort(group, kind="stable")
+    split = 1 + np.count_nonzero(group < 2)
+    flown = [nominal, *[lanes[i] for i in order]]
+    flown.insert(split, rough)
+    return flown, split, np.argsort(order) + 1 + (group == 2)
 
 
 def at_knots(

@@ -29,9 +29,8 @@ from visthrow.diagnose.throw.direct import (
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
-    Direction,
     States,
-    concerns,
+    deviations,
     directions,
     moved_along,
 )
@@ -160,11 +159,15 @@ class ThrowModel(Model):
             str, list[np.ndarray]
         ] = {}  # of other kinds of blocks, by their name, where they were asked for first
 
+    def at(self, theta: Mapping[str, float]) -> Setting:
+        """Return the setting with effects of these sizes."""
+        return apply(self.entries, self.setting, theta)
+
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`; with what was seen
         besides poses.
         """
-        setting = apply(self.entries, self.setting, theta)
+        setting = self.at(theta)
         self._directions = directions(setting.plant)  # another kind of block has other states
         states = self._settled_at[_key(theta)] = self._settled(setting)
         entries = self.entries.values()
@@ -201,16 +204,14 @@ class ThrowModel(Model):
         for e in self._switched:  # they are screened by these, and judged where they are flown
             if e.name not in self._secants:
                 self._secants[e.name] = self._secant(e, theta, listed)
-        blank = [np.zeros(len(w.residual)) for w in listed]  # of effects that a camera alone shows
-        columns = [*(self._secants[e.name] for e in self._switched), *[blank] * len(self._sighted)]
-        if columns:
-            return [
-                dataclasses.replace(
-                    w, effects=np.hstack((w.effects, np.stack([c[i] for c in columns], axis=1)))
-                )
-                for i, w in enumerate(listed)
-            ]
-        return listed
+        secants = [self._secants[e.name] for e in self._switched]
+        windows = []
+        for i, w in enumerate(listed):
+            columns = [secant[i][:, None] for secant in secants]
+            blank = np.zeros((len(w.residual), len(self._sighted)))
+            effects = np.hstack((w.effects, *columns, blank))
+            windows.append(dataclasses.replace(w, effects=effects))
+        return windows
 
     def _secant(
         self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
@@ -222,7 +223,7 @@ class ThrowModel(Model):
         would be taken for its effect."""
         on = theta.get(e.name, 0.0) > 0.5
         elsewhere = {**theta, e.name: 0.0 if on else 1.0}
-        perturbed = apply(self.entries, self.setting, elsewhere)
+        perturbed = self.at(elsewhere)
         start = self._settled(perturbed)
         self._latest[self._switches(elsewhere)] = start, self._none
         sign = -1.0 if on else 1.0
@@ -241,7 +242,7 @@ class ThrowModel(Model):
         """Return how far a window's state is from the middle of its prior, in its directions, shape
         (D,).
         """
-        return states[MOVED][w, [concerns(x, self.flights.cuts[w]) for x in self._directions]]
+        return states[MOVED][w, deviations(self._directions, [self.flights.cuts[w]])[0] > 0.0]
 
     def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
@@ -258,7 +259,7 @@ class ThrowModel(Model):
 
         Until windows are asked for, they are those of the states that were fitted; then those from
         the middle of the states' prior."""
-        setting = apply(self.entries, self.setting, theta)
+        setting = self.at(theta)
         if linearised is None:
             states, fitted = self._latest_states(theta, setting)
             moves = {}
@@ -287,7 +288,7 @@ class ThrowModel(Model):
         self, theta: Mapping[str, float], windows: Sequence[int]
     ) -> list[np.ndarray]:
         """See the base class; the command before stays."""
-        setting = apply(self.entries, self.setting, theta)
+        setting = self.at(theta)
         states = self._settled_at.get(_key(theta))
         if states is None:
             states, _ = self._latest_states(theta, setting)
@@ -316,34 +317,21 @@ class ThrowModel(Model):
         """
         change = [theta.get(name, 0.0) - linearised.theta.get(name, 0.0) for name in self.entries]
         ways = directions(setting.plant)
-        with self._lock:
-            if not linearised.ways:
-                linearised.ways.update(self._ways(ways, linearised))
+        present = deviations(ways, self.flights.cuts) > 0.0
+        follows = np.array([x.follows for x in ways])
+        lag = self.setting.plant.release.lag
+
+        def move(w: int, window: Window) -> np.ndarray:
+            return following(self.flights, w, window, follows[present[w]], np.array(change), lag)
+
+        numbers = self._retained[list(linearised.windows)]
+        sizes = np.zeros(present.shape)
+        for w, size in zip(numbers, parallel_map(move, numbers, linearised.windows.values())):
+            sizes[w, present[w]] = size
         begun = self._settled_at[_key(linearised.theta)]
-        sizes = np.zeros((len(self.flights.cuts), len(ways)))
-        for i, (members, by_effect) in linearised.ways.items():
-            sizes[self._retained[i], members] = by_effect @ change
         moved = sizes + begun[MOVED]
-        return moved_along(begun, ways, sizes), {
-            i: moved[self._retained[i], members] for i, (members, _) in linearised.ways.items()
-        }
-
-    def _ways(
-        self, directions_of: Sequence[Direction], linearised: Linearised
-    ) -> dict[int, tuple[list[int], np.ndarray]]:
-        """Return which directions each window's state has, and how it follows the effects in them,
-        shape (directions, K).
-        """
-
-        def way(i: int) -> tuple[list[int], np.ndarray]:
-            w = self._retained[i]
-            cut = self.flights.cuts[w]
-            members = [d for d, x in enumerate(directions_of) if concerns(x, cut)]
-            free = np.array([directions_of[d].follows for d in members], dtype=bool)
-            lag = self.setting.plant.release.lag
-            return members, following(self.flights, w, linearised.windows[i], free, lag)
-
-        return dict(zip(linearised.windows, parallel_map(way, linearised.windows)))
+        moves = [moved[w, present[w]] for w in numbers]
+        return moved_along(begun, ways, sizes), dict(zip(linearised.windows, moves))
 
     def _switches(self, theta: Mapping[str, float]) -> frozenset[str]:
         """Which other kinds of blocks are on."""
@@ -372,7 +360,7 @@ class ThrowModel(Model):
         """The setting with effects at ``theta``, and initial states fitted in it.
 
         ``cuts``: windows of the model's flights; default the model's."""
-        setting = apply(self.entries, self.setting, theta)
+        setting = self.at(theta)
         if cuts is None:
             return setting, self._settled(setting)
         flights = self._cut(self.flights.flights, cuts)

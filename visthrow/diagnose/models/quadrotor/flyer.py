@@ -5,7 +5,7 @@ Where the attitude is measured, the path of the centre of mass follows from thru
 alone, whatever controller flies; where each motor's command is logged, the rates follow too. No
 controller has to be known."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.law_terms import exerted
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -40,6 +41,7 @@ Slope = Callable[[int, np.ndarray], np.ndarray]
 """Of the half step, and states or velocities of lanes."""
 
 SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
+BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # number of the latent block that a channel shows
 
 
 class FlyerModel(NumericModel):
@@ -53,33 +55,30 @@ class FlyerModel(NumericModel):
 
         Raises LogError where no log has the channels, or none flies.
         """
-        optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
-        simulated = [name for name, part in optional.items() if part is not None]
-        self.channels = (params.position, *simulated)
-        drivers = ("battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
-        present = [name for name in drivers if all(name in log for log in logs)]
-        self.inputs = (params.attitude, params.input, *present)
-        self.needed = (params.position, params.attitude, params.input, *simulated)
-        self.has_voltage = "battery_voltage" in present
+        self.describe(logs, params)
+        # numbers of the latent blocks, in the order of their forces
+        self.blocks = (0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF])
         super().__init__(logs, params)
         self.steps = round(params.window / params.step)
         # see flyer_windows; the stretch is the first axis
-        self._rot, inputs, self._volts, self._since, self._lean, self._direction = (
-            np.array([s.data[name] for s in self.stretches])
-            for name in ("rot", "input", "volts", "since", "lean", "direction")
-        )
-        if NEIGHBOUR in present:
-            self._neighbour = np.array([s.data["neighbour"] for s in self.stretches])
-        self._commanded = params.thrust(inputs)  # [N], (S, fine steps, motors)
+        names = in_all([s.data for s in self.stretches], *self.stretches[0].data)
+        self._data = {name: np.array([s.data[name] for s in self.stretches]) for name in names}
+        self._commanded = params.thrust(self._data["input"])  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
-        hangs = params.cable is not None
-        # of the latent forces, in their order
-        self._blocks = (
-            "vehicle force",
-            *["payload force"] * hangs,
-            *["vehicle torque"] * (params.torque is not None),
-        )
-        self._rates = slice(12, 15) if hangs else slice(6, 9)  # of the states
+
+    def describe(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
+        """Set the channels that are looked at, that drive the model, and that it needs."""
+        optional = {"payload_pos_w": params.cable, "rate_b": params.torque}
+        simulated = [name for name, part in optional.items() if part is not None]
+        self.channels = (params.position, *simulated)
+        drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
+        self.inputs = (params.attitude, params.input, *drivers)
+        self.needed = (params.position, params.attitude, params.input, *simulated)
+
+    @property
+    def has_voltage(self) -> bool:
+        """Whether all logs tell the battery's voltage."""
+        return "battery_voltage" in self.inputs
 
     def catalogue(self) -> list[ModelEffect]:
         """See the base class; where the voltage is logged, thrust fades with it."""
@@ -103,7 +102,7 @@ class FlyerModel(NumericModel):
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
-        return windows_of(log, number, self.params, self.channels)
+        return windows_of(log, number, self.params, self.channels, self.blocks)
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
         """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held
@@ -144,7 +143,7 @@ class FlyerModel(NumericModel):
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
         curve = self.size_of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
-        since = self._since[lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
+        since = self._data["since"][lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
         faded = 1.0 + self.size_of(lanes, "thrust_fade") * since
         curved = 1.0 + curve * (thrust / hover - 1.0)
         return thrust * self._scale(lanes) * curved * faded[..., None]
@@ -179,31 +178,32 @@ class FlyerModel(NumericModel):
         time = np.unique(stretch.latent_time)
         grid = stretch.data["start"] + p.step * np.arange(len(path))
         halves = np.arange(2 * self.steps + 1) + self._spare
-        values = triangles(time, grid) @ path
+        at_knots = triangles(time, grid)
+        values = at_knots @ path
         rot = Rotation.from_matrix(stretch.data["rot"][halves])
-        turned = Slerp(stretch.data["start"] + 0.5 * p.step * np.arange(len(halves)), rot)
+        stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
+        turned = Slerp(stamps, rot)
         rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
         rate = triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
         thrust = values[:, -self._commanded.shape[2] :].sum(1)
         hung = None
         pose = {"time": time, "quat_wb": turned(time).as_quat()}
         if NEIGHBOUR in self.inputs:
-            stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
-            pose[NEIGHBOUR] = on_grid(stamps, stretch.data["neighbour"][halves], time)
+            pose[NEIGHBOUR] = on_grid(stamps, stretch.data[NEIGHBOUR][halves], time)
         if p.cable is not None:
             gap = path[:, 6:9] - stretch.data["rot"][halves[::2]] @ np.array(p.cable.mount)
             vel = path[:, 3:6] + path[:, 9:12]
             direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
             force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
             tension = np.maximum(-np.sum(direction * force, 1, keepdims=True), 0.0)
-            hung = triangles(time, grid) @ direction, triangles(time, grid) @ tension
+            hung = at_knots @ direction, at_knots @ tension
         return pose | self._quantities(values, rate, thrust, hung)
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
         p = self.params
         volts = (
-            (self._volts[lanes.owner] - p.reference_voltage)
+            (self._data["volts"][lanes.owner] - p.reference_voltage)
             if self.has_voltage
             else np.zeros(len(lanes.owner))
         )
@@ -227,7 +227,8 @@ class FlyerModel(NumericModel):
             time = stretch.time[rows].reshape(-1, 3)[:, 0]
             if name == "rate_b":
                 grid = start + p.step * np.arange(path.shape[1])
-                rates = [on_grid(grid, x[:, self._rates], time) for x in path]
+                last = path.shape[2] - self._commanded.shape[2]
+                rates = [on_grid(grid, x[:, last - 3 : last], time) for x in path]
                 out[:, rows] = np.reshape(rates, (len(path), -1))
                 continue
             late = (
@@ -269,7 +270,7 @@ class FlyerModel(NumericModel):
         if self.params.cable is None:
             return unknown
         length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
-        down = self._direction[lanes.owner]
+        down = self._data["direction"][lanes.owner]
         level = ((0, 0), (0, 1))  # a third component of 0
         side = np.pad(unknown[:, 6:8], level)
         direction = down + side - down * np.sum(down * side, 1, keepdims=True)
@@ -287,7 +288,8 @@ class FlyerModel(NumericModel):
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
         gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
         wind = self.stack(lanes, "wind_x", "wind_y", "")
-        latent = latent_force(lanes.latent, self.steps, len(self._blocks))
+        latent = latent_force(lanes.latent, self.steps, len(self.blocks))
+        names = [LATENT_BLOCKS[block] for block in self.blocks]
         force_of = self._force(lanes, thrust, rot)
         exerted_of = self._exerted(lanes, thrust, rot)
         pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
@@ -295,7 +297,7 @@ class FlyerModel(NumericModel):
 
         def slope(half: int, state: np.ndarray) -> np.ndarray:
             vel = state[:, 3:6]
-            loads = dict(zip(self._blocks, latent[half]))
+            loads = dict(zip(names, latent[half]))
             loads["vehicle force"] = loads["vehicle force"] + force_of(half, vel - wind)
             if self.laws:
                 hung = pulled and pulled(half, state, vel - wind, loads)
@@ -306,7 +308,7 @@ class FlyerModel(NumericModel):
                 acc, acc_payload, *_ = pulled(half, state, vel - wind, loads)
                 parts = [vel, acc, state[:, 9:12], acc_payload - acc]
             if turning is not None:
-                parts.append(turning(half, state[:, self._rates], loads["vehicle torque"]))
+                parts.append(turning(half, state[:, -3:], loads["vehicle torque"]))
             return np.concatenate(parts, 1)
 
         return slope
@@ -315,10 +317,11 @@ class FlyerModel(NumericModel):
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
         late = self._spare + self.size_of(lanes, "attitude_delay") / (0.5 * self.params.step)
         position = np.arange(2 * self.steps + 1)[:, None] + late
-        index = np.clip(position.astype(int), 0, self._rot.shape[1] - 2)
-        before = self._rot[lanes.owner, index]
+        measured = self._data["rot"]
+        index = np.clip(position.astype(int), 0, measured.shape[1] - 2)
+        before = measured[lanes.owner, index]
         share = (position - index)[..., None, None]
-        return before + share * (self._rot[lanes.owner, index + 1] - before)
+        return before + share * (measured[lanes.owner, index + 1] - before)
 
     def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
         """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
@@ -339,7 +342,7 @@ class FlyerModel(NumericModel):
             force_b = -(drag + parasitic * speed) * vel_b
             force_b[:, 2:3] += total[half] * (1.0 + lift * level)
             if turns:
-                off = turn + lean * self._lean[lanes.owner, half + self._spare]
+                off = turn + lean * self._data["lean"][lanes.owner, half + self._spare]
                 force_b = force_b + cross(off, force_b)
             return np.einsum("bij,bj->bi", rot[half], force_b)
 
@@ -383,7 +386,7 @@ class FlyerModel(NumericModel):
 
         def loads(half: int, state: np.ndarray, hung: tuple | None) -> dict[str, np.ndarray]:
             row = half + self._spare
-            before, after = (self._rot[lanes.owner, row + side] for side in (-1, 1))
+            before, after = (self._data["rot"][lanes.owner, row + side] for side in (-1, 1))
             turn = np.einsum("bji,bjk->bik", before, after)
             skew = turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]]
             rate = skew / (2.0 * self.params.step)
@@ -394,7 +397,7 @@ class FlyerModel(NumericModel):
                 **self._quantities(state, rate, total[half], hung and hung[2:]),
             }
             if NEIGHBOUR in self.inputs:
-                values[NEIGHBOUR] = self._neighbour[lanes.owner, row]
+                values[NEIGHBOUR] = self._data[NEIGHBOUR][lanes.owner, row]
             return exerted(self.laws, values)
 
         return loads
@@ -430,6 +433,11 @@ class FlyerModel(NumericModel):
             return (torque[half] - cross(rate, inertia * rate) + push) / inertia
 
         return turning
+
+
+def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
+    """Return the names that all logs hold."""
+    return [name for name in names if all(name in log for log in logs)]
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

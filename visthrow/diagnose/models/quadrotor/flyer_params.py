@@ -42,7 +42,7 @@ class TorqueParams(Bounded):
         front_left, front_right, rear_left, rear_right = np.moveaxis(thrusts, -1, 0)
         right_up = front_left + rear_left - front_right - rear_right
         nose_down = rear_left + rear_right - front_left - front_right
-        turn = self.torque_ratio * (thrusts @ np.array(self.spin))
+        turn = (self.torque_ratio * thrusts) @ np.array(self.spin)
         return np.stack([self.arm_y * right_up, self.arm_x * nose_down, turn], -1)
 
 

@@ -2,7 +2,8 @@
 state.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -42,86 +43,84 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
         )
 
 
-def windows_of(
-    log: FlightLog, number: int, params: FlyerParams, channels: Sequence[str]
-) -> list[Stretch]:
-    """Cut a log, the flight of a number, into windows that fly."""
-    sigma = {
-        name: sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels
-    }  # no less is believed
-    driving = (params.position, params.attitude, params.input, *[NEIGHBOUR] * (NEIGHBOUR in log))
+def flying(
+    log: FlightLog, params: QuadrotorParams, driving: Sequence[str]
+) -> Iterator[tuple[float, np.ndarray]]:
+    """Yield start [s] and held inputs of each window in which the vehicle flies and no channel of
+    ``driving`` has a large gap.
+    """
     driven = [log[name] for name in driving]
     first = max(c.time[0] for c in driven)
     last = min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
-    starts = starts[
-        :: max(1, len(starts) // (4 * params.most_windows))
-    ]  # hours are thinned before they are cut
-    begins = (
-        float(start)
-        for start in starts
-        if all(covered(c, start, start + params.window) for c in driven)
-    )
-    windows = (_window(log, number, params, channels, sigma, start) for start in begins)
-    return [stretch for stretch in windows if stretch is not None]
+    # hours are thinned before they are cut
+    stride = max(1, len(starts) // (4 * params.most_windows))
+    for start in starts[::stride].tolist():
+        if all(covered(c, start, start + params.window) for c in driven):
+            inputs = held_inputs(log[params.input], params, start)
+            if flies(inputs, params):
+                yield start, inputs
+
+
+def common(
+    log: FlightLog, params: QuadrotorParams, start: float, inputs: np.ndarray
+) -> dict[str, Any]:
+    """Return what the motors of a window need."""
+    middle = np.array([start + 0.5 * params.window])
+    volts = log["battery_voltage"].hold(middle)[0] if "battery_voltage" in log else 0.0
+    since = start - float(log[params.input].time[0])
+    return {"start": start, "input": inputs, "volts": float(volts), "since": since}
+
+
+def during(channel: Channel, params: QuadrotorParams, start: float) -> tuple[np.ndarray, ...]:
+    """Return stamps and values of a channel's samples in a window."""
+    inside = (channel.time >= start) & (channel.time < start + params.window)
+    rows = np.flatnonzero(channel.valid & inside)[:: params.every]
+    return channel.time[rows], channel.values[rows].astype(float)
+
+
+def windows_of(
+    log: FlightLog,
+    number: int,
+    params: FlyerParams,
+    channels: Sequence[str],
+    blocks: Sequence[int],
+) -> list[Stretch]:
+    """Cut a log, the flight of a number, into windows that fly.
+
+    ``blocks``: numbers of the latent blocks.
+    """
+    # no less is believed
+    sigma = [sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels]
+    driving = (params.position, params.attitude, params.input, *[NEIGHBOUR] * (NEIGHBOUR in log))
+    margin = spare(params.step)
+    halves = np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
+    stretches = []
+    for start, inputs in flying(log, params, driving):
+        rows = [during(log[name], params, start) for name in channels]
+        if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
+            continue
+        times = start + 0.5 * params.step * halves
+        rot = _attitudes(log[params.attitude], times)
+        guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
+        data = common(log, params, start, inputs) | {
+            "rot": rot,
+            "direction": direction,
+            "lean": _lean(log, params.attitude, params.estimator_rate, times),
+        }
+        if NEIGHBOUR in log:
+            data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
+        tables = [(*row, sd) for row, sd in zip(rows, sigma)]
+        layout = latent_layout(start, start + params.window, KNOTS, blocks)
+        stretches.append(Stretch.laid_out(number, "flight", tables, data, layout, guess, spread))
+    return stretches
 
 
 def covered(channel: Channel, start: float, end: float) -> bool:
     """Whether a channel has no large gap between two times."""
     stamps = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
-    return (
-        len(stamps) > 5
-        and float(np.max(np.diff(np.concatenate([[start], stamps, [end]])))) < _MOST_MISSING
-    )
-
-
-def _window(log, number: int, params: FlyerParams, channels, sigma, start: float) -> Stretch | None:
-    end = start + params.window
-    rows = []
-    for channel in (log[name] for name in channels):
-        samples = np.flatnonzero(channel.valid & (channel.time >= start) & (channel.time < end))[
-            :: params.every
-        ]
-        rows.append((channel.time[samples], channel.values[samples].astype(float)))
-    if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
-        return None
-    inputs = held_inputs(log[params.input], params, start)
-    if not flies(inputs, params):
-        return None
-    margin = spare(params.step)
-    halves = start + 0.5 * params.step * np.arange(
-        -margin, 2 * round(params.window / params.step) + 1 + margin
-    )
-    volts = (
-        log["battery_voltage"].hold(np.array([start + 0.5 * params.window]))[0]
-        if "battery_voltage" in log
-        else 0.0
-    )
-    rot = _attitudes(log[params.attitude], halves)
-    guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
-    blocks = [
-        0,
-        *([2] if params.cable is not None else []),
-        *([1] if params.torque is not None else []),
-    ]
-    return Stretch.laid_out(
-        number,
-        "flight",
-        [(time, values, sigma[name]) for name, (time, values) in zip(channels, rows)],
-        {
-            "start": start,
-            "rot": rot,
-            "input": inputs,
-            "volts": float(volts),
-            "direction": direction,
-            "lean": _lean(log, params.attitude, params.estimator_rate, halves),
-            "neighbour": (on_grid(*log[NEIGHBOUR].samples(), halves) if NEIGHBOUR in log else None),
-            "since": start - float(log[params.input].time[0]),
-        },
-        latent_layout(start, end, KNOTS, blocks),
-        guess,
-        spread,
-    )
+    gaps = np.diff(np.concatenate([[start], stamps, [end]]))
+    return len(stamps) > 5 and float(np.max(gaps)) < _MOST_MISSING
 
 
 def flies(inputs: np.ndarray, params: QuadrotorParams) -> bool:

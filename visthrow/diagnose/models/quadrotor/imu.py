@@ -4,7 +4,7 @@ accelerometer and gyro.
 Force along the rotors' axis and body rates tell the motors' lag, the thrust map's shape and ratios
 of torque to inertia. An accelerometer's offset hides the map's scale."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,16 +12,15 @@ import numpy as np
 
 from visthrow.diagnose.models.numeric import (
     Lanes,
-    NumericModel,
     Stretch,
     integrate,
     latent_force,
     latent_layout,
     sigma_of,
 )
-from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
-from visthrow.diagnose.models.quadrotor.flyer_windows import KNOTS, covered, flies, held_inputs
+from visthrow.diagnose.models.quadrotor.flyer_windows import KNOTS, common, during, flying
 from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
 from visthrow.logs.flightlog import FlightLog
 
@@ -53,83 +52,60 @@ class ImuModel(FlyerModel):
     channels = CHANNELS
     lawless = "nothing tells the attitude and the velocity that a law is made of"
 
-    def __init__(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
-        """See the base class."""
+    def describe(self, logs: Sequence[FlightLog], params: ImuParams) -> None:
+        """See the base class; the gyro is left out where the motors do not tell what turns the
+        vehicle.
+        """
         self.needed = (params.input, *CHANNELS)
+        self.inputs = (params.input, *in_all(logs, "battery_voltage"))
         turned = [r for log in logs if (r := _turned(log, params)) is not None]
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
             self.channels = CHANNELS[:1]
             self.notes = (_why_not(turned, params.input),)
-        self.has_voltage = all("battery_voltage" in log for log in logs)
-        self.inputs = (params.input, *["battery_voltage"] * self.has_voltage)
-        NumericModel.__init__(self, logs, params)
-        self.steps = round(params.window / params.step)
-        inputs, self._volts, self._since = (
-            np.array([s.data[name] for s in self.stretches]) for name in ("input", "volts", "since")
-        )
-        self._commanded = params.thrust(inputs)
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
         p = self.params
-        driven = [log[name] for name in self.needed]
-        first = max(c.time[0] for c in driven)
-        last = min(c.time[-1] for c in driven)
         sigma = [sigma_of(log[name], floor) for name, floor in zip(CHANNELS, QUIETEST)]
         stretches = []
-        for start in np.arange(first + p.window, last - p.window, p.window):
-            end = start + p.window
-            if not all(covered(c, start, end) for c in driven):
-                continue
-            inputs = held_inputs(log[p.input], p, start)
-            if not flies(inputs, p):
-                continue
-            acc, rate = (
-                log[name].only((log[name].time >= start) & (log[name].time < end)).samples()
-                for name in CHANNELS
-            )
-            samples = [
-                (time[:: p.every], values[:: p.every, part].astype(float), noise[part])
-                for (time, values), noise, part in zip((acc, rate), sigma, (slice(2, 3), slice(3)))
-            ]
-            volts = log["battery_voltage"].hold(np.array([end]))[0] if self.has_voltage else 0.0
-            data = {"start": start, "input": inputs, "volts": float(volts)}
-            data["since"] = start - float(log[p.input].time[0])
-            layout = latent_layout(start, end, KNOTS, (0, 1))
-            guess = [*samples[1][1][0], 0.0]
-            samples = samples[: len(self.channels)]
-            spread = [1.0, 1.0, 1.0, OFFSET]
-            stretches.append(
-                Stretch.laid_out(number, "flight", samples, data, layout, guess, spread)
-            )
+        for start, inputs in flying(log, p, self.needed):
+            (time, acc), (gyro_time, rate) = (during(log[n], p, start) for n in CHANNELS)
+            tables = [(time, acc[:, 2:], sigma[0][2:]), (gyro_time, rate, sigma[1])]
+            data = common(log, p, start, inputs)
+            layout = latent_layout(start, start + p.window, KNOTS, self.blocks)
+            begin = [*rate[0], 0.0], [1.0, 1.0, 1.0, OFFSET]
+            tables = tables[: len(self.channels)]
+            stretches.append(Stretch.laid_out(number, "flight", tables, data, layout, *begin))
         return stretches
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the state: body rates, and behind them the force along the rotors'
         axis over the mass [m/s^2], with the accelerometer's offset.
         """
-        p = self.params
         thrust = self._thrusts(lanes)
-        latent = latent_force(lanes.latent, self.steps, 2)
-        turning: Callable = self._turning(lanes, thrust)
+        latent = latent_force(lanes.latent, self.steps, len(self.blocks))
+        turning = self._turning(lanes, thrust)
 
         def slope(half: int, rate: np.ndarray) -> np.ndarray:
-            return turning(half, rate, latent[half, 1])
+            return turning(half, rate, latent[half, -1])
 
-        step = np.full((len(lanes.owner), 1), p.step)
-        rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
-        push = (thrust.sum(2) + latent[:, 0, :, 2])[::2].T / p.mass + lanes.nuisance[:, 3:]
-        return np.concatenate([rates, push[..., None]], 2)
+        step = np.full((len(lanes.owner), 1), self.params.step)
+        rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
+        if "rate_b" in self.channels:
+            rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
+        push = (thrust.sum(2) + latent[:, 0, :, 2])[::2].T / self.params.mass
+        return np.concatenate([rates, (push + lanes.nuisance[:, 3:])[..., None]], 2)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         grid = stretch.data["start"] + self.params.step * np.arange(path.shape[1])
         out = np.empty((len(path), len(stretch.time)))
-        for channel, part in enumerate((slice(3, 4), slice(3))[: len(self.channels)]):
+        parts = {"acc_b": path[..., 3:], "rate_b": path[..., :3]}
+        for channel, name in enumerate(self.channels):
             rows = stretch.channel == channel
-            width = part.stop - (part.start or 0)
-            time = stretch.time[rows][::width]
-            values = [on_grid(grid, states[:, part], time) for states in path]
+            states = parts[name]
+            time = stretch.time[rows][:: states.shape[2]]
+            values = [on_grid(grid, lane, time) for lane in states]
             out[:, rows] = np.reshape(values, (len(path), -1))
         return out
 
