@@ -96,6 +96,18 @@ def test_silent_at_the_truth(planted):
     assert sum(np.sum(r**2) for r in right) < sum(np.sum(r**2) for r in wrong)
 
 
+def test_commands_of_another_unit_are_no_error(planted):
+    """Thrust in grams throws the vehicle out of the room: no window is followed, and none raises."""
+    logs, _ = planted
+    wrong = []
+    for log in logs:
+        command = log["command"]
+        values = command.values * [101.97, 1.0, 1.0, 1.0]
+        wrong.append(FlightLog({**log.channels, "command": replace(command, values=values)}))
+    windows = ThrowModel(wrong, paper_plant(), only=["mass_quad"]).windows({})
+    assert max(np.abs(w.residual).max() for w in windows) > 100.0
+
+
 def test_derivatives_are_derivatives(planted):
     """Central differences of the residuals, with a step four times that of the columns: commands'
     switches make kinks.

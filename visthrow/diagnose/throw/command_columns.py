@@ -77,9 +77,5 @@ def _flown(
             for row, number in zip(resume, skip)
         ]
         rows_kept += int(flights.knots[w])
-    measured = flights.fly(simulation, states, lanes).seen
-    columns = []
-    for w, numbers in commands.items():
-        part = measured[: int(flights.rows[w]), first[w] : first[w] + len(numbers) + 1]
-        columns.append(np.moveaxis(part[:, 1:] - part[:, :1], 1, 2).reshape(-1, len(numbers)))
-    return columns
+    seen = flights.fly(simulation, states, lanes).seen
+    return [flights.differences(seen, w, first[w], len(commands[w])) for w in commands]

@@ -43,6 +43,8 @@ GROWTH = (
     0.5,
 )  # powers of the time that they have had: forces act as noise, attitude and rate are controlled
 HUBER = 30.0  # deviations, beyond which a sample counts less
+# deviations, beyond which no step leads back: a simulation that ran away
+FARTHEST = 1e9
 SETTLED = 1.0, 0.01  # fall of the cost, and relative one, below which an initial state is settled
 TRUE = 0.5  # of what it promised, which a step must bring for derivatives to be used further
 ONWARD = 0.1  # flown after the last sample that depends on the start: sensors may be early [s]
@@ -96,10 +98,11 @@ class _WindowFit:
             self.stale = False
 
     def cost_of(self, residual: np.ndarray) -> float:
-        """Huber's cost of a residual; infinite where it is not finite."""
+        """Huber's cost of a residual; infinite where it leads nowhere."""
         off = np.abs(residual) / self.spread
-        cost = float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
-        return cost if np.isfinite(cost) else np.inf
+        if not np.all(off < FARTHEST):
+            return np.inf
+        return float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
 
     def increment(self, done: np.ndarray) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the
@@ -195,7 +198,10 @@ class InitialFit:
         flown = self._residuals(rows_of(states, _numbers(remaining)), remaining)
         for fit, residual in zip(remaining, flown):
             fit.begin(residual, (slopes or {}).get(fit.number))
+        remaining = [fit for fit in remaining if np.isfinite(fit.cost)]
         for _ in range(ROUNDS):
+            if not remaining:
+                break
             self._take_slopes(states, [fit for fit in remaining if fit.stale])
             rows = _numbers(remaining)
             done = states[MOVED][rows]
@@ -207,8 +213,6 @@ class InitialFit:
             for name, value in states.items():
                 value[rows[helps]] = trial[name][helps]
             remaining = [fit for fit in remaining if fit.goes_on]
-            if not remaining:
-                break
         return states
 
     def _residuals(self, states: States, fits: Sequence[_WindowFit]) -> list[np.ndarray]:
@@ -235,11 +239,9 @@ class InitialFit:
         measured = self.flights.fly(self.simulation, moved, lanes, self._shortened).seen
         first = 0
         for fit in fits:
-            rows = int(self.flights.rows[fit.number])
-            lanes_of = measured[:rows, first : first + 1 + len(fit.free)]
-            flat = np.swapaxes(lanes_of, 1, 2).reshape(3 * rows, -1)
             steps = np.array([self.directions[d].step for d in fit.free])
-            fit.slopes = (flat[:, 1:] - flat[:, :1]) / steps * fit.sensitive[:, None]
+            change = self.flights.differences(measured, fit.number, first, len(steps))
+            fit.slopes = change / steps * fit.sensitive[:, None]
             fit.aged = False
             first += 1 + len(fit.free)
 

@@ -11,13 +11,13 @@ from functools import partial
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
+from visthrow.diagnose.models.law_terms import KnotValues
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
 from visthrow.diagnose.throw.recorded_flight import NEVER
@@ -270,11 +270,9 @@ def at_knots(
             if not name.startswith("payload") and name != "tension"
         }
     arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
-    reach = (
-        values["payload_pos_w"] - values["pos_w"] - Rotation.from_quat(values["quat_wb"]).apply(arm)
-    )
-    values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
     values["mount_b"] = np.tile(arm, (len(time), 1))
+    reach = KnotValues(values)["reach_w"]
+    values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)
     f = flights.flights[c.flight]
     if f.latch != NEVER:
         values["tension"][values["time"] > f.latch + setting.plant.release.lag] = 0.0

@@ -236,6 +236,15 @@ class ReplayedFlights:
         """
         return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
 
+    def differences(self, seen: np.ndarray, w: int, first: int, count: int) -> np.ndarray:
+        """Return what ``count`` lanes of a window saw, less what the lane before them saw, shape
+        (N, count).
+
+        ``seen``: by all lanes; ``first``: number of the lane before."""
+        rows = int(self.rows[w])
+        lanes = np.swapaxes(seen[:rows, first : first + 1 + count], 1, 2).reshape(3 * rows, -1)
+        return lanes[:, 1:] - lanes[:, :1]
+
     def fly(
         self,
         simulation: Simulation,
