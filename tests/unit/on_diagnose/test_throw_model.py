@@ -97,7 +97,7 @@ def test_silent_at_the_truth(planted):
 
 
 def test_commands_of_another_unit_are_no_error(planted):
-    """Thrust in grams throws the vehicle out of the room: no window is followed, and none raises."""
+    """Thrust in grams throws the vehicle out of the room: no window raises an error."""
     logs, _ = planted
     wrong = []
     for log in logs:

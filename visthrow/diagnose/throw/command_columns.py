@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from visthrow.diagnose.models.quadrotor.flyer_windows import acting
 from visthrow.diagnose.throw.initial_states import States
 from visthrow.diagnose.throw.replay import (
     BATCH,
@@ -45,10 +46,7 @@ def _acting(flights: ReplayedFlights, w: int, delay: float) -> np.ndarray:
     """Numbers of the commands that act in a window and differ from the one before."""
     c = flights.cuts[w]
     f = flights.flights[c.flight]
-    acts = f.command_time + delay
-    during = (np.append(acts[1:], np.inf) > c.start) & (acts < c.end)
-    changed = np.append(False, np.any(np.diff(f.command, axis=0) != 0.0, axis=1))
-    return np.flatnonzero(during & changed)
+    return acting(f.command_time, f.command, delay, c.start, c.end)
 
 
 def _flown(
@@ -69,7 +67,7 @@ def _flown(
         acts = acts + simulation.settings[0].plant.vehicle.queue.delay
         last = flights.knots[w] - 2  # behind it is the end
         resume = rows_kept + np.clip((acts - c.start) // KNOT_SPACING, 0, last).astype(int)
-        skip = flights.windows["command_first"][w] + numbers
+        skip = flights.first_command[c.flight] + numbers
         whole = first[w] = len(lanes)
         lanes.append(Lane(w, 0, w, keep=rows_kept, rough=True))
         lanes += [

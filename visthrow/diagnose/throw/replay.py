@@ -30,6 +30,7 @@ from visthrow.diagnose.throw.recorded_flight import (
 
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
+LATEST = 1.0  # by which commands may be late or early [s]; a window reads no others
 FINENESS = {"throw": 0.25}  # step in a phase against the one asked for: the rope whips in throws
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
 # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
@@ -133,7 +134,7 @@ class ReplayedFlights:
 
     Attributes:
         cuts: the windows. knots: of each window, shape (W,). rows: of output of each window, in
-            vectors. recording: for a replay.
+            vectors. recording: for a replay. first_command: number of each flight's first.
         time: stamps of each window's samples [s], shape (N,). sigma: their noise.
     """
 
@@ -151,6 +152,8 @@ class ReplayedFlights:
         self.cuts = list(cuts)
         spans = np.array([c.end - c.start for c in cuts])
         self.knots = np.ceil(spans / KNOT_SPACING - 1e-6).astype(int) + 1
+        counts = [len(f.command_time) for f in self.flights]
+        self.first_command = np.cumsum(counts) - counts
         self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
         self.samples = [self._samples_in(c, delays) for c in self.cuts]
         rows = [self._row(w) for w in range(len(self.cuts))]
@@ -205,7 +208,9 @@ class ReplayedFlights:
         c = self.cuts[w]
         f = self.flights[c.flight]
         vehicle, _, payload, gyro = self.samples[w]
-        before = sum(len(flight.command_time) for flight in self.flights[: c.flight])
+        reach = c.start - LATEST, c.end + LATEST
+        first, last = np.searchsorted(f.command_time, reach) + [-1, 1]
+        commands = np.clip([first, last], 0, len(f.command_time)) + self.first_command[c.flight]
         return {
             "start": c.start,
             "end": c.end,
@@ -214,8 +219,8 @@ class ReplayedFlights:
             "payload": c.payload,
             "latch": f.latch if c.payload == ATTACHED else NEVER,
             "clock_zero": f.start,
-            "command_first": before,
-            "command_last": before + len(f.command_time),
+            "command_first": commands[0],
+            "command_last": commands[1],
             "vehicle_count": len(vehicle.time),
             "payload_count": len(payload.time),
             "gyro_count": len(gyro.time),

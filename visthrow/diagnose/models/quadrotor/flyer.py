@@ -6,6 +6,8 @@ alone, whatever controller flies; where each motor's command is logged, the rate
 controller has to be known."""
 
 from collections.abc import Callable, Container, Mapping, Sequence
+from copy import copy
+from dataclasses import replace
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
@@ -33,6 +35,7 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
     expect_thrust,
     spare,
     windows_of,
+    without_each,
 )
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
@@ -250,6 +253,29 @@ class FlyerModel(NumericModel):
                 )
             out[:, rows] = pos.reshape(len(path), -1)
         return out
+
+    def without_commands(
+        self, theta: Mapping[str, float], windows: Sequence[int]
+    ) -> list[np.ndarray]:
+        """See the base class; commands that an autopilot logs of its own motors all came."""
+        if self.params.input != "command":
+            return []
+        return [self._without_each(self.size(theta), i) for i in windows]
+
+    def _without_each(self, size: np.ndarray, i: int) -> np.ndarray:
+        """Return the change of a window's samples by each command that does not come, shape
+        (N, T).
+        """
+        stretch = self.stretches[i]
+        data = stretch.data
+        inputs = [data["input"], *without_each(data["sent"], self.params, data["start"])]
+        model = copy(self)
+        model._commanded = self.params.thrust(np.array(inputs))
+        one = self._lanes(size).part(np.full(len(inputs), i))
+        model._data = {name: values[one.owner] for name, values in self._data.items()}
+        lanes = replace(one, owner=np.arange(len(inputs)))
+        seen = self.measure(stretch, model.simulate(lanes), lanes)
+        return (seen[1:] - seen[:1]).T
 
     def _mount(self, rot: np.ndarray) -> np.ndarray:
         """Return where the cable is attached, from the centre of mass, the velocity and the

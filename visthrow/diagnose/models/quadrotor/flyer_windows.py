@@ -107,6 +107,7 @@ def windows_of(
             "rot": rot,
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, times),
+            "sent": log[params.input],
         }
         if NEIGHBOUR in log:
             data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
@@ -150,6 +151,30 @@ def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.n
         [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)]
     )
     return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
+
+
+def acting(
+    time: np.ndarray, values: np.ndarray, delay: float, start: float, end: float
+) -> np.ndarray:
+    """Return the numbers of the commands that act between two times and differ from the one before.
+
+    ``time``: of the commands, shape (C,); ``values``: shape (C, N); ``delay``: to their acting."""
+    acts = time + delay
+    during = (np.append(acts[1:], np.inf) > start) & (acts < end)
+    changed = np.append(False, np.any(np.diff(values, axis=0) != 0.0, axis=1))
+    return np.flatnonzero(during & changed)
+
+
+def without_each(channel: Channel, params: FlyerParams, start: float) -> list[np.ndarray]:
+    """Return a window's held inputs without each command that acts in it: the one before stays."""
+    time, values = channel.samples()
+    inputs = []
+    thrusts = values[:, :1]
+    for k in acting(time, thrusts, params.command_delay, start, start + params.window):
+        held = values.copy()
+        held[k] = held[k - 1]
+        inputs.append(held_inputs(Channel(time, held, channel.unit), params, start))
+    return inputs
 
 
 def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
