@@ -110,6 +110,8 @@ class _WindowFit:
 
         ``done``: how far the state has been moved, shape (directions,)."""
         scaled = self.slopes * self.sd / self.spread[:, None]
+        if not np.all(np.abs(scaled) < FARTHEST):
+            return np.zeros(len(done)), 0.0
         off = self.residual / self.spread
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), 1e-12))
         bend = scaled.T @ (scaled * weight[:, None])
