@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from visthrow.diagnose.models.quadrotor.flyer_windows import acting
+from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
 from visthrow.diagnose.throw.initial_states import States
 from visthrow.diagnose.throw.replay import (
     BATCH,
@@ -46,7 +46,7 @@ def _acting(flights: ReplayedFlights, w: int, delay: float) -> np.ndarray:
     """Numbers of the commands that act in a window and differ from the one before."""
     c = flights.cuts[w]
     f = flights.flights[c.flight]
-    return acting(f.command_time, f.command, delay, c.start, c.end)
+    return find_acting(f.command_time, f.command, delay, c.start, c.end)
 
 
 def _flown(

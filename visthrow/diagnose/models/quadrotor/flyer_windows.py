@@ -43,7 +43,7 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
         )
 
 
-def flying(
+def cut_flying(
     log: FlightLog, params: QuadrotorParams, driving: Sequence[str]
 ) -> Iterator[tuple[float, np.ndarray]]:
     """Yield start [s] and held inputs of each window in which the vehicle flies and no channel of
@@ -62,7 +62,7 @@ def flying(
                 yield start, inputs
 
 
-def common(
+def read_common(
     log: FlightLog, params: QuadrotorParams, start: float, inputs: np.ndarray
 ) -> dict[str, Any]:
     """Return what the motors of a window need."""
@@ -72,7 +72,7 @@ def common(
     return {"start": start, "input": inputs, "volts": float(volts), "since": since}
 
 
-def during(channel: Channel, params: QuadrotorParams, start: float) -> tuple[np.ndarray, ...]:
+def take_samples(channel: Channel, params: QuadrotorParams, start: float) -> tuple[np.ndarray, ...]:
     """Return stamps and values of a channel's samples in a window."""
     inside = (channel.time >= start) & (channel.time < start + params.window)
     rows = np.flatnonzero(channel.valid & inside)[:: params.every]
@@ -96,14 +96,14 @@ def windows_of(
     margin = spare(params.step)
     halves = np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
     stretches = []
-    for start, inputs in flying(log, params, driving):
-        rows = [during(log[name], params, start) for name in channels]
+    for start, inputs in cut_flying(log, params, driving):
+        rows = [take_samples(log[name], params, start) for name in channels]
         if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
             continue
         times = start + 0.5 * params.step * halves
         rot = _attitudes(log[params.attitude], times)
         guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
-        data = common(log, params, start, inputs) | {
+        data = read_common(log, params, start, inputs) | {
             "rot": rot,
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, times),
@@ -153,7 +153,7 @@ def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.n
     return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
 
 
-def acting(
+def find_acting(
     time: np.ndarray, values: np.ndarray, delay: float, start: float, end: float
 ) -> np.ndarray:
     """Return the numbers of the commands that act between two times and differ from the one before.
@@ -170,10 +170,10 @@ def without_each(channel: Channel, params: FlyerParams, start: float) -> list[np
     time, values = channel.samples()
     inputs = []
     thrusts = values[:, :1]
-    for k in acting(time, thrusts, params.command_delay, start, start + params.window):
-        held = values.copy()
-        held[k] = held[k - 1]
-        inputs.append(held_inputs(Channel(time, held, channel.unit), params, start))
+    for k in find_acting(time, thrusts, params.command_delay, start, start + params.window):
+        repeated = values.copy()
+        repeated[k] = values[k - 1]
+        inputs.append(held_inputs(Channel(time, repeated, channel.unit), params, start))
     return inputs
 
 

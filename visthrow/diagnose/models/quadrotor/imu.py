@@ -20,7 +20,12 @@ from visthrow.diagnose.models.numeric import (
 )
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
-from visthrow.diagnose.models.quadrotor.flyer_windows import KNOTS, common, during, flying
+from visthrow.diagnose.models.quadrotor.flyer_windows import (
+    KNOTS,
+    cut_flying,
+    read_common,
+    take_samples,
+)
 from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
 from visthrow.logs.flightlog import FlightLog
 
@@ -68,10 +73,10 @@ class ImuModel(FlyerModel):
         p = self.params
         sigma = [sigma_of(log[name], floor) for name, floor in zip(CHANNELS, QUIETEST)]
         stretches = []
-        for start, inputs in flying(log, p, self.needed):
-            (time, acc), (gyro_time, rate) = (during(log[n], p, start) for n in CHANNELS)
+        for start, inputs in cut_flying(log, p, self.needed):
+            (time, acc), (gyro_time, rate) = (take_samples(log[n], p, start) for n in CHANNELS)
             tables = [(time, acc[:, 2:], sigma[0][2:]), (gyro_time, rate, sigma[1])]
-            data = common(log, p, start, inputs)
+            data = read_common(log, p, start, inputs)
             layout = latent_layout(start, start + p.window, KNOTS, self.blocks)
             begin = [*rate[0], 0.0], [1.0, 1.0, 1.0, OFFSET]
             tables = tables[: len(self.channels)]
