@@ -98,17 +98,7 @@ class ThrowModel(Model):
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
         carries = any(hangs)
-        release = (plant.release.lag, plant.release.landing_height)
-        all_cuts = [c for i, f in enumerate(flights) for c in cut(f, i, *release, hangs[i])]
-        cuts = thinned(all_cuts, flights)
-        if len(cuts) < len(all_cuts):
-            self.notes = (f"long flights: {len(cuts)} of {len(all_cuts)} windows are looked at",)
-        if not cuts:
-            raise DiagnoseError(
-                f"{len(flights)} flights hold no stretch of poses and commands long enough to"
-                " replay"
-            )
-        states = self._settled_without_slack(flights, cuts)
+        states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
         self.channels = [*_measured(flights, carries), *(kind.channel for kind in self._direct)]
@@ -124,6 +114,21 @@ class ThrowModel(Model):
         self._latest[frozenset()] = begun, self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
+
+    def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
+        """Cut flights into windows, fewer of long flights."""
+        release = self.setting.plant.release
+        known = release.lag, release.landing_height
+        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, *known, hangs[i])]
+        if not cuts:
+            raise DiagnoseError(
+                f"{len(flights)} flights hold no stretch of poses and commands long enough to"
+                " replay"
+            )
+        chosen = thinned(cuts, flights)
+        if len(chosen) < len(cuts):
+            self.notes = (f"long flights: {len(chosen)} of {len(cuts)} windows are looked at",)
+        return chosen
 
     def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
         """Return these windows of flights, in the time of their sensors."""
