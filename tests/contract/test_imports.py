@@ -5,7 +5,6 @@ installed.
 import ast
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Iterable
 from functools import cache
@@ -14,8 +13,10 @@ from pathlib import Path
 from pytest import mark
 
 from sim.solvers import SOLVERS
+from tests.commands import run_python
 
 ROOT = Path(__file__).resolve().parents[2]
+OURS = {**os.environ, "PYTHONPATH": str(ROOT)}
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 ONBOARD = (
@@ -135,9 +136,7 @@ trainer.EVALUATED = 4
 for words in {commands!r}:
     assert main(words.split()) == 0, words
 """
-    run = [sys.executable, "-c", code]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    result = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    result = run_python("-c", code, cwd=tmp_path, env=OURS)
     assert result.returncode == 0, result.stderr
 
 
@@ -160,9 +159,7 @@ for words, extra in {refused!r}.items():
         assert main(words.split()) == 2, words
     assert f"pip install 'visthrow[{{extra}}]'" in text.getvalue(), (words, text.getvalue())
 """
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    run = [sys.executable, "-c", code]
-    result = subprocess.run(run, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    result = run_python("-c", code, cwd=tmp_path, env=OURS)
     assert result.returncode == 0, result.stderr
 
 
@@ -185,7 +182,7 @@ try:
 except ImportError:
     print("done")
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    result = run_python("-c", code, cwd=ROOT)
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == ["done"], "the blocker itself must work"
     assert len(names) > len(ONBOARD)

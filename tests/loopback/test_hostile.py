@@ -6,7 +6,6 @@ import os
 import resource
 import signal
 import subprocess
-import sys
 import time
 
 from numpy.random import default_rng
@@ -15,6 +14,7 @@ from pytest import mark
 from bench.processes import free_port
 from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
+from tests.commands import start
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
 from tests.hil_flight import AutoOperator, simple_policy
 from tests.level import LevelPlant
@@ -220,21 +220,9 @@ def test_a_million_forged_packets_change_no_bit_of_a_throw(seed):
 
 def test_the_start_is_quick_and_ctrl_c_ends_a_waiting_run(tmp_path):
     device = f'link.device="udp:127.0.0.1:{free_port()}"'
-    command = [
-        sys.executable,
-        "-m",
-        "visthrow.cli",
-        "hil",
-        "run",
-        "--set",
-        device,
-        "--out",
-        str(tmp_path / "run"),
-    ]
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "stdin": subprocess.DEVNULL}
+    process = start(f"hil run --out {tmp_path}/run --set", device, **pipes)
     try:
         assert process.stderr.readline().startswith("ready after")
         time.sleep(0.3)

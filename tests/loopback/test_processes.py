@@ -11,7 +11,6 @@ import resource
 import signal
 import socket
 import subprocess
-import sys
 import termios
 import time
 
@@ -20,7 +19,7 @@ from pytest import fixture, mark
 
 from bench.processes import free_port
 from hil.control.recording.playback import replay
-from tests.commands import set_words
+from tests.commands import set_words, start
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
@@ -28,7 +27,6 @@ from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.throw=30.0")
-COMMAND = [sys.executable, "-m", "visthrow.cli", "hil"]
 PATIENCE = 120.0
 """For anything to happen on a busy machine [s]."""
 
@@ -70,13 +68,15 @@ class Pair:
             self._start_fake(kind, plant)
 
     def _start_fake(self, kind, plant):
-        words = f"fake --kind {KINDS[kind]} --device udpout:{self.device} --msp-port {self.msp}"
+        words = f"hil fake --kind {KINDS[kind]} --device udpout:{self.device} --msp-port {self.msp}"
         words += " --seconds 300 --after 1.5 --out"
-        self.fake = subprocess.Popen(
-            [*COMMAND, *words.split(), self.folder / "fake.json", *plant, *self.both],
+        self.fake = start(
+            words,
+            self.folder / "fake.json",
+            *plant,
+            *self.both,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            text=True,
         )
         assert "flies" in self.fake.stderr.readline()
 
@@ -86,13 +86,9 @@ class Pair:
             f'betaflight.device="tcp:127.0.0.1:{self.msp}"',
             f'policy="{policy}"',
         ]
-        words = f"run --config {CONFIGS[kind]} --auto-arm --out".split()
+        words = f"hil run --config {CONFIGS[kind]} --auto-arm --out"
         more = (*self.both, *set_words((*sets, *overrides)))
-        self.runner = subprocess.Popen(
-            [*COMMAND, *words, self.folder / "run", *more],
-            **self._streams(),
-            text=True,
-        )
+        self.runner = start(words, self.folder / "run", *more, **self._streams())
         if self.terminal is None:
             assert self.runner.stderr.readline().startswith("ready after")
         else:

@@ -30,6 +30,7 @@ from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
 from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
+from tests.commands import set_words, start
 from tests.configs import load_run
 from tests.loopback import test_endings as endings
 from visthrow.onboard.policy import Policy, find_policy
@@ -369,10 +370,6 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
         assert low < run.heights["abort"] - 0.3, "a descent of 0.4 m/s, for 1.5 s"
 
 
-def visthrow(*words, **more):
-    return subprocess.Popen([sys.executable, "-m", "visthrow.cli", *words], text=True, **more)
-
-
 def wait_for(process, words):
     """Read what a process says up to a line with these words."""
     said = []
@@ -385,17 +382,16 @@ def wait_for(process, words):
 
 def bridged(folder, report, *more):
     """Start the firmware with the bridge to it."""
-    words = f"hil fake --kind betaflight-sitl --speed {SPEED}".split()
-    places = "--firmware", str(program()), "--folder", str(folder), "--out", str(report)
-    return visthrow(*words, *places, *more, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    words = f"hil fake --kind betaflight-sitl --speed {SPEED}"
+    places = "--firmware", program(), "--folder", folder, "--out", report
+    return start(words, *places, *more, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
 
 
 def running(folder, *overrides):
     """Start the runner."""
-    words = f"hil run --config betaflight_sitl --auto-arm --bare --speed {SPEED}".split()
-    sets = (word for text in overrides for word in ("--set", text))
+    words = f"hil run --config betaflight_sitl --auto-arm --bare --speed {SPEED} --out"
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    return visthrow(*words, "--out", str(folder), *sets, **pipes)
+    return start(words, folder, *set_words(overrides), **pipes)
 
 
 def test_a_whole_throw(tmp_path):

@@ -6,12 +6,12 @@ Tiny networks.
 import os
 import signal
 import subprocess
-import sys
 import time
 
 import numpy as np
 from pytest import fixture, importorskip, mark
 
+from tests.commands import start
 from visthrow.onboard.policy import Policy
 from visthrow.paper.sweep.sweep_record import collect, status
 from visthrow.paper.sweep.work_units import load_list
@@ -48,25 +48,10 @@ def path(tmp_path):
 
 
 def sweep(path, out, *extra):
-    words = [
-        sys.executable,
-        "-m",
-        "visthrow.cli",
-        "sweep",
-        "run",
-        path,
-        "--out",
-        str(out),
-        "--devices",
-        "cpu",
-        "--jobs",
-        "1",
-    ]
-    environment = {
-        **os.environ,
-        "OMP_NUM_THREADS": "1",
-    }  # the same bits need the same number of threads
-    return subprocess.Popen([*words, *extra], env=environment, start_new_session=True)
+    # The same bits need the same number of threads.
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    line = f"sweep run {path} --out {out} --devices cpu --jobs 1"
+    return start(line, *extra, env=environment, start_new_session=True)
 
 
 def wait_for(condition):

@@ -6,8 +6,6 @@ import argparse
 import json
 import math
 import shutil
-import subprocess
-import sys
 import threading
 import time
 from dataclasses import replace
@@ -25,6 +23,7 @@ from hil.control.recording.flightlogs import measured, read, throws
 from hil.control.recording.record import load_run
 from hil.control.recording.run_report import finish
 from hil.errors import RunError
+from tests.commands import run_python
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
 
@@ -246,8 +245,7 @@ def test_the_same_run_as_mcap(run, tmp_path, capsys):
 
 def stored_entities(path) -> str:
     """What rerun itself lists of a recording."""
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return run_python("-m", "rerun", "rrd", "print", path, check=True).stdout
 
 
 class Stream:

@@ -3,8 +3,6 @@
 import csv
 import importlib.util
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -15,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, importorskip, mark, raises
 
 from sim.params import GRAVITY
-from tests.commands import run_command
+from tests.commands import run_command, run_python
 from tests.configs import load_experiment
 from visthrow import config
 from visthrow.cli import compare
@@ -246,11 +244,7 @@ def test_fly_writes_its_files(dropper, tmp_path, capsys):
     assert load_policy(tmp_path / "saved.npz").policy.obs_dim == load_policy(dropper).policy.obs_dim
     assert "pos_w" in (tmp_path / "flight.csv").read_text().splitlines()[0]
     assert f"{result['error']:.3f} m from the target" in told
-    verified = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", "verify", str(out / "throw.rrd")],
-        capture_output=True,
-        text=True,
-    )
+    verified = run_python("-m", "rerun", "rrd", "verify", out / "throw.rrd")
     assert verified.returncode == 0, verified.stderr
 
 

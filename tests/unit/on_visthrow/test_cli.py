@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pytest import fixture, mark, raises
 
-from tests.commands import run_command
+from tests.commands import run_command, run_python, start
 from visthrow import cli
 from visthrow.common import arguments
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
@@ -26,10 +26,8 @@ runs counts.
 """
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess:
-    return subprocess.run(
-        [sys.executable, "-m", "visthrow.cli", *arguments], capture_output=True, text=True
-    )
+def run(*arguments: str, **options) -> subprocess.CompletedProcess:
+    return run_python("-m", "visthrow.cli", *arguments, **options)
 
 
 @fixture
@@ -68,14 +66,8 @@ def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
     there.
     """
     (tmp_path / "camera.py").write_text("")
-    words = [sys.executable, "-m", "visthrow.cli", "config", "camera", "fisheye"]
-    result = subprocess.run(
-        words,
-        capture_output=True,
-        text=True,
-        cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = run("config", "camera", "fisheye", cwd=tmp_path, env=environment)
     assert result.returncode == 2
     assert f"{tmp_path / 'camera.py'} hides visthrow's own package" in result.stderr
     assert "Traceback" not in result.stderr
@@ -86,9 +78,7 @@ def test_a_file_that_hides_a_package_of_ours_is_named(tmp_path):
 )
 def test_configurations_and_misspelt_names_import_neither_torch_nor_warp(does):
     code = f"import sys; from visthrow.cli import main; main({does}); print(*sys.modules)"
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True
-    )
+    result = run_python("-c", code, check=True)
     assert {"torch", "warp"}.isdisjoint(result.stdout.split())
 
 
@@ -134,9 +124,7 @@ def test_ctrl_c_is_status_130(command, capsys):
 
 def test_a_reader_that_goes_away_is_no_failure():
     """As in ``visthrow config train | head -1``."""
-    child = subprocess.Popen(
-        [sys.executable, "-m", "visthrow.cli", "config", "vehicle", "paper"], stdout=subprocess.PIPE
-    )
+    child = start("config vehicle paper", stdout=subprocess.PIPE)
     child.stdout.close()
     assert child.wait() == 0
 
