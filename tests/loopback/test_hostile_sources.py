@@ -19,16 +19,10 @@ from hil.poses.sources.motion_capture import (
 )
 from tests.fuzz import EACH, SEEDS, noise
 from tests.motive import FRAME, Motive, frame, message
+from tests.waiting import eventually
 
 IDS = (RigidBody("vehicle", "7"), RigidBody("payload", "8"))
 LEVEL, UNKNOWN = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 0.0)
-
-
-def eventually(condition):
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 @fixture

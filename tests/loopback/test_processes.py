@@ -23,6 +23,7 @@ from tests.commands import set_words, start
 from tests.fakes import KINDS
 from tests.hil_flight import simple_policy
 from tests.loopback.wire import CONFIGS
+from tests.waiting import eventually
 from visthrow.onboard.actions import hover_action
 
 HOVER = hover_action(9.81 * 0.272, 14.0)[0]
@@ -129,10 +130,8 @@ class Pair:
         """Until so many actions of the policy are recorded: on a busy machine most ticks are
         missed.
         """
-        end, path = time.monotonic() + PATIENCE, self.folder / "run" / "ticks.jsonl"
-        while sum('"action": [' in line for line in path.read_text().splitlines()) < count:
-            assert time.monotonic() < end, f"no {count} actions within {PATIENCE} s"
-            time.sleep(0.05)
+        path = self.folder / "run" / "ticks.jsonl"
+        eventually(lambda: path.read_text().count('"action": [') >= count, PATIENCE)
 
     def report(self, end=True) -> dict:
         """The fake's, when it has ended, by Ctrl-C or by itself."""

@@ -11,6 +11,7 @@ from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.crazyflie import Crazyflie
 from hil.links.mavlink_link import Link, LinkSync
+from hil.links.pymav import Parser, mav
 from hil.links.roster import Roster
 from hil.poses.sources.mavlink import MavlinkSource
 from hil.poses.sources.open_source import parties
@@ -35,6 +36,12 @@ QUICK = (
 
 HERE = ("127.0.0.1", 1)
 """Address of the other end."""
+
+
+def wired(message, system=1, component=1):
+    """A message as it comes out of the wire, with its sender."""
+    (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
+    return got
 
 
 class MemoryPort:

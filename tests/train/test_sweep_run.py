@@ -6,12 +6,12 @@ Tiny networks.
 import os
 import signal
 import subprocess
-import time
 
 import numpy as np
 from pytest import fixture, importorskip, mark
 
 from tests.commands import start
+from tests.waiting import eventually
 from visthrow.onboard.policy import Policy
 from visthrow.paper.sweep.sweep_record import collect, status
 from visthrow.paper.sweep.work_units import load_list
@@ -54,13 +54,6 @@ def sweep(path, out, *extra):
     return start(line, *extra, env=environment, start_new_session=True)
 
 
-def wait_for(condition):
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "nothing happened"
-        time.sleep(0.05)
-
-
 def rows(source, out):
     path = source.folder(out) / "progress.csv"
     return path.read_text().count("\n") - 1 if path.is_file() else 0
@@ -91,7 +84,7 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
     first, second = work.sources
 
     running = sweep(path, broken)
-    wait_for(lambda: rows(first, broken) >= 7)
+    eventually(lambda: rows(first, broken) >= 7, PATIENCE)
     for pid in [*children(running), running.pid]:
         os.kill(pid, signal.SIGKILL)
     running.wait()
@@ -100,14 +93,14 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
     running = sweep(
         path, broken
     )  # its children end by themselves, with a checkpoint, when it is gone
-    wait_for(lambda: rows(first, broken) >= 15)
+    eventually(lambda: rows(first, broken) >= 15, PATIENCE)
     orphans = children(running)
     running.kill()
     running.wait()
     assert orphans
     assert not status(work, broken)[1]
     running = sweep(path, broken)  # waits until the orphan has let go
-    wait_for(lambda: rows(second, broken) >= 5)
+    eventually(lambda: rows(second, broken) >= 5, PATIENCE)
     before = first.policy(broken).stat().st_mtime_ns
     running.send_signal(signal.SIGINT)
     assert running.wait(PATIENCE) == 130

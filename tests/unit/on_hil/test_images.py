@@ -4,7 +4,6 @@ runner, live and recorded.
 
 import json
 import math
-import time
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -35,6 +34,7 @@ from hil.poses.sources.images import (
 from tests.commands import run_command
 from tests.configs import load_run
 from tests.drawn import render_scene
+from tests.waiting import eventually
 from visthrow.common.errors import ConfigError
 
 SMALL = FisheyeParams(280, 280, 72.9, 72.9, 139.5, 139.5)
@@ -292,9 +292,7 @@ def test_a_live_camera_is_read_in_a_thread_of_its_own(pictures):
     eyes = LiveImages(
         ImageParams("camera", fisheye=SMALL, delay=0.02), training(), lambda: 7.0, capture
     )
-    deadline = time.monotonic() + 60.0
-    while eyes.failure is None and time.monotonic() < deadline:
-        time.sleep(0.01)
+    eventually(lambda: eyes.failure is not None, 60.0)
     (detection,) = eyes.poll(0.0)
     assert detection.stamp == approx(6.98)
     assert detection.ball is not None

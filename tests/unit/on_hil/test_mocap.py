@@ -21,6 +21,7 @@ from hil.poses.sources.motion_capture import (
     RigidBody,
 )
 from hil.poses.sources.open_source import open_mocap
+from tests.waiting import eventually
 
 BODIES = (RigidBody("vehicle", "quad"), RigidBody("payload", "ball"))
 PARAMS = MocapParams("vicon", "127.0.0.1", timeout=1.0)
@@ -42,13 +43,6 @@ class System:
     def waitForNextFrame(self):
         self.next.acquire()
         self.rigidBodies = next(self._frames)
-
-
-def eventually(condition):
-    deadline = time.monotonic() + 20.0
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 def test_rigid_bodies_by_name_from_a_thread_of_their_own():

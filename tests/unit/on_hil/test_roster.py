@@ -5,18 +5,14 @@ refused is counted and said.
 from pytest import mark, raises
 
 from hil.errors import LinkError
-from hil.links.pymav import Parser, mav
+from hil.links.pymav import mav
 from hil.links.roster import MOST_KEPT, SILENT, SIMULATED, Party, Roster, check_allowed
+from tests.loopback.wire import wired
 
 AUTOPILOT = Party("autopilot", 1, 1, autopilot=mav.MAV_AUTOPILOT_PX4)
 VEHICLE = Party("vehicle", 1, 1, frozenset({"ATT_POS_MOCAP"}))
 BALL = Party("payload", 42, 0, frozenset({"ODOMETRY"}))
 A, B, C = ("127.0.0.1", 1001), ("127.0.0.1", 1002), ("10.0.0.9", 14550)
-
-
-def wired(message, system=1, component=1):
-    (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
-    return got
 
 
 def beat(autopilot=mav.MAV_AUTOPILOT_PX4, **ids):

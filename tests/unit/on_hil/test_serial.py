@@ -13,6 +13,7 @@ from hil.links.backends.betaflight import Betaflight
 from hil.links.device import Device, SerialPort
 from hil.links.writer import HEAD, LoggedPort
 from tests.configs import load_run
+from tests.waiting import eventually
 from visthrow.common.errors import StorageError
 
 PARAMS = load_run("fake_betaflight", ["betaflight.audit=false"]).betaflight
@@ -35,15 +36,16 @@ def wire():
 
 
 def asked(controller, command):
-    """Whether a command comes to the flight controller."""
-    parser, end = msp.FrameParser(), time.monotonic() + 30.0
-    while time.monotonic() < end:
+    """Wait until a command comes to the flight controller."""
+    parser = msp.FrameParser()
+
+    def came():
         try:
-            if any(frame.command == command for frame in parser.parse(os.read(controller, 65536))):
-                return True
+            return any(f.command == command for f in parser.parse(os.read(controller, 65536)))
         except BlockingIOError:
-            time.sleep(0.005)
-    return False
+            return False
+
+    eventually(came)
 
 
 def serve(backend, now):
@@ -58,7 +60,7 @@ def test_a_back_end_on_a_serial_port(wire):
     backend = Betaflight(port, PARAMS)
     assert port.read() is None, "reading never waits"
     backend.service(0.0)
-    assert asked(controller, msp.STATUS)
+    asked(controller, msp.STATUS)
     assert not backend.status(0.1).connected
     answer = msp.pack(msp.Frame(msp.STATUS, STATUS, msp.ANSWER))
     os.write(controller, answer[:7])
@@ -78,7 +80,7 @@ def test_a_back_end_on_a_serial_port(wire):
     assert backend.status(0.35).connected
     backend.ask("follow", 0.4)
     assert backend.send((2.668, 0.0, 0.0, 0.0), 0.4)
-    assert asked(controller, msp.SET_RAW_RC)
+    asked(controller, msp.SET_RAW_RC)
 
 
 def read_log(path):

@@ -10,7 +10,7 @@ from pytest import approx, mark, raises
 
 from hil.errors import SourceError
 from hil.links.mavlink_link import Link
-from hil.links.pymav import Parser, mav
+from hil.links.pymav import mav
 from hil.links.roster import Party, Roster
 from hil.links.writer import TlogWriter
 from hil.poses.pose import Pose
@@ -18,17 +18,11 @@ from hil.poses.sources.mavlink import BodyIds, MavlinkDecoder, MavlinkSource
 from hil.poses.sources.player import read_table, read_tlog
 from hil.poses.sources.pose_source import RecordedSource
 from tests.configs import load_run
-from tests.loopback.wire import pipe
+from tests.loopback.wire import pipe, wired
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog
 
 BODIES = (BodyIds("vehicle", "ATT_POS_MOCAP", 1, 0), BodyIds("payload", "ODOMETRY", 2, 1))
-
-
-def wired(message, system=1, component=1):
-    """A message as it comes out of the wire, with its sender."""
-    (got,) = Parser().parse(message.pack(mav.MAVLink(None, system, component)))
-    return got
 
 
 def mocap(time_us=1_000_000, x=1.0):

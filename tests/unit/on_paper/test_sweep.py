@@ -6,12 +6,12 @@ import json
 import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
 
 from tests.commands import run_command
+from tests.waiting import eventually
 from visthrow import config
 from visthrow.common.errors import BusyError, ConfigError, StorageError
 from visthrow.common.storage import write_json
@@ -242,9 +242,7 @@ def test_a_lock_excludes_and_a_killed_process_does_not_hold_it(tmp_path):
             pass
         other.send_signal(signal.SIGKILL)
         other.wait()
-        end = time.monotonic() + 10.0
-        while held(path) and time.monotonic() < end:
-            time.sleep(0.05)
+        eventually(lambda: not held(path))
         with locked(path):
             assert held(path)
         assert not held(path)
