@@ -18,6 +18,7 @@ from tests.commands import run_python
 ROOT = Path(__file__).resolve().parents[2]
 OURS = {**os.environ, "PYTHONPATH": str(ROOT)}
 PACKAGES = ("camera", "sim", "visthrow", "hil")
+WORLDS = "bench/worlds"
 
 ONBOARD = (
     "visthrow.config",
@@ -41,7 +42,8 @@ BLOCKED_ON_BOARD = ("sim", "warp", "rsl_rl", "tensordict", "mujoco")
 
 def sources(place: str) -> list[Path]:
     """Return the modules whose path from the root begins as a pattern says."""
-    paths = [path for package in PACKAGES for path in sorted((ROOT / package).rglob("*.py"))]
+    folders = [ROOT / name for name in (*PACKAGES, WORLDS)]
+    paths = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
     return [path for path in paths if re.match(place, path.relative_to(ROOT).as_posix())]
 
 
@@ -75,8 +77,9 @@ RULES = [
     ("sim/(?!torch_bridge.py)", ("torch",), ()),
     ("sim/(?!reference/|solvers/)", ("mujoco",), ()),
     ("sim/reference/", ("warp",), ()),
-    # An oracle that called the simulator's code would agree with its mistakes.
+    # An oracle, or a world, that called the simulator's code would agree with its mistakes.
     ("sim/reference/", ("sim",), ("sim.reference", "sim.params")),
+    (WORLDS, (*PACKAGES, "bench"), ("bench.worlds",)),
     *[
         (room.replace(".", "/"), PACKAGES, ("camera", *ONBOARD, "visthrow.__version__"))
         for room in ONBOARD

@@ -11,10 +11,8 @@ from pytest import fixture, mark
 
 from bench.diagnose import cases
 from bench.diagnose.bad import BAD
-from bench.diagnose.degenerate import PAIRS, manoeuvre_of
+from bench.diagnose.degenerate import PAIRS
 from bench.worlds.world import Recipe
-from visthrow.diagnose.planning.design import START, Limits, designed
-from visthrow.diagnose.planning.manoeuvres import catalogue
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
 from visthrow.logs.flightlog import FlightLog
 
@@ -38,17 +36,6 @@ def test_logs_hold_what_was_measured_and_nothing_of_the_truth(logs):
             "release_command",
             "battery_voltage",
         }
-    again = cases.logs_of(Recipe(12, "rod", {"com_y": 1e-3}, **SMALL))
-    assert (
-        np.abs(logs[0]["pos_w"].values - again[0]["pos_w"].values).max() > 1e-3
-    )  # another seed is another flight
-
-
-def test_a_design_is_flown_with_the_load_of_its_manoeuvre():
-    for manoeuvre in catalogue():
-        design = designed(manoeuvre, Limits(), START)
-        assert manoeuvre_of(design.name).payload == manoeuvre.payload, design.name
-        assert manoeuvre_of(manoeuvre.name).name == manoeuvre.name
 
 
 def test_what_the_configuration_knows_of_the_sensors_is_read(monkeypatch):
