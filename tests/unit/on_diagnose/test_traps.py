@@ -6,10 +6,8 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import numpy as np
 from pytest import approx, mark
 
-from tests.unit.on_logs.test_check import faults, flight, log_of
 from visthrow.diagnose.inputs import setup
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions
@@ -139,24 +137,3 @@ def test_a_scale_of_thrust_that_differs_from_flight_to_flight():
     logs = [*map(recorded, FLIGHTS), changed(recorded(205), ["thrust_command"], lambda v: 1.3 * v)]
     texts = [row.text for row in check(logs, CRAZYFLIE)[3].rows if row.verdict == "warn"]
     assert any("the thrust's scale differs from flight to flight" in text for text in texts)
-
-
-@mark.parametrize(
-    ("factor", "words"),
-    [
-        (0.5, "rear left reads 0.50 of the others in flight: half"),
-        (0.0, "sensor is dead"),
-        (2.0, "twice"),
-    ],
-)
-def test_a_rotor_sensor_that_reads_wrong(factor, words):
-    columns = flight()
-    speed = (
-        1500.0
-        * np.sqrt(columns["command"][:, :1] / 2.0)
-        * (1.0 + 0.01 * np.random.default_rng(0).normal(size=(1200, 4)))
-    )
-    rotors = Channel(columns["time"], speed, "rad/s")
-    assert "reads" not in faults(log_of(columns, motor_speed=rotors))
-    wrong = Channel(columns["time"], speed * [1.0, 1.0, factor, 1.0], "rad/s")
-    assert words in faults(log_of(columns, motor_speed=wrong))
