@@ -4,47 +4,13 @@ import argparse
 from pathlib import Path
 
 from visthrow import config
-from visthrow.common.arguments import NUMBER
+from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError
 
-DEFAULT_PLANTS = 64
 HARM = 0.02  # share by which a channel may get worse on held-out flights
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
-
-    parser.epilog = (
-        "examples:\n  visthrow diagnose apply out/explain/diagnosis.json --out mine.toml   a"
-        " configuration on top of the diagnosed one\n  visthrow train mine.toml                    "
-        "                         train in it\n  visthrow diagnose explain flights --plant"
-        " mine.toml                  and diagnose it again: nothing should be left\n  visthrow"
-        " diagnose explain others.csv --config mine.toml              of another model: its worth"
-        " on flights that it never saw\n"
-    )
-    add = parser.add_argument
-    what = "diagnosis.json of an explain, or a blackbox: its firmware's rate controller"
-    add("diagnosis", metavar="FILE", help=what)
-    what = "the configuration that was diagnosed (default: as it says; with a blackbox "
-    what += f"{DEFAULT_PLANT})"
-    add("--plant", metavar="NAME", help=what)
-    add("--config", metavar="NAME", help="likewise the setup, of another model than the throw")
-    what = "to write (default: extended.toml)"
-    add("--out", metavar="FILE", default="extended.toml", help=what)
-    what = "plants that training draws from the joint posterior; 1: the estimate alone (default: "
-    what += f"{DEFAULT_PLANTS})"
-    add("--plants", type=int, default=DEFAULT_PLANTS, metavar="N", help=what)
-    what = (
-        "write the laws of the N-th best explanation outside the catalogue, which belong together,"
-        " as well (default: 0, none)"
-    )
-    add("--laws", type=int, default=0, metavar="N", help=what)
-    what = "with a blackbox: throttle in hover, 0 to 1"
-    add("--hover", type=NUMBER, metavar="SHARE", help=what)
-    what = "with a blackbox: from a command to the mixer, where it is known [s]"
-    add("--delay", type=NUMBER, metavar="S", help=what)
-    add("--anyway", action="store_true", help="write it even if held-out flights saw no gain")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
