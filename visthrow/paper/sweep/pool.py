@@ -11,7 +11,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,19 +44,6 @@ class Process(subprocess.Popen):
     sweep work``).
     """
 
-    def __init__(self, words: Sequence[str], log: Path, environment: dict[str, str]) -> None:
-        log.parent.mkdir(parents=True, exist_ok=True)
-        environment = {**os.environ, "PYTHONUNBUFFERED": "1", **environment}
-        with log.open("ab") as file:
-            super().__init__(
-                words,
-                stdin=subprocess.DEVNULL,
-                stdout=file,
-                stderr=subprocess.STDOUT,
-                env=environment,
-                start_new_session=True,
-            )
-
     def stop(self) -> None:
         self.send_signal(signal.SIGINT)
 
@@ -72,31 +59,33 @@ class Local:
     changes: tuple[str, ...] = ()
 
     def start(self, task: Task, device: str, minutes: float | None) -> Process:
-        words = [
-            sys.executable,
-            "-m",
-            "visthrow.cli",
-            "sweep",
-            "work",
-            self.list_name,
-            "--out",
-            str(self.out),
-        ]
-        words += ["--units", ",".join(task.ids), "--parent", str(os.getpid())]
-        if device.startswith(
-            "cuda"
-        ):  # the process sees its own GPU alone, and puts no context on the others
+        environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
+        if device.startswith("cuda"):
+            # the process sees its own GPU alone, and puts no context on the others
             visible = [item for item in os.environ.get(VISIBLE, "").split(",") if item]
             index = int(device.removeprefix("cuda:"))
-            words = [*words, "--device", "cuda:0"]
-            environment = {VISIBLE: visible[index] if visible else str(index)}
-        else:
-            words = [*words, "--device", device]
-            environment = dict.fromkeys(THREADS, "1") if not task.gpu else {}
-        words += ["--minutes", f"{minutes:.3f}"] if minutes is not None else []
+            environment[VISIBLE] = visible[index] if visible else str(index)
+            device = "cuda:0"
+        elif not task.gpu:
+            environment |= dict.fromkeys(THREADS, "1")
+        words = [sys.executable, "-m", "visthrow.cli", "sweep", "work", self.list_name]
+        words += ["--out", str(self.out), "--units", ",".join(task.ids)]
+        words += ["--parent", str(os.getpid()), "--device", device]
+        if minutes is not None:
+            words += ["--minutes", f"{minutes:.3f}"]
         for change in self.changes:
             words += ["--set", change]
-        return Process(words, task.log(self.out), environment)
+        log = task.log(self.out)
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with log.open("ab") as file:
+            return Process(
+                words,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                env=environment,
+                start_new_session=True,
+            )
 
 
 @dataclass
@@ -199,11 +188,8 @@ class ProcessPool:
 
     def _reap(self) -> bool:
         """Take note of what ended; whether anything did."""
-        ended = [
-            (task, status)
-            for task, _, handle in self._running.values()
-            if (status := handle.poll()) is not None
-        ]
+        polled = [(task, handle.poll()) for task, _, handle in self._running.values()]
+        ended = [(task, status) for task, status in polled if status is not None]
         for task, status in ended:
             del self._running[task.name]
             if status in (EXIT_BUSY, EXIT_STOPPED):
