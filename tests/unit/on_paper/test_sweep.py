@@ -3,6 +3,7 @@ it.
 """
 
 import json
+import math
 import signal
 import subprocess
 import sys
@@ -410,7 +411,7 @@ def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused
         path, tmp_path / "out", "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"}
     )
     assert cluster.devices == ["job 0", "job 1"]
-    cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", None)
+    cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", math.inf)
     script = (tmp_path / "script").read_text()
     for wanted in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
         assert wanted in script

@@ -82,11 +82,11 @@ class Cluster:
         except (NameError, ValueError, TypeError) as error:
             raise ConfigError(f"options of the cluster {self.options}: {error}") from error
 
-    def start(self, task: Task, device: str, minutes: float | None) -> ClusterJob:
+    def start(self, task: Task, device: str, minutes: float) -> ClusterJob:
         self._executor.update_parameters(
             name=task.name, gpus_per_node=1 if task.gpu and self.executor == "slurm" else 0
         )
-        piece = self.minutes if minutes is None else min(minutes, self.minutes)
+        piece = min(minutes, self.minutes)
         where = (self.list_name, str(self.out.resolve()), self.changes, os.getcwd())
         job = self._executor.submit(do, *where, task.ids, "auto" if task.gpu else "cpu", piece)
         return ClusterJob(job, task.name, self._lost)

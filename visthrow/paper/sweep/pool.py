@@ -6,6 +6,7 @@ behind it, or one batch on a reference plant. Tasks run in processes of their ow
 or as jobs of a cluster (:class:`visthrow.paper.sweep.cluster.Cluster`); a process that was
 killed costs what it had not yet written, and no more."""
 
+import math
 import os
 import signal
 import subprocess
@@ -58,7 +59,7 @@ class Local:
     jobs: int
     changes: tuple[str, ...] = ()
 
-    def start(self, task: Task, device: str, minutes: float | None) -> Process:
+    def start(self, task: Task, device: str, minutes: float) -> Process:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}
         if device.startswith("cuda"):
             # the process sees its own GPU alone, and puts no context on the others
@@ -71,7 +72,7 @@ class Local:
         words = [sys.executable, "-m", "visthrow.cli", "sweep", "work", self.list_name]
         words += ["--out", str(self.out), "--units", ",".join(task.ids)]
         words += ["--parent", str(os.getpid()), "--device", device]
-        if minutes is not None:
+        if minutes < math.inf:
             words += ["--minutes", f"{minutes:.3f}"]
         for change in self.changes:
             words += ["--set", change]
@@ -126,8 +127,9 @@ class ProcessPool:
     """Keeps devices and cores busy until a list is done, the time is up or somebody asks to stop.
 
     Its ``starter`` has ``devices``, for one task at once on each, ``jobs``, for so many on CPU
-    cores, and ``start(task, device, minutes)``. What that returns has ``poll()`` for the exit
-    status, None while it runs, ``stop()`` to write what it has and end, and ``kill()``."""
+    cores, and ``start(task, device, minutes)``, minutes infinite where no end is set. What that
+    returns has ``poll()`` for the exit status, None while it runs, ``stop()`` to write what it has
+    and end, and ``kill()``."""
 
     def __init__(
         self, work: SweepWork, out: Path, starter: Any, say: Callable[[str], None]
@@ -144,12 +146,12 @@ class ProcessPool:
 
     def run(self, minutes: float | None = None) -> Outcome:
         """Work; returns when nothing is left, or ``minutes`` have passed, or after Ctrl-C."""
-        deadline = None if minutes is None else time.monotonic() + 60.0 * minutes
+        deadline = math.inf if minutes is None else time.monotonic() + 60.0 * minutes
         self._todo = list(tasks(self.work, self.out, self._done))
         try:
             while self._todo or self._running:
-                remaining = None if deadline is None else (deadline - time.monotonic()) / 60.0
-                if remaining is not None and remaining <= 0.0:
+                remaining = (deadline - time.monotonic()) / 60.0
+                if remaining <= 0.0:
                     self.outcome.stopped = True
                     break
                 self._fill(remaining)
@@ -163,7 +165,7 @@ class ProcessPool:
             self._stop()
         return self.outcome
 
-    def _fill(self, remaining: float | None) -> None:
+    def _fill(self, remaining: float) -> None:
         """Start what there is room for."""
         clock = time.monotonic()
         used = [device for _, device, _ in self._running.values()]
@@ -180,7 +182,7 @@ class ProcessPool:
             if not free and cores <= 0:
                 break
 
-    def _start(self, task: Task, slot: str, remaining: float | None) -> None:
+    def _start(self, task: Task, slot: str, remaining: float) -> None:
         device = "cpu" if slot == "cpu core" else slot
         self._running[task.name] = (task, slot, self.starter.start(task, device, remaining))
         if task.gpu:
