@@ -296,13 +296,6 @@ class TestFlyer:
         assert np.abs(columns[:, number] - truth).max() < 1e-9
         assert not FlyerModel([log], FLYER).without_commands({}, [1])
 
-    def test_a_law_is_looked_for(self):
-        logs = [fly(6.0, swirl=0.008, seed=i) for i in range(3)]
-        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
-        assert diagnosis.overall == "UNKNOWN"
-        assert not diagnosis.theta
-        assert diagnosis.laws[0].vector == "axis_cross_vel"
-
     def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
         logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
         diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
@@ -472,14 +465,6 @@ class TestImu:
         assert diagnosis.named == ("motor_tau",)
         assert diagnosis["inertia_xy"].missing == ("rate_b",)
         assert any("no torque or inertia" in reason for reason in diagnosis.reasons)
-
-    def test_a_lag_is_named_with_its_interval(self):
-        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(3)]
-        diagnosis = search.explain(ImuModel(logs, IMU))
-        assert diagnosis.named == ("motor_tau",)
-        finding = diagnosis["motor_tau"]
-        assert finding.estimate == approx(0.02, abs=5e-4)
-        assert 0.0 < finding.high - finding.low < 2e-3
 
 
 def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:

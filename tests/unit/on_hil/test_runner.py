@@ -538,30 +538,6 @@ def test_a_tilted_vehicle_without_poses_is_levelled_before_it_is_handed_over(rep
     assert handed - gone[0] < 0.4
 
 
-def test_payload_lost_but_not_the_vehicle():
-    _, decisions = thrown(action=NEVER, poses=lost({"payload"}), seconds=6.0)
-    assert ("recover", "stale poses") in changes(decisions)
-    assert "abort" not in [state for state, _ in changes(decisions)]
-    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
-
-
-@mark.parametrize("gap", [0.0, 0.15])
-def test_bodies_swapped_in_mid_throw_after_a_gap(gap):
-    """While nothing comes the room for a jump grows beyond the cable's length; the cable tells the
-    two apart.
-    """
-
-    def spoil(time, poses):
-        if time <= START:
-            return poses
-        return [] if time <= START + gap else [swap(p) for p in poses]
-
-    pilot, decisions = thrown(action=NEVER, poses=spoil, seconds=6.0)
-    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
-    assert all(track.gate.refused["swapped"] > 10 for track in pilot.tracks.values())
-
-
 def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
     gap = 0.13  # after it a jump of 0.4 m would pass
 
