@@ -17,7 +17,7 @@ from torch import Tensor
 
 from bench import start
 from bench.report import Report, Table, finish
-from camera.history import push
+from camera.arrays import push
 from camera.keypoints import KeypointCamera
 from camera.mount import rotate
 from visthrow.common import statistics

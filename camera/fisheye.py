@@ -1,14 +1,16 @@
-"""Kannala-Brandt fisheye model in torch: valid past 90 deg off the axis, finite and differentiable
-on the whole sphere.
+"""Kannala-Brandt fisheye model on tensors and arrays: valid past 90 deg off the axis, finite and
+differentiable on the whole sphere.
 
 The same functions serve a batch of thousands on a GPU inside a CUDA graph and a batch of one on
 board: no host copies, no branches on data, no boolean-mask indexing. Only elementwise operations
 whose vector and scalar paths agree are used (``atan``, not ``atan2``, whose remainder loop rounds
 otherwise), so that a batch of N equals N singles bit for bit on the CPU."""
 
-import torch
-from torch import Tensor
+from typing import Any
 
+import torch
+
+from camera.arrays import Array, library
 from camera.params import FisheyeParams
 
 AXIS_EPSILON = 1e-20
@@ -59,11 +61,9 @@ class Fisheye:
         fits_x = params.cx - reach_x >= low and params.cx + reach_x <= right
         fits_y = params.cy - reach_y >= low and params.cy + reach_y <= bottom
         self.circle_inside_image = fits_x and fits_y
-        self._constants: dict[tuple[torch.device, torch.dtype], tuple[Tensor, Tensor]] = {}
+        self._constants: dict[tuple[Any, Any], tuple[Any, Any]] = {}
 
-    def angle(
-        self, points_c: Tensor, epsilon: float = AXIS_EPSILON
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    def angle(self, points_c: Array, epsilon: float = AXIS_EPSILON) -> tuple[Array, Array, Array]:
         """Angle off the optical axis of points.
 
         Args:
@@ -74,37 +74,38 @@ class Fisheye:
             theta in [0, pi] [rad], distance from the axis and distance from the lens [unit of the
             points], each shape (...).
         """
-        x, y, z = points_c.unbind(-1)
+        xp = library(points_c)
+        x, y, z = points_c[..., 0], points_c[..., 1], points_c[..., 2]
         radius2 = x * x + y * y + epsilon
-        radius = radius2.sqrt()
-        distance = (radius2 + z * z).sqrt()
+        radius = xp.sqrt(radius2)
+        distance = xp.sqrt(radius2 + z * z)
         backward = z < 0.0
         # theta / 2 = atan(r / (d + z)) = atan((d - z) / r): the form without cancellation on each
         # side of the lens plane.
-        reach = distance + z.abs()
-        tangent = torch.where(backward, reach, radius) / torch.where(backward, radius, reach)
-        return tangent.atan() * 2.0, radius, distance
+        reach = distance + abs(z)
+        tangent = xp.where(backward, reach, radius) / xp.where(backward, radius, reach)
+        return xp.atan(tangent) * 2.0, radius, distance
 
-    def radius_from_angle(self, theta: Tensor) -> Tensor:
+    def radius_from_angle(self, theta: Array) -> Array:
         """theta_d [rad], shape of theta; past the field of view it goes on along its tangent."""
         if self._equidistant:
             return theta
         k1, k2, k3, k4 = self.params.coefficients
-        inner = theta.clamp(max=self.half_fov)
+        inner = theta.clip(max=self.half_fov)
         t2 = inner * inner
         radius = inner * (t2 * (t2 * (t2 * (t2 * k4 + k3) + k2) + k1) + 1.0)
         return radius + (theta - inner) * self._edge_slope
 
-    def slope_from_angle(self, theta: Tensor) -> Tensor:
+    def slope_from_angle(self, theta: Array) -> Array:
         """d theta_d / d theta [-], shape of theta; constant past the field of view."""
         if self._equidistant:
-            return torch.ones_like(theta)
+            return library(theta).ones_like(theta)
         k1, k2, k3, k4 = self.params.coefficients
-        inner = theta.clamp(max=self.half_fov)
+        inner = theta.clip(max=self.half_fov)
         t2 = inner * inner
         return t2 * (t2 * (t2 * (t2 * (9 * k4) + 7 * k3) + 5 * k2) + 3 * k1) + 1.0
 
-    def project_normalized(self, points_c: Tensor, clip: bool = False) -> tuple[Tensor, Tensor]:
+    def project_normalized(self, points_c: Array, clip: bool = False) -> tuple[Array, Array]:
         """Project points to normalised image coordinates.
 
         Args:
@@ -118,13 +119,13 @@ class Fisheye:
         """
         theta, radius, _ = self.angle(points_c)
         valid = theta <= self.half_fov
-        shrink = self.radius_from_angle(theta.clamp(max=self.half_fov) if clip else theta) / radius
-        normalized = points_c[..., :2] * (shrink * (1.0 / self.edge_radius)).unsqueeze(-1)
+        shrink = self.radius_from_angle(theta.clip(max=self.half_fov) if clip else theta) / radius
+        normalized = points_c[..., :2] * (shrink * (1.0 / self.edge_radius))[..., None]
         if not self.circle_inside_image:
             valid = valid & self.on_sensor(self.denormalize(normalized))
         return normalized, valid
 
-    def project(self, points_c: Tensor) -> tuple[Tensor, Tensor]:
+    def project(self, points_c: Array) -> tuple[Array, Array]:
         """Project points to pixels.
 
         Args:
@@ -136,10 +137,10 @@ class Fisheye:
         """
         theta, radius, _ = self.angle(points_c)
         focal, centre = self._pixel_constants(points_c)
-        scale = (self.radius_from_angle(theta) / radius).unsqueeze(-1)
+        scale = (self.radius_from_angle(theta) / radius)[..., None]
         return points_c[..., :2] * scale * focal + centre, theta <= self.half_fov
 
-    def unproject(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def unproject(self, pixels: Array) -> tuple[Array, Array]:
         """Turn pixels into unit rays.
 
         Args:
@@ -149,58 +150,63 @@ class Fisheye:
             Unit rays [-], shape (..., 3), camera frame, and validity (bool), shape (...): inside
             the field of view. Pixels beyond it give the ray at the edge.
         """
+        xp = library(pixels)
         focal, centre = self._pixel_constants(pixels)
         plane = (pixels - centre) / focal
-        x, y = plane.unbind(-1)
-        radius = (x * x + y * y + AXIS_EPSILON).sqrt()
+        x, y = plane[..., 0], plane[..., 1]
+        radius = xp.sqrt(x * x + y * y + AXIS_EPSILON)
         # A ray that was projected from the very edge may round to either side of it.
-        valid = radius <= self.edge_radius * (1.0 + 8.0 * torch.finfo(pixels.dtype).eps)
-        theta = self._angle_from_radius(radius.clamp(max=self.edge_radius))
-        lateral = plane * (theta.sin() / radius).unsqueeze(-1)
-        return torch.cat([lateral, theta.cos().unsqueeze(-1)], -1), valid
+        valid = radius <= self.edge_radius * (1.0 + 8.0 * float(xp.finfo(pixels.dtype).eps))
+        theta = self._angle_from_radius(radius.clip(max=self.edge_radius))
+        lateral = plane * (xp.sin(theta) / radius)[..., None]
+        return xp.concatenate([lateral, xp.cos(theta)[..., None]], -1), valid
 
-    def normalize(self, pixels: Tensor) -> Tensor:
+    def normalize(self, pixels: Array) -> Array:
         """Normalised image coordinates [-] of pixels [px], both shape (..., 2)."""
         focal, centre = self._pixel_constants(pixels)
         return (pixels - centre) / (focal * self.edge_radius)
 
-    def denormalize(self, normalized: Tensor) -> Tensor:
+    def denormalize(self, normalized: Array) -> Array:
         """Pixels [px] of normalised image coordinates [-], both shape (..., 2)."""
         focal, centre = self._pixel_constants(normalized)
         return normalized * (focal * self.edge_radius) + centre
 
-    def on_sensor(self, pixels: Tensor) -> Tensor:
+    def on_sensor(self, pixels: Array) -> Array:
         """Whether pixels [px], shape (..., 2), lie on the sensor, outer pixels' edges included:
         bool, shape (...).
         """
         low, right, top, bottom = self._bounds
-        u, v = pixels.unbind(-1)
+        u, v = pixels[..., 0], pixels[..., 1]
         return (u >= low) & (u <= right) & (v >= top) & (v <= bottom)
 
-    def _angle_from_radius(self, radius: Tensor) -> Tensor:
+    def _angle_from_radius(self, radius: Array) -> Array:
         """Invert theta_d by Newton inside a shrinking bracket; differentiable through the last
         step.
         """
         if self._equidistant:
             return radius
+        xp = library(radius)
         with torch.no_grad():
             theta = radius * (self.half_fov / self.edge_radius)
-            low = torch.zeros_like(theta)
-            high = torch.full_like(theta, self.half_fov)
+            low = xp.zeros_like(theta)
+            high = xp.full_like(theta, self.half_fov)
             for _ in range(NEWTON_STEPS):
                 excess = self.radius_from_angle(theta) - radius
-                low = torch.where(excess < 0.0, theta, low)
-                high = torch.where(excess < 0.0, high, theta)
+                low = xp.where(excess < 0.0, theta, low)
+                high = xp.where(excess < 0.0, high, theta)
                 step = theta - excess / self.slope_from_angle(theta)
-                theta = torch.where((step < low) | (step > high), (low + high) * 0.5, step)
+                theta = xp.where((step < low) | (step > high), (low + high) * 0.5, step)
         return theta - (self.radius_from_angle(theta) - radius) / self.slope_from_angle(theta)
 
-    def _pixel_constants(self, like: Tensor) -> tuple[Tensor, Tensor]:
+    def _pixel_constants(self, like: Array) -> tuple[Array, Array]:
         """Focal lengths and principal point on a tensor's device, made once: a CUDA graph can be
         captured later.
         """
         key = (like.device, like.dtype)
         if key not in self._constants:
             p = self.params
-            self._constants[key] = (like.new_tensor([p.fx, p.fy]), like.new_tensor([p.cx, p.cy]))
+            pairs = ([p.fx, p.fy], [p.cx, p.cy])
+            make = {"device": like.device, "dtype": like.dtype}
+            focal, centre = (library(like).asarray(pair, **make) for pair in pairs)
+            self._constants[key] = focal, centre
         return self._constants[key]

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from camera.history import at_latency, latency_weights
+from camera.arrays import at_latency, latency_weights
 from camera.params import KeypointNoiseParams
 
 
@@ -65,7 +65,7 @@ def apply_latency(history: Tensor, valid_history: Tensor, latency: Tensor) -> tu
     """Keypoints as they were ``latency`` steps ago.
 
     Args:
-        history: Keypoints [-], shape (E, H, K, 2), newest first (`camera.history.push`).
+        history: Keypoints [-], shape (E, H, K, 2), newest first (`camera.arrays.push`).
         valid_history: Shape (E, H, K), bool.
         latency: Age [policy steps], shape (E,) or scalar tensor.
 

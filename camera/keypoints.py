@@ -4,9 +4,12 @@ ball.
 `keypoints` is the one function that the training environment calls with a batch of thousands and
 the HIL runner with a batch of one."""
 
+import copy
+
 import torch
 from torch import Tensor
 
+from camera.arrays import Array, library
 from camera.fisheye import AXIS_EPSILON, Fisheye
 from camera.mount import nominal_rot_cb, points_c_from_w, rotate, rotation_from_vector
 from camera.params import CameraParams
@@ -59,6 +62,14 @@ class KeypointCamera:
         self._axes = torch.eye(2, 3, device=device, dtype=dtype)
         self.fisheye.normalize(self.position_b[:2])  # makes the lens constants on this device
 
+    def on_arrays(self) -> "KeypointCamera":
+        """Return the camera with its constants as NumPy arrays, for functions of arrays."""
+        camera = copy.copy(self)
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(camera, name, value.numpy())
+        return camera
+
     def extrinsics(self, rotation_error: Tensor, position_error: Tensor) -> tuple[Tensor, Tensor]:
         """Extrinsics with an error per environment:
 
@@ -89,7 +100,7 @@ def goal_square(side: float) -> Tensor:
     )
 
 
-def goal_corners_w(goal_w: Tensor, side: float = 0.25, square_w: Tensor | None = None) -> Tensor:
+def goal_corners_w(goal_w: Array, side: float = 0.25, square_w: Array | None = None) -> Array:
     """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
 
     Args:
@@ -102,8 +113,10 @@ def goal_corners_w(goal_w: Tensor, side: float = 0.25, square_w: Tensor | None =
     """
     if square_w is None:
         square_w = goal_square(side).to(goal_w)
+    xp = library(goal_w)
     flat = goal_w[:, None, :2] + square_w[:, :2]
-    return torch.cat([flat, square_w[:, 2:].expand(len(goal_w), -1, -1)], -1)
+    heights = xp.broadcast_to(square_w[:, 2:], (*flat.shape[:2], 1))
+    return xp.concatenate([flat, heights], -1)
 
 
 def ball_extremes_c(
@@ -155,7 +168,7 @@ def ball_extremes_c(
     return torch.cat([middle - step, middle + step], -2)
 
 
-def box_midpoints(extremes: Tensor) -> Tensor:
+def box_midpoints(extremes: Array) -> Array:
     """Edge midpoints of the axis-aligned box through four extreme points.
 
     A detector reports a box: four numbers. Its edge midpoints are computed from these alone, so a
@@ -174,8 +187,8 @@ def box_midpoints(extremes: Tensor) -> Tensor:
     bottom = extremes[:, 3, 1]
     u = (low + right) * 0.5
     v = (top + bottom) * 0.5
-    middles: Tensor = torch.stack([low, v, u, top, right, v, u, bottom], -1).unflatten(-1, (4, 2))
-    return middles
+    middles = library(extremes).stack([low, v, u, top, right, v, u, bottom], -1)
+    return middles.reshape(-1, 4, 2)
 
 
 def corrected_keypoints(
@@ -264,7 +277,7 @@ def keypoints(
     return by_rule(camera, points, valid)
 
 
-def by_rule(camera: KeypointCamera, points: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+def by_rule(camera: KeypointCamera, points: Array, valid: Array) -> tuple[Array, Array]:
     """Apply ``invalid_reads`` to points that are clipped to the edge.
 
     Args:
@@ -277,8 +290,10 @@ def by_rule(camera: KeypointCamera, points: Tensor, valid: Tensor) -> tuple[Tens
     """
     if camera.edge_reads:
         return points, valid
+    xp = library(points)
     box = valid[:, GOAL_KEYPOINTS:]
-    flanks, ends = (box[:, :2] & box[:, 2:]).split(1, 1)  # left and right, top and bottom
-    whole = box & torch.cat([ends, flanks, ends, flanks], 1)
-    valid = torch.cat([valid[:, :GOAL_KEYPOINTS], whole], 1)
-    return torch.where(valid.unsqueeze(-1), points, 0.0), valid
+    across = box[:, :2] & box[:, 2:]
+    flanks, ends = across[:, :1], across[:, 1:]  # left and right, top and bottom
+    whole = box & xp.concatenate([ends, flanks, ends, flanks], 1)
+    valid = xp.concatenate([valid[:, :GOAL_KEYPOINTS], whole], 1)
+    return xp.where(valid[..., None], points, 0.0), valid

@@ -10,6 +10,7 @@ import math
 import torch
 from torch import Tensor
 
+from camera.arrays import Array
 from camera.params import MountParams
 
 DOWNWARD_ROT_CB = ((0.0, -1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
@@ -57,7 +58,7 @@ def nominal_rot_cb(mount: MountParams) -> Tensor:
     return rot_cb
 
 
-def rotate(rot: Tensor, vectors: Tensor) -> Tensor:
+def rotate(rot: Array, vectors: Array) -> Array:
     """``rot @ v`` for each row v of vectors; as a matrix product, ``vectors @ rot^T``.
 
     Args:
@@ -67,7 +68,7 @@ def rotate(rot: Tensor, vectors: Tensor) -> Tensor:
     Returns:
         Rotated row vectors, shape (..., K, 3).
     """
-    rot = rot.unsqueeze(-3)
+    rot = rot[..., None, :, :]
     x = vectors[..., 0:1]
     y = vectors[..., 1:2]
     z = vectors[..., 2:3]
@@ -75,12 +76,12 @@ def rotate(rot: Tensor, vectors: Tensor) -> Tensor:
 
 
 def points_c_from_w(
-    points_w: Tensor,
-    pos_w: Tensor,
-    rot_wb: Tensor,
-    rot_cb: Tensor,
-    position_b: Tensor,
-) -> Tensor:
+    points_w: Array,
+    pos_w: Array,
+    rot_wb: Array,
+    rot_cb: Array,
+    position_b: Array,
+) -> Array:
     """Bring world points into the camera frame.
 
     Args:
@@ -93,5 +94,5 @@ def points_c_from_w(
     Returns:
         Points [m], shape (E, K, 3), camera frame.
     """
-    points_b = rotate(rot_wb.transpose(-1, -2), points_w - pos_w.unsqueeze(-2))
-    return rotate(rot_cb, points_b - position_b.unsqueeze(-2))
+    points_b = rotate(rot_wb.mT, points_w - pos_w[..., None, :])
+    return rotate(rot_cb, points_b - position_b[..., None, :])

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from camera.arrays import Array, library
 from camera.keypoints import GOAL_KEYPOINTS, KeypointCamera, goal_corners_w
 from camera.mount import points_c_from_w, rotate
 from visthrow.onboard.observations import VEHICLE, Layout, rotation_in
@@ -46,8 +47,8 @@ def empty_sums(count: int, device: str | torch.device = "cpu") -> Tensor:
 
 
 def fit(
-    sums: Tensor, time: Tensor, goal_xy: Tensor, weight: Tensor, fresh: Tensor
-) -> tuple[Tensor, Tensor]:
+    sums: Array, time: Array, goal_xy: Array, weight: Array, fresh: Array
+) -> tuple[Array, Array]:
     """Take in one step's goal and give the velocity so far.
 
     Args:
@@ -60,26 +61,27 @@ def fit(
     Returns:
         The new sums and the velocity [m/s], shape (E, 2), world frame.
     """
+    xp = library(sums)
     t = time[:, None]
     w = weight[:, None]
     wt = w * t
-    new = torch.cat([w, wt, wt * t, w * goal_xy, wt * goal_xy], dim=-1)
-    sums = torch.where(fresh[:, None], 0.0, sums) + new
+    new = xp.concatenate([w, wt, wt * t, w * goal_xy, wt * goal_xy], -1)
+    sums = xp.where(fresh[:, None], 0.0, sums) + new
     total = sums[:, :1]
     first = sums[:, 1:2]
     second = sums[:, 2:3]
     place = sums[:, 3:5]
     moved = sums[:, 5:7]
-    mean = first / total.clamp(min=1e-9)
-    velocity = (moved - mean * place) / ((second - mean * first).clamp(min=0.0) + SPEED_SIGMA**-2)
+    mean = first / total.clip(min=1e-9)
+    velocity = (moved - mean * place) / ((second - mean * first).clip(min=0.0) + SPEED_SIGMA**-2)
     return sums, velocity
 
 
-def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
+def place(sums: Array, time: Array, velocity: Array | None = None) -> Array:
     """Goal by all steps so far [m], shape (E, 2), world frame, by its velocity where it moves
     [m/s]; 0 where none has seen it.
     """
-    total = sums[:, :1].clamp(min=1e-9)
+    total = sums[:, :1].clip(min=1e-9)
     mean = sums[:, 3:5] / total
     if velocity is None:
         return mean
@@ -87,8 +89,8 @@ def place(sums: Tensor, time: Tensor, velocity: Tensor | None = None) -> Tensor:
 
 
 def measured_goal(
-    layout: Layout, frame: Tensor, valid: Tensor | None, camera: KeypointCamera | None
-) -> tuple[Tensor, Tensor]:
+    layout: Layout, frame: Array, valid: Array | None, camera: KeypointCamera | None
+) -> tuple[Array, Array]:
     """Goal in the world as one frame shows it.
 
     Args:
@@ -102,21 +104,21 @@ def measured_goal(
         offset = frame[:, VEHICLE : VEHICLE + 2]
         hanging = frame[:, VEHICLE + 2 : VEHICLE + 4]
         goal_xy = frame[:, :2] + hanging + offset
-        return goal_xy, torch.full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
+        return goal_xy, library(frame).full_like(goal_xy[:, 0], POSITION_SIGMA**-2)
     rot_wb = rotation_in(frame)
     goals, weight = goal_by_corner(
         frame, valid, camera, rot_wb, rays_w(camera, rot_wb, _corners(layout, frame))
     )
     total = weight.sum(-1)
-    return (weight[..., None] * goals).sum(1) / total.clamp(min=1e-9)[:, None], total
+    return (weight[..., None] * goals).sum(1) / total.clip(min=1e-9)[:, None], total
 
 
-def _corners(layout: Layout, frame: Tensor) -> Tensor:
+def _corners(layout: Layout, frame: Array) -> Array:
     """Goal corners of vision frames, normalised [-], shape (E, 4, 2)."""
-    return frame[:, VEHICLE : VEHICLE + layout.goal].unflatten(1, (GOAL_KEYPOINTS, 2))
+    return frame[:, VEHICLE : VEHICLE + layout.goal].reshape(-1, GOAL_KEYPOINTS, 2)
 
 
-def rays_w(camera: KeypointCamera, rot_wb: Tensor, points: Tensor) -> Tensor:
+def rays_w(camera: KeypointCamera, rot_wb: Array, points: Array) -> Array:
     """Directions in which points of the image lie, shape (E, K, 3), world frame.
 
     Args:
@@ -128,8 +130,8 @@ def rays_w(camera: KeypointCamera, rot_wb: Tensor, points: Tensor) -> Tensor:
 
 
 def goal_by_corner(
-    frame: Tensor, valid: Tensor, camera: KeypointCamera, rot_wb: Tensor, rays: Tensor
-) -> tuple[Tensor, Tensor]:
+    frame: Array, valid: Array, camera: KeypointCamera, rot_wb: Array, rays: Array
+) -> tuple[Array, Array]:
     """Goal in the world as each corner of one vision frame shows it.
 
     Args:
@@ -141,10 +143,10 @@ def goal_by_corner(
         Positions [m], shape (E, 4, 2), world frame, and their inverse variances [1/m^2], shape (E,
         4); 0 where a corner is not seen.
     """
-    lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b.expand(1, -1))[:, 0]
-    height = lens_w[:, None, 2].clamp(min=0.1)
+    lens_w = frame[:, :3] + rotate(rot_wb, camera.position_b[None])[:, 0]
+    height = lens_w[:, None, 2].clip(min=0.1)
     down = -rays[..., 2]
-    reach = height / down.clamp(min=GRAZING)
+    reach = height / down.clip(min=GRAZING)
     goals = lens_w[:, None, :2] + reach[..., None] * rays[..., :2] - camera.square_w[:, :2]
     followed = valid[:, :GOAL_KEYPOINTS] & (down > GRAZING)
     sharpness = height / (ANGLE_SIGMA * reach * reach)
@@ -154,21 +156,21 @@ def goal_by_corner(
 class GoalEstimate(NamedTuple):
     """The sums that :func:`fitted_goal` adds for a frame."""
 
-    sums: Tensor
-    velocity: Tensor | None  # of the goal [m/s], shape (E, 2), where the layout has it
-    places: Tensor | None  # where they lie, shape (E, layout.located), where the layout has it
-    frame: Tensor  # with corners that were not seen where they would be
-    valid: Tensor | None
+    sums: Array
+    velocity: Array  # of the goal [m/s], shape (E, 2), where the layout has it
+    places: Array  # where they lie, shape (E, layout.located), where the layout has it
+    frame: Array  # with corners that were not seen where they would be
+    valid: Array
 
 
 def fitted_goal(
     layout: Layout,
-    frame: Tensor,
-    valid: Tensor | None,
+    frame: Array,
+    valid: Array | None,
     camera: KeypointCamera | None,
-    sums: Tensor,
-    time: Tensor,
-    fresh: Tensor,
+    sums: Array,
+    time: Array,
+    fresh: Array,
 ) -> GoalEstimate:
     """Take one frame into the goal's fit; arguments as of :func:`measured_goal` and :func:`fit`."""
     if layout.name == "state" or not layout.located:
@@ -184,34 +186,35 @@ def fitted_goal(
 
 def _located(
     layout: Layout,
-    frame: Tensor,
-    valid: Tensor,
+    frame: Array,
+    valid: Array,
     camera: KeypointCamera,
-    sums: Tensor,
-    time: Tensor,
-    fresh: Tensor,
+    sums: Array,
+    time: Array,
+    fresh: Array,
 ) -> GoalEstimate:
     """:func:`fitted_goal` where the layout says where keypoints lie: of four points of goal or box
     a wrong one is outvoted.
 
     The places are goal - vehicle, horizontal [m], 2; direction from lens to payload, 3; whether the
     goal is known, 1; world frame. What is not known is 0."""
-    box = frame[:, VEHICLE + layout.goal :].unflatten(1, (-1, 2))
+    xp = library(frame)
+    box = frame[:, VEHICLE + layout.goal :].reshape(-1, 4, 2)
     box_valid = valid[:, GOAL_KEYPOINTS:]
     rot_wb = rotation_in(frame)
     centre = middle(box, box_valid)
-    points = torch.cat([_corners(layout, frame), centre[:, None]], dim=1)
+    points = xp.concatenate([_corners(layout, frame), centre[:, None]], 1)
     rays = rays_w(camera, rot_wb, points)
     goals, weight = goal_by_corner(frame, valid, camera, rot_wb, rays[:, :GOAL_KEYPOINTS])
-    one, two, three, four = weight.unbind(-1)
-    sums, velocity = fit(sums, time, middle(goals, weight > 0.0), one + two + three + four, fresh)
+    total = weight[:, 0] + weight[:, 1] + weight[:, 2] + weight[:, 3]
+    sums, velocity = fit(sums, time, middle(goals, weight > 0.0), total, fresh)
     moves = velocity if layout.motion else None
     goal_xy = place(sums, time, moves)
     located = sums[:, :1] > 0.0
-    hangs = box_valid.any(-1, keepdim=True)
+    hangs = box_valid.any(-1)[:, None]
     goal = (goal_xy - frame[:, :2]) * located
     ball = rays[:, GOAL_KEYPOINTS] * hangs
-    places = torch.cat([goal, ball, located.to(frame.dtype)], dim=-1)
+    places = xp.concatenate([goal, ball, located], -1)
     return GoalEstimate(
         sums, moves, places, *predicted(layout, frame, valid, camera, rot_wb, goal_xy, located)
     )
@@ -219,13 +222,13 @@ def _located(
 
 def predicted(
     layout: Layout,
-    frame: Tensor,
-    valid: Tensor,
+    frame: Array,
+    valid: Array,
     camera: KeypointCamera,
-    rot_wb: Tensor,
-    goal_xy: Tensor,
-    is_known: Tensor,
-) -> tuple[Tensor, Tensor]:
+    rot_wb: Array,
+    goal_xy: Array,
+    is_known: Array,
+) -> tuple[Array, Array]:
     """Return the frame, and its validity, with corners that are not seen where the goal so far
     would be seen.
 
@@ -235,31 +238,34 @@ def predicted(
         goal_xy: goal by the steps so far [m], shape (E, 2), world frame. is_known: whether one has
             seen it, bool, shape (E, 1).
     """
+    xp = library(frame)
     corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
     points, visible = camera.fisheye.project_normalized(corners_c, clip=True)
     measured_valid = valid[:, :GOAL_KEYPOINTS]
     end = VEHICLE + layout.goal
     filled = visible & is_known & ~measured_valid
-    corners = torch.where(filled[..., None], points, _corners(layout, frame))
-    frame = torch.cat([frame[:, :VEHICLE], corners.flatten(1), frame[:, end:]], dim=-1)
-    return frame, torch.cat([measured_valid | filled, valid[:, GOAL_KEYPOINTS:]], dim=-1)
+    corners = xp.where(filled[..., None], points, _corners(layout, frame)).reshape(len(frame), -1)
+    frame = xp.concatenate([frame[:, :VEHICLE], corners, frame[:, end:]], -1)
+    return frame, xp.concatenate([measured_valid | filled, valid[:, GOAL_KEYPOINTS:]], -1)
 
 
-def middle(points: Tensor, valid: Tensor) -> Tensor:
+def middle(points: Array, valid: Array) -> Array:
     """Median of four points, shape (E, 4, 2), over those that are valid, shape (E, 4): a wrong one
     is outvoted; 0 where none is.
     """
-    count = valid.sum(-1, keepdim=True)
-    one, two = torch.where(valid.unsqueeze(-1), points, torch.inf).split(2, 1)
+    xp = library(points)
+    count = valid.sum(-1)[:, None]
+    known = xp.where(valid[..., None], points, float("inf"))
+    one, two = known[:, :2], known[:, 2:]
     # of two pairs, each
-    small = torch.minimum(one, two)
-    large = torch.maximum(one, two)
-    first = torch.minimum(small[:, 0], small[:, 1])
-    inner = torch.maximum(small[:, 0], small[:, 1])
-    outer = torch.minimum(large[:, 0], large[:, 1])
-    second = torch.minimum(inner, outer)
-    third = torch.maximum(inner, outer)
-    lower = torch.where(count > 2, second, first)
-    upper = torch.where(count > 3, third, torch.where(count > 1, second, first))
-    return torch.where(count > 0, (lower + upper) * 0.5, 0.0)
+    small = xp.minimum(one, two)
+    large = xp.maximum(one, two)
+    first = xp.minimum(small[:, 0], small[:, 1])
+    inner = xp.maximum(small[:, 0], small[:, 1])
+    outer = xp.minimum(large[:, 0], large[:, 1])
+    second = xp.minimum(inner, outer)
+    third = xp.maximum(inner, outer)
+    lower = xp.where(count > 2, second, first)
+    upper = xp.where(count > 3, third, xp.where(count > 1, second, first))
+    return xp.where(count > 0, (lower + upper) * 0.5, 0.0)

@@ -33,9 +33,8 @@ from functools import lru_cache
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from camera.history import push
+from camera.arrays import Array, library, push
 from camera.keypoints import KEYPOINTS
 
 VEHICLE = 15
@@ -132,7 +131,12 @@ def layout_of(params: Any) -> Layout:
     raise ValueError(f"observation layout {params.layout!r}; expected 'state' or 'vision'")
 
 
-def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float) -> Tensor:
+def joined(parts: list[Array]) -> Array:
+    """Return arrays side by side."""
+    return library(parts[0]).concatenate(parts, -1)
+
+
+def resampled(history: Array, newest: Array, ages: list[float], period: float) -> Array:
     """Histories as they would be if a step had come each period before now, by straight lines
     between those that came.
 
@@ -147,82 +151,85 @@ def resampled(history: Tensor, newest: Tensor, ages: list[float], period: float)
         Rows that are 1, 2, ... periods old, shape (E, 1 + H, layout.payload); what is older than
         all that came is the oldest.
     """
+    xp = library(history)
     knots = [0.0, *ages[: history.shape[1]]]
-    rows = torch.cat([newest[:, None], history], dim=1)
+    rows = xp.concatenate([newest[:, None], history], 1)
     out = []
     for k in range(1, 1 + history.shape[1]):
         after = next((i for i, age in enumerate(knots) if age >= k * period), len(knots) - 1)
         gap = knots[after] - knots[after - 1]
         share = min((k * period - knots[after - 1]) / gap, 1.0)
-        out.append(torch.lerp(rows[:, after - 1], rows[:, after], share))
-    return torch.stack(out, dim=1)
+        before = rows[:, after - 1]
+        out.append((1.0 - share) * before + share * rows[:, after])
+    return xp.stack(out, 1)
 
 
 @lru_cache
 @torch.inference_mode(False)
-def _of_rotation(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+def _of_rotation(xp: Any, device: Any, dtype: Any) -> tuple[Any, Any, Any]:
     """Which products of quaternion entries make the entries of the matrix, two each, their signs,
     and what they add to.
     """
     # of xx, xy, xz, xw, yx, ...
     one, two = ([5, 1, 2, 1, 0, 6, 2, 6, 0], [10, 11, 7, 11, 10, 3, 7, 3, 5])
     signs = [-1, 1, 1, 1, -1, 1, 1, 1, -1, -1, -1, 1, 1, -1, -1, -1, 1, -1]
-    identity = torch.eye(3, device=device, dtype=dtype).flatten()
-    chosen = torch.tensor([*one, *two], device=device)
-    return chosen, torch.tensor(signs, device=device, dtype=dtype), identity
+    identity = xp.eye(3, device=device, dtype=dtype).flatten()
+    chosen = xp.asarray([*one, *two], device=device)
+    return chosen, xp.asarray(signs, device=device, dtype=dtype), identity
 
 
-def rotation_from_quat(quat: Tensor) -> Tensor:
+def rotation_from_quat(quat: Array) -> Array:
     """Rotation matrix, shape (E, 3, 3), of unit quaternions xyzw, shape (E, 4)."""
-    chosen, signs, identity = _of_rotation(quat.device, quat.dtype)
-    products = quat.unsqueeze(-1) * (quat + quat).unsqueeze(-2)  # of all pairs at once
-    terms = products.flatten(-2).index_select(-1, chosen) * signs
-    one, two = terms.unflatten(-1, (2, 9)).unbind(-2)
-    rot_wb: Tensor = (identity + (one + two)).unflatten(-1, (3, 3))
-    return rot_wb
+    chosen, signs, identity = _of_rotation(library(quat), quat.device, quat.dtype)
+    products = quat[..., None] * (quat + quat)[..., None, :]  # of all pairs at once
+    terms = products.reshape(*quat.shape[:-1], 16)[..., chosen] * signs
+    rot_wb = identity + (terms[..., :9] + terms[..., 9:])
+    return rot_wb.reshape(*quat.shape[:-1], 3, 3)
 
 
-def rotation_in(frame: Tensor) -> Tensor:
+def rotation_in(frame: Array) -> Array:
     """Measured attitude rot_wb, shape (E, 3, 3), of frames, shape (E, F): with noise its columns
     are not quite a rotation's.
     """
     x_axis = frame[:, 9:12]
     y_axis = frame[:, 12:15]
-    return torch.stack([x_axis, y_axis, torch.linalg.cross(x_axis, y_axis)], dim=-1)
+    xp = library(frame)
+    return xp.stack([x_axis, y_axis, xp.linalg.cross(x_axis, y_axis)], -1)
 
 
-def vehicle_part(pos_w: Tensor, vel_w: Tensor, rate_b: Tensor, rot_wb: Tensor) -> Tensor:
+def vehicle_part(pos_w: Array, vel_w: Array, rate_b: Array, rot_wb: Array) -> Array:
     """Vehicle's part of a frame, shape (E, 15)."""
-    return torch.cat([pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]], dim=-1)
+    parts = [pos_w, vel_w, rate_b, rot_wb[..., 0], rot_wb[..., 1]]
+    return joined(parts)
 
 
-def state_part(pos_w: Tensor, goal_w: Tensor, payload_w: Tensor) -> Tensor:
+def state_part(pos_w: Array, goal_w: Array, payload_w: Array) -> Array:
     """Goal and payload of a state frame: horizontal offset goal - payload, payload - vehicle; shape
     (E, 5).
     """
-    return torch.cat([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w], dim=-1)
+    return joined([goal_w[:, :2] - payload_w[:, :2], payload_w - pos_w])
 
 
-def answer(frame: Tensor, previous_action: Tensor) -> Tensor:
+def answer(frame: Array, previous_action: Array) -> Array:
     """Return the vehicle's response in one step, shape (E, 10): velocity, body rates, and the
     action before it.
     """
-    return torch.cat([frame[:, 3:9], previous_action[:, :4]], dim=-1)
+    return joined([frame[:, 3:9], previous_action[:, :4]])
 
 
 def observe(
     layout: Layout,
-    frame: Tensor,
-    valid: Tensor | None,
-    previous_action: Tensor,
-    attached: Tensor,
-    history: Tensor,
-    fresh: Tensor,
-    goal_vel_w: Tensor | None = None,
-    places: Tensor | None = None,
-    answers: Tensor | None = None,
-    setup: Tensor | None = None,
-) -> tuple[Tensor, Tensor]:
+    frame: Array,
+    valid: Array | None,
+    previous_action: Array,
+    attached: Array,
+    history: Array,
+    fresh: Array,
+    goal_vel_w: Array | None = None,
+    places: Array | None = None,
+    answers: Array | None = None,
+    setup: Array | None = None,
+) -> tuple[Array, Array]:
     """Assemble the actor's input and move the history on.
 
     Args:
@@ -256,13 +263,13 @@ def observe(
     further = []
     for name, value in optional.items():
         if getattr(layout, name) and value is not None:
-            further.append(value.flatten(1).to(frame.dtype))
+            further.append(value.reshape(len(frame), -1))
     history = push(history, frame[:, goal_end:], fresh)
     parts = [
         frame[:, :VEHICLE],
         previous_action,
         frame[:, VEHICLE:goal_end],
-        history.flatten(1),
-        attached.unsqueeze(-1),
+        history.reshape(len(frame), -1),
+        attached[:, None],
     ]
-    return torch.cat(parts + further, dim=-1), history
+    return joined(parts + further), history

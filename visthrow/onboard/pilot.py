@@ -4,19 +4,20 @@ The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.on
 the training environment calls, with a batch of one on board; only the noise is missing."""
 
 import time
-from collections.abc import Collection, Sequence
+import warnings
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy import ndarray
 from torch import Tensor
 
-from camera.history import push
+from camera.arrays import Array, push
 from camera.keypoints import KeypointCamera
-from camera.keypoints import keypoints as seen_keypoints
+from camera.keypoints import keypoints as keypoints_of
 from camera.params import CameraParams
 from visthrow import config
 from visthrow.common.errors import PolicyError
@@ -24,8 +25,8 @@ from visthrow.common.free_fall import GRAVITY
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.compiled import Compiled
 from visthrow.onboard.policy import Policy
+from visthrow.onboard.row_keypoints import row_keypoints
 
 VIEWS = {
     "pos_w": 3,
@@ -36,7 +37,7 @@ VIEWS = {
     "goal_w": 3,
     "attached": 1,
 }
-"""What one step is shown, and the width of each: the columns of one array."""
+"""What one step is shown, and the width of each."""
 
 SHARED = ("goal_w", "attached")
 """Of these one may serve all."""
@@ -60,6 +61,17 @@ class PilotOutput:
     valid: ndarray | None  # which of them are seen, shape (E, 8), bool
 
 
+class Seen(NamedTuple):
+    """The observation of one control step, and what is remembered of it."""
+
+    observation: Array  # shape (E, D)
+    history: Array  # with this step in it, newest first
+    answers: Array  # the vehicle's response likewise
+    goal_fit: Array  # sums, where the layout fits the goal
+    points: Array  # keypoints, None without a camera
+    valid: Array
+
+
 def camera_conditions(params: CameraParams) -> dict[str, Any]:
     """Return what a vision policy's contract says of the camera: lens, mount and sizes, without
     noise.
@@ -76,14 +88,6 @@ def by_own_rule(policy: Policy, params: CameraParams) -> CameraParams:
     """
     rule = policy.contract.get("camera", {}).get("invalid_reads", params.noise.invalid_reads)
     return replace(params, noise=replace(params.noise, invalid_reads=rule))
-
-
-def _resampled(history: ndarray, sample: ndarray, ages: list[float], period: float) -> ndarray:
-    """`visthrow.onboard.observations.resampled`, of arrays; ``sample``: history with this
-    step in it.
-    """
-    row = torch.from_numpy(sample)[:, 0]
-    return ob.resampled(torch.from_numpy(history), row, ages, period).numpy()
 
 
 class Pilot:
@@ -144,15 +148,16 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, {"camera"}, allow)
         self.policy = policy
         self.count = count
-        if camera_params is None:
-            self.camera = None
-        else:
-            self.camera = KeypointCamera(camera_params)
-        self._views = np.zeros((count, sum(VIEWS.values())), dtype=np.float32)
-        self._time = np.zeros(count, dtype=np.float32)
-        self._observe, self._observe_given = Compiled(self._observed), Compiled(self._observed)
-        self._decide = Compiled(self._decision)
-        self._later = np.zeros(count, dtype=bool)
+        self.camera = self._camera = None
+        if camera_params is not None:
+            self.camera = self._camera = KeypointCamera(camera_params)
+            if count == 1:
+                self._camera = self.camera.on_arrays()
+        examples = torch.zeros(count, policy.obs_dim), policy.begin(count)
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")  # of branches that depend on shapes alone
+            # the network without its Python code
+            self._decide = torch.jit.trace(self._decision, examples, check_trace=False)
         self.spent = (0.0, 0.0)
         first = act.hover_action(GRAVITY * mass, self._max_thrust)
         self._first = np.array([first], dtype=np.float32)
@@ -160,14 +165,14 @@ class Pilot:
 
     def start(self) -> None:
         """Begin a throw from hover: the next call fills the history."""
-        self._previous = self._first.repeat(self.count, 0)
-        shape = (self.count, 1 + self.layout.history, self.layout.payload)
-        self._history = np.zeros(shape, dtype=np.float32)
-        shape = (self.count, 1 + self.layout.response, ob.RESPONSE)
-        self._answers = np.zeros(shape, dtype=np.float32)
-        self._memory = self.policy.begin(self.count).numpy()
-        self._fresh = np.ones(self.count, dtype=bool)
-        self._goal_fit = goal_motion.empty_sums(self.count).numpy()
+        count = self.count
+        layout = self.layout
+        self._previous = self._first.repeat(count, 0)
+        self._history = self._zeros(count, 1 + layout.history, layout.payload)
+        self._answers = self._zeros(count, 1 + layout.response, ob.RESPONSE)
+        self._goal_fit = self._zeros(count, goal_motion.SUMS)
+        self._memory = self.policy.begin(count)
+        self._fresh = self._zeros(count) == 0.0
         self._steps = 0
         # of the rows of history and response, newest first; rows beyond copy the oldest [s]
         self._times: tuple[float, ...] = ()
@@ -210,24 +215,36 @@ class Pilot:
         goal_w = np.asarray(goal_w).reshape(-1, 3)
         attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
-        inputs = () if keypoints is None else tuple(map(np.asarray, keypoints))
-        observation, *state = self._seen(views, inputs)
-        if now is not None and self._bridged(now, state):
-            observation, *state = self._seen(views, inputs)
-        self._history, *frame = state
-        if self.layout.response:
-            self._answers, *frame = frame
-        if self.layout.fits:
-            self._goal_fit, *frame = frame
+        detected = None if keypoints is None else tuple(map(self._native, keypoints))
+        self._shown = views, detected
+        seen = self._see(views, detected)
+        if now is not None and self._bridged(now, seen):
+            seen = self._see(views, detected)
+        self._history = seen.history
+        self._answers = seen.answers
+        self._goal_fit = seen.goal_fit
         decided = time.perf_counter()
+        observation = torch.as_tensor(seen.observation)
         action, command, release, self._memory = self._decide(observation, self._memory)
         self._unasked = self._previous[:, 4]
-        self._previous = action
-        self._fresh = self._later
-        self._steps = self._steps + 1
-        points, valid = frame if frame else (None, None)
+        self._previous = action.numpy()
+        self._fresh = self._zeros(self.count) > 0.0
+        self._steps += 1
         self.spent = (decided - begin, time.perf_counter() - decided)
-        return PilotOutput(action, command, release, observation, points, valid)
+        return PilotOutput(
+            self._previous,
+            command.numpy(),
+            release.numpy(),
+            observation.numpy(),
+            None if seen.points is None else np.asarray(seen.points),
+            None if seen.points is None else np.asarray(seen.valid),
+        )
+
+    @torch.inference_mode()
+    def warm(self) -> None:
+        """Decide the last step again and forget it: then its code and weights are in the caches."""
+        seen = self._see(*self._shown)
+        self._decide(torch.as_tensor(seen.observation), self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of
@@ -235,25 +252,22 @@ class Pilot:
         """
         self._previous = np.concatenate([self._previous[:, :4], self._unasked[:, None]], axis=-1)
 
-    def _seen(self, views: ndarray, inputs: tuple[ndarray, ...]) -> tuple[ndarray, ...]:
-        """Return the observation of a step from its measurements and the memory; ``inputs``:
-        keypoints of a detector.
+    def _native(self, array: ndarray) -> Array:
+        """Return an array as what the observation is computed on: arrays for one vehicle, else
+        tensors.
         """
-        carried: tuple[ndarray, ...] = (self._previous, self._history, self._fresh)
-        if self.layout.response:
-            carried += (self._answers,)
-        if self.layout.fits:
-            self._time[:] = self._steps * self.period
-            carried += (self._goal_fit, self._time)
-        return (self._observe_given if inputs else self._observe)(views, *carried, *inputs)
+        return np.asarray(array) if self.count == 1 else torch.as_tensor(array)
 
-    def _bridged(self, timestamp: float, frame: Sequence[ndarray]) -> bool:
+    def _zeros(self, *shape: int) -> Array:
+        return self._native(np.zeros(shape, dtype=np.float32))
+
+    def _bridged(self, timestamp: float, seen: Seen) -> bool:
         """Make history and response those of steps a period apart, as in training; whether steps
         before this one were late or missing.
 
         Args:
             timestamp: of this step [s].
-            frame: history and response with this step in them, newest first.
+            seen: in this step.
         """
         times = self._times
         period = self.period
@@ -267,21 +281,20 @@ class Pilot:
         errors = [abs(time - when) for time, when in zip(times, due)]
         late = len(due) != len(times) or any(error > JITTER for error in errors)
         if late:
-            self._history = _resampled(self._history, frame[0], ages, period)
+            self._history = ob.resampled(self._history, seen.history[:, 0], ages, period)
             if self.layout.response:
-                self._answers = _resampled(self._answers, frame[1], ages, period)
+                self._answers = ob.resampled(self._answers, seen.answers[:, 0], ages, period)
             self._steps += max(round(ages[0] / period) - 1, 0)
             times = tuple(due)
         self._times = (timestamp, *times[: rows - 1])
         return late
 
-    def _measured(self, *views: ndarray | bool) -> ndarray:
-        """Return the measurements of one step side by side, shape (E, 20): the columns of
-        :data:`VIEWS`.
+    def _measured(self, *views: ndarray | bool) -> list[Array]:
+        """Return the measurements of one step in the order of :data:`VIEWS`, float32, E rows each.
 
         Raises ValueError: one of another shape.
         """
-        row = 0
+        rows = []
         for (name, width), value in zip(VIEWS.items(), views):
             array = np.asarray(value)
             if array.shape != (self.count, width) and not (
@@ -290,67 +303,51 @@ class Pilot:
                 raise ValueError(
                     f"{name} has shape {array.shape}; expected ({self.count}, {width})"
                 )
-            self._views[:, row : row + width] = array
-            row += width
-        return self._views
+            row = np.empty((self.count, width), np.float32)
+            row[:] = array
+            rows.append(self._native(row))
+        return rows
 
-    def _observed(
-        self, views: Tensor, previous: Tensor, history: Tensor, fresh: Tensor, *further: Tensor
-    ) -> tuple[Tensor, ...]:
-        """Assemble the observation, shape (E, D).
+    def _see(self, views: list[Array], detected: tuple[Array, Array] | None) -> Seen:
+        """Assemble the observation of a step from its measurements and what is remembered.
 
         Args:
-            views: shape (E, 20). previous, history, fresh: see
-                `visthrow.onboard.observations.observe`.
-            further: the vehicle's response, where the layout has it; sums of the goal's fit and
-                time [s], where it fits it; then keypoints and validity that a detector saw, else
-                what the camera sees of goal and payload is computed, where there is one.
-
-        Returns:
-            Observation, new history, new response, new sums of the goal's fit, keypoints and
-            validity; where there are any.
+            views: see :data:`VIEWS`.
+            detected: keypoints and validity by a detector; None: what the camera sees of goal and
+                payload, where there is one.
         """
-        answers: tuple[Tensor, ...] = ()
-        if self.layout.response:
-            answers = further[:1]
-            further = further[1:]
-        pos, quat, vel, rate, payload, goal, attached = views.split(list(VIEWS.values()), -1)
+        pos, quat, vel, rate, payload, goal, attached = views
+        layout = self.layout
+        previous = self._native(self._previous)
         rot = ob.rotation_from_quat(quat)
-        fitted = 2 if self.layout.fits else 0
-        fit = further[fitted:]
-        if not fit and self.camera is not None:
-            fit = seen_keypoints(self.camera, pos, rot, goal, payload)
-        points, valid = (fit[0], fit[1]) if fit else (None, None)
+        camera = self._camera
+        points: Array = None
+        valid: Array = None
+        if detected is not None:
+            points, valid = detected
+        elif camera is not None:
+            project = row_keypoints if self.count == 1 else keypoints_of
+            points, valid = project(camera, pos, rot, goal, payload)
         part = ob.state_part(pos, goal, payload)
-        if points is not None and self.layout.name == "vision":
-            part = points.flatten(1)
-        frame = torch.cat([ob.vehicle_part(pos, vel, rate, rot), part], dim=-1)
-        sums: tuple[Tensor, ...] = ()
-        velocity = places = None
-        if fitted:
-            fit_sums, time = further[:2]
-            new, velocity, places, frame, valid = goal_motion.fitted_goal(
-                self.layout, frame, valid, self.camera, fit_sums, time, fresh
+        if layout.name == "vision":
+            part = points.reshape(len(points), -1)
+        frame = ob.joined([ob.vehicle_part(pos, vel, rate, rot), part])
+        filled = valid
+        goal_fit = self._goal_fit
+        answers = self._answers
+        velocity = places = earlier = None
+        if layout.fits:
+            passed = self._zeros(self.count) + self._steps * self.period
+            goal_fit, velocity, places, frame, filled = goal_motion.fitted_goal(
+                layout, frame, valid, camera, goal_fit, passed, self._fresh
             )
-            sums = (new,)
-        answers = tuple(push(buffer, ob.answer(frame, previous), fresh) for buffer in answers)
-        if answers:
-            earlier = answers[0][:, 1:]
-        else:
-            earlier = None
-        observation, history = ob.observe(
-            self.layout,
-            frame,
-            valid,
-            previous,
-            attached[:, 0],
-            history,
-            fresh,
-            velocity,
-            places,
-            earlier,
-        )
-        return observation, history, *answers, *sums, *fit
+        if layout.response:
+            answers = push(answers, ob.answer(frame, previous), self._fresh)
+            earlier = answers[:, 1:]
+        carried = previous, attached[:, 0], self._history, self._fresh
+        further = velocity, places, earlier
+        observation, history = ob.observe(layout, frame, filled, *carried, *further)
+        return Seen(observation, history, answers, goal_fit, points, valid)
 
     def _decision(
         self, observation: Tensor, memory: Tensor
@@ -376,7 +373,6 @@ class Pilot:
         goal_w = np.asarray(goal_w).reshape(-1, 3)
         attached = np.ones((1, 1))
         measured = self._measured(pos_w, quat_wb, zero, zero, payload_w, goal_w, attached)
-        views = torch.from_numpy(measured)
-        pos, quat, _, _, payload, goal, _ = views.split(list(VIEWS.values()), -1)
-        points, valid = seen_keypoints(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
+        pos, quat, _, _, payload, goal, _ = map(torch.as_tensor, measured)
+        points, valid = keypoints_of(self.camera, pos, ob.rotation_from_quat(quat), goal, payload)
         return points.numpy(), valid.numpy()

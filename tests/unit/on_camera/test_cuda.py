@@ -3,7 +3,7 @@
 import torch
 from pytest import mark
 
-from camera.history import push
+from camera.arrays import push
 from camera.keypoint_noise import StepDraw, apply_noise
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector

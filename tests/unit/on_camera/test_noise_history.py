@@ -3,7 +3,7 @@
 import torch
 from pytest import approx, mark
 
-from camera.history import at_latency, push
+from camera.arrays import at_latency, push
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.params import KeypointNoiseParams
 

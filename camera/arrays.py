@@ -1,0 +1,97 @@
+"""The functions that tensors and NumPy arrays share: one piece of code serves a batch in training
+and the single row on board.
+
+A history is newest first. Its functions neither index by masks nor branch on data, so that they run
+inside a CUDA graph. On reset it is filled with the first value: so it never mixes two episodes and
+never holds zeros that were no measurement.
+
+On one row NumPy takes a fraction of torch's time. Both give the same bits: sums, products and
+quotients round alike, and roots and angles are torch's own."""
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Array = Any
+"""A tensor or an array; what a function returns is of the kind of its arguments."""
+
+
+def _by_torch(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
+    """Return a function of tensors as one of arrays."""
+    return lambda *arrays: function(*map(torch.from_numpy, arrays)).numpy()
+
+
+class ArrayFunctions:
+    """The functions of arrays, under the names that torch has for them."""
+
+    asarray = np.asarray
+    broadcast_to = np.broadcast_to
+    concatenate = np.concatenate
+    eye = np.eye
+    finfo = np.finfo
+    full_like = np.full_like
+    maximum = np.maximum
+    minimum = np.minimum
+    ones_like = np.ones_like
+    stack = np.stack
+    where = np.where
+    zeros_like = np.zeros_like
+    atan = _by_torch(torch.atan)
+    cos = _by_torch(torch.cos)
+    sin = _by_torch(torch.sin)
+    sqrt = _by_torch(torch.sqrt)
+    linalg = SimpleNamespace(cross=_by_torch(torch.linalg.cross))
+
+
+def library(array: Tensor | np.ndarray) -> Any:
+    """Return where the functions of a tensor or an array are: torch, or `ArrayFunctions`."""
+    return torch if isinstance(array, Tensor) else ArrayFunctions
+
+
+def push(history: Array, new: Array, reset_mask: Array) -> Array:
+    """Return the history with a value put in front and the oldest dropped.
+
+    Args:
+        history: Shape (E, H, ...), newest first.
+        new: The newest value, shape (E, ...).
+        reset_mask: Environments whose history is filled with the new value, bool, shape (E,).
+
+    Returns:
+        The new history, shape (E, H, ...).
+    """
+    xp = library(history)
+    front = new[:, None]
+    mask = reset_mask.reshape(-1, *(1,) * (history.ndim - 1))
+    return xp.where(mask, front, xp.concatenate([front, history[:, :-1]], 1))
+
+
+def at_latency(history: Tensor, latency: Tensor) -> Tensor:
+    """Value that is ``latency`` steps old, linear between the two stored neighbours.
+
+    Written as hat-function weights over the whole (short) history: no gather, latencies may differ
+    by environment. A latency beyond the history reads its oldest value.
+
+    Args:
+        history: Floating point, shape (E, H, ...), newest first.
+        latency: Age [steps], shape (E,) or scalar tensor.
+
+    Returns:
+        Shape (E, ...).
+    """
+    weights = latency_weights(history.shape[1], latency, history)
+    weights = weights.reshape(*weights.shape, *(1,) * (history.dim() - 2))
+    value = history[:, 0] * weights[:, 0]
+    for age in range(1, history.shape[1]):
+        value = value + history[:, age] * weights[:, age]
+    return value
+
+
+def latency_weights(length: int, latency: Tensor, like: Tensor) -> Tensor:
+    """Weight of each stored age: shape (E, H), rows sum to 1; (1, H) for a scalar latency."""
+    ages = torch.arange(length, device=like.device, dtype=like.dtype)
+    age = latency.to(like.dtype).reshape(-1, 1).clamp(0.0, length - 1.0)
+    return (1.0 - (ages - age).abs()).clamp(min=0.0)
