@@ -136,7 +136,7 @@ def fly(
     """
     vehicle, decisions, command = Vehicle(), [], None
     waiting: list[Pose] = []
-    mass = (runner.mass, runner.parts.vehicle_mass)
+    mass = (runner.mass, runner.vehicle_mass)
     while vehicle.time < seconds and runner.machine.state != "done":
         now = vehicle.time + late(vehicle.time)
         decision = runner.tick(
@@ -153,8 +153,8 @@ def fly(
         released = bool(runner.backend.release_times) and now >= runner.backend.release_times[0]
         waiting = []
         for _ in range(SUBSTEPS):
-            vehicle.step(command, released, runner.parts.hang, mass)
-            waiting += poses(vehicle.time, vehicle.poses(runner.parts.hang))
+            vehicle.step(command, released, runner.hang, mass)
+            waiting += poses(vehicle.time, vehicle.poses(runner.hang))
     return decisions
 
 

@@ -34,7 +34,7 @@ def record_run(
 
     def keep(time, poses, status, words, recording=True):
         decision = tick(time, poses, status, words, recording)
-        times = {"late": 1e-4, "poll": 2e-4, **runner.parts.spent}
+        times = {"late": 1e-4, "poll": 2e-4, **runner.spent}
         recorder.tick(len(decisions), poses, status, words, recording, decision, times)
         decisions.append(decision)
         return decision

@@ -10,6 +10,7 @@ from typing import Any
 
 from hil.poses.body_track import BodyState
 from hil.poses.pose import Vector
+from visthrow.common.rotations import plus
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.onboard.hover import GRAVITY
 
@@ -55,15 +56,15 @@ class ReleaseCheck:
     def landing(self, payload: BodyState) -> tuple[float, float]:
         """Return where a payload in this state lands if the latch trips now [m], world frame."""
         vel = payload.vel
-        pos = tuple(x + self._delay * v for x, v in zip(payload.pos, vel))
+        pos = plus(payload.pos, vel, self._delay)
         time = 0.0
         while time < LONGEST:
-            middle = tuple(v + 0.5 * TIME_STEP * a for v, a in zip(vel, self._acceleration(vel)))
-            after = tuple(x + TIME_STEP * v for x, v in zip(pos, middle))
+            middle = plus(vel, self._acceleration(vel), 0.5 * TIME_STEP)
+            after = plus(pos, middle, TIME_STEP)
             if after[2] < self._height:
                 share = min(max((pos[2] - self._height) / (pos[2] - after[2]), 0.0), 1.0)
                 return pos[0] + share * (after[0] - pos[0]), pos[1] + share * (after[1] - pos[1])
-            vel = tuple(v + TIME_STEP * a for v, a in zip(vel, self._acceleration(middle)))
+            vel = plus(vel, self._acceleration(middle), TIME_STEP)
             pos = after
             time += TIME_STEP
         return pos[0], pos[1]

@@ -14,7 +14,7 @@ from typing import Any
 from hil.control.state_machine import Inputs, OperatorInput, State, TickRecord
 from hil.control.tick.commander import Commander
 from hil.control.tick.decider import Decider
-from hil.control.tick.flight_parts import build_parts
+from hil.control.tick.flight_parts import FlightParts
 from hil.control.tick.state_estimator import StateEstimator
 from hil.links.backends.base import Backend, Status
 from hil.params import HilParams
@@ -25,11 +25,10 @@ from visthrow.onboard.policy import Policy
 MOST_ERRORS = 100  # tracebacks that are kept
 
 
-class Runner:
+class Runner(FlightParts):
     """Flies one vehicle.
 
     Attributes:
-        parts: what the steps share; the most used ones are attributes too.
         estimator, decider, commander: the three steps.
         errors: tracebacks of what was caught, each once.
     """
@@ -42,18 +41,10 @@ class Runner:
         Raises MismatchError, PolicyError: the camera is not the one that the policy was trained
         with, or the policy is incomplete; RunError: the mechanism is slower than the policy was
         trained for."""
-        self.parts = parts = build_parts(params, policy, backend, mechanism_lag)
-        self.params = params
-        self.backend = backend
-        self.pilot = parts.pilot
-        self.machine = parts.machine
-        self.tracks = parts.tracks
-        self.latch = parts.latch
-        self.calibrating = parts.calibrating
-        self.mass = parts.mass
-        self.estimator = StateEstimator(parts)
-        self.decider = Decider(parts)
-        self.commander = Commander(parts)
+        super().__init__(params, policy, backend, mechanism_lag)
+        self.estimator = StateEstimator(self)
+        self.decider = Decider(self)
+        self.commander = Commander(self)
         self.errors: list[str] = []
         self._early_error: Exception | None = None
 
@@ -88,7 +79,7 @@ class Runner:
             recording: whether everything was recorded so far.
         """
         begin = perf_counter()
-        self.parts.spent = {}
+        self.spent = {}
         try:
             self._raise_early_error()
             self.estimator.take_poses(poses)
@@ -96,7 +87,7 @@ class Runner:
             record = self.decider.decide(estimate, status, words, recording)
             self.commander.enter(estimate, record.state)
             self.estimator.show_detection(estimate, record)
-            self.parts.spent["estimate"] = perf_counter() - begin
+            self.spent["estimate"] = perf_counter() - begin
             self.commander.act(estimate, status, record, begin)
         except Exception as error:  # in flight nothing raises past the runner
             return self.fail(time, error)
@@ -151,7 +142,7 @@ class Runner:
             "cancelled": machine.cancelled,
             "latches": latch.count,
             "stuck": latch.stuck,
-            "held_back": self.parts.aim.refused,
+            "held_back": self.aim.refused,
             "landings": [asdict(landing) for landing in latch.landings],
             "guard": {
                 "clipped": guard.clipped,

@@ -23,7 +23,7 @@ class State(StrEnum):
     IDLE = "idle"
     CHECK = "check"
     READY = "ready"
-    ARMED = "armed"
+    ARMED = "armed"  # the operator armed a throw; the vehicle flies
     THROW = "throw"
     RECOVER = "recover"
     LAND = "land"

@@ -95,19 +95,18 @@ class Port(Protocol):
 
 
 def chunks(
-    port: Port, refuse: Callable[[tuple[str, int] | None], None] = lambda sender: None
+    port: Port, refuses: Callable[[tuple[str, int] | None], bool] = lambda sender: False
 ) -> Iterator[bytes]:
-    """Yield what has arrived at a port from the peer that its device names, at most `MOST_CHUNKS`
-    chunks of it; ``refuse`` is called with the address of each other sender's datagram.
+    """Yield what has arrived at a port, at most `MOST_CHUNKS` chunks of it; no datagram of a sender
+    that ``refuses`` returns True for.
     """
     looked = shut_out = 0
     while looked < MOST_CHUNKS and shut_out < MOST_SHUT_OUT:
         data = port.read()
         if data is None:
             return
-        if port.peer is not None and port.sender != port.peer:
+        if refuses(port.sender):
             shut_out += 1
-            refuse(port.sender)
             continue
         looked += 1
         yield data

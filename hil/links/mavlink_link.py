@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from hil.links.clock import TimeSync
-from hil.links.device import MOST_CHUNKS, MOST_SHUT_OUT, Port
+from hil.links.device import Port, chunks
 from hil.links.pymav import Parser, Signed, mav
 from hil.links.roster import Address, Roster, Traffic, address_text
 from hil.links.writer import TlogWriter
@@ -90,25 +90,16 @@ class Link:
         self._listeners.append(listener)
 
     def pump(self, clock: Callable[[], float]) -> int:
-        """Hand all that has arrived to the listeners; returns the number of chunks that were read,
-        refused ones as well.
-        """
-        count = 0
+        """Hand all that has arrived to the listeners; returns 0 where nothing has."""
         looked = 0
-        shut = 0
-        while (
-            looked < MOST_CHUNKS and shut < MOST_SHUT_OUT and (data := self.port.read()) is not None
-        ):
+        refused = self.roster.refused
+        for data in chunks(self.port, self.roster.shuts_out):
             self.sender = self.port.sender
-            if self.roster.shuts_out(self.sender):
-                shut += 1
-                continue
             looked += 1
-            count += self._take(data, clock())
-        self.received += count
+            self.received += self._take(data, clock())
         for call in self.on_pump:
             call(clock())
-        return looked + shut
+        return looked + self.roster.refused - refused
 
     def _take(self, data: bytes, arrival: float) -> int:
         """Hand on the messages in a chunk that are of our parties; returns their number."""

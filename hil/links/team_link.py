@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from hil.errors import ConfigError
-from hil.links.device import MOST_SHUT_OUT, check_device, open_port
+from hil.links.device import check_device, chunks, open_port
 from visthrow.config.bounds import Bound, Bounded
 
 NOTHING, THROW, RELEASE = range(3)
@@ -108,12 +108,8 @@ class TeamLink:
     def agreed(self, time: float) -> int:
         """Read what has come; return what all agreed on for the tick at a time [s]."""
         self._agreement.begin(int((time + self.offset) / self._period + ROUNDING))
-        for _ in range(MOST_SHUT_OUT):
-            datagram = self._port.read()
-            if datagram is None:
-                break
-            if self._port.sender in self._others:
-                self._agreement.receive(datagram, self._others[self._port.sender])
+        for datagram in chunks(self._port, lambda sender: sender not in self._others):
+            self._agreement.receive(datagram, self._others[self._port.sender])
         return self._agreement.agreed
 
     def say(self, ready: int) -> None:

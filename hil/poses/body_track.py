@@ -9,7 +9,7 @@ from hil.poses.frames import FrameParams, Frames
 from hil.poses.gate import Gate, GateParams, Tether
 from hil.poses.pose import Pose, Quaternion, Vector, has_attitude
 from hil.poses.stream import Stream
-from visthrow.common.rotations import turned_one
+from visthrow.common.rotations import plus, turned_one
 
 # poses are carried forward by no more than this [s]; older ones are the timers' affair
 MOST_PREDICTION = 0.1
@@ -110,8 +110,7 @@ class Track:
         pose = self._pose
         if pose is None:
             return None
-        age = time - pose.arrival
-        return tuple(x + age * v for x, v in zip(pose.pos, self._vel))
+        return plus(pose.pos, self._vel, time - pose.arrival)
 
     def sample(self) -> tuple[Pose, Vector, Vector]:
         """Return the last pose, its stamp freed of clock steps, with velocity and body rate; raises
@@ -151,10 +150,10 @@ class Track:
         rate = self.filter.rate if self._turns else (0.0, 0.0, 0.0)
         lead = min(max(lead, 0.0), MOST_PREDICTION)
         if lead > 0.0:
-            pos = tuple(x + lead * v for x, v in zip(pos, vel))
-            vel = tuple(v + TRUST * lead * a for v, a in zip(vel, self.filter.acceleration))
+            pos = plus(pos, vel, lead)
+            vel = plus(vel, self.filter.acceleration, TRUST * lead)
             if quat is not None:
                 quat = turned_one(quat, rate, lead)
             if self._turns:
-                rate = tuple(r + TRUST * lead * a for r, a in zip(rate, self.filter.spin))
+                rate = plus(rate, self.filter.spin, TRUST * lead)
         return BodyState(pos, quat, vel, rate, age)

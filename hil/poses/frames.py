@@ -19,7 +19,14 @@ import numpy as np
 
 from hil.errors import FrameError
 from hil.poses.pose import Pose, Quaternion, Vector
-from visthrow.common.rotations import conjugate, cross_one, multiply, quat_of_matrix, rotate_one
+from visthrow.common.rotations import (
+    conjugate,
+    cross_one,
+    multiply,
+    plus,
+    quat_of_matrix,
+    rotate_one,
+)
 from visthrow.config.bounds import Bounded
 from visthrow.logs.axes import turn_of
 
@@ -86,9 +93,9 @@ class Frames:
         vel = None if pose.vel is None else self.world_from_source(pose.vel)
         rate = None if pose.rate is None else rotate_one(self._body, pose.rate)
         if quat is not None and any(self._offset):
-            pos = _minus(pos, rotate_one(quat, self._offset))
+            pos = plus(pos, rotate_one(quat, self._offset), -1.0)
             if vel is not None and rate is not None:
-                vel = _minus(vel, rotate_one(quat, cross_one(rate, self._offset)))
+                vel = plus(vel, rotate_one(quat, cross_one(rate, self._offset)), -1.0)
         return replace(pose, pos=pos, quat=quat, vel=vel, rate=rate)
 
     def source_from_pose(self, pose: Pose) -> Pose:
@@ -96,9 +103,9 @@ class Frames:
         pos = pose.pos
         vel = pose.vel
         if pose.quat is not None and any(self._offset):
-            pos = _plus(pos, rotate_one(pose.quat, self._offset))
+            pos = plus(pos, rotate_one(pose.quat, self._offset))
             if vel is not None and pose.rate is not None:
-                vel = _plus(vel, rotate_one(pose.quat, cross_one(pose.rate, self._offset)))
+                vel = plus(vel, rotate_one(pose.quat, cross_one(pose.rate, self._offset)))
         quat = (
             None
             if pose.quat is None
@@ -122,11 +129,3 @@ def _quaternion(matrix: np.ndarray) -> Quaternion:
     )
     sign = math.copysign(1.0, next(v for v in (w, x, y, z) if v))
     return (sign * x + 0.0, sign * y + 0.0, sign * z + 0.0, sign * w + 0.0)
-
-
-def _plus(a: Vector, b: Vector) -> Vector:
-    return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
-
-
-def _minus(a: Vector, b: Vector) -> Vector:
-    return (a[0] - b[0], a[1] - b[1], a[2] - b[2])

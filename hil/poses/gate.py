@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 from hil.poses.pose import Pose, Vector
 from visthrow.common.errors import ConfigError
+from visthrow.common.rotations import plus
 from visthrow.config.bounds import Bounded, Positive
 
 OK, WARN, HOLD, ABORT = range(4)  # levels of staleness
@@ -184,7 +185,7 @@ class Gate:
         in which nothing came at all [s].
         """
         p = self.params
-        expected = tuple(x + age * v for x, v in zip(last.pos, velocity or (0.0, 0.0, 0.0)))
+        expected = last.pos if velocity is None else plus(last.pos, velocity, age)
         off = math.dist(pose.pos, expected)
         if tether is not None and off > p.max_jump:
             distance = math.dist(pose.pos, tether.pos)

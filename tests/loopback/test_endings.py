@@ -113,7 +113,7 @@ def test_it_ends_by_landing(way, state, kind, monkeypatch):
     if kind == "betaflight":
         assert run.fake.override, "it is the runner that brings it down"
         if way != "source raises":
-            asked = run.runner.parts.hovering.place_w[2]
+            asked = run.runner.hovering.place_w[2]
             assert asked < 1.333 - 0.3 * 0.4, "a descent of 0.4 m/s, for 0.6 s"
     else:
         assert LANDS[kind] in [text for _, text in run.after]

@@ -135,8 +135,8 @@ def test_the_sign_of_a_rate(kind, axis):
     runner, said, sunk = fly(kind, spoil=turn(axis))
     require_refused(runner, said, sunk)
     assert f"handed back: {AXES[axis]}: the vehicle turns against its commands" in said
-    most = AT_ONCE if runner.parts.response.reported else BY_POSES
-    assert runner.parts.response.time <= most + 1e-9
+    most = AT_ONCE if runner.response.reported else BY_POSES
+    assert runner.response.time <= most + 1e-9
 
 
 @mark.parametrize("kind", KINDS)

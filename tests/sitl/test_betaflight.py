@@ -23,7 +23,7 @@ from pytest import approx, fixture, mark
 from bench.sitl import override
 from bench.sitl.direct import opened, throw
 from hil.links.backends.base import FOLLOW
-from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight, version_text
+from hil.links.backends.betaflight import EXPIRES, FACTS, Betaflight
 from hil.links.device import Device, UdpPort, check_device, open_port
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges.betaflight_bridge import BetaflightSitl
@@ -323,7 +323,7 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     """
     found = override.killed(program(), tmp_path, state)
     told, expires = found["killed"], found["version"] >= EXPIRES - 1e-6
-    print(f"\n{version_text(found['version'])}, {state}: {told}")
+    print(f"\n{found['version']:g}, {state}: {told}")
     assert (told["expired"] is not None) == expires
     if expires:
         assert told["expired"] == approx(FACTS["override_window"], abs=0.1)

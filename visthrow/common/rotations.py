@@ -139,6 +139,11 @@ def conjugate(quat: Quaternion) -> Quaternion:
     return (-x, -y, -z, w)
 
 
+def plus(a: Vector, b: Vector, factor: float = 1.0) -> Vector:
+    """Return ``a + factor b`` of single vectors."""
+    return (a[0] + factor * b[0], a[1] + factor * b[1], a[2] + factor * b[2])
+
+
 def rotate_one(quat: Quaternion, vector: Vector) -> Vector:
     """Turn a single vector by a unit quaternion: ``v + 2 q x (q x v + w v)``."""
     x, y, z, w = quat

@@ -70,7 +70,7 @@ class Playback:
         if isinstance(calibration, dict):
             calibration = Calibration.of(calibration)
         runner.commander.calibration = calibration
-        runner.parts.agreed = line.get("agreed")
+        runner.agreed = line.get("agreed")
         decision = runner.tick(
             time,
             line["poses"],

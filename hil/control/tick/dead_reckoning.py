@@ -5,7 +5,7 @@ import math
 from hil.control.tick.body_estimate import Estimate
 from hil.links.backends.base import Command
 from hil.poses.body_track import BodyState
-from visthrow.common.rotations import rotate_one, turned_one
+from visthrow.common.rotations import plus, rotate_one, turned_one
 from visthrow.onboard.hover import GRAVITY
 
 RESPONSE = 0.05  # time constant with which body rates follow their command [s]
@@ -64,6 +64,6 @@ def _advanced(
     quat = turned_one(state.quat, rates, step)
     force_w = rotate_one(quat, (0.0, 0.0, thrust / mass))
     acceleration_w = (force_w[0], force_w[1], force_w[2] - GRAVITY)
-    vel = tuple(v + step * a for v, a in zip(state.vel, acceleration_w))
-    pos = tuple(x + step * v for x, v in zip(state.pos, vel))
+    vel = plus(state.vel, acceleration_w, step)
+    pos = plus(state.pos, vel, step)
     return BodyState(pos, quat, vel, rates, state.age + step)

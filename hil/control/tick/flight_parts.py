@@ -1,7 +1,6 @@
 """The parts of a runner that the steps of its ticks share."""
 
 import math
-from dataclasses import dataclass, field
 
 from hil.control.aim import ReleaseCheck
 from hil.control.calibrating import Calibrating
@@ -25,28 +24,65 @@ CALM_SPEED = 0.25
 """
 
 
-@dataclass
 class FlightParts:
-    """One vehicle with what observes, judges and commands it."""
+    """One vehicle with what observes, judges and commands it.
 
-    params: HilParams
-    backend: Backend
-    pilot: Pilot
-    machine: Machine
-    tracks: dict[str, Track]  # by body
-    latch: Latch  # of the release, with the landings so far
-    aim: ReleaseCheck
-    hovering: Hovering  # on poses, where no policy flies
-    response: Response | None  # None for a dry run
-    detections: Detections | None  # where keypoints are a detector's
-    calibrating: Calibrating | None  # of the camera in the hover, where the config asks for it
-    mass: float  # of vehicle, rope and payload [kg]
-    vehicle_mass: float  # [kg]
-    hang: float  # of the payload's centre below the vehicle's at rest [m]
-    thrust_tolerance: float  # of the hover, relative to the weight
-    trained_age: float  # of the poses in training [s]
-    agreed: int | None = None  # by the team for this tick; None without a team
-    spent: dict[str, float] = field(default_factory=dict)  # by the stages of the last tick [s]
+    Attributes:
+        params, backend, pilot, machine: of the run.
+        tracks: by body.
+        latch: of the release, with the landings so far. aim: judges releases.
+        hovering: on poses, where no policy flies.
+        response: of the first hover; None for a dry run.
+        detections: where keypoints are a detector's; else None.
+        calibrating: of the camera in the hover, where the config asks for it; else None.
+        mass: of vehicle, rope and payload [kg]. vehicle_mass: of the vehicle [kg].
+        hang: of the payload's centre below the vehicle's at rest [m].
+        thrust_tolerance: of the hover, relative to the weight.
+        trained_age: of the poses in training [s].
+        agreed: by the team for this tick; None without a team.
+        spent: by the stages of the last tick [s].
+    """
+
+    def __init__(
+        self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float
+    ) -> None:
+        """Build the parts; arguments and errors as of `hil.control.runner.Runner`."""
+        self.params = params
+        self.backend = backend
+        self.pilot = pilot = Pilot(policy, params.camera)
+        delay = params.delay
+        check = params.check
+        contract = policy.contract
+        rope = contract["rope"]
+        dry = params.backend == "dry-run"
+        self.vehicle_mass = contract["vehicle"]["body"]["mass"]
+        self.mass = self.vehicle_mass + rope["rope_mass"] + rope["payload_mass"]
+        self.hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
+        tolerance = math.inf if dry else getattr(params, params.backend).thrust.tolerance
+        self.thrust_tolerance = tolerance
+        self.trained_age = 0.5 * sum(contract["observation"]["latency"])
+        self.machine = Machine(params.states, params.throws, params.observe, not dry)
+        self.tracks = {
+            body: Track(frames, params.gate, params.estimate, body == VEHICLE)
+            for body, frames in params.frames.items()
+        }
+        command_delay = delay.command if delay.compensate else 0.0
+        height = params.landing_height
+        limits = check.rope_tolerance, height, command_delay
+        self.latch = Latch(pilot.lag, mechanism_lag, self.hang, *limits)
+        self.aim = ReleaseCheck(params.aim, self.trained_age + self.latch.lag, height, rope)
+        heading = math.radians(check.heading_deg)
+        max_thrust = float(contract["action"]["max_thrust"])
+        self.hovering = Hovering(params.home_w, heading, max_thrust, pilot.period)
+        self.response = self.detections = self.calibrating = None
+        if not dry:
+            self.response = Response(pilot.period, self.mass, tolerance, check.probe)
+        if params.keypoints == "detector":
+            self.detections = Detections(pilot.camera, params.images.hold)
+        if params.calibration is not None:
+            self.calibrating = Calibrating(params.calibration)
+        self.agreed: int | None = None
+        self.spent: dict[str, float] = {}
 
     def carries_payload(self, estimate: Estimate) -> bool:
         """Return whether the payload hangs on the vehicle, by the latch and by its own poses."""
@@ -68,49 +104,3 @@ class FlightParts:
         if self.latch.at is None and estimate.payload is not None:
             bodies.append(PAYLOAD)
         return all(self.tracks[body].calm_speed() < CALM_SPEED for body in bodies)
-
-
-def build_parts(
-    params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float
-) -> FlightParts:
-    """Build the parts of a runner; errors as of `hil.control.runner.Runner`."""
-    pilot = Pilot(policy, params.camera)
-    delay = params.delay
-    check = params.check
-    contract = policy.contract
-    rope = contract["rope"]
-    vehicle_mass = contract["vehicle"]["body"]["mass"]
-    mass = vehicle_mass + rope["rope_mass"] + rope["payload_mass"]
-    max_thrust = float(contract["action"]["max_thrust"])
-    hang = -rope["mount"][2] + rope["length"] + rope["payload_offset"]
-    dry = params.backend == "dry-run"
-    tolerance = math.inf if dry else getattr(params, params.backend).thrust.tolerance
-    command_delay = delay.command if delay.compensate else 0.0
-    trained_age = 0.5 * sum(contract["observation"]["latency"])
-    height = params.landing_height
-    latch = Latch(pilot.lag, mechanism_lag, hang, check.rope_tolerance, height, command_delay)
-    heading = math.radians(check.heading_deg)
-    detections = None
-    if params.keypoints == "detector":
-        detections = Detections(pilot.camera, params.images.hold)
-    return FlightParts(
-        params,
-        backend,
-        pilot,
-        Machine(params.states, params.throws, params.observe, not dry),
-        {
-            body: Track(frames, params.gate, params.estimate, body == VEHICLE)
-            for body, frames in params.frames.items()
-        },
-        latch,
-        ReleaseCheck(params.aim, trained_age + latch.lag, height, rope),
-        Hovering(params.home_w, heading, max_thrust, pilot.period),
-        None if dry else Response(pilot.period, mass, tolerance, check.probe),
-        detections,
-        None if params.calibration is None else Calibrating(params.calibration),
-        mass,
-        vehicle_mass,
-        hang,
-        tolerance,
-        trained_age,
-    )

@@ -41,7 +41,6 @@ class Rule:
     write: bool = False
     optional: bool = False  # firmware without it is right as well
     warns: bool = False  # a mismatch is told, and flown with
-    text: Callable[[float], str] = "{:g}".format  # a value in words
 
     def good(self, value: float) -> bool:
         """Return whether a value is as required."""
@@ -160,7 +159,7 @@ class Audit:
         if not missing or waited > GIVE_UP:
             self.done = True
             answers = {name: f": {why}" for name, why in self.refused.items()}
-            answers |= {name: f" is {self.rules[name].text(x)}" for name, x in self.found.items()}
+            answers |= {name: f" is {x:g}" for name, x in self.found.items()}
             self.problems = [
                 f"{r.name}{answers.get(r.name, ' was not told')}; expected {r.words}"
                 for r in self._wrong()
@@ -196,11 +195,9 @@ class Audit:
         rows = [("", "parameter", "found", "expected", "why")]
         wrong = self._wrong()
         for name, rule in self.rules.items():
-            text = (
-                rule.text(self.found[name])
-                if name in self.found
-                else self.refused.get(name, "no answer")
-            )
+            text = self.refused.get(name, "no answer")
+            if name in self.found:
+                text = f"{self.found[name]:g}"
             text += " (written)" if name in self.written else ""
             judged = ("WARN" if rule.warns else "WRONG") if rule in wrong else "ok"
             rows.append((judged, name, text, rule.words, rule.why))

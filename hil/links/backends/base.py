@@ -327,9 +327,12 @@ class OnPort(Autopilot):
     def close(self) -> None:
         self._port.close()
 
-    def _stranger(self, sender: Address) -> None:
-        """Count a datagram of another sender than the one that the device names."""
-        self.roster.drop(sender, "datagram", f"the device is {address_text(self._port.peer)}")
+    def _refuses(self, sender: Address) -> bool:
+        """Return whether a datagram is of another sender than the device names, and count it."""
+        stranger = self._port.peer not in (None, sender)
+        if stranger:
+            self.roster.drop(sender, "datagram", f"the device is {address_text(self._port.peer)}")
+        return stranger
 
     def _put(self, data: bytes) -> bool:
         taken = self._port.write(data)

@@ -53,8 +53,8 @@ BLOCKS = FACTS["blocks"]
 switch itself, which is raised while another one is set.
 """
 
-EXPIRES = FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
-"""First version, as of :func:`version_text`, in which the sticks of MSP OVERRIDE expire."""
+EXPIRES = FACTS["calendar_base"] + FACTS["override_since"][0] + 0.01 * FACTS["override_since"][1]
+"""First version, year and month, in which the sticks of MSP OVERRIDE expire."""
 
 FEWEST_AUX = 4  # channels of a frame beside the sticks
 IMU = struct.Struct(f"<{FACTS['imu_rates']}x3h")  # body rates of MSP_RAW_IMU
@@ -163,8 +163,8 @@ class Betaflight(OnPort):
             for name, curve in curves.items()
             for i, axis in enumerate(AXES)
         }
-        rules = rules_of(self.name, p, rates_type=RATES_TYPES[p.rates.type], **numbers)
-        return rules if p.arm_channel else [*rules, expiry()]
+        numbers |= {"rates_type": RATES_TYPES[p.rates.type], "expires": EXPIRES}
+        return rules_of(self.name, p, **numbers)
 
     def _hint(self) -> str:
         if not self._taken or self._raised:
@@ -433,28 +433,6 @@ SETTINGS = {
 """Which answer tells which setting. Some hold more than a number: see :func:`settings`."""
 
 
-def version_text(version: float) -> str:
-    """Return a version, 4.06 or 26.06, as people write it: 4.6, 2026.6."""
-    first = int(version)
-    base = FACTS["calendar_base"] if first >= FACTS["calendar"] else 0
-    return f"{base + first}.{round(100 * (version - first))}"
-
-
-def expiry() -> Rule:
-    """Return the rule of what becomes of the last sticks when the runner dies under MSP OVERRIDE,
-    which warns alone.
-    """
-    return Rule(
-        "fc_version",
-        f"there the pilot's sticks count {FACTS['override_window']:g} s after the runner dies;"
-        " before, its last sticks count until the pilot switches MSP OVERRIDE off",
-        minimum=EXPIRES,
-        expected=f"{version_text(EXPIRES)} or newer",
-        warns=True,
-        text=version_text,
-    )
-
-
 def blocked(flags: int) -> str:
     """Return what speaks against arming, in words."""
     named = [text for bit, text in enumerate(BLOCKS) if flags >> bit & 1]
@@ -472,6 +450,8 @@ def settings(frame: msp.Frame, params: BetaflightParams) -> dict[str, float]:
     for name in {"api_version", "fc_version"} & values.keys():
         minor = frame.number("B", SETTINGS[name].offset + 1)
         values = {} if minor is None else {name: values[name] + 0.01 * minor}
+    if values.get("fc_version", 0.0) >= FACTS["calendar"]:
+        values["fc_version"] += FACTS["calendar_base"]
     if "channel_forwarding" in values:
         values["channel_forwarding"] = float(bool(int(values["channel_forwarding"]) & FORWARDING))
     if frame.command == msp.MODE_RANGES:

@@ -15,7 +15,7 @@ import math
 from dataclasses import dataclass
 
 from hil.links import crtp
-from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule
+from hil.links.backends.audit import NO_SUCH_PARAMETER, Audit, Rule, rules_of
 from hil.links.backends.base import ACCEPTED, FOLLOW, PENDING, WAIT, Command, OnPort, Release
 from hil.links.backends.crazyflie_gyro import GyroStream
 from hil.links.backends.thrust_curve import HoverThrustParams
@@ -29,7 +29,6 @@ from visthrow.common.rotations import tilt_and_heading
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 FACTS = values("crazyflie")
-MODES = tuple(name for name in FACTS if "." in name)  # parameters that are set before it is armed
 
 ASK = 0.1  # between two questions for its state [s]
 ARM_PERIOD = 0.2  # between two requests to arm [s]
@@ -94,17 +93,11 @@ class Crazyflie(OnPort):
         self._asked = self._armed_at = -1e9
 
     def _rules(self) -> list[Rule]:
-        why = {name: fact.means for name, fact in facts(self.name).items()}
-        oldest = FACTS["protocol_state"]
-        old = (
-            "firmware of 2026.04: an older one stops its motors at a manual set-point, or"
-            " tells no state"
-        )
-        return [
-            Rule("protocol", old, minimum=oldest, expected=f"{oldest} or newer"),
-            *(Rule(name, why[name], (FACTS[name],)) for name in MODES),
-            Rule(self.params.release_parameter, "the mechanism, closed", (0.0,)),
-        ]
+        """Return the rules of ``rules.toml``, and of each parameter that is a fact."""
+        protocol, release = rules_of(self.name, self.params)
+        named = {name: fact for name, fact in facts(self.name).items() if "." in name}
+        modes = [Rule(name, fact.means, (fact.value,)) for name, fact in named.items()]
+        return [protocol, *modes, release]
 
     def _ask(self, name: str) -> None:
         """Ask for the version, or set a parameter: its answer says that it is so."""
@@ -178,7 +171,7 @@ class Crazyflie(OnPort):
         self._put(crtp.set_parameter(self.params.release_parameter, 0))
 
     def service(self, host_time: float) -> None:
-        for data in chunks(self._port, self._stranger):
+        for data in chunks(self._port, self._refuses):
             packet = crtp.unpack(data)
             if packet is None:
                 self.roster.drop(self._port.sender, "datagram", "no CRTP packet")

@@ -148,7 +148,7 @@ class Hall:
         true, _ = keypoints(
             self.camera, tensors[0], rotation_from_quat(tensors[1]), self.goal, tensors[2]
         )
-        shown, valid = self.runner.parts.detections.keypoints(self.plant.time)
+        shown, valid = self.runner.detections.keypoints(self.plant.time)
         assert valid.all()
         return float(np.sqrt(np.square(shown - true.numpy()).mean()))
 

@@ -94,7 +94,7 @@ def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(comma
     runner = watched(f"delay.command={command}", late=late)
     now = 0.39 + late
     estimate = runner.estimator.estimate(now)
-    trained = runner.parts.trained_age
+    trained = runner.trained_age
     assert estimate.vehicle.pos[0] == approx(now - trained + command, abs=1e-6)
     assert estimate.shown_age == approx(min(late, trained))
 
@@ -102,6 +102,6 @@ def test_a_state_stands_for_when_the_command_acts_less_the_age_of_training(comma
 def test_a_detector_is_told_the_payloads_distance_while_it_hangs():
     runner = watched(late=0.0)
     hint = runner.estimator.hint(0.39)
-    assert hint.ball_distance == approx((0.5 * runner.parts.hang, 1.4 * runner.parts.hang))
+    assert hint.ball_distance == approx((0.5 * runner.hang, 1.4 * runner.hang))
     runner.latch.at = 0.39
     assert runner.estimator.hint(0.39).ball_distance is None

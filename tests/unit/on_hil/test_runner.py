@@ -71,7 +71,7 @@ def test_a_throw_from_idle_to_done():
     (landing,) = pilot.latch.landings
     np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
     assert landing.error == approx(2.0, abs=0.02)
-    fall = math.sqrt(2 * (1.333 - pilot.parts.hang - 0.04) / 9.81)
+    fall = math.sqrt(2 * (1.333 - pilot.hang - 0.04) / 9.81)
     assert landing.duration == approx(LAG + fall, abs=0.02)
     assert not pilot.errors
 
@@ -159,7 +159,7 @@ def test_a_release_that_waits_for_late_commands_is_not_stopped_before_its_time()
 @mark.parametrize(("share", "throws"), [(0.1, True), (1.05, True), (1.3, False)])
 def test_another_hover_thrust_than_the_weights_forbids_a_throw_unless_it_stands(share, throws):
     pilot = runner(NEVER)
-    pilot.parts.thrust_tolerance = 0.1
+    pilot.thrust_tolerance = 0.1
     thrust = share * pilot.mass * 9.81
     decisions = fly(pilot, 5.0, status=lambda time: Status(True, thrust=thrust))
     assert ("throw" in {d.state for d in decisions}) is throws
@@ -167,7 +167,7 @@ def test_another_hover_thrust_than_the_weights_forbids_a_throw_unless_it_stands(
 
 def test_errors_are_not_integrated_while_the_vehicle_follows_another():
     pilot, resets = runner(NEVER), []
-    pilot.parts.hovering.reset = lambda: resets.append(1)
+    pilot.hovering.reset = lambda: resets.append(1)
     fly(pilot, 3.0, status=lambda time: Status(True, mode=HOLD))
     assert len(resets) > 50
 
@@ -184,9 +184,9 @@ def test_a_payload_that_rolls_on_after_its_landing_keeps_no_vehicle_from_being_c
 def test_a_vehicle_that_the_autopilot_holds_is_calm_away_from_its_hover_point():
     pilot = runner(NEVER)
     fly(pilot, 2.0)
-    pilot.parts.params = replace(pilot.parts.params, home_w=(0.5, 0.0, 1.333))
+    pilot.params = replace(pilot.params, home_w=(0.5, 0.0, 1.333))
     estimate = pilot.estimator.estimate(2.0)
-    assert [pilot.parts.is_calm(estimate, holding) for holding in (True, False)] == [True, False]
+    assert [pilot.is_calm(estimate, holding) for holding in (True, False)] == [True, False]
 
 
 def test_a_hover_has_a_share_after_a_second_and_descends_to_the_ground():
@@ -282,7 +282,7 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     corners = tuple(map(tuple, (ahead / np.linalg.norm(ahead, axis=1, keepdims=True)).tolist()))
     shown = {"goal": corners, "ball": (0.0, 0.1, math.sqrt(0.99), 0.08)}
     pilot = runner(NEVER)
-    pilot.parts.detections = Detections(pilot.pilot.camera, 0.1)
+    pilot.detections = Detections(pilot.pilot.camera, 0.1)
 
     def watch(time, decision):
         seen = {
@@ -349,9 +349,7 @@ def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
         if time > START:
             pilot.pilot.act = broken
         if decision.state == "abort":
-            places.append(
-                (pilot.tracks["vehicle"].state(time).pos[0], pilot.parts.hovering.place_w[0])
-            )
+            places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot.hovering.place_w[0]))
 
     fly(pilot, START + 0.2, watch=watch)
     assert places[0][0] > 0.15
