@@ -12,7 +12,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from camera import history as hist
+from camera import arrays
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
 from visthrow.common.free_fall import free_flight
@@ -203,7 +203,7 @@ class TeamEnv(VecEnv):
         requests = self._worlds(act.release_asked(actions, self.cfg.release.threshold)).all(1)
         requests &= self.episode_length_buf[:: self.team] >= self.earliest
         fresh = torch.zeros_like(requests)
-        memory["requests"].copy_(hist.push(memory["requests"], requests.float(), fresh))
+        memory["requests"].copy_(arrays.push(memory["requests"], requests.float(), fresh))
         steps = (memory["age"] / self.cfg.sim.control_period - 1e-3).ceil().long()
         agreed = memory["requests"].gather(1, steps[:, None])[:, 0] > 0.5
         self.views.release.copy_(self._rows(agreed))
@@ -375,10 +375,10 @@ class TeamEnv(VecEnv):
         goal = self.views.goal_w
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
-        poses = hist.push(memory["poses"], torch.cat([vehicle, load], -1), fresh)
+        poses = arrays.push(memory["poses"], torch.cat([vehicle, load], -1), fresh)
         memory["poses"].copy_(poses)
         period = self.cfg.sim.control_period
-        pose = hist.at_latency(poses, memory["pose_age"] / period)
+        pose = arrays.at_latency(poses, memory["pose_age"] / period)
         vehicle_seen = pose[:, : ob.VEHICLE]
         offset = ob.state_part(pose[:, :3], goal, pose[:, ob.VEHICLE :])
         frame = torch.cat([vehicle_seen, offset], -1)
@@ -411,7 +411,7 @@ class TeamEnv(VecEnv):
         """
         noise = self.cfg.task.noise.observation_step
         age = self._rows(self._memory["age"]) / self.cfg.sim.control_period
-        late = hist.at_latency(poses, age)
+        late = arrays.at_latency(poses, age)
         parts = []
         for k in range(1, self.team):
             neighbour = self._neighbour(late, k)
@@ -425,7 +425,7 @@ class TeamEnv(VecEnv):
         state = self.views.state
         memory = self._memory
         offset = ob.state_part(state["pos_w"], self.views.goal_w, load)
-        history = hist.push(memory["true_history"], offset[:, 2:], fresh)
+        history = arrays.push(memory["true_history"], offset[:, 2:], fresh)
         memory["true_history"].copy_(history)
         numbers = [state[name] for name in ("release_timer", "mass_scale", "voltage")]
         numbers = torch.stack([*numbers, attached], -1)

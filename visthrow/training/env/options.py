@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from camera import history as hist
+from camera import arrays
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.keypoints import KEYPOINTS, KeypointCamera, corrected_keypoints, keypoints
 from camera.params import CameraParams
@@ -78,7 +78,7 @@ class PoseDelay:
 
     def push(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Take the current pose sample; return the delayed one, linear between control steps."""
-        self.poses.copy_(hist.push(self.poses, pose, fresh))
+        self.poses.copy_(arrays.push(self.poses, pose, fresh))
         if self._params.oldest == 0.0:
             return pose
         age = self.age
@@ -175,8 +175,8 @@ class DetectorView:
         if noise.scale_std > 0.0:
             points = points * (1.0 + buffers["scale_error"])
         if noise.latency > 0.0:
-            buffers["late_points"].copy_(hist.push(buffers["late_points"], points, fresh))
-            buffers["late_valid"].copy_(hist.push(buffers["late_valid"], valid, fresh))
+            buffers["late_points"].copy_(arrays.push(buffers["late_points"], points, fresh))
+            buffers["late_valid"].copy_(arrays.push(buffers["late_valid"], valid, fresh))
             points, valid = apply_latency(
                 buffers["late_points"], buffers["late_valid"], self._latency
             )

@@ -10,7 +10,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import Tensor
 
-from camera import history as hist
+from camera import arrays
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY, RopeParams
 from sim.torch_bridge import TorchViews, on_torch_stream
@@ -379,7 +379,7 @@ class ThrowEnv(VecEnv):
             _, goal_vel, places, measured, valid = fitted
         if self.layout.response:
             buffers["answers"].copy_(
-                hist.push(buffers["answers"], ob.answer(measured, buffers["previous"]), fresh)
+                arrays.push(buffers["answers"], ob.answer(measured, buffers["previous"]), fresh)
             )
             answers = buffers["answers"][:, 1:]
         actor, history = ob.observe(
@@ -412,7 +412,7 @@ class ThrowEnv(VecEnv):
         parts = [actor]
         if "exact" in named:
             offset = ob.state_part(state["pos_w"], self.views.goal_w, payload)
-            true_history = hist.push(buffers["true_history"], offset[:, 2:], fresh)
+            true_history = arrays.push(buffers["true_history"], offset[:, 2:], fresh)
             buffers["true_history"].copy_(true_history)
             parts = [vehicle, buffers["previous"], offset[:, :2], true_history.flatten(1)]
         quantities = (
