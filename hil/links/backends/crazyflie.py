@@ -29,6 +29,8 @@ from visthrow.common.rotations import tilt_and_heading
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 
 FACTS = values("crazyflie")
+# parameters that are set before it is armed
+MODES = {name: fact for name, fact in facts("crazyflie").items() if "." in name}
 
 ASK = 0.1  # between two questions for its state [s]
 ARM_PERIOD = 0.2  # between two requests to arm [s]
@@ -93,10 +95,8 @@ class Crazyflie(OnPort):
         self._asked = self._armed_at = -1e9
 
     def _rules(self) -> list[Rule]:
-        """Return the rules of ``rules.toml``, and of each parameter that is a fact."""
         protocol, release = rules_of(self.name, self.params)
-        named = {name: fact for name, fact in facts(self.name).items() if "." in name}
-        modes = [Rule(name, fact.means, (fact.value,)) for name, fact in named.items()]
+        modes = [Rule(name, fact.means, (fact.value,)) for name, fact in MODES.items()]
         return [protocol, *modes, release]
 
     def _ask(self, name: str) -> None:
