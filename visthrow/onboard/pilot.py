@@ -153,11 +153,7 @@ class Pilot:
             self.camera = self._camera = KeypointCamera(camera_params)
             if count == 1:
                 self._camera = self.camera.on_arrays()
-        examples = torch.zeros(count, policy.obs_dim), policy.begin(count)
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # of branches that depend on shapes alone
-            # the network without its Python code
-            self._decide = torch.jit.trace(self._decision, examples, check_trace=False)
+        self._decide = self._traced()
         self.spent = (0.0, 0.0)
         first = act.hover_action(GRAVITY * mass, self._max_thrust)
         self._first = np.array([first], dtype=np.float32)
@@ -357,6 +353,13 @@ class Pilot:
         action = act.clip_action(raw)
         command = act.command_from_action(action, self._max_thrust, self._max_rate)
         return action, command, act.release_asked(raw, self._threshold), memory
+
+    def _traced(self) -> Any:
+        """Return :meth:`_decision` as a program that runs without its Python code."""
+        examples = torch.zeros(self.count, self.policy.obs_dim), self.policy.begin(self.count)
+        with warnings.catch_warnings(), torch.no_grad():
+            warnings.simplefilter("ignore")  # of branches that depend on shapes alone
+            return torch.jit.trace(self._decision, examples, check_trace=False)
 
     @torch.inference_mode()
     def see(
