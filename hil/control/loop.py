@@ -180,12 +180,17 @@ class Loop:
         self._ended = clock.now()
 
     def _warm(self, spent: float) -> None:
-        """Have the policy in the caches when the tick comes; it took a time in the last one [s]."""
+        """Have the policy in the caches when the tick comes; it took a time in the last one [s].
+
+        What the back-end has to do before the tick is not held up.
+        """
+        runner = self.runner
+        tick = self.ticker.due()
         lead = 2.0 * max(spent, self._warming)
         self._warming = 0.0
-        if lead < MOST_WARMING:
-            runner = self.runner
-            _wait(self.clock, self.ticker.due() - lead, runner.backend, self.source)
+        due = runner.backend.due()
+        if lead < MOST_WARMING and (due is None or due >= tick):
+            _wait(self.clock, tick - lead, runner.backend, self.source)
             begin = perf_counter()
             runner.pilot.warm()
             self._warming = perf_counter() - begin
