@@ -105,8 +105,6 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
     vec3 = t.vec3
     L = segments
     State = parts.State
-    load = parts.load
-    coupled = parts.coupled
     Wrench = st.array_struct(t, "Wrench", WRENCH_FIELDS)
     Bodies = st.array_struct(t, "Bodies", BODY_FIELDS)
     load_bodies, store_bodies = build_body_access(t, L)
@@ -129,8 +127,8 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
             return
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
-        s = load_bodies(state, env, load(state, env), n, u)
-        pos, vel = coupled.payload(rope_of(plants, env), s, n, u)
+        s = load_bodies(state, env, parts.load(state, env), n, u)
+        pos, vel = parts.coupled.payload(rope_of(plants, env), s, n, u)
         store_bodies(bodies, env, s, n, u, pos, vel)
         wrench.pull_w[env] = vec3()
         wrench.twist_b[env] = vec3()
@@ -166,7 +164,6 @@ def build_exchange(
     """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
     real = t.real
     vec3 = t.vec3
-    vec4 = t.vec4
     L = params.rope.segments
     loaded = bool(extensions & LOADS)
     parts = step.parts
@@ -175,10 +172,8 @@ def build_exchange(
     load = parts.load
     store = parts.store
     bodies_access = build_bodies(t, parts, L)
-    load_bodies = bodies_access.load_bodies
     flow = parts.flow
     advance = parts.advance
-    coupled = parts.coupled
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Plants = t.Plants
@@ -194,7 +189,7 @@ def build_exchange(
         # State in:
         state: State,
         # In:
-        command: wp.array(dtype=vec4),
+        command: wp.array(dtype=t.vec4),
         release: Ints,
         mask: Ints,
         # Out:
@@ -254,7 +249,7 @@ def build_exchange(
             p, rope, air_of(plants, state, env), s, n, u, stiffness, active, state.attached[env]
         )
         if state.attached[env] == 0:
-            s = coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
+            s = parts.coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
             if st.size(s) < limit:
                 store(state, env, s)
             else:
@@ -307,7 +302,7 @@ def build_exchange(
         vel = bodies.payload_vel_w[env]
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
-        s = load_bodies(bodies, env, load(state, env), n, u)
+        s = bodies_access.load_bodies(bodies, env, load(state, env), n, u)
         size = st.size(s) + parts.rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite

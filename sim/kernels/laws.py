@@ -273,13 +273,9 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleName
     vel_w)`` [N] on a payload that has left. Without laws both do nothing."""
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
     vec4 = t.vec4
     real = t.real
-    Vehicle = t.Vehicle
-    Rope = t.Rope
     Air = t.Air
-    QuadState = t.QuadState
     Around = t.from_names("Around", AROUND)
 
     @wp.func
@@ -322,13 +318,13 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleName
 
     @wp.func
     def on(
-        p: Vehicle,
-        rope: Rope,
+        p: t.Vehicle,
+        rope: t.Rope,
         air: Air,
-        s: QuadState,
+        s: t.QuadState,
         n: Vectors,
         u: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         command: vec4,
         attached: int,
     ):

@@ -32,10 +32,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     """Build the reset kernels for a number of segments; ``hangs``: whether a rope does."""
     real = t.real
     vec3 = t.vec3
-    Vectors = t.Vectors
-    Reals = t.Reals
     Plants = t.Plants
-    Randomization = t.Randomization
     L = params.rope.segments
     start = build_start(t, params.vehicle, State)
     attached = int(hangs)
@@ -80,7 +77,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         state: State,
         # In:
         mask: Ints,
-        used: Reals,
+        used: t.Reals,
     ):
         env = wp.tid()
         if mask[env] != 0:
@@ -91,7 +88,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         # Params:
         first: int,
         plants: Plants,
-        spreads: wp.array(dtype=Randomization),
+        spreads: wp.array(dtype=t.Randomization),
         seed: int,
         # State in:
         state: State,
@@ -99,7 +96,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         # In:
         mask: Ints,
         # Out:
-        goal_w: Vectors,
+        goal_w: t.Vectors,
     ):
         env = wp.tid() + first
         if mask[env] != 0:

@@ -58,10 +58,7 @@ def build_parts(
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
-    Vehicle = t.Vehicle
     Rope = t.Rope
-    Release = t.Release
-    Air = t.Air
     QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
@@ -88,7 +85,7 @@ def build_parts(
         return total
 
     @wp.func
-    def hazards(p: Vehicle, rope: Rope, s: QuadState, n: Vectors, payload_pos: vec3):
+    def hazards(p: t.Vehicle, rope: Rope, s: QuadState, n: Vectors, payload_pos: vec3):
         """Bits of the status: the payload strikes the vehicle; a joint of the rope stands within a
         propeller disc, one centimetre thick."""
         status = int(0)
@@ -108,8 +105,8 @@ def build_parts(
     @wp.func
     def depart(
         rope: Rope,
-        r: Release,
-        air: Air,
+        r: t.Release,
+        air: t.Air,
         s: QuadState,
         pos: vec3,
         vel: vec3,
@@ -174,34 +171,24 @@ def build_step(
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
-    vec4 = t.vec4
-    Rope = t.Rope
-    Release = t.Release
-    Air = t.Air
     Plants = t.Plants
-    QuadState = t.QuadState
     L = params.rope.segments
     nonfinite = st.NONFINITE
-    fallback = st.FALLBACK
     parts = build_parts(t, params, direct, extensions, motors, integrator)
     State = parts.State
     Output = parts.Output
     chain = parts.chain
     coupled = parts.coupled
-    laws = parts.laws
     load = parts.load
-    store = parts.store
     load_rope = parts.load_rope
-    store_rope = parts.store_rope
-    rope_size = parts.rope_size
     limit = real(st.SPEED_LIMIT)
 
     @wp.func
     def separate(
-        rope: Rope,
-        r: Release,
-        air: Air,
-        s: QuadState,
+        rope: t.Rope,
+        r: t.Release,
+        air: t.Air,
+        s: t.QuadState,
         n: Vectors,
         u: Vectors,
         gravity: real,
@@ -224,7 +211,7 @@ def build_step(
         # State in:
         state: State,
         # In:
-        command: wp.array(dtype=vec4),
+        command: wp.array(dtype=t.vec4),
         release: Ints,
         mask: Ints,
         # Out:
@@ -272,7 +259,7 @@ def build_step(
             for k in range(count):
                 if attached != 0:
                     rope = chain.stretched(natural, rope, stiffness, u, h)
-                law_factors = laws.on(p, rope, air, s, n, u, stiffness, active, attached)
+                law_factors = parts.laws.on(p, rope, air, s, n, u, stiffness, active, attached)
                 if attached != 0:
                     s, total, fell_back = coupled.step(
                         p,
@@ -290,7 +277,7 @@ def build_step(
                         h,
                     )
                     if fell_back:
-                        status = status | fallback
+                        status = status | st.FALLBACK
                 else:
                     s = coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
             time = until
@@ -302,9 +289,9 @@ def build_step(
             timer = wp.max(timer - period, real(0.0))
         state.release_timer[env] = timer
         state.attached[env] = attached
-        if st.size(s) + rope_size(u, n) < limit:  # false for NaN
-            store(state, env, s)
-            store_rope(state, env, n, u, stiffness)
+        if st.size(s) + parts.rope_size(u, n) < limit:  # false for NaN
+            parts.store(state, env, s)
+            parts.store_rope(state, env, n, u, stiffness)
         else:
             status = status | nonfinite
             s = load(state, env)

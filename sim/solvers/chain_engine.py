@@ -37,11 +37,8 @@ def _kernel(world: World) -> wp.Kernel:
     real = t.real
     vec3 = t.vec3
     vec4 = t.vec4
-    Vehicle = t.Vehicle
-    Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    QuadRate = t.QuadRate
     State = world.kernels.State
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
@@ -49,9 +46,9 @@ def _kernel(world: World) -> wp.Kernel:
     load_bodies, store_bodies = build_body_access(t, L)
 
     @wp.func
-    def flow(p: Vehicle, air: Air, s: QuadState, command: vec4):
+    def flow(p: t.Vehicle, air: Air, s: QuadState, command: vec4):
         """The wrench that was given: here the air carries its force in the body frame."""
-        out = QuadRate()
+        out = t.QuadRate()
         out.pos_w = s.vel_w
         out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
         out.force_b = air.push_w
@@ -61,7 +58,7 @@ def _kernel(world: World) -> wp.Kernel:
     chain = build_chain(t, L, extensions)
 
     @wp.func
-    def hanging(rope: Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
+    def hanging(rope: t.Rope, air: Air, vel_w: vec3, along_w: vec3, jet_w: vec3):
         return air.payload_push_w
 
     coupled = build_coupled_step(t, flow, advance, chain, extensions, hanging=hanging)

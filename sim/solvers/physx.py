@@ -239,7 +239,6 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
     """Kernels between the exchange's arrays and PhysX's tensors."""
     t = world.types
     L = world.params.rope.segments
-    Rope = t.Rope
     Wrench = world.kernels.Wrench
     Bodies = world.kernels.Bodies
     loaded = bool(extensions_of(world.ropes) & LOADS) or bool(world.params.laws)
@@ -278,7 +277,7 @@ def _kernels(world: World) -> dict[str, wp.Kernel]:
     @unique_kernel
     def show(
         # Params:
-        ropes: wp.array(dtype=Rope),
+        ropes: wp.array(dtype=t.Rope),
         # In:
         rows: Ints,
         links: wp.array2d(dtype=wp.transformf),

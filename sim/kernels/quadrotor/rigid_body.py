@@ -116,11 +116,10 @@ def build_flow(
     motor_rate = MOTORS[vehicle.motor.kind]
     battery_rate = BATTERIES[vehicle.battery.kind]
     aerodynamics = AEROS[vehicle.aero.kind]
-    QuadRate = t.QuadRate
 
     @wp.func
     def flow(p: Any, air: Any, s: Any, command: Any):
-        out = QuadRate()
+        out = t.QuadRate()
         target, integral_rate, setpoint_rate, gyro_rate = rate_controller(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
@@ -158,13 +157,12 @@ def build_direct_flow(t: Types):
 
     What the bare-dynamics scenes of the tests fly, and an idealised vehicle for whoever wants one.
     """
-    QuadRate = t.QuadRate
     vec3 = t.vec3
     real = t.real
 
     @wp.func
     def flow(p: Any, air: Any, s: Any, command: Any):
-        out = QuadRate()
+        out = t.QuadRate()
         out.pos_w = s.vel_w
         out.quat_wb = quat_rate(s.quat_wb, s.rate_b)
         out.force_b = vec3(real(0.0), real(0.0), command[0])

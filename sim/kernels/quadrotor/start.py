@@ -44,14 +44,12 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
     It puts motors, filters, battery and queue of an environment in hover under a collective thrust
     [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
     rate must have been set before."""
-    Vehicle = t.Vehicle
     real = t.real
-    vec3 = t.vec3
     vec4 = t.vec4
     ideal = vehicle.battery.kind == "ideal"
 
     @wp.func
-    def start(p: Vehicle, state: State, env: int, thrust: real, used: real):
+    def start(p: t.Vehicle, state: State, env: int, thrust: real, used: real):
         voltage = p.battery.reference_voltage
         charge_used = used
         if wp.static(ideal):
@@ -64,7 +62,7 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
                 )
         speed = hover_speed(p, thrust / real(4.0), voltage)
         state.motor_speed[env] = vec4(speed, speed, speed, speed)
-        state.integral[env] = vec3()
+        state.integral[env] = t.vec3()
         state.setpoint[env] = state.rate_b[env]
         state.gyro[env] = state.rate_b[env]
         state.charge_used[env] = charge_used

@@ -171,11 +171,8 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
     real = t.real
     Vectors = t.Vectors
     Reals = t.Reals
-    Vehicle = t.Vehicle
     Rope = t.Rope
     Release = t.Release
-    State = structs.State
-    Windows = structs.Windows
     Moment = structs.Moment
     attached_code = ATTACHED
     loose_code = LOOSE
@@ -183,12 +180,12 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
 
     @wp.func
     def begin(
-        p: Vehicle,
+        p: t.Vehicle,
         natural: Rope,
         r: Release,
-        windows: Windows,
+        windows: structs.Windows,
         w: int,
-        starts: State,
+        starts: structs.State,
         start: int,
         n: Vectors,
         u: Vectors,
@@ -275,7 +272,6 @@ def build_replay(
     load_rope, store_rope = st.build_rope_access(t, L)
     loose = build_loose(t, chain, extra)
     sampling = build_sampling(t, Sensing, Windows, Data, loose.Ball)
-    Steps = sampling.Steps
     Moment = sampling.Moment
     structs = SimpleNamespace(
         State=State,
@@ -381,7 +377,7 @@ def build_replay(
             active = data.command[acting]
             peak = windows.first_knot[w] + real(float(lanes.knot[lane])) * knot_spacing
             for j in range(count):
-                k = Steps()
+                k = sampling.Steps()
                 k.t0 = m.time + real(float(j)) * h
                 k.t1 = k.t0 + h
                 k.h = h

@@ -92,7 +92,6 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
     """
     real = t.real
     vec3 = t.vec3
-    Vehicle = t.Vehicle
     Pointers = make_struct(
         "Pointers", {"vehicle": wp.int32, "payload": wp.int32, "gyro": wp.int32, "due": real}
     )
@@ -110,7 +109,7 @@ def build_sampling(t: Types, Sensing: type, Windows: type, Data: type, Ball: typ
 
     @wp.func
     def sample(
-        p: Vehicle,
+        p: t.Vehicle,
         x: Sensing,
         data: Data,
         windows: Windows,

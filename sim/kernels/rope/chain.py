@@ -164,8 +164,6 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
-    Rope = t.Rope
     vec2 = rods.vec2
     giving = "compliance" in extensions
 
@@ -179,12 +177,12 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
 
     @wp.func
     def up(
-        rope: Rope,
+        rope: t.Rope,
         n: Vectors,
         u: Vectors,
         n2: Vectors,
         k1: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         root_rate_w: vec3,
         gravity: vec3,
         load: vec3,
@@ -291,7 +289,6 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
     Rope = t.Rope
     vec2 = rods.vec2
     giving = "compliance" in extensions
@@ -337,7 +334,7 @@ def build_descent(t: Types, rods: SimpleNamespace, extensions: frozenset[str]):
         rope: Rope,
         n: Vectors,
         u: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         mount_acc_w: vec3,
         mount_force_w: vec3,
         gravity: vec3,

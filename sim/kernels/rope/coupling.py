@@ -68,15 +68,11 @@ def build_coupled_step(
     frame)."""
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
-    vec4 = t.vec4
     real = t.real
     Vehicle = t.Vehicle
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
-    QuadRate = t.QuadRate
-    vec2 = chain.vec2
     L = chain.segments
     loaded = bool(extensions & LOADS)
 
@@ -89,7 +85,7 @@ def build_coupled_step(
         rope: Rope,
         air: Air,
         s: QuadState,
-        f: QuadRate,
+        f: t.QuadRate,
         n: Vectors,
         u: Vectors,
         k1: Vectors,
@@ -132,10 +128,10 @@ def build_coupled_step(
         air: Air,
         s: QuadState,
         total: vec3,
-        command: vec4,
+        command: t.vec4,
         n: Vectors,
         u: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         gravity: vec3,
         gamma: real,
         max_turn: real,
@@ -145,7 +141,7 @@ def build_coupled_step(
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
         c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=vec2)
+        hs = wp.zeros(shape=(L,), dtype=chain.vec2)
         half = real(0.5)
         weight = (p.body.mass + rope.total_mass) * gravity
 

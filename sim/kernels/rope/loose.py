@@ -22,11 +22,7 @@ def build_loose_step(t: Types, chain):
     velocity of the upper end; the arrays n, u and stiffness change in place."""
     vec3 = t.vec3
     Vectors = t.Vectors
-    Reals = t.Reals
     real = t.real
-    Rope = t.Rope
-    Air = t.Air
-    vec2 = chain.vec2
     L = chain.segments
 
     @wp.func
@@ -35,13 +31,13 @@ def build_loose_step(t: Types, chain):
 
     @wp.func
     def step(
-        rope: Rope,
-        air: Air,
+        rope: t.Rope,
+        air: t.Air,
         pos_w: vec3,
         vel_w: vec3,
         n: Vectors,
         u: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         gravity: vec3,
         gamma: real,
         max_turn: real,
@@ -51,7 +47,7 @@ def build_loose_step(t: Types, chain):
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
         c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=vec2)
+        hs = wp.zeros(shape=(L,), dtype=chain.vec2)
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
         load1 = free_force(rope, air, chain.speed(rope, vel_w, u, k1, h))
@@ -110,11 +106,8 @@ def build_loose(
     vec3 = t.vec3
     real = t.real
     Vectors = t.Vectors
-    Reals = t.Reals
     Rope = t.Rope
-    Air = t.Air
     Release = t.Release
-    QuadState = t.QuadState
     last = chain.segments - 1
     names = ("pos", "vel", "root", "root_vel", "tail", "tail_vel")
     Ball = make_struct("Ball", dict.fromkeys(names, vec3))
@@ -122,7 +115,7 @@ def build_loose(
     fly_ball = build_step_in_flight(t, build_flight(t, laws))
 
     @wp.func
-    def let_go(r: Release, rope: Rope, s: QuadState, n: Vectors, u: Vectors):
+    def let_go(r: Release, rope: Rope, s: t.QuadState, n: Vectors, u: Vectors):
         ball = Ball()
         ball.root = mount_position(rope, s)
         ball.root_vel = mount_velocity(rope, s)
@@ -151,10 +144,10 @@ def build_loose(
         ball: Ball,
         rope: Rope,
         r: Release,
-        air: Air,
+        air: t.Air,
         n: Vectors,
         u: Vectors,
-        stiffness: Reals,
+        stiffness: t.Reals,
         gravity: vec3,
         gamma: real,
         max_turn: real,

@@ -45,13 +45,11 @@ def build_flight(t: Types, laws: SimpleNamespace):
     """Return ``flight_acceleration(rope, air, vel_w, gravity)`` [m/s^2] of the payload alone, laws
     on it included.
     """
-    real = t.real
-    in_flight = laws.in_flight
 
     @wp.func
     def flight_acceleration(rope: Any, air: Any, vel_w: Any, gravity: Any):
-        return gravity + (free_force(rope, air, vel_w) + in_flight(air, vel_w)) * (
-            real(1.0) / rope.payload_mass
+        return gravity + (free_force(rope, air, vel_w) + laws.in_flight(air, vel_w)) * (
+            t.real(1.0) / rope.payload_mass
         )
 
     return flight_acceleration
