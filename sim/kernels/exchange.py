@@ -163,6 +163,7 @@ def build_exchange(
 ) -> ExchangeKernels:
     """Build the kernels from the parts of a fused step of the same plant and ``extensions``."""
     real = t.real
+    zero = real(0.0)
     vec3 = t.vec3
     L = params.rope.segments
     loaded = bool(extensions & LOADS)
@@ -208,7 +209,7 @@ def build_exchange(
         if not push(state.queue, env, command[env]):
             state.status[env] = nonfinite
         out.separated[env] = 0
-        if release[env] != 0 and state.release_timer[env] < real(0.0) and state.attached[env] != 0:
+        if release[env] != 0 and state.release_timer[env] < zero and state.attached[env] != 0:
             state.release_timer[env] = release_of(plants, env).lag
 
     @unique_kernel
@@ -265,7 +266,7 @@ def build_exchange(
         wrench.force_b[env] = f.force_b
         wrench.torque_b[env] = f.torque_b
         if wp.static(loaded):
-            jet = wp.quat_rotate(s.quat_wb, vec3(real(0.0), real(0.0), -f.force_b[2]))
+            jet = wp.quat_rotate(s.quat_wb, vec3(zero, zero, -f.force_b[2]))
             wrench.load_w[env] = hanging_force(
                 rope, law_factors, out.payload_vel_w[env], n[L - 1], jet
             )
@@ -322,9 +323,9 @@ def build_exchange(
             state.cable_dir_w[i, env] = n[i]
             state.cable_vel_w[i, env] = u[i]
         timer = state.release_timer[env]
-        if timer >= real(0.0) and time > timer - tiny:
+        if timer >= zero and time > timer - tiny:
             one = real(1.0)
-            part = wp.clamp((timer - (time - h)) / h, real(0.0), one)
+            part = wp.clamp((timer - (time - h)) / h, zero, one)
             before = out.payload_vel_w[env]
             # backwards from the end with the acceleration between the ends
             remaining_time = (one - part) * h
@@ -340,7 +341,7 @@ def build_exchange(
                 plants.gravity,
                 out,
                 env,
-                wp.max(timer, real(0.0)),
+                wp.max(timer, zero),
             )
             state.attached[env] = 0
         else:
@@ -361,9 +362,9 @@ def build_exchange(
         env = wp.tid() + first
         if mask[env] == 0:
             return
-        if state.release_timer[env] >= real(0.0):
+        if state.release_timer[env] >= zero:
             state.release_timer[env] = wp.max(
-                state.release_timer[env] - plants.control_period, real(0.0)
+                state.release_timer[env] - plants.control_period, zero
             )
         if state.attached[env] != 0:
             s = load(state, env)

@@ -169,6 +169,7 @@ def build_step(
         integrator: of a vehicle that carries nothing.
     """
     real = t.real
+    zero = real(0.0)
     vec3 = t.vec3
     Vectors = t.Vectors
     Plants = t.Plants
@@ -230,14 +231,14 @@ def build_step(
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
-        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, zero)
         s = load(state, env)
 
         taken = push(state.queue, env, command[env])
         whole, switch = split_delay(p, period)
         timer = state.release_timer[env]
         attached = state.attached[env]
-        if release[env] != 0 and timer < real(0.0) and attached != 0:
+        if release[env] != 0 and timer < zero and attached != 0:
             timer = rel.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
         tiny = real(1.0e-6)
         status = int(0)
@@ -247,7 +248,7 @@ def build_step(
 
         total = coupled.momentum(p, rope, s, u)
         time = real(0.0)
-        if attached != 0 and timer >= real(0.0) and timer < tiny:
+        if attached != 0 and timer >= zero and timer < tiny:
             separate(rope, r, air, s, n, u, gravity, out, env, time)
             attached = int(0)
         while time < period - tiny:
@@ -281,12 +282,12 @@ def build_step(
                 else:
                     s = coupled.step_alone(p, law_factors, s, active, plants.gravity_w, h)
             time = until
-            if attached != 0 and timer >= real(0.0) and time > timer - tiny:
+            if attached != 0 and timer >= zero and time > timer - tiny:
                 separate(rope, r, air, s, n, u, gravity, out, env, time)
                 attached = int(0)
 
-        if timer >= real(0.0):
-            timer = wp.max(timer - period, real(0.0))
+        if timer >= zero:
+            timer = wp.max(timer - period, zero)
         state.release_timer[env] = timer
         state.attached[env] = attached
         if st.size(s) + parts.rope_size(u, n) < limit:  # false for NaN
@@ -320,7 +321,7 @@ def build_step(
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
-        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, zero)
         if state.attached[env] != 0:
             pos, vel = coupled.payload(rope, s, n, u)
             out.payload_pos_w[env] = pos
@@ -342,10 +343,10 @@ def build_step(
         u = wp.zeros(shape=(L,), dtype=vec3)
         stiffness = wp.zeros(shape=(L,), dtype=real)
         load_rope(state, env, n, u, stiffness)
-        rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+        rope = chain.stretched(natural, natural, stiffness, u, zero)
         s = load(state, env)
         r = release_of(plants, env)
         air = air_of(plants, state, env)
-        separate(rope, r, air, s, n, u, plants.gravity, out, env, real(0.0))
+        separate(rope, r, air, s, n, u, plants.gravity, out, env, zero)
 
     return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output, parts)

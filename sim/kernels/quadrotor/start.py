@@ -45,6 +45,7 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
     [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
     rate must have been set before."""
     real = t.real
+    zero = real(0.0)
     vec4 = t.vec4
     ideal = vehicle.battery.kind == "ideal"
 
@@ -68,6 +69,6 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
         state.charge_used[env] = charge_used
         state.voltage[env] = voltage
         for k in range(state.queue.shape[0]):
-            state.queue[k, env] = vec4(thrust, real(0.0), real(0.0), real(0.0))
+            state.queue[k, env] = vec4(thrust, zero, zero, zero)
 
     return start

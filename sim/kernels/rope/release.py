@@ -129,6 +129,7 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
     if not dragging:
         return SimpleNamespace(time_to_height=time_to_height, after=projectile, clearance=clearance)
     real = t.real
+    zero = real(0.0)
     vec3 = t.vec3
     Rope = t.Rope
     Air = t.Air
@@ -136,11 +137,11 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
 
     @wp.func
     def fly(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, h: real):
-        return step(rope, air, pos_w, vel_w, vec3(real(0.0), real(0.0), -gravity), h)
+        return step(rope, air, pos_w, vel_w, vec3(zero, zero, -gravity), h)
 
     @wp.func
     def after(rope: Rope, air: Air, pos_w: vec3, vel_w: vec3, gravity: real, time: real):
-        count = int(wp.ceil(wp.max(time, real(0.0)) / real(FLIGHT_STEP)))
+        count = int(wp.ceil(wp.max(time, zero) / real(FLIGHT_STEP)))
         pos = pos_w
         vel = vel_w
         for _ in range(count):
@@ -156,7 +157,7 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         time = real(0.0)
         next_pos, next_vel = fly(rope, air, pos, vel, gravity, h)
         count = int(0)
-        while (next_pos[2] > height or next_vel[2] > real(0.0)) and count < FLIGHT_STEPS:
+        while (next_pos[2] > height or next_vel[2] > zero) and count < FLIGHT_STEPS:
             pos = next_pos
             vel = next_vel
             time = time + h
@@ -165,8 +166,8 @@ def build_ballistic(t: Types, acceleration, dragging: bool) -> SimpleNamespace:
         share = time_to_height(rope, air, pos, vel, height, gravity)
         for _ in range(3):
             next_pos, next_vel = fly(rope, air, pos, vel, gravity, share)
-            if next_vel[2] < real(0.0):
-                share = wp.max(share - (next_pos[2] - height) / next_vel[2], real(0.0))
+            if next_vel[2] < zero:
+                share = wp.max(share - (next_pos[2] - height) / next_vel[2], zero)
         return time + share
 
     @wp.func
