@@ -99,9 +99,9 @@ class ExchangeKernels:
     Bodies: type
 
 
-def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNamespace:
-    """Build the structs ``Wrench`` and ``Bodies``, their access of :func:`build_body_access` and
-    the kernels that copy between the bodies and the plant."""
+def build_bodies(t: Types, parts: SimpleNamespace, segments: int):
+    """Return the structs ``Wrench`` and ``Bodies``, ``load_bodies`` of :func:`build_body_access`,
+    and the kernels that show the plant in the bodies and put out the bodies' payload."""
     vec3 = t.vec3
     L = segments
     State = parts.State
@@ -149,13 +149,7 @@ def build_bodies(t: Types, parts: SimpleNamespace, segments: int) -> SimpleNames
             out.payload_pos_w[env] = bodies.payload_pos_w[env]
             out.payload_vel_w[env] = bodies.payload_vel_w[env]
 
-    return SimpleNamespace(
-        Wrench=Wrench,
-        Bodies=Bodies,
-        load_bodies=load_bodies,
-        show=show_kernel,
-        payload=payload_kernel,
-    )
+    return Wrench, Bodies, load_bodies, show_kernel, payload_kernel
 
 
 def build_exchange(
@@ -172,14 +166,12 @@ def build_exchange(
     Output = step.Output
     load = parts.load
     store = parts.store
-    bodies_access = build_bodies(t, parts, L)
+    Wrench, Bodies, load_bodies, show_kernel, payload_kernel = build_bodies(t, parts, L)
     flow = parts.flow
     advance = parts.advance
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Plants = t.Plants
-    Wrench = bodies_access.Wrench
-    Bodies = bodies_access.Bodies
     tiny = real(1.0e-6)
 
     @unique_kernel
@@ -303,7 +295,7 @@ def build_exchange(
         vel = bodies.payload_vel_w[env]
         n = wp.zeros(shape=(L,), dtype=vec3)
         u = wp.zeros(shape=(L,), dtype=vec3)
-        s = bodies_access.load_bodies(bodies, env, load(state, env), n, u)
+        s = load_bodies(bodies, env, load(state, env), n, u)
         size = st.size(s) + parts.rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite
@@ -376,13 +368,13 @@ def build_exchange(
             state.status[env] = state.status[env] | hazard_bits
 
     return ExchangeKernels(
-        begin=begin_kernel,
-        wrench=wrench_kernel,
-        take=take_kernel,
-        end=end_kernel,
-        show=bodies_access.show,
-        payload=bodies_access.payload,
-        State=State,
-        Wrench=Wrench,
-        Bodies=Bodies,
+        begin_kernel,
+        wrench_kernel,
+        take_kernel,
+        end_kernel,
+        show_kernel,
+        payload_kernel,
+        State,
+        Wrench,
+        Bodies,
     )

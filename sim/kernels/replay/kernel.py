@@ -166,7 +166,7 @@ def note_slack(m: Any, pull: Any, weight: Any, begins: Any, t0: Any, t1: Any):
     return out
 
 
-def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
+def build_lane(t: Types, structs: SimpleNamespace, chain, coupled, loose, load_quad, load_rope):
     """Return Warp functions ``begin`` and ``latch_or_separate`` of a lane between two steps."""
     real = t.real
     Vectors = t.Vectors
@@ -194,13 +194,13 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
         """A lane at its window's start; n, u and stiffness are filled in."""
         m = Moment()
         m.time = windows.start[w]
-        m.quad = blocks.load_quad(starts, start)
-        blocks.load_rope(starts, start, n, u, stiffness)
+        m.quad = load_quad(starts, start)
+        load_rope(starts, start, n, u, stiffness)
         m.mode = windows.payload[w]
         m.separation = windows.end[w] + real(1.0)
         if m.mode == attached_code:
-            m.rope = blocks.chain.stretched(natural, natural, stiffness, u, real(0.0))
-            pos, vel = blocks.coupled.payload(m.rope, m.quad, n, u)
+            m.rope = chain.stretched(natural, natural, stiffness, u, real(0.0))
+            pos, vel = coupled.payload(m.rope, m.quad, n, u)
             m.pay = pos
             m.pay_vel = vel
             if windows.latch[w] <= m.time:  # the pull at the latch lies before this window
@@ -210,9 +210,9 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
             m.rope = natural
             m.pay = starts.payload_pos_w[start]
             m.pay_vel = starts.payload_vel_w[start]
-            m.ball = blocks.loose.hang_below(natural, m.pay, m.pay_vel, n, u)
+            m.ball = loose.hang_below(natural, m.pay, m.pay_vel, n, u)
             m.latched = 1
-        m.total = blocks.coupled.momentum(p, m.rope, m.quad, u)
+        m.total = coupled.momentum(p, m.rope, m.quad, u)
         m.before = m.quad.rate_b
         m.slack_first = m.time - real(1.0)
         m.slack_last = m.slack_first
@@ -234,11 +234,11 @@ def build_lane(t: Types, structs: SimpleNamespace, blocks: SimpleNamespace):
         out = m
         if m.mode == attached_code:
             if latch <= m.time + tiny and m.latched == 0:
-                pull = blocks.chain.pull(m.rope, stiffness, u)
+                pull = chain.pull(m.rope, stiffness, u)
                 out.separation = latch + lag(r, m.rope, pull, gravity)
                 out.latched = 1
             if out.separation <= m.time + tiny:
-                out.ball = blocks.loose.let_go(r, m.rope, m.quad, n, u)
+                out.ball = loose.let_go(r, m.rope, m.quad, n, u)
                 out.mode = int(loose_code)
                 out.rope = natural
                 out.pay = out.ball.pos
@@ -284,10 +284,7 @@ def build_replay(
         Ropes=Ropes,
         Pointers=sampling.Pointers,
     )
-    blocks = SimpleNamespace(
-        chain=chain, coupled=coupled, loose=loose, load_quad=load_quad, load_rope=load_rope
-    )
-    begin, latch_or_separate = build_lane(t, structs, blocks)
+    begin, latch_or_separate = build_lane(t, structs, chain, coupled, loose, load_quad, load_rope)
     attached_code = ATTACHED
     loose_code = LOOSE
     tiny = real(TINY)
