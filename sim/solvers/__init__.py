@@ -70,6 +70,10 @@ class World:
     wrench: Any  # of sim.kernels.exchange.WRENCH_FIELDS
     bodies: Any  # of sim.kernels.exchange.BODY_FIELDS
 
+    def launch(self, kernel: wp.Kernel, arguments: list[Any]) -> None:
+        """Launch a kernel for all environments."""
+        wp.launch(kernel, self.count, arguments, device=self.device)
+
     @property
     def substep(self) -> float:
         """Time between two exchanges [s]."""

@@ -76,30 +76,27 @@ class MujocoSolver:
 
     def place(self, mask) -> None:
         w = self.world
-        device = self.world.device
         end = 2 * w.params.rope.segments
         root = [self.qpos[:, :7], self.qvel[:, :6]]
         rope = [self.qpos[:, 7 : 7 + end], self.qvel[:, 6 : 6 + end]]
         place = [w.state, mask, self._rows, *root, *rope]
-        wp.launch(self._kernels["place"], w.count, place, device=device)
+        w.launch(self._kernels["place"], place)
         masses = [self._nominal, self._vehicle, self._masses]
         pack = [w.plants.ropes, w.state, mask, *masses, self.qpos, self.qvel]
-        wp.launch(self._kernels["pack"], w.count, pack, device=device)
+        w.launch(self._kernels["pack"], pack)
         self._placed(mask)
         self._show()
 
     def advance(self, duration: float) -> None:
         w = self.world
-        device = self.world.device
-        push = [w.wrench, self._payload_quat, self.ctrl]
-        wp.launch(self._kernels["push"], w.count, push, device=device)
+        w.launch(self._kernels["push"], [w.wrench, self._payload_quat, self.ctrl])
         self._step()
         self._show()
 
     def _show(self) -> None:
         w = self.world
         outputs = [w.plants.ropes, self.qpos, self.qvel, w.bodies, self._payload_quat]
-        wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
+        w.launch(self._kernels["show"], outputs)
 
 
 def _on_cpu(model, wide: dict[str, ndarray], count: int, device: str) -> tuple:

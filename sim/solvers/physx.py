@@ -177,9 +177,7 @@ class PhysxSolver:
         names = ("pose", "velocity", "angles", "rates")
         arrays = [self._arrays[name] for name in names]
         rows = wp.array(moved, dtype=wp.uint8, device=w.device)
-        wp.launch(
-            self._kernels["place"], w.count, [w.state, mask, self._rows, *arrays], device=w.device
-        )
+        w.launch(self._kernels["place"], [w.state, mask, self._rows, *arrays])
         scale = w.state.mass_scale.numpy()[self._order]
         masses = np.where(moved, self._unscaled * scale, self._masses[:, 0])
         changed = masses != self._masses[:, 0]
@@ -194,13 +192,13 @@ class PhysxSolver:
         arrays = self._arrays
         tensors = self._tensors
         inputs = [w.wrench, w.bodies, self._rows, arrays["wrench"]]
-        wp.launch(self._kernels["push"], w.count, inputs, device=w.device)
+        w.launch(self._kernels["push"], inputs)
         tensors["wrench"].write(arrays["wrench"])
         self._physx.step_sync(duration)
         for name in ("links", "link_velocities"):
             tensors[name].read(arrays[name])
         outputs = [w.plants.ropes, self._rows, arrays["links"], arrays["link_velocities"], w.bodies]
-        wp.launch(self._kernels["show"], w.count, outputs, device=w.device)
+        w.launch(self._kernels["show"], outputs)
 
 
 def _start(device: str) -> ModuleType:
