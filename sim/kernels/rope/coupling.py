@@ -73,6 +73,7 @@ def build_coupled_step(
     Rope = t.Rope
     Air = t.Air
     QuadState = t.QuadState
+    vec2 = chain.vec2
     L = chain.segments
     loaded = bool(extensions & LOADS)
 
@@ -141,7 +142,7 @@ def build_coupled_step(
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
         c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=chain.vec2)
+        hs = wp.zeros(shape=(L,), dtype=vec2)
         half = real(0.5)
         weight = (p.body.mass + rope.total_mass) * gravity
 

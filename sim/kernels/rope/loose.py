@@ -23,6 +23,7 @@ def build_loose_step(t: Types, chain):
     vec3 = t.vec3
     Vectors = t.Vectors
     real = t.real
+    vec2 = chain.vec2
     L = chain.segments
 
     @wp.func
@@ -47,7 +48,7 @@ def build_loose_step(t: Types, chain):
         n2 = wp.zeros(shape=(L,), dtype=vec3)
         c1 = wp.zeros(shape=(L,), dtype=vec3)
         c2 = wp.zeros(shape=(L,), dtype=vec3)
-        hs = wp.zeros(shape=(L,), dtype=chain.vec2)
+        hs = wp.zeros(shape=(L,), dtype=vec2)
         half = real(0.5)
         total = rope.total_mass * vel_w + chain.momentum(rope, u)
         load1 = free_force(rope, air, chain.speed(rope, vel_w, u, k1, h))
