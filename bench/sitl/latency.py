@@ -23,7 +23,8 @@ import numpy as np
 
 from hil.links import msp
 from hil.links.pymav import mav
-from tests.sitl.test_betaflight import program, visthrow, wait_for
+from tests.commands import set_words, start
+from tests.sitl.test_betaflight import program, wait_for
 
 POSES = 14560
 COMMANDS = 5761
@@ -89,39 +90,15 @@ class Wire(threading.Thread):
 def flown(folder: Path, seconds: float, speed: float) -> dict:
     """Hover through the firmware for a time; the report."""
     wire = Wire()
-    words = ("--speed", str(speed))
-    bridge = visthrow(
-        "hil",
-        "fake",
-        "--kind",
-        "betaflight-sitl",
-        "--firmware",
-        str(program()),
-        "--folder",
-        str(folder / "firmware"),
-        *words,
-        "--out",
-        str(folder / "bridge.json"),
-        stderr=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-    )
+    pipes = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL}
+    places = ("--firmware", program(), "--folder", folder / "firmware")
+    words = f"hil fake --kind betaflight-sitl --speed {speed} --out"
+    bridge = start(words, folder / "bridge.json", *places, **pipes)
     try:
         wait_for(bridge, "it flies")
         sets = (f"states.armed_least={seconds}", f"states.armed={seconds + 20.0}", "delay.hold=0.0")
-        runner = visthrow(
-            "hil",
-            "run",
-            "--config",
-            "betaflight_sitl",
-            "--auto-arm",
-            "--bare",
-            *words,
-            "--out",
-            str(folder / "run"),
-            *(word for text in sets for word in ("--set", text)),
-            stderr=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-        )
+        words = f"hil run --config betaflight_sitl --auto-arm --bare --speed {speed} --out"
+        runner = start(words, folder / "run", *set_words(sets), **pipes)
         wait_for(runner, " s  armed ")
         wire.start()
         with_time = threading.Timer(seconds / speed, runner.send_signal, (signal.SIGINT,))
