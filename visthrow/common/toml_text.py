@@ -25,18 +25,31 @@ def dumps(tree: dict[str, Any]) -> str:
     Raises ValueError if a value has no TOML form (NaN, infinity, None, other types).
     """
     lines: list[str] = []
-    _table(tree, (), lines)
+    _table(tree, "", lines)
     return "\n".join(lines).strip("\n") + "\n"
 
 
-def _table(tree: dict[str, Any], path: tuple[str, ...], lines: list[str]) -> None:
-    plain = {key: value for key, value in tree.items() if not isinstance(value, dict)}
-    tables = {key: value for key, value in tree.items() if isinstance(value, dict)}
+def _table(tree: dict[str, Any], path: str, lines: list[str], head: str = "[{}]") -> None:
+    tables = {key: value for key, value in tree.items() if _holds_tables(value)}
+    plain = {key: value for key, value in tree.items() if key not in tables}
     if path and (plain or not tables):
-        lines += ["", f"[{'.'.join(_key(part) for part in path)}]"]
-    lines += [f"{_key(key)} = {_value(value, (*path, key))}" for key, value in plain.items()]
+        lines += ["", head.format(path)]
+    lines += [f"{_key(key)} = {_value(value, f'{path}.{key}')}" for key, value in plain.items()]
     for key, value in tables.items():
-        _table(value, (*path, key), lines)
+        place = f"{path}.{_key(key)}" if path else _key(key)
+        if isinstance(value, dict):
+            _table(value, place, lines)
+            continue
+        for item in value:
+            _table(item, place, lines, "[[{}]]")
+
+
+def _holds_tables(value: Any) -> bool:
+    """Whether a value is a table, or a list of tables each of which holds something plain."""
+    if not isinstance(value, list | tuple):
+        return isinstance(value, dict)
+    flat = (isinstance(item, dict) and not all(map(_holds_tables, item.values())) for item in value)
+    return bool(value) and all(flat)
 
 
 def _key(key: str) -> str:
@@ -48,7 +61,7 @@ def _string(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _value(value: Any, path: tuple[str, ...]) -> str:
+def _value(value: Any, path: str) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -65,7 +78,7 @@ def _value(value: Any, path: tuple[str, ...]) -> str:
             + ", ".join(f"{_key(key)} = {_value(item, path)}" for key, item in value.items())
             + "}"
         )
+    where = path.removeprefix(".")
     raise ValueError(
-        f"{'.'.join(path)}: {value!r} has no TOML form: no string, bool, finite number, list or"
-        " table"
+        f"{where}: {value!r} has no TOML form: no string, bool, finite number, list or table"
     )
