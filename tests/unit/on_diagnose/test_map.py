@@ -121,6 +121,27 @@ def test_brackets_say_units_and_the_lean_says_the_order_of_a_quaternion():
     assert "by gravity" in found.why["quat_wb"]
 
 
+@pytest.mark.parametrize("angles", [False, True])
+@pytest.mark.parametrize("down", [False, True])
+def test_north_east_down_is_known_by_gravity(angles, down):
+    columns = flight(20.0)
+    flip = np.array([1.0, -1.0, -1.0]) if down else np.ones(3)
+    quat = columns["quat_wb"] * [*flip, 1.0]
+    attitude = {f"q{a}": c for a, c in zip("xyzw", quat.T)}
+    if angles:
+        lean = Rotation.from_quat(quat).as_euler("ZYX", degrees=True)[:, ::-1]
+        attitude = dict(zip(("roll", "pitch", "yaw"), lean.T))
+    table = {"time": columns["time"], **attitude}
+    for stem, name in (("pos", "pos_w"), ("gyro", "rate_b"), ("acc", "acc_b"), ("v", "vel_w")):
+        table |= named(stem, columns[name] * flip)
+    found = propose(table, "a.csv")
+    axes = "x,-y,-z" if down else ""
+    assert not found.questions
+    assert {c.name: c.axes for c in found.mapping.channels} == dict.fromkeys(
+        ("quat_wb", "pos_w", "vel_w", "rate_b", "acc_b"), axes
+    )
+
+
 def test_the_input_that_the_force_follows_drives_the_vehicle():
     columns = flight(20.0)
     thrust = columns["command"][:, 0]

@@ -25,8 +25,10 @@ from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
 from visthrow.logs.unit_names import UNITS
 
-UPS = ("", "x,-z,y")
-"""Axes of a world whose z is up, and of one whose y is, as Motive's."""
+Y_UP = "x,-z,y"
+"""Our axes in those of Motive's world, whose y is up."""
+NED = "x,-y,-z"
+"""Our axes in those of an autopilot: north, east, down; and forward, right, down of its body."""
 _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1"))
 """Unit of commands of motors by what they exceed."""
 # Of a path's derivative with what may be it: correlations that settle it, and that suggest it,
@@ -180,9 +182,9 @@ class Recognition:
         open_order = entry.kind == "quaternion" and not _lettered(group)
         units = ("rad", "deg") if open_unit else (entry.unit,)
         orders = ("wxyz", "xyzw") if open_order else (entry.order,)
-        ups = UPS if self.settings else UPS[:1]
+        worlds = ("", Y_UP if self.settings else NED)
         ways: list[Attitude | None] = []
-        for unit, order, axes in product(units, orders, ups):
+        for unit, order, axes in product(units, orders, worlds):
             tried = replace(entry, unit=unit, order=order, axes=axes, body_axes=axes)
             channel = make_channel(self.time, group.values, tried, "table")[0]
             if not np.any(channel.valid):
@@ -190,7 +192,7 @@ class Recognition:
             doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
             doubt += _TILTED * (physics.median_tilt(channel) > physics.STEEPEST)
             words = [unit] * open_unit + [f"order {order}"] * open_order
-            words += [f"axes {axes or 'x,y,z'}"] * (len(ups) > 1)
+            words.append(f"axes {axes or 'x,y,z'}")
             ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
         return ways
 
@@ -238,6 +240,10 @@ class Recognition:
     def _up(self) -> str:
         """Axes of the world, as the attitude has them."""
         return self._made["quat_wb"][0].axes if "quat_wb" in self._made else ""
+
+    def _body(self) -> str:
+        """Axes of what is measured on board: an autopilot's, where its attitude has them."""
+        return NED if self._up() == NED else ""
 
     def _paths(self, groups: list[Group]) -> list[Path]:
         """Settle the units of paths and the reading of the attitude together: those that fit best
@@ -428,7 +434,7 @@ class Recognition:
                 f"are the rates {group.listed} in rad/s or deg/s? '{unit}' is taken: no attitude"
                 " says"
             )
-        self._take("rate_b", group, unit, why)
+        self._take("rate_b", group, unit, why, axes=self._body())
 
     def _forces(self) -> None:
         for group in [g for g in self._open(3) if g.hints_at("acc_b")]:
@@ -436,7 +442,7 @@ class Recognition:
             for unit in ("m/s^2", "g", "mg"):
                 if 0.8 < size * UNITS[unit][1] / physics.GRAVITY < 1.25:
                     why = f"a middle size of {size:.3g}: gravity in {unit}"
-                    self._take("acc_b", group, unit, why, frame="body")
+                    self._take("acc_b", group, unit, why, frame="body", axes=self._body())
 
     def _motors(self) -> None:
         for group in [g for g in self._open(4) if g.stem == "motor"]:

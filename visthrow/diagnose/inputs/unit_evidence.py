@@ -43,6 +43,7 @@ _SHARE = 0.1
 _HALL = (0.1, 60.0)  # what a path in a hall reaches from the origin of the capture [m]
 # nats against a unit in which a path leaves a hall or does not fall as it falls
 _OUTSIDE = 15.0
+_BELOW = 4.0  # nats against an attitude by which a path stays below the floor
 _FAR = 2.5  # deviations beyond which doubt grows with the distance alone: more than a lean may push
 
 
@@ -113,7 +114,10 @@ def readings(
         nats = together[attitude.kind if attitude is not None else None] if leaning else 0.0
         for unit in units:
             size = UNITS[unit][1]
-            doubt = (attitude.doubt if attitude is not None else 0.0) - nats
+            doubt = -nats
+            if attitude is not None:
+                height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
+                doubt += attitude.doubt + _BELOW * (height < 0.0)
             doubt += _OUTSIDE * (not _HALL[0] <= size * reach <= _HALL[1])
             doubt += _OUTSIDE * (fall not in ("", unit))
             why = f"{unit} by the size of a hall: {reach:.3g} from the origin"
