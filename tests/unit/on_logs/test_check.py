@@ -224,6 +224,13 @@ def test_spoilt_samples_are_named(channel, rows, change, verdict, words):
     assert words in faults(log_of(columns), verdict)
 
 
+@mark.parametrize(("gain", "refused"), [(0.1, False), (57.3, True)])
+def test_rates_that_follow_with_a_small_gain_are_in_no_other_unit(gain, refused):
+    columns = flight(20.0)
+    columns["command"][:, 1:] /= gain
+    assert ("the rates follow" in faults(log_of(columns))) == refused
+
+
 def test_scrambled_commands_are_caught():
     columns = flight(40.0)
     columns["command"] = flight(40.0, seed=5)["command"]

@@ -594,6 +594,7 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
     is_measured = relation.delay_sd < _UNTOLD
     late = is_measured and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
+    hint = hint if "degrees" in hint else ""  # a gain may be any other number
     weak = relation.correlation < FIRMLY
     verdict = "bad" if hint else "warn" if late or weak else "ok"
     when = (
