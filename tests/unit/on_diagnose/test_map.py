@@ -305,7 +305,7 @@ def test_metres_with_radians_are_told_from_centimetres_with_degrees_or_asked_abo
 def test_angles_that_would_turn_a_flight_over_are_in_degrees():
     found = propose(unnamed(flight(20.0, scale=0.2), "mm", "deg"), "a.csv")
     assert {c.name: c.unit for c in found.mapping.channels} == {"pos_w": "mm", "quat_wb": "deg"}
-    assert "deg by gravity" in found.why["quat_wb"]
+    assert "deg, axes x,y,z by gravity" in found.why["quat_wb"]
     assert not found.questions
 
 
