@@ -140,6 +140,12 @@ def test_north_east_down_is_known_by_gravity(angles, down):
     assert {c.name: c.axes for c in found.mapping.channels} == dict.fromkeys(
         ("quat_wb", "pos_w", "vel_w", "rate_b", "acc_b"), axes
     )
+    onboard = {name: c for name, c in table.items() if not name.startswith(("pos", "v_"))}
+    found = propose(onboard, "a.csv")
+    assert not found.questions
+    assert {c.name: c.axes for c in found.mapping.channels} == dict.fromkeys(
+        ("quat_wb", "rate_b", "acc_b"), axes
+    )
 
 
 def test_the_input_that_the_force_follows_drives_the_vehicle():

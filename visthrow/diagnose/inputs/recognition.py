@@ -183,6 +183,7 @@ class Recognition:
         units = ("rad", "deg") if open_unit else (entry.unit,)
         orders = ("wxyz", "xyzw") if open_order else (entry.order,)
         worlds = ("", Y_UP if self.settings else NED)
+        down = self._z_points_down()
         ways: list[Attitude | None] = []
         for unit, order, axes in product(units, orders, worlds):
             tried = replace(entry, unit=unit, order=order, axes=axes, body_axes=axes)
@@ -191,10 +192,21 @@ class Recognition:
                 continue
             doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
             doubt += _TILTED * (physics.median_tilt(channel) > physics.STEEPEST)
+            doubt += 0.5 * _TILTED * (-down if axes == NED else down)
             words = [unit] * open_unit + [f"order {order}"] * open_order
             words.append(f"axes {axes or 'x,y,z'}")
             ways.append(Attitude(tried, channel, doubt, ", ".join(words)))
         return ways
+
+    def _z_points_down(self) -> float:
+        """Return 1 where an accelerometer says that its z points down in flight, -1 where up, else
+        0.
+        """
+        for group in [g for g in self._open(3) if g.hints_at("acc_b")]:
+            middle = np.nanmedian(group.values, axis=0)
+            if abs(middle[2]) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
+                return -float(np.sign(middle[2]))
+        return 0.0
 
     def _positions(self) -> None:
         smooth = [g for g in self._open(3) if self._smooth(g) and g.unit not in ("deg", "rad")]
