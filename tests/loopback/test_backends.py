@@ -354,6 +354,7 @@ def test_what_the_audit_says(kind, override, parameters, problems):
 
 
 def test_px4_in_software_has_no_minimum_of_an_output():
+    """Nor a switch of the gripper, which is gone since 1.17."""
     desk = Desk("px4", 'px4.output_parameter="PWM_MAIN_FUNC9"', parameters={"PWM_MAIN_FUNC9": 430})
     desk.turn(1.5)
     assert desk.status.fault is None
@@ -601,14 +602,6 @@ def test_what_speaks_against_arming_is_said_in_words():
     desk = Desk("betaflight", "betaflight.arm_channel=1", all_channels=True, arming=False)
     desk.turn(1.0)
     assert desk.status.note == "arming disabled: tilted more than small_angle (flags 0x100)"
-
-
-def test_px4_without_the_gripper_switch_flies():
-    """PD_GRIPPER_EN is gone since 1.17."""
-    desk = Desk("px4")
-    desk.turn(1.5)
-    assert (desk.backend.audit.done, desk.status.fault) == (True, None)
-    assert desk.backend.audit.refused == {"PD_GRIPPER_EN": "no such parameter"}
 
 
 @mark.parametrize(("kind", "closed"), [("ardupilot", 1900), ("px4", 2000)])

@@ -6,7 +6,6 @@ from typing import Annotated
 
 from pytest import mark, raises
 
-from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
@@ -48,8 +47,3 @@ def test_what_lies_outside_is_named_with_its_bound(wrong, message):
 def test_ends_that_belong_to_it_and_none_pass():
     assert More(lag=0.0, channel=12, hold=0.5).hold == 0.5
     assert More().hold is None
-
-
-def test_a_file_is_named_with_the_key():
-    with raises(ConfigError, match=r"mine\.toml.*channel is 0; expected 1 to 12"):
-        config.loads(More, "channel = 0", name="mine.toml")
