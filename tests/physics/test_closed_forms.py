@@ -6,7 +6,6 @@ import numpy as np
 from numpy.linalg import norm
 from numpy.testing import assert_allclose
 from pytest import approx, mark
-from scipy.optimize import root
 from scipy.special import ellipk
 
 from sim.hybrid import HybridSim
@@ -19,15 +18,11 @@ PERIOD = 1e-4
 """Of a pendulum's period; order 2 at 2 ms leaves (w h)^2 = 2e-4 of the phase, less by the method's
 constant.
 """
-SHAPE = 1e-4
-"""Distance from the shape of equilibrium [m]: the start is exact to round-off, so this is what the
-step adds.
-"""
 HELD = 2e3
 """Mass of a vehicle that the rope hardly moves [kg]: by 3e-5 of its own motion."""
 
 
-def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
+def held(plant: PlantParams, **rope) -> HybridSim:
     """Rope under a vehicle too heavy to move, carried by a force of its own weight and
     the load's.
     """
@@ -36,7 +31,7 @@ def held(plant: PlantParams, substep: float = 0.002, **rope) -> HybridSim:
     vehicle = replace(plant.vehicle, body=body, controller=strong, queue=QueueParams(0.0))
     changed = replace(plant.rope, mount=(0.0, 0.0, 0.0), **rope)
     sim = HybridSim(
-        PlantParams(vehicle, changed, plant.release, numerics(substep, "float64")), 1, direct=True
+        PlantParams(vehicle, changed, plant.release, numerics(0.002, "float64")), 1, direct=True
     )
     load = HELD + changed.rope_mass + changed.payload_mass
     sim.set_command([[load * GRAVITY, 0.0, 0.0, 0.0]])
@@ -82,79 +77,6 @@ def test_pendulum_period(amplitude):
     period = np.mean(np.diff(crossings))
     assert period == approx(expected, rel=PERIOD)
     assert norm(sim.get("pos_w")) < 1e-3, "the vehicle was to be held"
-
-
-def turning_shape(rope, rate: float) -> np.ndarray:
-    """Angles off the vertical [rad], shape (L,), of a rope that turns steadily about the vertical
-    through its mount.
-
-    In the turning frame each rod balances its weight and its centrifugal forces about its upper
-    joint; forces below a joint add up. Rods turn about the vertical, so their transverse inertia J
-    adds ``J rate^2 sin cos``."""
-    count, length, mass = rope.segments, rope.length / rope.segments, rope.rope_mass / rope.segments
-
-    def unbalanced(angles):
-        sin, cos = np.sin(angles), np.cos(angles)
-        ends = length * np.cumsum(sin)
-        centres = ends - 0.5 * length * sin
-        ball = ends[-1] + rope.payload_offset * sin[-1]
-        outwards = np.append(mass * rate**2 * centres, rope.payload_mass * rate**2 * ball)
-        weights = np.append(np.full(count, mass), rope.payload_mass) * GRAVITY
-        moments = []
-        for i in range(count):
-            out, down = outwards[i + 1 :].sum(), weights[i + 1 :].sum()
-            moment = length * (out * cos[i] - down * sin[i])
-            moment += 0.5 * length * (outwards[i] * cos[i] - weights[i] * sin[i])
-            moment += mass * length**2 / 12.0 * rate**2 * sin[i] * cos[i]
-            if i == count - 1:
-                arm = rope.payload_offset
-                moment += arm * (outwards[-1] * cos[i] - weights[-1] * sin[i])
-                moment += rope.payload_inertia * rate**2 * sin[i] * cos[i]
-            moments.append(moment)
-        return np.array(moments)
-
-    found = root(unbalanced, np.linspace(0.7, 1.0, count), tol=1e-13)
-    assert np.abs(found.fun).max() < 1e-12
-    assert found.x.min() > 0.1, "not the straight solution"
-    return found.x
-
-
-def test_turning_rope_keeps_its_curve():
-    """The shape of a rope in steady rotation, with weight and centrifugal force as the load of a
-    catenary.
-
-    A rope that hangs from one end has no catenary at rest; this is its curve of equilibrium in a
-    turning frame, found here by balancing moments."""
-    rate, steps = 6.5, 50
-    sim = held(paper_plant(), substep=0.0005, joint_damping=0.0, rope_mass=0.05)
-    angles = turning_shape(sim.params.rope, rate)
-    assert np.ptp(angles) > 0.02, "the rope is to be bent"
-
-    def directions(azimuth):
-        sin, cos = np.sin(angles), np.cos(angles)
-        return np.stack((sin * np.cos(azimuth), sin * np.sin(azimuth), -cos), -1)
-
-    start = directions(0.0)
-    sim.place(
-        np.zeros((1, 3)),
-        cable_dir_w=start[None],
-        cable_vel_w=np.cross([0.0, 0.0, rate], start)[None],
-    )
-    sim.set_command(
-        [
-            [
-                (HELD + sim.params.rope.rope_mass + sim.params.rope.payload_mass) * GRAVITY,
-                0.0,
-                0.0,
-                0.0,
-            ]
-        ]
-    )
-    advance(sim, steps)
-    expected = directions(rate * 0.02 * steps)
-    reach = sim.params.rope.length / sim.params.rope.segments
-    apart = reach * np.cumsum(sim.get("cable_dir_w")[0] - expected, axis=0)
-    assert np.abs(apart).max() < SHAPE
 
 
 def test_motor_step():
