@@ -6,20 +6,15 @@ A rope that never fails may do so by false damping; so its segments' rates are h
 from dataclasses import replace
 
 import numpy as np
-import torch
-import warp as wp
 from numpy.testing import assert_allclose
 from pytest import mark
 
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import FALLBACK, NONFINITE
 from sim.params import PlantParams
-from sim.torch_bridge import TorchViews
 from tests.configs import load_experiment
 from tests.simulators import numerics, random_commands
-from visthrow.onboard import observations as ob
 from visthrow.task import Experiment, plant_of
-from visthrow.training import terminations
 
 PERIOD = 0.02
 FAILED = 1e-3
@@ -45,31 +40,6 @@ def started(count: int, seed: int, plant: PlantParams | None = None) -> HybridSi
     return sim
 
 
-def fly_with_terminations(count: int, steps: int, seed: int) -> tuple[int, int]:
-    """Episodes that ended and steps that failed, under the task's terminations."""
-    exp, sim = experiment(), started(count, seed)
-    views, age, ended, failed = TorchViews(sim), np.zeros(count), 0, 0
-    for command in random_commands(seed, steps, count):
-        sim.set_command(command)
-        sim.step()
-        age += 1.0
-        failed += np.count_nonzero(sim.get("status") & NONFINITE)
-        done = terminations.negative(
-            exp.task.bounds,
-            views.state["pos_w"],
-            ob.rotation_from_quat(views.state["quat_wb"]),
-            views.out["payload_pos_w"],
-            views.state["status"],
-            views.state["release_timer"] >= 0.0,
-            torch.from_numpy(age * PERIOD),
-            exp.release.landing_height,
-        ).numpy()
-        ended += np.count_nonzero(done)
-        age[done] = 0.0
-        sim.randomize(exp.task.start, wp.array(done.astype(np.int32), device="cpu"))
-    return ended, failed
-
-
 def fly_freely(count: int, steps: int, seed: int, episode: int) -> tuple[int, int, float]:
     """Episodes, those with a failed state, and the share of steps with a fall-back, without
     terminations.
@@ -89,25 +59,11 @@ def fly_freely(count: int, steps: int, seed: int, episode: int) -> tuple[int, in
     return count * steps // episode, failed, fallbacks / (count * steps)
 
 
-def test_no_failed_state_with_terminations():
-    ended, failed = fly_with_terminations(400, 50, seed=1)
-    assert ended > 400
-    assert failed == 0
-
-
 def test_hardly_a_failed_state_without_terminations():
     episodes, failed, fallbacks = fly_freely(400, 100, seed=2, episode=50)
     assert episodes == 800
     assert failed <= FAILED * episodes
     assert fallbacks < 0.01
-
-
-@mark.slow
-def test_a_million_steps_with_terminations(capsys):
-    ended, failed = fly_with_terminations(4000, 250, seed=11)
-    with capsys.disabled():
-        print(f"\n1,000,000 env-steps with terminations: {ended} episodes, {failed} failed states")
-    assert failed == 0
 
 
 @mark.slow
