@@ -205,7 +205,9 @@ class Detector:
         radius = self.lens.params.fx * self.radius / math.sqrt(low * high)
         u, v = (int(x) for x in middle[0].round())
         patch = level[max(v - 3, 0) : v + 4, max(u - 3, 0) : u + 4]
-        distinct = cv2.subtract(level, ABOVE * float(np.median(patch)) if patch.size else 0.0)  # type: ignore[call-overload]  # a scalar: its types leave it out
+        ground = ABOVE * float(np.median(patch)) if patch.size else 0.0
+        # OpenCV's types leave a scalar out
+        distinct = cv2.subtract(level, ground)  # type: ignore[call-overload]
         mask = ((distinct > 0.0) & (self._in_view > 0)).astype(np.uint8)
         circles = [(centre, size) for centre, size in circles_of(mask) if size < 2.0 * radius]
         return self._best_cone([(middle[0].numpy(), radius), *circles], distinct, prior)

@@ -90,5 +90,5 @@ def in_units(
         size = units.size(dimension_of[name])
         return tuple(x / size for x in item) if isinstance(item, tuple) else item / size
 
-    fields = {f.name: stated(f.name, getattr(value, f.name)) for f in dataclasses.fields(value)}  # type: ignore[arg-type]
-    return type(value)(**fields)
+    names = [f.name for f in dataclasses.fields(value)]  # type: ignore[arg-type]
+    return type(value)(**{name: stated(name, getattr(value, name)) for name in names})
