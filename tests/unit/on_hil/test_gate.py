@@ -17,7 +17,7 @@ from visthrow.common.errors import ConfigError
 
 PARAMS = GateParams(0.02, 0.12, 8.0, 0.3, 15.0, 0.5, 0.04, 0.1, 0.25)
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-TURNED = (0.0, 0.0, 1.0, 0.0)
+FRAMES = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
 
 
 def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
@@ -32,12 +32,8 @@ def pose(time=0.0, x=0.0, quat=LEVEL, arrival=None, **more) -> Pose:
         (pose(0.01, math.inf), "finite"),
         (pose(0.01, quat=(0.0, 0.0, math.nan, 1.0)), "finite"),
         (pose(0.01, 0.01, (0.0, 0.0, 0.0, 0.0)), "quaternion"),
-        (pose(0.01, 0.01, (0.0, 0.0, 0.0, 1.05)), "quaternion"),
-        (pose(0.01, 0.15), "jump"),
         (pose(0.01, 0.5), "speed"),
-        (pose(0.01, 0.01, vel=(9.0, 0.0, 0.0)), "speed"),
         (pose(0.01, 0.01, vel=(math.nan, 0.0, 0.0)), "finite"),
-        (pose(0.01, 0.01, TURNED), "turn"),
         (pose(0.01), "repeated"),
         (pose(0.0, 0.01), "old"),
         (pose(-0.02, 0.01), "old"),
@@ -152,9 +148,8 @@ def test_staleness_is_of_content_not_of_arrival():
 @mark.parametrize("quat", [(math.nan,) * 4, (0.0,) * 4, (0.0, math.nan, 0.0, 1.0)])
 def test_a_single_marker_is_a_position(quat):
     """The vehicle's attitude is needed, a ball's is not. A body that is not seen is neither."""
-    frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
     for turns, reason in ((True, "quaternion"), (False, None)):
-        track = Track(frames, PARAMS, EstimateParams(0.055, 2), turns)
+        track = Track(FRAMES, PARAMS, EstimateParams(0.055, 2), turns)
         refused = track.update(pose(0.0, 0.1, quat))
         assert refused == ("finite" if turns and math.isnan(sum(quat)) else reason)
         zeros = Pose(1.0, 1.0, "payload", (0.0, 0.0, 0.0), quat)
@@ -164,8 +159,7 @@ def test_a_single_marker_is_a_position(quat):
 
 
 def test_a_stamp_that_is_no_time_spoils_no_velocity():
-    frames = FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0))
-    track = Track(frames, PARAMS, EstimateParams(0.055, 2))
+    track = Track(FRAMES, PARAMS, EstimateParams(0.055, 2))
     assert track.update(Pose(1e300, 0.0, "vehicle", (0.0, 0.0, 1.0), LEVEL)) == "stamp"
     for i in range(1, 8):
         assert track.update(pose(0.01 * i, 0.01 * i)) is None
@@ -181,11 +175,7 @@ def test_wrong_limits():
 
 
 def track() -> Track:
-    return Track(
-        FrameParams("x,y,z", "x,y,z", "xyzw", 0.0, (0.0, 0.0, 0.0)),
-        PARAMS,
-        EstimateParams(0.025, 1),
-    )
+    return Track(FRAMES, PARAMS, EstimateParams(0.025, 1))
 
 
 @mark.parametrize("step", [1.0, -1.0])
