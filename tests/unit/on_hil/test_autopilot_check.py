@@ -1,13 +1,14 @@
 """What a recorded run says of its hover, and what its summary keeps of the autopilot."""
 
 import json
+import shutil
 from types import SimpleNamespace
 
 from pytest import approx, fixture, mark, raises
 
 from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
-from hil.control.recording.record import CONFIG, TICKS, RunRecorder
+from hil.control.recording.record import TICKS, RunRecorder
 from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import autopilot_record
@@ -54,8 +55,7 @@ def test_a_hover_that_took_another_thrust_gives_the_share_to_write_down(
     for line in lines:
         if line["command"]:
             line["command"][0] *= factor
-    for name in (CONFIG, "policy.npz"):
-        (tmp_path / name).write_bytes((run / name).read_bytes())
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
     (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
     found, text = hover_of_run(tmp_path)
     assert found == good
@@ -74,8 +74,7 @@ def test_a_hover_counts_once_it_has_settled(run, tmp_path):
     lines[middle]["state"] = "throw"
     for i in (*flown[:SETTLING], *range(middle + 1, middle + 1 + SETTLING)):
         lines[i]["command"][0] *= 3.0
-    for name in (CONFIG, "policy.npz"):
-        (tmp_path / name).write_bytes((run / name).read_bytes())
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
     (tmp_path / TICKS).write_text("\n".join(map(json.dumps, lines)) + "\n")
     assert hover_of_run(tmp_path)[1].startswith("hover took 1.0")
 
@@ -95,8 +94,8 @@ def test_each_report_of_a_steady_flight_counts_once(height, speed, counted):
 
 
 def test_runs_that_say_nothing_of_a_hover(run, tmp_path):
-    for name in (CONFIG, "policy.npz"):
-        (tmp_path / name).write_bytes((run / name).read_bytes())
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    (tmp_path / TICKS).unlink()
     with raises(RunError, match="no folder of a run; expected"):
         hover_of_run(tmp_path)
     (tmp_path / TICKS).write_text("")
