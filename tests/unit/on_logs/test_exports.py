@@ -132,27 +132,33 @@ EXPORTS = {
 }
 
 
-def test_poses_of_kitti_are_matrices(tmp_path):
+@pytest.fixture
+def proposed(tmp_path):
+    """Function that writes a file; returns its table, what is proposed for it, and its logs."""
+
+    def take(text, name="a.csv", **more):
+        path = tmp_path / name
+        path.write_text(text, newline="")
+        table = table_of(path)
+        found = propose(table, name, **more)
+        return table, found, logs_of(table, found.mapping, name)
+
+    return take
+
+
+def test_poses_of_kitti_are_matrices(proposed):
     """Twelve numbers a row without a head or a stamp: the upper rows of a pose, row by row."""
     poses = np.concatenate([TURN.as_matrix(), POS[:, :, None]], axis=2).reshape(-1, 12)
-    path = tmp_path / "00.txt"
-    path.write_text(lines(poses.round(9).tolist(), " "))
-    table = table_of(path)
-    proposal = propose(table, path)
-    (log,) = logs_of(table, proposal.mapping, str(path))
-    assert any("how far are the rows apart" in question for question in proposal.questions)
+    _, found, (log,) = proposed(lines(poses.round(9).tolist(), " "), "00.txt")
+    assert any("how far are the rows apart" in question for question in found.questions)
     assert_allclose(log["pos_w"].values, POS, atol=1e-6)
     turned = (Rotation.from_quat(log["quat_wb"].values) * TURN.inv()).magnitude()
     assert np.max(turned) < 1e-6
 
 
 @pytest.mark.parametrize("name", EXPORTS)
-def test_an_export_gives_the_motion_that_it_was_made_of(name, tmp_path):
-    path = tmp_path / name
-    path.write_text(EXPORTS[name], newline="")
-    table = table_of(path)
-    found = propose(table, name)
-    log = logs_of(table, found.mapping, name)[0]
+def test_an_export_gives_the_motion_that_it_was_made_of(name, proposed):
+    _, found, (log, *_) = proposed(EXPORTS[name], name)
     time = log["pos_w"].time - log["pos_w"].time[0]
     pos, turn = motion(time)
     good = log["pos_w"].valid
@@ -166,11 +172,8 @@ def test_an_export_gives_the_motion_that_it_was_made_of(name, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["motive 3.csv", "vicon nexus.csv", "qualisys.tsv"])
-def test_every_column_that_is_left_out_is_listed(name, tmp_path):
-    path = tmp_path / name
-    path.write_text(EXPORTS[name])
-    table = table_of(path)
-    found = propose(table, name)
+def test_every_column_that_is_left_out_is_listed(name, proposed):
+    table, found, _ = proposed(EXPORTS[name], name)
     used = {column for entry in found.mapping.channels for column in entry.columns}
     assert used | {found.mapping.time.column} | set(found.left_out) == set(table)
     assert any("Frame" in column for column in found.left_out)
@@ -207,16 +210,12 @@ def test_a_table_of_matlab_is_refused_by_its_kind(tmp_path):
 
 
 @pytest.mark.parametrize("mode", ["all zero", "position zero", "held"])
-def test_a_body_that_the_capture_lost_is_a_gap(mode, tmp_path):
+def test_a_body_that_the_capture_lost_is_a_gap(mode, proposed):
     pos, quat = POS.copy(), QUATS.copy()
     pos[200:260] = pos[199] if mode == "held" else 0.0
     quat[200:260] = {"all zero": [0, 0, 0, 0], "position zero": [0, 0, 0, 1]}.get(mode, quat[199])
     rows = [[t, *p, *q, *(b - [0, 0, 0.5])] for t, p, q, b in zip(TIME, pos, quat, POS)]
-    path = tmp_path / "a.csv"
-    path.write_text("time,x,y,z,qx,qy,qz,qw,px,py,pz\n" + lines(rows))
-    table = table_of(path)
-    found = propose(table, "a.csv")
-    log = logs_of(table, found.mapping, "a.csv")[0]
+    _, found, (log, *_) = proposed("time,x,y,z,qx,qy,qz,qw,px,py,pz\n" + lines(rows))
     assert "pos_w" in log
     if mode != "held":
         assert "payload_pos_w" in log
@@ -225,14 +224,12 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, tmp_path):
 
 
 @pytest.mark.parametrize("extra", ["", "EVENT\tThrow\t120\t1.2\n", "TRAJECTORY_TYPES\tA\tB\n"])
-def test_markers_of_qualisys_without_names_of_columns(extra, tmp_path):
+def test_markers_of_qualisys_without_names_of_columns(extra, proposed):
     """Places alone below the settings: the markers' names and the rate stand among these."""
     head = "NO_OF_FRAMES\t400\nNO_OF_MARKERS\t2\nFREQUENCY\t100\nDATA_INCLUDED\t3D\n"
     rows = [[*(1e3 * p).round(3), *(1e3 * (p - [0, 0, 0.5])).round(3)] for p in POS]
-    path = tmp_path / "a.tsv"
-    path.write_text(f"{head}{extra}MARKER_NAMES\tquad\tball\n{lines(rows, chr(9))}")
-    table = table_of(path)
-    (log,) = logs_of(table, propose(table, path).mapping, str(path))
+    text = f"{head}{extra}MARKER_NAMES\tquad\tball\n{lines(rows, chr(9))}"
+    _, _, (log,) = proposed(text, "a.tsv")
     assert_allclose(log["pos_w"].values, POS, atol=1e-6)
     assert_allclose(log["payload_pos_w"].time[:3], [0.0, 0.01, 0.02])
 
@@ -247,14 +244,12 @@ def test_a_body_that_was_never_solved_is_named(tmp_path):
 KINDS = {"Rotation": "deg", "Position": "m"}
 
 
-def test_angles_in_degrees_are_no_position(tmp_path):
+def test_angles_in_degrees_are_no_position(proposed):
     """Euler angles of an order that no name tells are left out and listed."""
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
-    path = tmp_path / "a.csv"
     rows = [[t, *a, *p] for t, a, p in zip(TIME, angles, POS)]
-    path.write_text(lines([["time", *names], *rows]))
-    found = propose(table_of(path), path)
+    _, found, _ = proposed(lines([["time", *names], *rows]))
     (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
     assert "quad.Rotation.X [deg]" in found.left_out
@@ -269,49 +264,43 @@ ASKED = {
 
 
 @pytest.mark.parametrize("head", ASKED)
-def test_what_nothing_checks_is_asked(head, tmp_path):
+def test_what_nothing_checks_is_asked(head, proposed):
     rng = np.random.default_rng(0)
     rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
     acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
-    path = tmp_path / "a.csv"
-    path.write_text(f"time,{head}\n" + lines([[t, *r, *a] for t, r, a in zip(TIME, rates, acc)]))
-    found = propose(table_of(path), "a.csv")
+    rows = [[t, *r, *a] for t, r, a in zip(TIME, rates, acc)]
+    _, found, _ = proposed(f"time,{head}\n" + lines(rows))
     assert any(ASKED[head] in question for question in found.questions)
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
-def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, tmp_path):
+def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, proposed):
     turn = (
         Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
     )  # it turns about itself all the while
     vel = np.gradient(POS, TIME, axis=0)
     vel = vel if frame == "world" else turn.inv().apply(vel)
     rows = [[t, *p, *q, *v] for t, p, q, v in zip(TIME, POS, turn.as_quat(), vel)]
-    path = tmp_path / "a.csv"
-    path.write_text("time,x,y,z,qx,qy,qz,qw,vx,vy,vz\n" + lines(rows))
-    found = propose(table_of(path), "a.csv")
+    _, found, _ = proposed("time,x,y,z,qx,qy,qz,qw,vx,vy,vz\n" + lines(rows))
     names = {entry.name for entry in found.mapping.channels}
     assert ("vel_b" in names, "vel_w" in names) == (frame == "body", frame == "world")
 
 
-def test_rotor_speeds_are_proposed_as_speeds(tmp_path):
+def test_rotor_speeds_are_proposed_as_speeds(proposed):
     speeds = 6000.0 + 100.0 * np.sin(np.outer(TIME, [1.0, 1.1, 1.2, 1.3]))
     for head, unit in (
         ("rpm1,rpm2,rpm3,rpm4", "rpm"),
         ("m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]", "rad/s"),
     ):
-        path = tmp_path / "a.csv"
         rows = [[t, *p, *s] for t, p, s in zip(TIME, POS, speeds)]
-        path.write_text(f"time,x,y,z,{head}\n" + lines(rows))
-        found = propose(table_of(path), "a.csv")
+        _, found, _ = proposed(f"time,x,y,z,{head}\n" + lines(rows))
         (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
         assert entry.unit == unit
 
 
-def test_the_unit_of_time_can_be_told(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("t,x,y,z\n" + lines([[1e3 * t, *p] for t, p in zip(TIME, POS)]))
-    assert propose(table_of(path), "a.csv", time_unit="ms").mapping.time.unit == "ms"
+def test_the_unit_of_time_can_be_told(proposed):
+    text = "t,x,y,z\n" + lines([[1e3 * t, *p] for t, p in zip(TIME, POS)])
+    assert proposed(text, time_unit="ms")[1].mapping.time.unit == "ms"
 
 
 def test_a_log_that_needs_no_mapping_is_sent_to_check(tmp_path):
