@@ -5,7 +5,7 @@ import re
 import struct
 
 import numpy as np
-from pytest import approx, mark
+from pytest import approx, fixture, mark
 
 from tests import logfiles
 from visthrow.logs import read
@@ -49,6 +49,23 @@ def outputs(name, field, size, moving, count=300, first=0.5):
     return ["uint64_t timestamp", f"float[{size}] {field}"], rows
 
 
+@fixture
+def px4(tmp_path):
+    """Function that returns the log of what `ulog` writes."""
+    return lambda **options: read(ulog(tmp_path / "a.ulg", **options))[0]
+
+
+@fixture
+def ardupilot(tmp_path):
+    """Function that returns the log of a dataflash file with some messages."""
+
+    def log(formats, rows):
+        logfiles.write_bin(tmp_path / "a.BIN", formats, rows)
+        return read(tmp_path / "a.BIN")[0]
+
+    return log
+
+
 @mark.parametrize(
     ("change", "channel", "word"),
     [
@@ -58,8 +75,8 @@ def outputs(name, field, size, moving, count=300, first=0.5):
         ({"eph": 40.0}, "pos_w", "eph"),
     ],
 )
-def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, tmp_path):
-    log = read(ulog(tmp_path / "a.ulg", **change))[0]
+def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, px4):
+    log = px4(**change)
     valid = log[channel].valid
     assert np.all(valid[:150])
     assert not np.any(valid[150:])
@@ -68,8 +85,8 @@ def test_what_the_estimator_calls_invalid_is_invalid(change, channel, word, tmp_
     assert any(word in text for text in rows)
 
 
-def test_a_reset_of_the_estimate_is_told(tmp_path):
-    rows = check(read(ulog(tmp_path / "a.ulg", resets=1)))[0].rows
+def test_a_reset_of_the_estimate_is_told(px4):
+    rows = check([px4(resets=1)])[0].rows
     assert any("reset 1 times" in row.text for row in rows if row.channel == "pos_w")
 
 
@@ -89,9 +106,9 @@ def test_a_reset_of_the_estimate_is_told(tmp_path):
         ({"SYS_AUTOSTART": 5001}, "quadrotor that is no X"),
     ],
 )
-def test_motors_of_another_vehicle_are_left_out_by_its_name(parameters, kind, tmp_path):
+def test_motors_of_another_vehicle_are_left_out_by_its_name(parameters, kind, px4):
     motors = {("actuator_motors", 0): outputs("", "control", 12, range(6))}
-    log = read(ulog(tmp_path / "a.ulg", topics=motors, parameters=parameters))[0]
+    log = px4(topics=motors, parameters=parameters)
     assert log.meta["vehicle"] == kind
     assert "motor_command" not in log
     checked = check([log])[0]
@@ -102,32 +119,32 @@ def test_motors_of_another_vehicle_are_left_out_by_its_name(parameters, kind, tm
         assert any(kind in text for text in contradictions([checked]))
 
 
-def test_six_motors_that_move_are_no_quadrotor_even_where_no_parameter_says_so(tmp_path):
+def test_six_motors_that_move_are_no_quadrotor_even_where_no_parameter_says_so(px4):
     motors = {("actuator_motors", 0): outputs("", "control", 12, range(6))}
-    log = read(ulog(tmp_path / "a.ulg", topics=motors))[0]
+    log = px4(topics=motors)
     assert "motor_command" not in log
     assert log.meta["left_out"] == ["actuator_motors: 6 motors move, not the four of a quadrotor"]
 
 
 @mark.parametrize("shift", [0, 1, 3])
-def test_motors_are_ordered_by_where_they_sit(shift, tmp_path):
+def test_motors_are_ordered_by_where_they_sit(shift, px4):
     parameters: dict[str, float] = {"CA_ROTOR_COUNT": 4, "MAV_TYPE": 2}
     for i in range(4):
         ahead, right = ROTOR_PLACES[(i + shift) % 4]
         parameters |= {f"CA_ROTOR{i}_PX": 0.2 * ahead, f"CA_ROTOR{i}_PY": 0.3 * right}
     rows = [(1_000_000 + 50_000 * i, *(k + 0.1 * swing(i) for k in range(4))) for i in range(300)]
     topic = {("actuator_motors", 0): (["uint64_t timestamp", "float[4] control"], rows)}
-    log = read(ulog(tmp_path / "a.ulg", topics=topic, parameters=parameters))[0]
+    log = px4(topics=topic, parameters=parameters)
     expected = [(motor - shift) % 4 for motor in (2, 0, 1, 3)]  # FL FR RL RR
     assert np.round(log["motor_command"].values[0]).tolist() == expected
 
 
-def test_the_instance_that_moves_is_taken(tmp_path):
+def test_the_instance_that_moves_is_taken(px4):
     topics = {
         ("actuator_outputs", 0): outputs("", "output", 16, (), first=0.0),
         ("actuator_outputs", 1): outputs("", "output", 16, range(4), first=1500.0),
     }
-    log = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
+    log = px4(topics=topics)
     assert log["motor_output"].values.min() > 1400.0
     assert log.meta["ingest"]["motor_output"]["instance"] == 1
 
@@ -135,7 +152,7 @@ def test_the_instance_that_moves_is_taken(tmp_path):
 @mark.parametrize(
     ("arming", "landed", "flown"), [(2, 0, True), (1, 0, False), (2, 1, False), (1, 1, False)]
 )
-def test_a_vehicle_on_the_desk_has_not_flown(arming, landed, flown, tmp_path):
+def test_a_vehicle_on_the_desk_has_not_flown(arming, landed, flown, px4):
     times = [1_000_000 + 500_000 * i for i in range(30)]
     topics = {
         ("vehicle_status", 0): (
@@ -147,23 +164,21 @@ def test_a_vehicle_on_the_desk_has_not_flown(arming, landed, flown, tmp_path):
             [(t, landed) for t in times],
         ),
     }
-    log = read(ulog(tmp_path / "a.ulg", topics=topics))[0]
+    log = px4(topics=topics)
     assert bool(np.all(log["flying"].values)) == flown
     words = " ".join(row.text for row in check([log])[0].rows)
     assert ("never armed and in the air" in words) != flown
     assert ("0 s flown" in words) != flown
 
 
-def test_rotor_speeds_of_escs_that_log_one_by_one(tmp_path):
-    path = tmp_path / "b.BIN"
+def test_rotor_speeds_of_escs_that_log_one_by_one(ardupilot):
     formats = {"ATT": logfiles.ATT, "ESC": ("QBff", "TimeUS,Instance,RPM,Volt")}
     messages = []
     for i in range(100):
         t = 1_000_000 + 20_000 * i
         messages.append(("ATT", (t, 0, 1.0, 0, 0.0, 0, 0.0)))
         messages += [("ESC", (t + k, k, 6000.0 + 100 * k, 15.0)) for k in range(4)]
-    logfiles.write_bin(path, formats, messages)
-    speeds = read(path)[0]["motor_speed"].values[0] * 30 / np.pi
+    speeds = ardupilot(formats, messages)["motor_speed"].values[0] * 30 / np.pi
     assert speeds == approx([6200, 6000, 6100, 6300])
 
 
@@ -253,17 +268,15 @@ def test_odometry_of_a_failed_tracker_or_of_another_frame_is_no_position(frame, 
         assert any("ODOMETRY: its frame_id is 8" in part for part in log.meta["left_out"])
 
 
-def test_one_stamp_that_is_ahead_of_all_others_costs_its_row_alone(tmp_path):
+def test_one_stamp_that_is_ahead_of_all_others_costs_its_row_alone(ardupilot):
     rows = [("ATT", (1_000_000 + 20_000 * i, 0, swing(i), 0, 0.0, 0, 0.0)) for i in range(200)]
     rows[100] = ("ATT", (4_000_000_000_000_000_000, 0, 1.0, 0, 0.0, 0, 0.0))
-    path = tmp_path / "a.BIN"
-    logfiles.write_bin(path, {"ATT": logfiles.ATT}, rows)
-    log = read(path)[0]
+    log = ardupilot({"ATT": logfiles.ATT}, rows)
     assert len(log["quat_wb"].time) == 199
     assert log["quat_wb"].time[-1] == approx(3.98)
 
 
-def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
+def test_ardupilots_older_logs_count_in_milliseconds(ardupilot):
     formats = {
         "ATT": ("Icccccc", "TimeMS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
         "EKF1": ("IccCfffffff", "TimeMS,Roll,Pitch,Yaw,VN,VE,VD,PN,PE,PD,GX"),
@@ -272,9 +285,7 @@ def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
     for i in range(200):
         rows.append(("ATT", (1000 + 20 * i, 0.0, 10.0, 0.0, 0.0, 0.0, 0.0)))
         rows.append(("EKF1", (1000 + 20 * i, 0.0, 0.0, 0.0, 1.0, 0, 0, swing(i), 0.0, -2.0, 0)))
-    path = tmp_path / "a.BIN"
-    logfiles.write_bin(path, formats, rows)
-    log = read(path)[0]
+    log = ardupilot(formats, rows)
     assert log["pos_w"].time[-1] == approx(3.98)
     assert log["pos_w"].values[0, 2] == approx(2.0)
     assert log["quat_wb"].values[0, 0] == approx(math.sin(math.radians(5.0)), abs=1e-3)
@@ -295,7 +306,7 @@ def test_ardupilots_older_logs_count_in_milliseconds(tmp_path):
         ),
     ],
 )
-def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware, kind, tmp_path):
+def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware, kind, ardupilot):
     names = ",".join(f"C{i}" for i in range(1, 15))
     formats = {
         "PARM": ("QNf", "TimeUS,Name,Value"),
@@ -309,9 +320,7 @@ def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware,
         t = 1_000_000 + 20_000 * i
         rows.append(("ATT", (t, 0, 1.0, 0, 0.0, 0, 0.0)))
         rows.append(("RCOU", (t, *(1000 + 10 * n + i % 3 for n in range(1, 15)))))
-    path = tmp_path / "a.BIN"
-    logfiles.write_bin(path, formats, rows)
-    log = read(path)[0]
+    log = ardupilot(formats, rows)
     assert log.meta["vehicle"] == kind
     refused = any(row.topic == "vehicle" for row in check([log])[0].rows)
     assert refused == (kind in ("plane", "VTOL"))  # rotors in a plus fly by the same physics
@@ -323,13 +332,12 @@ def test_ardupilots_frame_says_which_output_is_which_rotor(parameters, firmware,
 
 
 @mark.parametrize(("ignored", "quality", "good"), [(0, 0, True), (1, 0, False), (0, -1, False)])
-def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, good, tmp_path):
+def test_external_poses_that_ardupilot_ignored_are_invalid(ignored, quality, good, ardupilot):
     rows = [
         ("VISP", (1000 * i, 0, i, swing(i), 0.0, -1.0, 0, 0, 0, 0, 0, 0, ignored, quality))
         for i in range(10)
     ]
-    logfiles.write_bin(tmp_path / "a.BIN", {"VISP": logfiles.VISP}, rows)
-    assert np.all(read(tmp_path / "a.BIN")[0]["mocap_pos_w"].valid == good)
+    assert np.all(ardupilot({"VISP": logfiles.VISP}, rows)["mocap_pos_w"].valid == good)
 
 
 def test_telemetry_is_read_from_fields_that_mavlink_has():
