@@ -16,17 +16,6 @@ from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 FINE = 8  # points between two knots at which a curve is looked at
 
 
-def joined(knots: Sequence[KnotValues], names: Sequence[str]) -> KnotValues:
-    """The knots of several windows after one another, of quantities that all of them have.
-
-    What follows from them follows at each knot by itself, but for the thrust's slope, which is
-    taken within windows."""
-    taken = [*names, "slope"] if {"thrust", "time"} <= set(names) else names
-    return KnotValues(
-        {name: np.concatenate([knots_of[name] for knots_of in knots]) for name in taken}
-    )
-
-
 @lru_cache(maxsize=64)
 def between(count: int) -> np.ndarray:
     """Coefficients of hats at the knots that come nearest to the smooth curve through values at the

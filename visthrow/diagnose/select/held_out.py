@@ -14,12 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
-from sim.params import LawParams
 from visthrow.diagnose.likelihood.evidence import (
     NORMAL_95,
     OWN_FLOOR,
     STRONG,
-    Priors,
     covariance,
     estimate,
 )
@@ -32,14 +30,13 @@ from visthrow.diagnose.likelihood.forms import (
     unit_of,
 )
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
-from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.select import result, terms
+from visthrow.diagnose.select import result
 from visthrow.diagnose.select.candidates import NOTHING, Names, columns_of, shared
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, candidate
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
 from visthrow.diagnose.select.scatter import allowed, between_flights, freed
 
@@ -54,7 +51,6 @@ leave a flight out, all.
 """
 # of what flights promise in the mean, from which one counts among those that can tell
 TELLING = 0.1
-WIDE = 10.0  # prior deviation of a law's coefficient, in its size: flights alone say it
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
@@ -83,7 +79,7 @@ class Work:
     crossed: Crossed | None = None  # searches without some of the flights
 
 
-def groups_of(point: Point, windows: Sequence[int]) -> tuple[list[int], str]:
+def groups_of(point: Point) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
@@ -110,7 +106,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     priors = work.problem.priors
     point = work.after
     effects = work.problem.effects
-    groups, left_out = groups_of(point, work.problem.kept)
+    groups, left_out = groups_of(point)
     statistics = freed(regrouped(point, groups), point.varies.by_flight)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
@@ -355,7 +351,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     point = diagnosis.work.after
     if compares_phases(point):
         return diagnosis
-    groups, left_out = groups_of(point, work.problem.kept)
+    groups, left_out = groups_of(point)
     names = work.problem.model.channels
     errors_of = errors(
         point.windows, groups, point.noise, [w.residual for w in point.windows], len(names)
@@ -518,62 +514,19 @@ def _kind(work: Work, channel: int) -> str:
     return ", ".join(parts)
 
 
-def with_repeated_laws(diagnosis: Diagnosis) -> Diagnosis:
-    """Return a diagnosis without the laws that other flights do not repeat.
-
-    Each flight is left out in turn; what the others say of the coefficients predicts it, beside the
-    names as all flights size them.
-    """
-    laws = {law.formula: law for law in diagnosis.laws}
-    if not laws:
-        return diagnosis
-    work = diagnosis.work
-    count = len(work.problem.effects)
-    effects = [
-        terms.as_effect(
-            term_of(LawParams(law.block, law.factors, law.vector, 0.0)),
-            WIDE * max(abs(law.coefficient), law.sd),
-            0.0,
-        )
-        for law in laws.values()
-    ]
-    wide, (point,) = terms.extended(work.problem, [work.before], effects)
-    columns = {formula: count + i for i, formula in enumerate(laws)}
-    sets = [[columns[law.formula] for law in together] for together in diagnosis.explanations]
-    point = candidate(wide, point, [*work.active, *sets[0]])
-    groups, left_out = groups_of(point, work.problem.kept)
-    statistics = regrouped(point, groups)
-    names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
-    shares = [_repeated_share(statistics, wide.priors, names, chosen) for chosen in sets]
-    repeated = [e for e, (_, low, _) in zip(diagnosis.explanations, shares) if low > 0.0]
-    repeated = repeated if shares[0][1] > 0.0 else []  # none in place of a better one
-    formulas = {law.formula for together in repeated for law in together}
-    reasons = list(diagnosis.reasons)
-    if not repeated:
-        share, low, high = (100.0 * value for value in shares[0])
-        best = [law.formula for law in diagnosis.explanations[0]]
-        reasons = [r for r in reasons if not any(formula in r for formula in best)]
-        reasons.append(
-            f"a formula explains these flights, but {left_out} that are left out do not repeat it:"
-            f" they bear out {share:.0f} % [{low:.0f}, {high:.0f}] of what it promises"
-        )
-    return replace(
-        diagnosis,
-        reasons=tuple(reasons),
-        explanations=tuple(repeated),
-        laws=tuple(law for law in diagnosis.laws if law.formula in formulas),
-    )
-
-
-def _repeated_share(
-    statistics: Statistics, priors: Priors, names: np.ndarray, laws: Sequence[int]
+def repeated_share(
+    problem: Problem, point: Point, laws: Sequence[int]
 ) -> tuple[float, float, float]:
-    """Return the part of what laws promise that flights without a say in them bear out, with its
-    95 % interval; ``names``: sizes of the names in floors, shape (K,).
-    """
+    """Return the part of what laws promise that flights without a say in their coefficients bear
+    out beside the names as all flights size them, with its 95 % interval.
+
+    ``laws``: numbers of the laws' terms among the effects."""
+    statistics = regrouped(point, groups_of(point)[0])
+    count = len(problem.model.effects)
+    names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
     information = statistics.information[:, laws][:, :, laws]
     score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
-    prior = np.diag(priors.slab[laws] ** -2.0)
+    prior = np.diag(problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
     training = total - information, score.sum(0) - score
     trained = np.linalg.solve(training[0], training[1][..., None])[..., 0]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.interpolate import CubicSpline, PchipInterpolator
+from scipy.interpolate import PchipInterpolator
 
 from sim.effects.effect import RandomEffect
 from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, log_evidence
@@ -107,43 +107,26 @@ def relinearised_per_flight(
     floors, or returns None where that fails.
     """
     shift = (statistics.information @ (theta - statistics.theta))[:, j]
-    diagonal = statistics.information[:, j, j]
-    score = statistics.score[:, j] - shift
-    reach = np.abs(
-        np.divide(score, diagonal, out=np.zeros_like(diagonal), where=diagonal > 0.0)
-    ).max(initial=0.0)
+    diagonal = np.maximum(statistics.information[:, j, j], 1e-300)
+    flown = np.flatnonzero(statistics.information[:, j, j] > 0.0)
+    reach = np.abs((statistics.score[:, j] - shift) / diagonal)[flown].max(initial=0.0)
     if reach < FAR_FLOORS:
         return statistics
-    sizes = []
-    simulated = []
-    for size in np.unique(
-        np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j]) - theta[j]
-    ):
-        statistics_moved = simulate(np.where(np.arange(len(theta)) == j, theta + size, theta))
-        if statistics_moved is not None:
-            sizes = [*sizes, size]
-            simulated = [*simulated, statistics_moved]
-    if len(sizes) < len(SIZES) // 2:
+    unit = np.eye(len(theta))[j]
+    places = np.unique(np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])) - theta[j]
+    simulated = {size: simulate(theta + size * unit) for size in places.tolist()}
+    simulated = {size: there for size, there in simulated.items() if there is not None}
+    if len(simulated) < len(SIZES) // 2:
         return statistics
-    squares = np.array([statistics_moved.square for statistics_moved in simulated])
-    curve = CubicSpline(sizes, squares)
-    best = np.argmin(squares, axis=0)
-    scores = statistics.score.copy()
-    for f in np.flatnonzero(diagonal > 0.0):
-        grid = np.linspace(
-            sizes[max(best[f] - 1, 0)], sizes[min(best[f] + 1, len(sizes) - 1)], FINE
-        )
-        position = np.where(
-            np.arange(len(theta)) == j, theta + grid[np.argmin(curve(grid)[:, f])], theta
-        )
-        information = statistics.information[f]
-        misfit = simulated[best[f]].score[f]
-        scores[f] = (
-            misfit
-            - information[:, j] * misfit[j] / diagonal[f]
-            + information @ (position - statistics.theta)
-        )
-    return replace(statistics, score=scores)
+    sizes = list(simulated)
+    scores = np.stack([there.score for there in simulated.values()])
+    score = statistics.score.copy()
+    for f in flown:
+        best = np.interp(0.0, -scores[:, f, j], sizes)
+        misfit = [np.interp(best, sizes, column) for column in scores[:, f].T]
+        change = theta + best * unit - statistics.theta
+        score[f] = misfit + statistics.information[f] @ change
+    return replace(statistics, score=score)
 
 
 def over_deviations(
@@ -229,16 +212,27 @@ def between_flights(
     Source: Laird and Ware 1982; Gelman 2006 (half-normal deviations of few groups).
     """
     information = statistics.information.diagonal(axis1=1, axis2=2)
-    mean_part = ((information / np.maximum(information.sum(0), 1e-300)) ** 2).sum(
-        0
-    )  # 1 / F of F that say as much
-    freed_flights = [
-        freed(statistics, Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in active}))
-        for u in REACH
-    ]
-    value = np.array([evidence_of(flights, priors, active) for flights in freed_flights])
+    share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F of F that say as much
+    value = differing(statistics, priors, active, theta, active)
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
-    return float(weight @ REACH**2 / weight.sum()) * bool(active), mean_part
+    return float(weight @ REACH**2 / weight.sum()) * bool(active), (share**2).sum(0)
+
+
+def differing(
+    statistics: Statistics,
+    priors: Priors,
+    active: Sequence[int],
+    theta: np.ndarray,
+    columns: Sequence[int],
+) -> np.ndarray:
+    """Return log Z of named effects of which some differ from flight to flight by each deviation of
+    ``REACH``, in what is :func:`allowed`.
+    """
+    nats = []
+    for u in REACH:
+        varies = Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in columns})
+        nats.append(evidence_of(freed(statistics, varies), priors, active))
+    return np.array(nats)
 
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
@@ -257,37 +251,6 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
     if not varies.drifts:
         return of_flights
     return integrated(by_day(of_flights, varies.days), varies.drifts.items())
-
-
-def freed_beside(
-    information: np.ndarray,
-    score: np.ndarray,
-    cross: np.ndarray,
-    statistics: Statistics,
-    varies: Varies,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Integrate out the flights' shares for candidates that are no effects yet, each alone beside
-    the effects, summed over flights.
-
-    ``information``: information of each, shape (F, T); ``score``: about 0, shape (F, T); ``cross``:
-    information with the effects, shape (F, T, K)."""
-    rows = replace(statistics, score=statistics.absolute, theta=np.zeros_like(statistics.theta))
-    for by_day_too in (False, True):
-        if by_day_too and varies.drifts:
-            member = _members(rows, varies.days)[1]
-            information = member @ information
-            score = member @ score
-            cross = np.tensordot(member, cross, 1)
-            rows = by_day(rows, varies.days)
-        for j, size in varies.drifts.items() if by_day_too else varies.of(rows):
-            column, cross_column = rows.information[:, :, j], cross[:, :, j]
-            part = (size**2 / (1.0 + size**2 * column[:, j]))[:, None] * cross_column
-            information, score = (
-                information - part * cross_column,
-                score - part * rows.score[:, j, None],
-            )
-            cross, rows = cross - part[..., None] * column[:, None], integrated(rows, [(j, size)])
-    return information.sum(0), score.sum(0), cross.sum(0)
 
 
 def _members(statistics: Statistics, days: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:

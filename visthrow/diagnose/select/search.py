@@ -152,7 +152,7 @@ def explain(
             break
         problem, nominal = _left_out(problem, nominal, untracked, say)
         begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
-    diagnosis = held_out.with_repeated_laws(held_out.judged(conclude(selection, commands)))
+    diagnosis = held_out.judged(conclude(selection, commands))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(problem.kept)
     if left_out:

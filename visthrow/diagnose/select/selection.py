@@ -17,7 +17,6 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
-    OWN_FLOOR,
     SPIKE,
     STRONG,
     certainty,
@@ -27,7 +26,6 @@ from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.select import terms
 from visthrow.diagnose.select.candidates import (
-    ALL,
     NOTHING,
     Candidate,
     Names,
@@ -95,18 +93,15 @@ class Selector:
         self.window: list[tuple[Trial, float]] = []  # sets that are possible, with nats behind
         self._linear: dict[int, tuple[Point, Linear]] = {}
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
-        self._visited: set[Names] = set()
+        self._visited = {NOTHING}
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
-        self._followed: set[Names] = set()
         self._proposed: set[Names] = set()
-        self._linearised_at: set[Names] = set()  # for a law's sake
-        self._every = False  # whether any effect may differ among flights
         self._offer()
 
     def _offer(self) -> None:
         effects, priors = self.problem.effects, self.problem.priors
         self.candidates = shared(effects) + random_shares(
-            effects, priors, self.nominal.plain, self.problem.days, self._every
+            effects, priors, self.nominal.plain, self.problem.days
         )
         self._linear.clear()
 
@@ -122,8 +117,7 @@ class Selector:
         That an effect differs among flights is a second claim beside its being there. What acts in
         the block of a law may be a part of its form and must be worth more than elsewhere. Without
         a calm phase to compare with, a law stands in place of all names."""
-        counted = without_means(chosen)
-        total = sum(c.claims * self.threshold + c.penalty for c in counted)
+        total = sum(c.claims * self.threshold + c.penalty for c in without_means(chosen))
         forms = laws_of(chosen)
         if not forms:
             return total
@@ -134,28 +128,13 @@ class Selector:
         blocks = {c.law for c in forms}
         joint = grammar.JOINT in blocks
         charged = [c for c in chosen if not c.law and self.block_of(c.columns[0], joint) in blocks]
-        return total + (len(forms) + len(charged)) * terms.LAW
+        return total + len(charged) * terms.LAW
 
     def block_of(self, j: int, joint: bool = False) -> str:
         """Return the block that an effect of the model acts in; ``joint``: of the rope's joint as
         well.
         """
         return self._acting[joint][j]
-
-    def crowded(self, members: Iterable[Candidate]) -> dict[str, list[Candidate]]:
-        """Return the blocks in which some candidates cost more together than a law that nobody
-        wrote down, with those that act there: its parts are likelier than so many causes.
-        """
-        by_block: dict[str, list[Candidate]] = {}
-        for c in members:
-            if not c.law:
-                by_block.setdefault(self.block_of(c.columns[0]), []).append(c)
-        law = self.threshold + terms.LAW
-        return {
-            block: acting
-            for block, acting in by_block.items()
-            if block and sum(self.threshold + c.penalty for c in acting) > law
-        }
 
     def linear(self, point: Point) -> Linear:
         """Return the values of sets by the statistics of a point."""
@@ -168,59 +147,28 @@ class Selector:
 
     def run(self, begin: Names = NOTHING) -> "Selector":
         """Select, beginning with a set."""
-        if begin:
-            (start,) = self._tried(self.nominal, [begin])
+        for start in self._tried(self.nominal, [begin] if begin else []):
             self._go(start)
-        while True:
-            self._visited.add(self.best.chosen)
-            if self.crowded(self.best.chosen):
-                self._propose()  # before names take ever more parts of a law
-            if not self._moved() and not self._propose() and not self._widen():
-                return self
-
-    def _widen(self) -> bool:
-        """Let any effect differ among flights, if no law is why they do; False where that was done.
-
-        A wider form is asked about where narrower ones fall short."""
-        if self._every:
-            return False
-        self._every = True
-        self._offer()
-        return True
+        while self._moved() or self._propose():
+            pass
+        return self
 
     def _moved(self) -> bool:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
         that is there stays.
         """
-        listed = self._listed()
-        tried = self._tried(self.nominal, self._laws_instead())
-        alike_tried = False
-        while True:
-            better = [t for t in tried if self._better(t)]
-            minimum = -np.inf
-            if better:
-                minimum = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
-            shortlist = self._short(listed, tried, minimum)
-            if not shortlist:
-                break
-            shortlist += [] if alike_tried else self._alike(shortlist[0])
-            alike_tried = True
-            tried += self._tried(self.best.point, dict.fromkeys(shortlist))
+        listed, tried, least = self._listed(), [], -np.inf
+        while shortlist := self._short(listed, tried, least):
+            tried += self._tried(self.best.point, shortlist)
+            leads = [t.lead for t in tried if self._better(t)]
+            least = max([*leads, max(listed.values()) - WINDOW]) if leads else least
+        better = [t for t in tried if self._better(t)]
         if better:
             top = max(better, key=lambda t: t.lead)
-            if laws_of(top.chosen) and self._approached():
-                return True
             self._record(top, tried, listed)
             self._go(top)
             return True
-        if followed := self._followed_up(tried, listed):
-            self._record(followed, [*tried, followed], listed)
-            self._go(followed)
-            return True
-        rivals: dict[Names, Trial] = {}  # each where it is worth most
-        for t in sorted(tried, key=lambda t: t.lead):
-            rivals[t.chosen] = t
-        close = [t for t in rivals.values() if -t.lead < STRONG and self.is_admissible(t)]
+        close = [t for t in tried if -t.lead < STRONG and self.is_admissible(t)]
         close += [  # sets that were the best before
             Trial(s, self.best.point, lead=nats)
             for s, nats in self._simulated.items()
@@ -248,30 +196,6 @@ class Selector:
         self._linear.pop(id(free))
         ahead_of.pop(present, None)
         return ahead_of
-
-    def _laws_instead(self) -> list[Names]:
-        """Return the sets of one law in place of all names: where the names lead, derivatives tell
-        nothing of a model that has the law in their place.
-        """
-        if not self.best.chosen or laws_of(self.best.chosen):
-            return []
-        laws = [frozenset({c}) for c in self.candidates if c.law]
-        done = {s for s, nats in self._simulated.items() if nats < -WINDOW} | self._visited
-        return [chosen for chosen in laws if chosen not in done]
-
-    def _alike(self, chosen: Names) -> list[Names]:
-        """Return the sets with another cause in place of a new one, that the catalogue says looks
-        like it: where a rope whips, derivatives may promise far too little.
-        """
-        visible, exchanged = self.problem.priors.visible, []
-        by_name = {c.name: c for c in self.candidates if c.group == ALL and visible[c.columns[0]]}
-        for c in chosen - self.best.chosen:
-            effect = self.problem.effects[c.columns[0]]
-            alternatives = [by_name[name] for name in effect.confused_with if name in by_name]
-            exchanged += [
-                chosen - {c} | {o} for o in alternatives if o not in chosen and c.group == ALL
-            ]
-        return exchanged
 
     def _short(
         self, listed: Mapping[Names, float], tried: Sequence[Trial], minimum: float
@@ -323,7 +247,7 @@ class Selector:
         simulated_trials = [
             Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)
         ]
-        simulated_trials = [replace(t, lead=self._lead(t)) for t in simulated_trials]
+        simulated_trials = [replace(t, lead=self.lead(t, self.best)) for t in simulated_trials]
         for t in simulated_trials:  # what may not be named gains nothing
             nats = t.lead if self.is_admissible(t) else min(t.lead, 0.0)
             self._simulated[t.chosen] = max(nats, self._simulated.get(t.chosen, -np.inf))
@@ -343,15 +267,6 @@ class Selector:
     def _better(self, trial: Trial) -> bool:
         new = trial.chosen not in self._visited
         return new and trial.lead > ENOUGH_NATS and self.is_admissible(trial)
-
-    def _lead(self, trial: Trial) -> float:
-        """Return the nats by which a set is worth more than the best.
-
-        Where names show that something is missing, a law in their place need not show it again."""
-        nats, laws = self.lead(trial, self.best), laws_of(trial.chosen)
-        if laws_of(self.best.chosen) or self.best.chosen <= trial.chosen:
-            return nats
-        return nats + len(laws) * terms.LAW
 
     def lead(self, first: Trial, second: Trial) -> float:
         """Return the nats by which a set is worth more than another, each where it was simulated,
@@ -393,35 +308,6 @@ class Selector:
             for j in laws
         )
 
-    def _followed_up(self, tried: Iterable[Trial], listed: Mapping[Names, float]) -> Trial | None:
-        """Return the set that promised most, with derivatives and initial states of its own where
-        it leads, if it is worth more there.
-
-        A rope that whips forgets its initial state within a window; what was fitted for another
-        rope explains nothing. The present set begins there as well: new states alone are no gain.
-        """
-        promising = [
-            t for t in tried if listed.get(t.chosen, 0.0) > 0.0 and t.chosen not in self._followed
-        ]
-        kinds = self.problem.switches
-        promising = [t for t in promising if not np.any(t.point.theta[kinds])]
-        if not promising:
-            return None
-        trial = max(promising, key=lambda t: listed[t.chosen])
-        self._followed.add(trial.chosen)
-        origin, point = self.origin, trial.point
-        if np.abs(point.theta[trial.columns]).max(initial=0.0) < 1.0:
-            goal = estimate(point.information, point.score, self.problem.priors, trial.columns)
-            point = fitted(self.problem, self._linearised(goal, point), trial.columns)
-        point = self._settled(point, trial.columns)
-        trial = replace(trial, point=point)
-        (unchanged,) = self._tried(point, [self.best.chosen])
-        nats = min(self.lead(trial, self.best), self.lead(trial, unchanged))
-        if nats > ENOUGH_NATS and self.is_admissible(trial):
-            return replace(trial, lead=nats)
-        self.origin = origin
-        return None
-
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
         self._simulated = {s: nats - trial.lead for s, nats in self._simulated.items()}
@@ -436,6 +322,7 @@ class Selector:
             point = with_varying(point, varies_of(shares, self.problem.days)) if shares else point
             trial = Trial(trial.chosen, point, shares, occam)
         self.best = trial
+        self._visited.add(trial.chosen)
         self._linear = {id(self.nominal): (self.nominal, self.linear(self.nominal))}
 
     def _settled(self, point: Point, active: list[int]) -> Point:
@@ -459,21 +346,6 @@ class Selector:
             if close or curvature(self.problem, self.origin, point) <= SPIKE:
                 break
         return point
-
-    def _approached(self) -> bool:
-        """Linearise where the best set is; False where that was done. A law may explain what
-        derivatives of elsewhere lack.
-        """
-        present = self.best.point.theta
-        is_near = np.abs(self.origin.theta - present).max(initial=0.0) <= OWN_FLOOR
-        if is_near or self.best.chosen in self._linearised_at:
-            return False
-        self._linearised_at.add(self.best.chosen)
-        self.progress("derivatives are taken where the causes are, for a law may explain the rest")
-        self.origin = self._linearised(present, self.best.point)
-        point = fitted(self.problem, self.origin, self.best.columns)
-        self.best = replace(self.best, point=point)
-        return True
 
     def _linearised(self, theta: np.ndarray, like: Point) -> Point:
         return linearise(self.problem, theta, like.noise, varies=like.varies)

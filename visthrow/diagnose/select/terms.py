@@ -12,15 +12,13 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-import torch
 from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
-from visthrow.diagnose.likelihood.grammar import TermEffect, forces, joined, through_latents
+from visthrow.diagnose.likelihood.grammar import TermEffect, forces, through_latents
 from visthrow.diagnose.likelihood.marginal import Gram, LatentStatistics, gather
-from visthrow.diagnose.likelihood.stack import BATCH, statistics
+from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
-from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.law_terms import (
     JOINT,
     KnotValues,
@@ -32,9 +30,15 @@ from visthrow.diagnose.models.law_terms import (
 )
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.excess import floors_of
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem, regathered
+from visthrow.diagnose.select.point import (
+    UNKNOWN_RATIO,
+    Point,
+    Problem,
+    regathered,
+    with_shares,
+)
 from visthrow.diagnose.select.result import Law
-from visthrow.diagnose.select.scatter import freed_beside
+from visthrow.diagnose.select.scatter import Varies
 
 LAW = 2.0 * STRONG
 """Nats by which a term must be ahead where it takes the place of no name, and which a name costs
@@ -81,8 +85,8 @@ def typical_level(levels: Mapping[tuple[int, str], float], block: int) -> float:
 
 
 def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
-    """The point as if no phase were much rougher than is usual in its block, and the statistics of
-    its windows.
+    """The point as if no phase were much rougher than is usual in its block and each flight's
+    random shares were known, and the statistics of its windows.
 
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of
     it would stand out."""
@@ -94,8 +98,10 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     noise = replace(
         point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()}
     )
-    parts = statistics(point.grams, noise, point.device)
-    return replace(point, noise=noise, plain=gather(point.grams, parts, point.theta)), parts
+    grams = with_shares(point, point.theta)
+    parts = statistics(grams, noise, point.device)
+    plain = gather(grams, parts, point.theta)
+    return replace(point, noise=noise, grams=grams, plain=plain, varies=Varies()), parts
 
 
 def screen(
@@ -108,99 +114,21 @@ def screen(
     terms, layout = _laid(block, shared) if "time" in shared else ((), None)
     if layout is None:
         return None
-    latent_block, size = (
-        LATENT_BLOCKS.index(level_block(block)),
-        BATCH if point.device == "cpu" else len(carriers),
-    )
+    latent_block = LATENT_BLOCKS.index(level_block(block))
 
-    ends = np.cumsum([len(quantities[w]["time"]) for w in carriers])[:-1]
-    factors = zip(
-        *(
-            np.split(values, ends)
-            for values in layout.factors(joined([quantities[w] for w in carriers], shared))
-        )
-    )
-    exerted = parallel_map(
-        lambda w: _exerted(point, parts[w], w, block, quantities[w], latent_block), carriers
-    )
-    at_windows = [(*one, *at_knots) for one, at_knots in zip(exerted, factors)]
-    flights = np.searchsorted(point.plain.flights, [point.windows[w].flight for w in carriers])
-    rows = (
-        [np.flatnonzero(flights == f) for f in range(len(point.plain.flights))]
-        if point.varies
-        else [np.arange(len(at_windows))]
-    )
-    batches = [
-        [at_windows[i] for i in own_rows[first : first + size]]
-        for own_rows in rows
-        for first in range(0, len(own_rows), size)
-    ]
-    row_of = np.repeat(np.arange(len(rows)), [-(-len(own_rows) // size) for own_rows in rows])
-    shares = zip(*parallel_map(lambda batch: _products(batch, layout, point.device), batches))
-    square, information, score, cross = (_summed(values, row_of, len(rows)) for values in shares)
-    information, score, cross = freed_beside(information, score, cross, point.plain, point.varies)
+    def in_window(w: int) -> tuple[np.ndarray, ...]:
+        """Square, information, score and cross information of all terms."""
+        part, transfer = parts[w], through_latents(point.windows[w], quantities[w], block)
+        values = layout.table(quantities[w]).reshape(transfer.shape[1], -1)
+        exerted = transfer[point.grams[w].latent_block == latent_block] @ values
+        loads = transfer @ values
+        information = (loads * (part.latent_information @ loads)).sum(0)
+        score = part.latent_score + part.latent_effects @ point.theta
+        return (exerted**2).sum(0), information, score @ loads, loads.T @ part.latent_effects
+
+    square, information, score, cross = map(sum, zip(*parallel_map(in_window, carriers)))
     count = sum(int((point.grams[w].latent_block == latent_block).sum()) // 3 for w in carriers)
-    return Screen(terms, np.sqrt(square.sum(0) / max(count, 1)), information, score, cross)
-
-
-def _summed(values: Sequence[np.ndarray], row_of: np.ndarray, rows: int) -> np.ndarray:
-    """Sums of arrays by the row that each belongs to."""
-    out = np.zeros((rows, *values[0].shape))
-    np.add.at(out, row_of, np.array(values))
-    return out
-
-
-def _exerted(
-    point: Point, part: LatentStatistics, w: int, block: str, values: KnotValues, latent_block: int
-) -> tuple[np.ndarray, ...]:
-    """Return square and information, score and cross information of what is exerted at a window's
-    knots.
-    """
-    transfer = through_latents(point.windows[w], values, block)
-    felt_transfer = transfer[point.grams[w].latent_block == latent_block]
-    score = part.latent_score + part.latent_effects @ point.theta
-    return (
-        felt_transfer.T @ felt_transfer,
-        transfer.T @ part.latent_information @ transfer,
-        transfer.T @ score,
-        transfer.T @ part.latent_effects,
-    )
-
-
-def _products(
-    windows: Sequence[tuple[np.ndarray, ...]], layout: TermLayout, device: str
-) -> tuple[np.ndarray, ...]:
-    """Square, information, score and cross information of all terms, of these windows together.
-
-    ``windows``: of each, what is exerted at its knots, and the scalars and vectors there.
-    """
-    longest = max((len(scalars) for *_, scalars, _ in windows), default=0)
-    square, information, score, cross, scalars, vectors = (
-        _padded(arrays, axes, longest, device)
-        for arrays, axes in zip(
-            zip(*windows), ((3, 3), (3, 3), (3,), (3, None), (1, None), (1, None, None))
-        )
-    )
-    values = vectors[..., torch.from_numpy(layout.vector).to(device)]
-    for which in layout.scalar:
-        values *= scalars[:, :, None, torch.from_numpy(which).to(device)]
-    values = values.reshape(len(windows), 3 * longest, -1)
-    flat = values.reshape(-1, values.shape[-1])
-    cross = cross.reshape(-1, cross.shape[-1])
-    squares = [((inner @ values) * values).sum((0, 1)) for inner in (square, information)]
-    return tuple(all_to_host((*squares, score.reshape(-1) @ flat, flat.T @ cross)))
-
-
-def _padded(
-    arrays: Sequence[np.ndarray], axes: Sequence[int | None], longest: int, device: str
-) -> torch.Tensor:
-    """Arrays side by side, with zeros up to so many knots along each axis that has some entries a
-    knot.
-    """
-    shape = tuple(
-        size if per is None else per * longest for size, per in zip(arrays[0].shape, axes)
-    )
-    return side_by_side([[array] for array in arrays], shape, device)
+    return Screen(terms, np.sqrt(square / max(count, 1)), information, score, cross)
 
 
 def gains(

@@ -29,17 +29,20 @@ from visthrow.diagnose.select.candidates import (
     Candidate,
     Names,
     as_random,
+    columns_of,
     laws_of,
     varies_of,
 )
-from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
-from visthrow.diagnose.select.held_out import Work, sized
+from visthrow.diagnose.select.excess import acts_on, levels, too_strong
+from visthrow.diagnose.select.held_out import Work, regrouped, repeated_share, sized
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
     Point,
+    Problem,
     moved,
     with_floors_noise,
+    with_shares,
     with_varying,
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
@@ -51,12 +54,13 @@ from visthrow.diagnose.select.scatter import (
     Varies,
     allowed,
     by_day,
+    differing,
     freed,
     judged,
     relinearised_per_flight,
     unit_suffix,
 )
-from visthrow.diagnose.select.selection import Selector, Trial
+from visthrow.diagnose.select.selection import Selector
 
 BIT = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
@@ -79,22 +83,25 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         selection.threshold,
     )
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
-    explanations = _explanations(selection) if overall == result.UNKNOWN else []
+    laws = _explanations(selection) if overall == result.UNKNOWN else ([], "")
+    explanations, unrepeated = laws
+    reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
+    problem, point = selection.bare(point)
+    nominal = selection.bare(selection.nominal)[1]
+    names = selection.names
+    active = [j for j in names if j not in withdrawn]
     has_laws = bool(laws_of(selection.best.chosen))
-    bare = _without_laws(selection)
-    active = [j for j in bare.best.columns if j not in withdrawn]
-    point = bare.best.point
     if has_laws:
-        active = surely_there(point.information, point.score, bare.problem.priors, active)
-        withdrawn = set(bare.best.columns) - set(active)
-    if not active and bare.best.columns:
-        point = bare.nominal
-    statistics = point.plain if has_laws else _about_means(bare, point, active, varies)
+        active = surely_there(point.information, point.score, problem.priors, active)
+        withdrawn = set(names) - set(active)
+    if names and not active:
+        point = nominal
+    statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
     reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
-    theta, spread, unlike = sized(bare.problem, reported_point, active)
-    sets = _sets_of(bare)
+    theta, spread, unlike = sized(problem, reported_point, active)
+    sets = _sets_of(selection)
     findings = tuple(
-        _finding(bare, reported_point, j, active, sets, unlike, withdrawn)
+        _finding(problem, reported_point, j, active, sets, unlike, withdrawn)
         for j in range(len(model.effects))
     )
     return Diagnosis(
@@ -117,12 +124,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         flights=len(point.plain.flights),
         windows=len(point.windows),
         samples=int(point.statistics.samples.sum()),
-        work=Work(
-            bare.problem,
-            bare.nominal,
-            bare.best.point if active else bare.nominal,
-            tuple(active),
-        ),
+        work=Work(problem, nominal, point if active else nominal, tuple(active)),
     )
 
 
@@ -145,7 +147,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
     for c in concerned:
         statistics = best.point.plain
         if c in random and len(c.columns) == 1:
-            statistics = _straight(selection, best.point, best.columns, c.columns[0])
+            statistics = _straight(problem, best.point, best.columns, c.columns[0])
         fixed_shares = {o: size for o, size in best.shares.items() if o != c}
         means = {
             o for o in selection.candidates if o.group == ALL and set(o.columns) & set(c.columns)
@@ -191,24 +193,24 @@ def share_verdict(
     )
 
 
-def _straight(selection: Selector, point: Point, active: Sequence[int], j: int) -> Statistics:
+def _straight(problem: Problem, point: Point, active: Sequence[int], j: int) -> Statistics:
     theta = np.zeros(len(point.theta))
     theta[list(active)] = point.theta[list(active)]
 
     def simulate(position: np.ndarray) -> Statistics | None:
-        moved_point = moved(selection.problem, point, position)
+        moved_point = moved(problem, point, position)
         return None if moved_point is None else moved_point.plain
 
-    return relinearised_per_flight(point.plain, theta, selection.problem.priors, j, simulate)
+    return relinearised_per_flight(point.plain, theta, problem.priors, j, simulate)
 
 
 def _about_means(
-    selection: Selector, point: Point, active: Sequence[int], varies: Varies
+    problem: Problem, point: Point, active: Sequence[int], varies: Varies
 ) -> Statistics:
     """Return what the flights say of the means of effects that vary."""
     statistics = point.plain
     for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
-        statistics = _straight(selection, replace(point, plain=statistics), active, j)
+        statistics = _straight(problem, replace(point, plain=statistics), active, j)
     return statistics
 
 
@@ -218,46 +220,35 @@ def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
     return [
         (tuple(t.columns), nats)
         for t, nats in selection.window
-        if {c for c in t.chosen if c.group != ALL} == random
+        if not laws_of(t.chosen) and {c for c in t.chosen if c.group != ALL} == random
     ]
 
 
-def _without_laws(selection: Selector) -> Selector:
-    """Return the selection as if the laws of its set were known: what they explain is left out of
-    the residuals.
+def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
+    """Return the laws of the set, then others one by one in their place, best first, where flights
+    without a say in their coefficients repeat them; else none, and why.
     """
-    problem, best = selection.problem, selection.best
-    if not problem.terms:
-        return selection
-    names = frozenset(c for c in best.chosen if not c.law)
-    bare = Selector(
-        terms.without_laws(problem, best.point)[0],
-        terms.without_laws(problem, selection.nominal)[1],
-        selection.threshold,
-        selection.progress,
-        laws=False,
-    )
-    bare.origin = terms.without_laws(problem, selection.origin)[1]
-    bare.best = Trial(names, terms.without_laws(problem, best.point)[1], best.shares, best.occam)
-    bare.window = [(t, nats) for t, nats in selection.window if not laws_of(t.chosen)]
-    return bare
-
-
-def _explanations(selection: Selector) -> list[tuple[Law, ...]]:
-    """Return the laws of the set, then others one by one in their place, best first."""
     best, problem = selection.best, selection.problem
     if not laws_of(best.chosen):
-        return []
+        return [], ""
     names = frozenset(c for c in best.chosen if not c.law)
     linear = selection.linear(best.point)
     alternatives = {names | {c} for c in selection.candidates if c.law} | {best.chosen}
     value = {s: linear.value(s) - linear.value(names) for s in alternatives}
     ranked = sorted((s for s in alternatives if s != best.chosen), key=value.get, reverse=True)
+    sets = [best.chosen, *(s for s in ranked if value[s] > 0.0)]
+    shares = [repeated_share(problem, best.point, [c.columns[0] for c in laws_of(s)]) for s in sets]
+    if shares[0][1] <= 0.0:  # none in place of a better one
+        share, low, high = (100.0 * part for part in shares[0])
+        return [], (
+            "a formula explains these flights, but those that are left out do not repeat it: they"
+            f" bear out {share:.0f} % [{low:.0f}, {high:.0f}] of what it promises"
+        )
     return [
-        terms.laws(problem, best.point, [c.columns[0] for c in s if c.group == ALL], value[s])
-        for s in (best.chosen, *ranked)
-        if s == best.chosen or value[s] > 0.0
-    ]
+        terms.laws(problem, best.point, columns_of(s), value[s])
+        for s, (_, low, _) in zip(sets, shares)
+        if low > 0.0
+    ], ""
 
 
 def _law(selection: Selector) -> tuple[set[int], str]:
@@ -384,13 +375,13 @@ def _overall(
         )
         block = selection.block_of(stuck[0]) or selection.problem.effects[stuck[0]].block
         return result.UNKNOWN, block, reasons, set(active)
+    if inconsistent := _inconsistent(selection):
+        names = ", ".join(selection.problem.effects[j].name for j in inconsistent)
+        reasons.append(f"the size of {names} differs from window to window; the form is another")
+        return result.UNKNOWN, selection.block_of(inconsistent[0]), reasons, set(inconsistent)
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(selection, excessive)
-    for block, names in _parts_of_a_law(selection).items():
-        words = ", ".join(sorted(c.name for c in names))
-        reason = f"{words} act in the {block} and some hardly differ: another law is likelier"
-        return result.UNKNOWN, block, [*reasons, reason], {c.columns[0] for c in names}
     catalogue = {v.name for v in random_effects()}
     forms = [s for s in scatter if s.found and s.name not in catalogue]
     if len(forms) > 1:
@@ -407,21 +398,13 @@ def _overall(
     return result.NO_EFFECT, "", [nothing], set()
 
 
-def _parts_of_a_law(selection: Selector) -> dict[str, list[Candidate]]:
-    """Return the blocks that are crowded with names, of which some explain others by more than
-    half, with the names that act there.
-    """
-    if not compares_phases(selection.nominal):  # there what is left over says so
-        return {}
-    names = [c for c in selection.best.chosen if c.group == ALL]
-    parts: dict[str, list[Candidate]] = {}
-    for block, members in selection.crowded(names).items():
-        columns = [c.columns[0] for c in members]
-        information = selection.best.point.information[np.ix_(columns, columns)]
-        unlike = 1.0 / (np.diag(information) * np.diag(np.linalg.pinv(information)))
-        if unlike.min() < 0.5:
-            parts[block] = members
-    return parts
+def _inconsistent(selection: Selector) -> list[int]:
+    """Return the names whose size differs from window to window by more than is :func:`allowed`."""
+    best, priors = selection.best, selection.problem.priors
+    point = replace(best.point, grams=with_shares(best.point, best.point.theta))
+    windows = regrouped(point, range(len(point.windows)))
+    nats = {j: differing(windows, priors, best.columns, point.theta, [j]) for j in selection.names}
+    return [j for j, n in nats.items() if n.max() - n[REACH <= 1.0].max() > selection.threshold]
 
 
 def _excess(level: Level) -> str:
@@ -433,14 +416,9 @@ def _excess(level: Level) -> str:
 
 
 def _withdrawn(selection: Selector, excessive: Sequence[Level]) -> set[int]:
-    """Names that stand for the unknown effect's wrong form: a chain of them in its block, or one
-    that left it as it was.
-    """
+    """Return names that act in the unknown effect's block, and leave it as it was."""
     blocks = {j: selection.block_of(j) for j in selection.best.columns}
     in_excess = {j for j, block in blocks.items() if block in {level.block for level in excessive}}
-    crowd = selection.crowded(c for c in selection.best.chosen if c.columns[0] in in_excess)
-    if crowd:
-        return in_excess
     eased = {level.block: level.after < 0.5 * level.before for level in excessive}
     return {j for j in in_excess if not eased.get(blocks[j], True)}
 
@@ -462,7 +440,7 @@ def _on_bound(selection: Selector, j: int) -> bool:
 
 
 def _finding(
-    selection: Selector,
+    problem: Problem,
     point: Point,
     j: int,
     active: list[int],
@@ -474,7 +452,7 @@ def _finding(
 
     ``sets``: effects of each possible set, and its nats behind; ``unlike``: variance among flights,
     in what is allowed."""
-    problem, priors = selection.problem, selection.problem.priors
+    priors = problem.priors
     effect, blank = problem.effects[j], _blank(problem.effects[j])
     if not priors.visible[j]:
         missing = tuple(c for c in effect.channels if c not in problem.model.channels)
@@ -490,7 +468,7 @@ def _finding(
     if j in active or partners:
         differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
         members = sorted({j, *partners})
-        return _named(selection, point, replace(blank, differs=differs), mean, members, active)
+        return _named(problem, point, replace(blank, differs=differs), mean, members, active)
     low, high = (
         float(np.clip(mean * effect.floor + side * NORMAL_95 * deviation, *effect.bounds)) + 0.0
         for side in (-1.0, 1.0)
@@ -571,7 +549,7 @@ def _class_of(
 
 
 def _named(
-    selection: Selector,
+    problem: Problem,
     point: Point,
     blank: Finding,
     mean: float,
@@ -597,9 +575,9 @@ def _named(
             f" {blank.nats:.0f} nats; another flight may differ by {blank.differs:.2g}."
         )
         return replace(blank, verdict=result.FOUND, sentence=sentence)
-    effects = selection.problem.effects
+    effects = problem.effects
     names = tuple(effects[k].name for k in members if effects[k].name != blank.name)
-    joint = _joint(selection, point, members, [k for k in active if k not in members])
+    joint = _joint(problem, point, members, [k for k in active if k not in members])
     sentence = (
         f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it"
         f" from {', '.join(names)}. Only this combination is determined: {joint}."
@@ -607,11 +585,11 @@ def _named(
     return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
 
 
-def _joint(selection: Selector, point: Point, members: list[int], named: list[int]) -> str:
+def _joint(problem: Problem, point: Point, members: list[int], named: list[int]) -> str:
     """The best known combination of a class: first eigenvector of its members' information in prior
     deviations.
     """
-    priors, effects = selection.problem.priors, selection.problem.effects
+    priors, effects = problem.priors, problem.effects
     slab = priors.slab[members]
     sigma = covariance(point.information, priors.deviation([*members, *named]))
     precision = np.linalg.inv(sigma[np.ix_(members, members)])
