@@ -111,6 +111,7 @@ def answer_foreign(seed: int, trees: list[str], until: float) -> dict:
                 "judged": foreign.judged(hidden, groups, verdict["overall"]),
                 "seconds": verdict["seconds"],
                 "error": verdict.get("error", ""),
+                "reasons": verdict.get("reasons", [])[:2],
             }
     return line
 
@@ -134,6 +135,7 @@ def answer_sealed(kind: str, recipe: Recipe, trees: list[str], until: float) -> 
                 "errors": sealed.errors_of(recipe, verdict),
                 "seconds": verdict["seconds"],
                 "error": verdict.get("error", ""),
+                "reasons": verdict.get("reasons", [])[:2],
             }
             sizes[side] = verdict.get("theta", {})
         if has_names(line):
@@ -380,6 +382,7 @@ def differing(lines: list[dict], tests: tuple, sides: list[str]) -> None:
             answers = [
                 f"{side} {'ok' if test(line, side) else 'NO'} {line[side]['overall']}"
                 f" {line[side]['named']} {line[side].get('varies', '')} {line[side]['error'][:60]}"
+                f" {' | '.join(line[side].get('reasons', ()))}"
                 for side in sides
             ]
             print(f"{name}: {line['kind']} {hidden}\n    " + "\n    ".join(answers))

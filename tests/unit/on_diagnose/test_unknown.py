@@ -21,7 +21,7 @@ from visthrow.diagnose.select import result, search, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies
+from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares
 from visthrow.diagnose.select.selection import Selector, Trial
 
 EFFECTS = catalogue(12)
@@ -348,13 +348,21 @@ def test_the_table_takes_up_what_no_name_explains():
 
 @mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
 def test_terms_are_screened_beside_what_varies(days):
-    """As if each were an effect of the problem: else what flights have of their own is taken for a
-    law.
-    """
+    """Beside each flight's own share: else what flights have of their own is taken for a law."""
     model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {(0, FLIGHT): 5.0} | ({(4, DAY): 2.0} if days else {}))
-    calm, parts = terms.with_capped_gusts(replace(linearise(problem, np.zeros(12)), varies=varies))
+    point = replace(linearise(problem, np.zeros(12)), varies=varies)
+    calm, parts = terms.with_capped_gusts(point)
+    shares = own_shares(point.plain, point.theta, varies)
+    assert np.abs(shares[:, 0]).max() > 1.0
+    moves = dict(zip(point.plain.flights.tolist(), shares * problem.priors.floor))
+    calm = replace(
+        calm,
+        windows=[
+            replace(w, residual=w.residual - w.effects @ moves[w.flight]) for w in calm.windows
+        ],
+    )
     screen = terms.screen(
         calm, parts, "payload force", [laws.KnotValues(w.knots) for w in calm.windows]
     )

@@ -35,39 +35,24 @@ def levels(problem: Problem, before: Point, after: Point, threshold: float) -> t
 
     ``threshold``: nats from which a level would count as excessive if it were the only one; of
     many, one is higher by chance."""
-    levels_found = []
-    threshold = threshold + np.log(max(len(after.noise.latent_sd), 1))
-    blocks = sorted({block for block, _ in after.noise.latent_sd})
-    phases = {phase: _Phase(after, phase) for _, phase in after.noise.latent_sd}
+    noise = after.noise
+    threshold = threshold + np.log(max(len(noise.latent_sd), 1))
+    phases = {phase: _Phase(after, phase) for _, phase in noise.latent_sd}
+    limits = {key: phases[key[1]].upper_limit(key[0]) for key in noise.latent_sd}
     floors = floors_of(problem, after)
-    for block in blocks:
-        limits = {
-            phase: phases[phase].upper_limit(block)
-            for b, phase in after.noise.latent_sd
-            if b == block
-        }
-        quiet = min(limits.values())
-        for phase in limits:
-            level = after.noise.latent_sd[block, phase]
-            nats = 0.0
-            limit = max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
-            if level > limit:
-                nats = phases[phase].likelihood(block, level) - phases[phase].likelihood(
-                    block, limit
-                )
-            earlier = before.noise.latent_sd.get((block, phase), float("nan"))
-            levels_found.append(
-                Level(
-                    LATENT_BLOCKS[block],
-                    phase,
-                    earlier,
-                    level,
-                    quiet,
-                    float(nats),
-                    bool(nats > threshold),
-                )
-            )
-    return tuple(levels_found)
+    listed = []
+    for block, phase in sorted(limits, key=lambda key: key[0]):
+        level = noise.latent_sd[block, phase]
+        quiet = min(limit for (b, _), limit in limits.items() if b == block)
+        most = max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
+        nats = 0.0
+        if level > most:
+            likelihood = phases[phase].likelihood
+            nats = likelihood(block, level) - likelihood(block, most)
+        earlier = before.noise.latent_sd.get((block, phase), float("nan"))
+        name, excessive = LATENT_BLOCKS[block], bool(nats > threshold)
+        listed.append(Level(name, phase, earlier, level, quiet, float(nats), excessive))
+    return tuple(listed)
 
 
 def compares_phases(point: Point) -> bool:

@@ -284,17 +284,9 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             f"held-out {measured.left_out} are explained worse with {', '.join(names)} ({how});"
             " withdrawn"
         )
-        return _unconfirmed(
-            _demoted(
-                diagnosis,
-                names,
-                result.NOT_IDENTIFIABLE,
-                "held-out flights are explained worse with it",
-            ),
-            measured,
-            names,
-            reason,
-        )
+        why = "held-out flights are explained worse with it"
+        diagnosis = _demoted(diagnosis, names, result.NOT_IDENTIFIABLE, why)
+        return _unconfirmed(diagnosis, measured, names, reason)
     falls = [c.low if uncompared else c.gain for c in measured.channels]
     confirmed = not measured.channels or any(fall > 0.0 for fall in falls)
     if not (measured.low > 0.0 and confirmed):
@@ -302,12 +294,9 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
         reason = f"held-out {measured.left_out} do not confirm {', '.join(names)} ({failed})"
         if np.isnan(measured.low) or measured.folds < PARTS:
             reason += f"; {_one_more(diagnosis, names)}"
-        return _unconfirmed(
-            _demoted(diagnosis, names, result.CANDIDATE, "held-out flights do not confirm it"),
-            measured,
-            names,
-            reason,
-        )
+        why = "held-out flights do not confirm it"
+        diagnosis = _demoted(diagnosis, names, result.CANDIDATE, why)
+        return _unconfirmed(diagnosis, measured, names, reason)
     return _agreed(diagnosis, measured, uncompared)
 
 
@@ -330,7 +319,7 @@ def _agreed(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Diagno
     if not after.theta:
         reason = f"searches that leave {measured.left_out} out do not agree on a name"
         return _unconfirmed(after, measured, names, reason)
-    unexplained = [c for c in measured.channels if uncompared and c.after > UNKNOWN_RATIO * c.floor]
+    unexplained = _unexplained(measured.channels) if uncompared else []
     after = replace(after, held_out=measured)
     if diagnosis.overall == result.UNKNOWN or not unexplained:
         return after
@@ -339,6 +328,11 @@ def _agreed(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Diagno
         overall=result.IN_PART,
         reasons=tuple(_remaining(c, diagnosis.work) for c in unexplained),
     )
+
+
+def _unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
+    """Return channels of which far more than noise is left."""
+    return [c for c in gains if c.after > UNKNOWN_RATIO * c.floor]
 
 
 def _innovations(diagnosis: Diagnosis) -> Diagnosis:
@@ -352,28 +346,18 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     if compares_phases(point):
         return diagnosis
     groups, left_out = groups_of(point)
-    names = work.problem.model.channels
-    errors_of = errors(
-        point.windows, groups, point.noise, [w.residual for w in point.windows], len(names)
-    )
-    error = errors_of.square.sum(2)
-    limit = UNKNOWN_RATIO**2 * errors_of.floor.sum(2)
-    firm = [name for c, name in enumerate(names) if jackknifed(limit[:, c], error[:, c])[2] < 0.0]
-    if not firm:
+    none = np.zeros((len(set(groups)), len(point.theta)))
+    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], none, {}))
+    unexplained = _unexplained(gains)
+    if not unexplained:
         return diagnosis
-    gains = channel_gains(
-        work,
-        Crossed(
-            groups, left_out, point.statistics, [], np.zeros((len(error), len(point.theta))), {}
-        ),
-    )
     floors = floors_of(work.problem, point)
     level = max(
         diagnosis.levels,
         key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf),
         default=None,
     )
-    reasons = tuple(_remaining(c, work) for c in gains if c.channel in firm)
+    reasons = tuple(_remaining(c, work) for c in unexplained)
     return replace(
         diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons
     )

@@ -327,27 +327,16 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     theta = problem.possible(theta)
     kinds = problem.switches
     linearised = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
-    count = len(
-        problem.model.effects
-    )  # a term's column stays that of the place where derivatives were taken
-    sizes = problem.priors.floor * theta
-    change = problem.priors.floor * (theta - point.theta)
-    if (flown := problem.flown(theta)) is not None:
-        residuals_of = flown.residuals(problem.sizes(theta), linearised)
-        residuals = [residuals_of[i] for i in problem.kept]
-    elif np.array_equal(theta[:count], point.theta[:count]):
-        residuals = [w.residual - w.effects[:, count:] @ change[count:] for w in point.windows]
-    else:
-        residuals_of = problem.model.residuals(problem.sizes(theta), linearised)
-        residuals = [
-            residuals_of[i] - w.effects[:, count:] @ sizes[count:]
-            for i, w in zip(problem.kept, point.windows)
-        ]
-        residuals = (
-            [r - problem.lost * c.sum(1) for r, c in zip(residuals, point.commands)]
-            if point.commands
-            else residuals
-        )
+    flown = problem.flown(theta)
+    count = len(problem.model.effects)  # a term's column stays that of where derivatives were taken
+    sizes = problem.priors.floor[count:] * theta[count:] * (flown is None)
+    simulated = (flown or problem.model).residuals(problem.sizes(theta), linearised)
+    residuals = [
+        simulated[i] - w.effects[:, count:] @ sizes for i, w in zip(problem.kept, point.windows)
+    ]
+    if point.commands:
+        lost = [problem.lost * c.sum(1) for c in point.commands]
+        residuals = [r - mean for r, mean in zip(residuals, lost)]
     if not all(np.all(np.isfinite(r)) for r in residuals):
         return None
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
@@ -385,13 +374,6 @@ def curvature(problem: Problem, origin: Point, moved_point: Point) -> float:
     return float(np.abs(linearisation_bias(problem, origin, moved_point, ())).max(initial=0.0))
 
 
-def with_fitted_noise(point: Point) -> Point:
-    """Return the point with noise levels estimated from its residuals and the random shares."""
-    if point.varies:
-        return with_varying(point, point.varies)
-    return regathered(point, noise=levels.maximised(point.grams, point.noise, point.device)[0])
-
-
 def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     """Return the point with the noise levels that remain when every effect may have its linear
     estimate.
@@ -399,7 +381,7 @@ def with_all_effects_noise(problem: Problem, point: Point) -> Point:
     A large missing effect is taken for noise as long as it is not named; these levels show what may
     be hidden under it."""
     visible = np.flatnonzero(problem.priors.visible & ~problem.switches)
-    return _with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
+    return with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
 
 
 def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
@@ -410,7 +392,7 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
     either; nor is what an effect that varies has of its own in each flight. ``point``: whose
     derivatives and residuals are taken."""
     theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
-    return _with_noise_at(point, theta)
+    return with_noise_at(point, theta)
 
 
 def with_noise_of(point: Point, source: Point) -> Point:
@@ -419,12 +401,7 @@ def with_noise_of(point: Point, source: Point) -> Point:
     return regathered(point, source.integrals if alike else None, noise=source.noise)
 
 
-def with_varying(point: Point, varies: Varies) -> Point:
-    """Return the point with other random effects, and the noise levels that this leaves."""
-    return _with_noise_at(replace(point, varies=varies), point.theta)
-
-
-def _with_noise_at(point: Point, theta: np.ndarray) -> Point:
+def with_noise_at(point: Point, theta: np.ndarray) -> Point:
     """Return the point with noise levels estimated from the residuals at ``theta``, and each
     flight's random shares beside it.
     """
@@ -512,7 +489,8 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
     ``point``: whose derivatives and noise levels it begins with, and whose kinds of blocks.
     """
-    point = with_fitted_noise(fitted(problem, point, active))
+    point = fitted(problem, point, active)
+    point = with_noise_at(point, point.theta)
     for _ in range(TURNS):
         if predicted_gain(problem, point, active) < TURNED:
             break
@@ -520,7 +498,7 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
         point = fitted(problem, point, active)
         if np.array_equal(point.theta, before.theta):
             break
-        point = with_fitted_noise(point)
+        point = with_noise_at(point, point.theta)
     return point
 
 

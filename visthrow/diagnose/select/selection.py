@@ -49,8 +49,8 @@ from visthrow.diagnose.select.point import (
     predicted_gain,
     switched,
     with_all_effects_noise,
+    with_noise_at,
     with_noise_of,
-    with_varying,
 )
 from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
@@ -319,7 +319,9 @@ class Selector:
                 point.plain, self.problem.priors, self.candidates, self.penalty, self.problem.days
             )
             shares, occam = linear.shares(trial.chosen)
-            point = with_varying(point, varies_of(shares, self.problem.days)) if shares else point
+            if shares:
+                varied = replace(point, varies=varies_of(shares, self.problem.days))
+                point = with_noise_at(varied, point.theta)
             trial = Trial(trial.chosen, point, shares, occam)
         self.best = trial
         self._visited.add(trial.chosen)

@@ -12,11 +12,15 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.linalg import lapack
 
 from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
-from visthrow.diagnose.likelihood.grammar import TermEffect, forces, through_latents
-from visthrow.diagnose.likelihood.marginal import Gram, LatentStatistics, gather
+from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
+from visthrow.diagnose.likelihood.marginal import (
+    LatentStatistics,
+    correlated_of,
+    gather,
+    grams_of,
+)
 from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import (
@@ -28,7 +32,7 @@ from visthrow.diagnose.models.law_terms import (
     loads,
     terms_of,
 )
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.excess import floors_of
 from visthrow.diagnose.select.point import (
     UNKNOWN_RATIO,
@@ -36,6 +40,7 @@ from visthrow.diagnose.select.point import (
     Problem,
     regathered,
     with_shares,
+    with_terms,
 )
 from visthrow.diagnose.select.result import Law
 from visthrow.diagnose.select.scatter import Varies
@@ -185,43 +190,15 @@ def extended(
 ) -> tuple[Problem, list[Point]]:
     """The problem and points of it with more terms as effects, at 0; nothing is simulated again."""
     wide = replace(problem, terms=(*problem.terms, *terms))
-
-    def extended_window(pair: tuple[Window, Gram]) -> tuple[Window, Gram]:
-        window, gram = pair
-        transfer = forces(window, terms)
-        columns = transfer * wide.priors.floor[-len(terms) :]
-        columns = lapack.dtrtrs(gram.factor, columns, lower=1)[0] if gram.latents else columns
-        cross = np.hstack((gram.cross, gram.cross[:, _latents(gram)] @ columns))
-        return (
-            replace(window, effects=np.hstack((window.effects, window.latent @ transfer))),
-            replace(gram, inner=_appended(gram, columns), cross=cross),
-        )
-
+    channels, none = len(problem.model.channels), np.zeros(len(terms))
     widened = []
     for point in points:
-        pairs = parallel_map(extended_window, zip(point.windows, point.grams))
-        windows, grams = map(list, zip(*pairs))
-        theta = np.append(point.theta, np.zeros(len(terms)))
+        windows = parallel_map(lambda w: with_terms(w, terms, none), point.windows)
+        grams = grams_of(windows, wide.priors.floor, channels)
+        grams = correlated_of(grams, windows, point.noise.correlation_time)
+        theta = np.append(point.theta, none)
         widened.append(regathered(point, theta=theta, windows=windows, grams=grams))
     return wide, widened
-
-
-def _latents(gram: Gram) -> slice:
-    return slice(gram.nuisances, gram.nuisances + gram.latents)
-
-
-def _appended(gram: Gram, columns: np.ndarray) -> np.ndarray:
-    """A gram's inner products with G columns as further effects; ``columns`` are in the gram's own
-    latents, shape (L, T).
-    """
-    part = _latents(gram)
-    products = gram.inner[:, :, part] @ columns
-    return np.block(
-        [
-            [gram.inner, products],
-            [products.transpose(0, 2, 1), columns.T @ products[:, part]],
-        ]
-    )
 
 
 def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:

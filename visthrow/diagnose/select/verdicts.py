@@ -42,8 +42,8 @@ from visthrow.diagnose.select.point import (
     Problem,
     moved,
     with_floors_noise,
+    with_noise_at,
     with_shares,
-    with_varying,
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import (
@@ -73,7 +73,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     model, point = selection.problem.model, selection.best.point
     scatter, varies = random_shares_of(selection)
     if varies or point.varies:
-        point = with_varying(point, varies)
+        point = with_noise_at(replace(point, varies=varies), point.theta)
         selection.best = replace(selection.best, point=point)
     scatter = (*scatter, *([commands] if commands else []))
     block_levels = levels(
@@ -91,9 +91,6 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     names = selection.names
     active = [j for j in names if j not in withdrawn]
     has_laws = bool(laws_of(selection.best.chosen))
-    if has_laws:
-        active = surely_there(point.information, point.score, problem.priors, active)
-        withdrawn = set(names) - set(active)
     if names and not active:
         point = nominal
     statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
@@ -255,10 +252,9 @@ def _law(selection: Selector) -> tuple[set[int], str]:
     """Return the names that are not told beside the set's laws, and why there are laws in words.
 
     Names that act in a law's block may be a part of its form. A name acts there by its column or by
-    what the other names cannot stand in for, as two delays that differ by a force. What is worth
-    nothing without those is not told either."""
+    what the other names cannot stand in for, as two delays that differ by a force. What is not
+    surely there without those is not told either."""
     best = selection.best
-    priors = selection.problem.priors
     names = selection.names
     blocks = {c.law for c in laws_of(best.chosen)}
     joint = grammar.JOINT in blocks
@@ -268,26 +264,15 @@ def _law(selection: Selector) -> tuple[set[int], str]:
         residual_block = acts_on(best.point, [j], joint=joint, free_effects=remaining)[0]
         if {selection.block_of(j, joint), residual_block} & blocks:
             in_block.add(j)
-    remaining_columns = [j for j in best.columns if j not in in_block]
-    while in_block and set(remaining_columns) & set(names):
-        whole = best.point.evidence(priors, remaining_columns)
-        worth = {
-            j: whole - best.point.evidence(priors, [k for k in remaining_columns if k != j])
-            for j in remaining_columns
-            if j in names
-        }
-        weakest = min(worth, key=worth.get)
-        if worth[weakest] > selection.threshold:
-            break
-        remaining_columns.remove(weakest)
+    point = best.point
+    columns = [j for j in best.columns if j not in in_block]
+    sure = surely_there(point.information, point.score, selection.problem.priors, columns)
     laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
     text = " and ".join(
         f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
         for law in laws_of_set
     )
-    return set(names) - set(
-        remaining_columns
-    ), f"{text} explains what no cause of the catalogue does"
+    return set(names) - set(sure), f"{text} explains what no cause of the catalogue does"
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
