@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
+from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.grammar import through_latents
 from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
@@ -18,7 +19,6 @@ from visthrow.diagnose.models.law_terms import JOINT, JOINT_NEEDS, KnotValues
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import Level
-from visthrow.logs.flightlog import STANDARD_CHANNELS
 
 LANDING = 5e-3
 """Distance [m] that a latent force must move a body along an axis within a window, else it does not
@@ -66,13 +66,8 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
     within the median window.
     """
-    channels = problem.model.channels
+    positions = positions_of(problem)
     moves = {}
-    positions = [
-        c
-        for c, name in enumerate(channels)
-        if name in STANDARD_CHANNELS and STANDARD_CHANNELS[name].unit == "m"
-    ]
     for gram, window in zip(point.grams, point.windows):
         positions_moved = window.latent[np.isin(window.channel, positions)]
         for block in np.unique(gram.latent_block) if len(positions_moved) else ():
@@ -85,6 +80,11 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
         for key, distances in moves.items()
         if (median := float(np.median(distances))) > 0.0
     }
+
+
+def positions_of(problem: Problem) -> list[int]:
+    """Return the numbers of the channels that are positions."""
+    return [c for c, name in enumerate(problem.model.channels) if unit_of(name) == "m"]
 
 
 class _Phase:
@@ -128,30 +128,25 @@ def acts_on(
     for gram, window in zip(point.grams, point.windows):
         inner = np.tensordot(weight, gram.inner, 1)
         size = gram.nuisances + gram.latents
-        free = np.array([*range(gram.nuisances), *(size + k for k in free_effects)], dtype=int)
+        unit = np.eye(len(inner))
+        free = unit[:, [*range(gram.nuisances), *(size + k for k in free_effects)]]
         columns = size + np.asarray(effects, dtype=int)
-        explained_free = _explained(inner[np.ix_(free, free)], inner[np.ix_(free, columns)])
-        total += inner[columns, columns] - explained_free
-        for block in np.unique(gram.latent_block):
-            with_block = np.concatenate(
-                (free, gram.nuisances + np.flatnonzero(gram.latent_block == block))
-            )
-            explained = _explained(
-                inner[np.ix_(with_block, with_block)], inner[np.ix_(with_block, columns)]
-            )
-            by_block[LATENT_BLOCKS[block]] += explained - explained_free
+        latents = unit[:, gram.nuisances : size]
+        bases = {
+            LATENT_BLOCKS[block]: latents[:, gram.latent_block == block]
+            for block in np.unique(gram.latent_block)
+        }
         if joint and (torques := joint_torques(gram, window)) is not None:
-            move = np.zeros((len(inner), len(free) + torques.shape[1]))
-            move[free, np.arange(len(free))] = 1.0
-            move[gram.nuisances : size, len(free) :] = torques
-            by_block[JOINT] += (
-                _explained(move.T @ inner @ move, move.T @ inner[:, columns]) - explained_free
-            )
-    best = [max(by_block, key=lambda name: by_block[name][i]) for i in range(len(effects))]
-    return [
-        name if total[i] > 0.0 and by_block[name][i] > 0.5 * total[i] else ""
-        for i, name in enumerate(best)
-    ]
+            bases[JOINT] = latents @ torques
+        known = _explained(inner, free, columns)
+        total += inner[columns, columns] - known
+        for name, basis in bases.items():
+            by_block[name] += _explained(inner, np.hstack((free, basis)), columns) - known
+    blocks = []
+    for i in range(len(effects)):
+        best = max(by_block, key=lambda name: by_block[name][i])
+        blocks.append(best if by_block[best][i] > 0.5 * total[i] > 0.0 else "")
+    return blocks
 
 
 def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
@@ -166,11 +161,14 @@ def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
     return np.linalg.solve(gram.factor, through_latents(window, values, JOINT))
 
 
-def _explained(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Parts of columns' squares that other columns explain, from these columns' inner products with
-    themselves and with those.
+def _explained(inner: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Parts of columns' squares that combinations of all columns explain.
+
+    ``inner``: inner products of all, shape (P, P); ``basis``: the combinations, shape (P, m).
     """
-    normal = normal + np.diag(1e-9 * np.diag(normal) + 1e-12)
+    normal = basis.T @ inner @ basis
+    right = basis.T @ inner[:, columns]
+    normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
     return np.sum(right * np.linalg.solve(normal, right), axis=0)
 
 

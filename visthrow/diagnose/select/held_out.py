@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import stdtrit
 
+from visthrow.diagnose.likelihood.correlation import components
 from visthrow.diagnose.likelihood.evidence import (
     NORMAL_95,
     OWN_FLOOR,
@@ -468,31 +469,27 @@ def _kind(work: Work, channel: int) -> str:
     """Return where a channel's remaining error lies: in an axis, in a flight, or growing with the
     time in the flight.
     """
-    point = work.after
-    by_axis = np.zeros(3)
-    by_flight = Counter()
-    halves = np.zeros((2, 2))  # squares and samples of the first and the second half of flights
-    spans = {}
-    for window in point.windows:
-        spans.setdefault(window.flight, []).append(window.time.mean())
-    for window in point.windows:
+    point, windows = work.after, [w for w in work.after.windows if np.any(w.channel == channel)]
+    by_axis, by_flight = np.zeros(3), Counter()
+    halves: dict[bool, list[float]] = {False: [], True: []}  # of the flights
+    middle = {}
+    for flight in {w.flight for w in windows}:
+        times = [w.time.mean() for w in windows if w.flight == flight]
+        middle[flight] = 0.5 * (min(times) + max(times))
+    for window in windows:
         rows = window.channel == channel
-        if not rows.any():
-            continue
         innovation, _, horizon = predicted(window, point.noise, window.residual)
         square = np.where(horizon < 0, 0.0, innovation**2)[rows]
-        times = window.time[rows]
-        if len(square) % 3 == 0 and np.all(np.diff(times.reshape(-1, 3), axis=1) == 0.0):
+        if components(window, channel) is not None and len(square) % 3 == 0:
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())
-        middle = 0.5 * (min(spans[window.flight]) + max(spans[window.flight]))
-        halves[int(window.time.mean() > middle)] += square.sum(), len(square)
+        halves[bool(window.time.mean() > middle[window.flight])] += square.tolist()
     parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
         parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
     if len(by_flight) > 2 and max(by_flight.values()) > MOSTLY * sum(by_flight.values()):
         parts.append(f"mostly in flight {max(by_flight, key=by_flight.get)}")
-    first, second = np.sqrt(halves[:, 0] / np.maximum(halves[:, 1], 1.0))
+    first, second = (np.sqrt(np.sum(half) / max(len(half), 1)) for half in halves.values())
     if second > 1.5 * first > 0.0:
         parts.append("growing within the flight")
     return ", ".join(parts)

@@ -217,28 +217,24 @@ class Linear:
         other, neither shows alone.
         """
         listed: dict[Names, float] = {}
-        removed = [frozenset(g) for n in range(3) for g in combinations(chosen, n)]
-        for subset in (chosen - g for g in removed):
-            if len(subset) + 2 > MOST_NAMES or not np.isfinite(base := self.value(subset)):
+        for subset in (chosen - set(g) for n in range(3) for g in combinations(chosen, n)):
+            offered = [c for c in self.plain if c not in subset and not c.law]
+            base, active = self.value(subset), columns_of(subset)
+            if len(subset) + 2 > MOST_NAMES or len(offered) < 2 or not np.isfinite(base):
                 continue
-            columns = np.array([c.columns[0] for c in self.plain if c not in subset and not c.law])
-            if len(columns) < 2:
-                continue
-            by_column = {c.columns[0]: c for c in self.plain}
-            active = columns_of(subset)
-            gain = pair_additions(*self.total(subset), self.priors, active)[
-                np.ix_(columns, columns)
-            ]
-            single = additions(*self.total(subset), self.priors, active)[columns]
-            price = np.array([self.penalty(subset | {by_column[j]}) for j in columns.tolist()])
-            price -= self.penalty(subset)
-            synergy = gain - np.maximum.outer(single, single) - np.minimum.outer(price, price)
-            worth = base + gain - np.add.outer(price, price)
-            close = np.argwhere(np.triu((synergy > -STRONG) & np.isfinite(gain), 1))
-            for a, b in sorted(close.tolist(), key=lambda ab: -worth[tuple(ab)])[:RANDOM_TRIED]:
-                new = subset | {by_column[int(columns[a])], by_column[int(columns[b])]}
-                self._shares.setdefault(new, self.shares(subset))
-                listed[new] = float(worth[a, b])
+            columns = [c.columns[0] for c in offered]
+            price = np.array([self.penalty(subset | {c}) for c in offered]) - self.penalty(subset)
+            alone = additions(*self.total(subset), self.priors, active)[columns] - price
+            both = pair_additions(*self.total(subset), self.priors, active)
+            worth = both[np.ix_(columns, columns)] - np.add.outer(price, price)
+            synergy = worth - np.maximum.outer(alone, alone)
+            synergy[np.tril_indices(len(columns))] = -np.inf
+            for place in np.argsort(-synergy, axis=None)[:RANDOM_TRIED].tolist():
+                a, b = np.unravel_index(place, synergy.shape)
+                if np.isfinite(synergy[a, b]):
+                    new = subset | {offered[a], offered[b]}
+                    self._shares.setdefault(new, self.shares(subset))
+                    listed[new] = base + float(worth[a, b])
         return listed
 
 

@@ -303,7 +303,7 @@ class Selector:
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         names = {*columns, *self.names} - set(laws)  # a term takes no name away that says the same
         return all(
-            terms.exceeds_floor(self.problem, point, j, float(point.theta[j] * priors.floor[j]))
+            terms.moves_landing(self.problem, point, j)
             and all(terms.unexplained_nats(point, priors, columns, j, k) > terms.LAW for k in names)
             for j in laws
         )

@@ -29,11 +29,10 @@ from visthrow.diagnose.models.law_terms import (
     Term,
     TermLayout,
     carries,
-    loads,
     terms_of,
 )
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.select.excess import floors_of
+from visthrow.diagnose.select.excess import LANDING, positions_of
 from visthrow.diagnose.select.point import (
     UNKNOWN_RATIO,
     Point,
@@ -293,27 +292,14 @@ def strongest_forces(point: Point) -> dict[str, float]:
     return strongest if all(w.knots for w in point.windows) else {}
 
 
-def exceeds_floor(problem: Problem, point: Point, j: int, size: float) -> bool:
-    """Whether a term's force, in a phase, exceeds what does not move a landing in a block it acts
-    in.
-
-    ``j``: number of the term among the effects.
-    """
-    term = problem.effects[j].term
-    layout = TermLayout.of([term])
-    square: dict[tuple[int, str], list[float]] = {}
-    for window, gram in zip(point.windows, point.grams):
-        if carries(gram.latent_block, term.block):
-            quantities = KnotValues(window.knots)
-            for block, values in loads(term.block, quantities, layout.table(quantities)).items():
-                square.setdefault((LATENT_BLOCKS.index(block), window.phase), []).append(
-                    float((values**2).sum((1, 2)).mean())
-                )
-    floors = floors_of(problem, point)
-    return any(
-        abs(size) * np.sqrt(np.mean(values)) > floors.get(key, 0.0)
-        for key, values in square.items()
-    )
+def moves_landing(problem: Problem, point: Point, j: int) -> bool:
+    """Whether an effect moves a position by ``LANDING`` within the median window of a phase."""
+    positions, size = positions_of(problem), point.theta[j] * problem.priors.floor[j]
+    moves: dict[str, list[float]] = {}
+    for window in point.windows:
+        moved = size * window.effects[np.isin(window.channel, positions), j]
+        moves.setdefault(window.phase, []).append(np.abs(moved).max(initial=0.0))
+    return any(np.median(distances) > LANDING for distances in moves.values())
 
 
 def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
