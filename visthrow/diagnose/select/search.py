@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG, estimate, threshold
+from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
 from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
@@ -16,12 +16,9 @@ from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names
 from visthrow.diagnose.select.point import (
     ROUNDS,
-    Point,
     Problem,
     linearise,
-    moved,
     only,
-    predicted_gain,
     untracked_windows,
 )
 from visthrow.diagnose.select.result import IN_PART, INCONSISTENT, UNKNOWN, Diagnosis
@@ -142,16 +139,22 @@ def explain(
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
     begin, commands = NOTHING, None
     for further in range(2 * ROUNDS, -1, -1):
-        if further and (untracked := untracked_windows(nominal)):  # the worst hide others
-            problem, nominal = _left_out(problem, nominal, untracked, say)
-            continue
-        needed = _threshold(problem, nominal, seed, say)
-        selection, commands = _selected(Selector(problem, nominal, needed, say, laws), begin)
-        untracked = _not_followed(selection)
-        if not further or not untracked:
-            break
-        problem, nominal = _left_out(problem, nominal, untracked, say)
-        begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
+        untracked = untracked_windows(nominal) if further else []  # the worst hide others
+        if not untracked:
+            needed = threshold(nominal.statistics, problem.priors, np.random.default_rng(seed))
+            flights = len(nominal.plain.flights)
+            say(
+                f"{len(nominal.windows)} windows of {flights} flights; a cause needs"
+                f" {needed:.1f} nats"
+            )
+            selection, commands = _selected(Selector(problem, nominal, needed, say, laws), begin)
+            begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
+            untracked = untracked_windows(selection.best.point) if further else []
+            if not untracked:
+                break
+        say(f"{len(untracked)} windows are left out, which the simulation does not follow")
+        remaining = [i for i in range(len(problem.kept)) if i not in set(untracked)]
+        problem, nominal = problem.only(remaining), only(nominal, remaining)
     diagnosis = held_out.judged(conclude(selection, commands))
     reasons = diagnosis.reasons
     left_out = len(considered) - len(problem.kept)
@@ -161,19 +164,6 @@ def explain(
             " follow: a cause that acts in these alone does not show",
         )
     return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
-
-
-def _not_followed(selection: Selector) -> list[int]:
-    """Return windows that the simulation does not follow with the causes, at their sizes or where
-    the derivatives would have them.
-    """
-    problem, point, columns = selection.problem, selection.best.point, selection.best.columns
-    untracked = untracked_windows(point)
-    if untracked or predicted_gain(problem, point, columns) < STRONG:
-        return untracked
-    goal = estimate(point.information, point.score, problem.priors, columns)
-    moved_point = moved(problem, point, np.where(problem.switches, point.theta, goal))
-    return [] if moved_point is None else untracked_windows(moved_point)
 
 
 def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
@@ -255,22 +245,3 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
             )
         )
     return value[0] - value[1]
-
-
-def _threshold(problem: Problem, nominal: Point, seed: int, say: Callable[[str], None]) -> float:
-    """Return the threshold [nats]."""
-    needed = threshold(nominal.statistics, problem.priors, np.random.default_rng(seed))
-    say(
-        f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights; a cause needs"
-        f" {needed:.1f} nats"
-    )
-    return needed
-
-
-def _left_out(
-    problem: Problem, nominal: Point, windows_lost: Sequence[int], say: Callable[[str], None]
-) -> tuple[Problem, Point]:
-    """The problem without some of its windows, and the model as it stands."""
-    say(f"{len(windows_lost)} windows are left out, which the simulation does not follow")
-    remaining = [i for i in range(len(problem.kept)) if i not in set(windows_lost)]
-    return problem.only(remaining), only(nominal, remaining)

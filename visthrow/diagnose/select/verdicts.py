@@ -349,9 +349,10 @@ def _overall(
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
     laws = laws_of(selection.best.chosen)
+    inconsistent = _inconsistent(selection)
     if laws:
         unnamed, law_text = _law(selection)
-        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed
+        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed | set(inconsistent)
     stuck = [j for j in active if _on_bound(selection, j)]
     if stuck:
         names = ", ".join(selection.problem.effects[j].name for j in stuck)
@@ -360,7 +361,7 @@ def _overall(
         )
         block = selection.block_of(stuck[0]) or selection.problem.effects[stuck[0]].block
         return result.UNKNOWN, block, reasons, set(active)
-    if inconsistent := _inconsistent(selection):
+    if inconsistent:
         names = ", ".join(selection.problem.effects[j].name for j in inconsistent)
         reasons.append(f"the size of {names} differs from window to window; the form is another")
         return result.UNKNOWN, selection.block_of(inconsistent[0]), reasons, set(inconsistent)
