@@ -211,9 +211,8 @@ class Selector:
                 parts = (nats for part, nats in shortfalls if part < chosen ^ present)
                 expected[chosen] = promised - max(parts, default=0.0)
         margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
-        close = [s for s, nats in expected.items() if nats > max(minimum, -margin)]
-        ranked = sorted(close, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
-        close = [s for s in ranked if expected[s] > -STRONG or expected[s] > -self._doubt(s)]
+        ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
+        close = [s for s in ranked if expected[s] > max(minimum, -min(margin, self._doubt(s)))]
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
     def _doubt(self, chosen: Names) -> float:
