@@ -265,70 +265,45 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     if diagnosis.overall == result.NO_EFFECT:
         return _innovations(diagnosis)
     spanning = [n for n in diagnosis.theta if diagnosis[n].low <= 0.0 <= diagnosis[n].high]
-    if spanning:
-        why = "its interval holds 0"
-        diagnosis = _demoted(diagnosis, spanning, result.CANDIDATE, why)
-        if not diagnosis.theta:
-            reason = f"{', '.join(spanning)}: every interval holds 0"
-            return _unconfirmed(diagnosis, None, spanning, reason)
+    reason = f"{', '.join(spanning)}: every interval holds 0"
+    why = "its interval holds 0"
+    diagnosis = _withdrawn(diagnosis, spanning, result.CANDIDATE, why, reason)
     if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
         return diagnosis
-    work = replace(diagnosis.work, crossed=crossed(diagnosis))
-    diagnosis = replace(diagnosis, work=work)
+    diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
     measured = measure(diagnosis)
     uncompared = not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
+    text = ", ".join(names)
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
     if measured.share <= 0.0 or harmed:
         how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(measured)
-        reason = (
-            f"held-out {measured.left_out} are explained worse with {', '.join(names)} ({how});"
-            " withdrawn"
-        )
+        reason = f"held-out {measured.left_out} are explained worse with {text} ({how}); withdrawn"
         why = "held-out flights are explained worse with it"
-        diagnosis = _demoted(diagnosis, names, result.NOT_IDENTIFIABLE, why)
-        return _unconfirmed(diagnosis, measured, names, reason)
+        return _withdrawn(diagnosis, names, result.NOT_IDENTIFIABLE, why, reason, measured)
     falls = [c.low if uncompared else c.gain for c in measured.channels]
     confirmed = not measured.channels or any(fall > 0.0 for fall in falls)
     if not (measured.low > 0.0 and confirmed):
         failed = _share(measured) if not measured.low > 0.0 else _no_gain(measured)
-        reason = f"held-out {measured.left_out} do not confirm {', '.join(names)} ({failed})"
+        reason = f"held-out {measured.left_out} do not confirm {text} ({failed})"
         if np.isnan(measured.low) or measured.folds < PARTS:
             reason += f"; {_one_more(diagnosis, names)}"
         why = "held-out flights do not confirm it"
-        diagnosis = _demoted(diagnosis, names, result.CANDIDATE, why)
-        return _unconfirmed(diagnosis, measured, names, reason)
-    return _agreed(diagnosis, measured, uncompared)
-
-
-def _agreed(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Diagnosis:
-    """Keep the names that searches without a flight name again; ``uncompared``: no calm phase tells
-    what gusts are.
-    """
-    names = list(diagnosis.theta)
-    alike = {
-        name: (name, *diagnosis[name].partners) for name in names
-    }  # what names one of a class names it
-    unsure = [
-        name
-        for name in names
-        if sum(measured.named_in.get(member, 0.0) for member in alike[name]) < FIRM + 1e-9
-    ]
-    after = _demoted(
-        diagnosis, unsure, result.CANDIDATE, "not all searches that leave flights out name it"
-    )
-    if not after.theta:
-        reason = f"searches that leave {measured.left_out} out do not agree on a name"
-        return _unconfirmed(after, measured, names, reason)
-    unexplained = _unexplained(measured.channels) if uncompared else []
+        return _withdrawn(diagnosis, names, result.CANDIDATE, why, reason, measured)
+    unsure = []
+    for name in names:  # what names one of a class names it
+        alike = (name, *diagnosis[name].partners)
+        if sum(measured.named_in.get(member, 0.0) for member in alike) < FIRM + 1e-9:
+            unsure.append(name)
+    why = "not all searches that leave flights out name it"
+    reason = f"searches that leave {measured.left_out} out do not agree on a name"
+    after = _withdrawn(diagnosis, unsure, result.CANDIDATE, why, reason, measured)
     after = replace(after, held_out=measured)
-    if diagnosis.overall == result.UNKNOWN or not unexplained:
+    unexplained = _unexplained(measured.channels) if uncompared else []
+    if after.overall == result.UNKNOWN or not unexplained:
         return after
-    return replace(
-        after,
-        overall=result.IN_PART,
-        reasons=tuple(_remaining(c, diagnosis.work) for c in unexplained),
-    )
+    reasons = tuple(_remaining(c, diagnosis.work) for c in unexplained)
+    return replace(after, overall=result.IN_PART, reasons=reasons)
 
 
 def _unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
@@ -364,52 +339,47 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     )
 
 
-def _unconfirmed(
-    diagnosis: Diagnosis, measured: HeldOut | None, names: Sequence[str], reason: str
+def _withdrawn(
+    diagnosis: Diagnosis,
+    names: Sequence[str],
+    verdict: str,
+    why: str,
+    reason: str,
+    measured: HeldOut | None = None,
 ) -> Diagnosis:
-    """Something is there that no confirmed name explains: in the block of the name that promised
-    most.
-    """
+    """Names and the members of their classes with another verdict; what stays named is sized
+    without them.
+
+    Where no name stays, something is there that no confirmed name explains: in the block of the
+    name that promised most."""
+    if not names:
+        return diagnosis
+    work = diagnosis.work
+    removed = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
+    removed -= set(diagnosis.theta) - set(names)
+    findings = [
+        replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
+        if f.name in removed and f.verdict in (result.FOUND, result.CLASS)
+        else f
+        for f in diagnosis.findings
+    ]
+    numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
+    active = tuple(numbers[name] for name in diagnosis.theta if name not in names)
+    theta, spread, _ = sized(work.problem, work.after, active)
+    after = work.after if active else work.before
+    work = replace(work, after=after, active=active, crossed=None)
+    left = replace(diagnosis, findings=tuple(findings), theta=theta, covariance=spread, work=work)
+    if active:
+        return left
     strongest = max((diagnosis[name] for name in names), key=lambda f: f.nats)
-    block = diagnosis.block or strongest.block
     earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
     return replace(
-        diagnosis,
+        left,
         overall=result.UNKNOWN,
-        block=block,
+        block=diagnosis.block or strongest.block,
         reasons=(reason, *earlier),
         held_out=measured,
     )
-
-
-def _demoted(diagnosis: Diagnosis, names: Sequence[str], verdict: str, why: str) -> Diagnosis:
-    """Names and the members of their classes with another verdict; what stays named is sized
-    without them.
-    """
-    if not names:
-        return diagnosis
-    removed = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
-    remaining = {name: size for name, size in diagnosis.theta.items() if name not in names}
-    findings = tuple(
-        (
-            replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
-            if f.name in removed
-            and f.name not in remaining
-            and f.verdict in (result.FOUND, result.CLASS)
-            else f
-        )
-        for f in diagnosis.findings
-    )
-    work = diagnosis.work
-    effect_names = [e.name for e in diagnosis.work.problem.effects]
-    active = [effect_names.index(name) for name in remaining]
-    theta, spread, _ = sized(work.problem, work.after, active)
-    work = (
-        replace(work, active=tuple(active), crossed=None)
-        if active
-        else replace(work, after=work.before, active=(), crossed=None)
-    )
-    return replace(diagnosis, findings=findings, theta=theta, covariance=spread, work=work)
 
 
 def sized(

@@ -103,29 +103,24 @@ class CommandStatistics:
         ) - self._evidence(0.0, priors, active)
 
     def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
-        e = slice(0, -self.commands)
-        c = slice(-self.commands, None)
-        information = self.information[:, e, e]
-        score = self.score[:, e]
+        effects, commands = slice(0, -self.commands), slice(-self.commands, None)
+        information = self.information[:, effects, effects].sum(0)
+        score = self.score[:, effects].sum(0)
         value = 0.0
         if share > 0.0:
-            variance = share * (1.0 - share)
-            crossed = self.information[:, c, e]
-            command_information = self.information[:, c, c]
-            mean = np.full(self.commands, share)
-            remaining = self.score[:, c] - command_information @ mean
-            moved = score - mean @ crossed
-            factor = np.linalg.cholesky(variance * command_information + np.eye(self.commands))
-            half = np.linalg.solve(
-                factor, np.sqrt(variance) * np.concatenate((remaining[..., None], crossed), axis=2)
-            )
-            tells = half[..., 0]
-            transfer = half[..., 1:]
-            value = float((mean @ (self.score[:, c] + remaining).T).sum() + (tells**2).sum()) / 2.0
-            value -= float(np.log(np.diagonal(factor, axis1=1, axis2=2)).sum())
-            information = information - transfer.transpose(0, 2, 1) @ transfer
-            score = moved - (tells[:, None] @ transfer)[:, 0]
-        return value + log_evidence(information.sum(0), score.sum(0), priors, list(active))
+            variance, mean = share * (1.0 - share), np.full(self.commands, share)
+            inner, unit = self.information[:, commands, commands], np.eye(self.commands)
+            crossed = self.information[:, commands, effects]
+            remaining = self.score[:, commands] - inner @ mean
+            right = np.concatenate((remaining[..., None], crossed), axis=2)
+            explained = np.linalg.solve(inner + unit / variance, right)
+            explained = (right.transpose(0, 2, 1) @ explained).sum(0)
+            mean_gain = mean @ (self.score[:, commands] + remaining).sum(0)
+            log_det = np.linalg.slogdet(unit + variance * inner)[1].sum()
+            value = 0.5 * float(mean_gain + explained[0, 0] - log_det)
+            information = information - explained[1:, 1:]
+            score = score - mean @ crossed.sum(0) - explained[1:, 0]
+        return value + log_evidence(information, score, priors, list(active))
 
 
 def verdict(
@@ -140,7 +135,8 @@ def verdict(
     priors = problem.priors
     sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
-    sets = active, np.flatnonzero(priors.visible & ~problem.switches).tolist()
+    causes = np.flatnonzero(priors.visible & ~problem.switches)
+    sets = active, causes[causes < len(problem.model.effects)].tolist()
     numbers = range(len(problem.kept))
     for rows, shares in ((few_of(numbers), reach[::STRIDE]), (numbers, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])

@@ -215,6 +215,14 @@ class Diagnosis:
         """Effects of ``theta``."""
         return tuple(self.theta)
 
+    @property
+    def expected(self) -> dict[str, float]:
+        """Return the sizes that another flight is expected to have: those named, and the means of
+        what varies.
+        """
+        means = {name: mean for s in self.scatter if s.found for name, mean in s.mean.items()}
+        return means | dict(self.theta)
+
     def to_dict(self) -> dict[str, Any]:
         """All but ``work``, for JSON."""
         plain = asdict(replace(self, work=None))

@@ -52,6 +52,8 @@ class Scatter:
     flights: int  # or days or commands, that say something about it
     manoeuvres: tuple[str, ...] = ()
     by: str = FLIGHT  # or DAY, or COMMAND
+    # effect -> mean of these flights [unit]: what is expected of another flight
+    mean: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def sentence(self) -> str:
@@ -253,15 +255,10 @@ def freed(statistics: Statistics, varies: Varies) -> Statistics:
     return integrated(by_day(of_flights, varies.days), varies.drifts.items())
 
 
-def _members(statistics: Statistics, days: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Days of flights, and which flights belong to each, shape (D, F)."""
-    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
-    return names, (row == np.arange(len(names))[:, None]).astype(float)
-
-
 def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
-    names, member = _members(statistics, days)
+    names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
+    member = (row == np.arange(len(names))[:, None]).astype(float)
     return replace(
         statistics,
         flights=names,

@@ -171,14 +171,14 @@ def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | Non
 
     Lost commands are a candidate that needs a linearisation of its own."""
     plain = selector.run(begin)
-    (problem, nominal), needed = plain.bare(plain.nominal), plain.threshold
+    problem, nominal, needed = plain.problem, plain.nominal, plain.threshold
     loss = lost_commands.verdict(problem, nominal, (), needed)
     if (loss is None or not loss.found) and plain.best.columns:
-        loss = lost_commands.verdict(*plain.bare(plain.best.point), plain.names, needed)
+        loss = lost_commands.verdict(problem, plain.best.point, plain.best.columns, needed)
     if loss is None or not loss.found:
         return plain, None
-    lossy = replace(problem, lost=loss.size)
-    start = linearise(lossy, np.zeros_like(nominal.theta), nominal.noise)
+    lossy = replace(problem, terms=(), lost=loss.size)
+    start = linearise(lossy, np.zeros(len(problem.model.effects)), nominal.noise)
     lossy_selection = Selector(lossy, start, needed, plain.progress, plain.laws).run(begin)
     gain = lossy_selection.value - needed - plain.value
     plain.progress(f"commands got lost: {loss.size:.1%} of them, {gain:.1f} nats ahead")

@@ -395,10 +395,6 @@ class Selector:
         """Return the numbers of the model's effects in the best set."""
         return columns_of(c for c in self.best.chosen if not c.law)
 
-    def bare(self, point: Point) -> tuple[Problem, Point]:
-        """Return the problem and a point of it without the terms that were offered."""
-        return terms.without_laws(self.problem, point)
-
 
 def names_of(chosen: Names) -> str:
     """Return the names of a set in words."""

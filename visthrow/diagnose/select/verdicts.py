@@ -86,8 +86,8 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     laws = _explanations(selection) if overall == result.UNKNOWN else ([], "")
     explanations, unrepeated = laws
     reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
-    problem, point = selection.bare(point)
-    nominal = selection.bare(selection.nominal)[1]
+    problem, point = terms.without_laws(selection.problem, point)
+    nominal = terms.without_laws(selection.problem, selection.nominal)[1]
     names = selection.names
     active = [j for j in names if j not in withdrawn]
     has_laws = bool(laws_of(selection.best.chosen))
@@ -96,6 +96,11 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
     reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
     theta, spread, unlike = sized(problem, reported_point, active)
+    varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
+    means = sized(problem, reported_point, sorted({*active, *varying}))[0]
+    scatter = tuple(
+        replace(s, mean={name: means[name] for name in s.of if name in means}) for s in scatter
+    )
     sets = _sets_of(selection)
     findings = tuple(
         _finding(problem, reported_point, j, active, sets, unlike, withdrawn)
