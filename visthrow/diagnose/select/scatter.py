@@ -226,12 +226,13 @@ def differing(
     active: Sequence[int],
     theta: np.ndarray,
     columns: Sequence[int],
+    deviations: np.ndarray = REACH,
 ) -> np.ndarray:
-    """Return log Z of named effects of which some differ from flight to flight by each deviation of
-    ``REACH``, in what is :func:`allowed`.
+    """Return log Z of named effects of which some differ from flight to flight by each of these
+    deviations, in what is :func:`allowed`.
     """
     nats = []
-    for u in REACH:
+    for u in deviations:
         varies = Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in columns})
         nats.append(evidence_of(freed(statistics, varies), priors, active))
     return np.array(nats)

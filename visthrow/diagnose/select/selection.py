@@ -133,9 +133,10 @@ class Selector:
 
     def linear(self, point: Point) -> Linear:
         """Return the values of sets by the statistics of a point."""
+        problem = self.problem
         if id(point) not in self._linear:
             linear = Linear(
-                point.plain, self.problem.priors, self.candidates, self.penalty, self.problem.days
+                point.plain, problem.priors, self.candidates, self.penalty, problem.days
             )
             self._linear[id(point)] = point, linear
         return self._linear[id(point)][1]
@@ -309,10 +310,7 @@ class Selector:
             self.origin = self.nominal
         point = self._settled(trial.point, trial.columns)
         if point is not trial.point or trial.shares:
-            linear = Linear(
-                point.plain, self.problem.priors, self.candidates, self.penalty, self.problem.days
-            )
-            shares, occam = linear.shares(trial.chosen)
+            shares, occam = self.linear(point).shares(trial.chosen)
             if shares:
                 varied = replace(point, varies=varies_of(shares, self.problem.days))
                 point = with_noise_at(varied, point.theta)

@@ -67,6 +67,9 @@ BIT = 0.5
 less than a bit about it.
 """
 
+DIFFER = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0])
+"""Deviations of a name's size among windows, in what is allowed, that are compared."""
+
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
@@ -394,8 +397,11 @@ def _inconsistent(selection: Selector) -> list[int]:
     best, priors = selection.best, selection.problem.priors
     point = replace(best.point, grams=with_shares(best.point, best.point.theta))
     windows = regrouped(point, range(len(point.windows)))
-    nats = {j: differing(windows, priors, best.columns, point.theta, [j]) for j in selection.names}
-    return [j for j, n in nats.items() if n.max() - n[REACH <= 1.0].max() > selection.threshold]
+    nats = {
+        j: differing(windows, priors, best.columns, point.theta, [j], DIFFER)
+        for j in selection.names
+    }
+    return [j for j, n in nats.items() if n.max() - n[DIFFER <= 1.0].max() > selection.threshold]
 
 
 def _excess(level: Level) -> str:
