@@ -134,7 +134,7 @@ class Stack:
             torch.from_numpy(a).to(self.device)
             for a in (cross, square, counts, log_sigma, member, initial)
         ]
-        parts = [[gram.inner[:, :size, :size]] for gram, size in zip(grams, sizes)]
+        parts = [gram.inner[:, :size, :size] for gram, size in zip(grams, sizes)]
         hidden = side_by_side(parts, (channels, n, n), self.device)
         phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
         return _Batch(windows, (phases.tolist(), phase), list(grams), hidden, *arrays)
@@ -371,9 +371,8 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     width = len(batch.grams[0].inner[0]) - sizes[0]
 
     def weighed(parts: Sequence[np.ndarray], height: int) -> torch.Tensor:
-        rows = [[part] for part in parts]
         device = str(batch.square.device)
-        return _weighed(shape.weight, side_by_side(rows, (channels, height, width), device))
+        return _weighed(shape.weight, side_by_side(parts, (channels, height, width), device))
 
     right = weighed([products[:, :size, size:] for products, size in zip(inner, sizes)], n)
     effects = weighed([products[:, size:, size:] for products, size in zip(inner, sizes)], width)

@@ -80,14 +80,6 @@ def level_block(block: str) -> str:
     return "vehicle torque" if block == JOINT else block
 
 
-def typical_level(levels: Mapping[tuple[int, str], float], block: int) -> float:
-    """The lower median of a block's levels; the least of a phase with few windows may
-    be anything.
-    """
-    levels_of = sorted(level for (b, _), level in levels.items() if b == block)
-    return levels_of[(len(levels_of) - 1) // 2]
-
-
 def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     """The point as if no phase were much rougher than is usual in its block and each flight's
     random shares were known, and the statistics of its windows.
@@ -95,10 +87,10 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     A force that the model lacks is taken for gusts in the phases in which it acts; there no term of
     it would stand out."""
     levels = point.noise.latent_sd
-    limits = {
-        block: UNKNOWN_RATIO * typical_level(levels, block)
-        for block in {block for block, _ in levels}
-    }
+    limits = {}
+    for block in {block for block, _ in levels}:  # the least of a phase with few windows may be any
+        of_phases = [level for (b, _), level in levels.items() if b == block]
+        limits[block] = UNKNOWN_RATIO * np.percentile(of_phases, 50, method="lower")
     noise = replace(
         point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()}
     )

@@ -588,18 +588,14 @@ def _joint(problem: Problem, point: Point, members: list[int], named: list[int])
     """
     priors, effects = problem.priors, problem.effects
     slab = priors.slab[members]
-    sigma = covariance(point.information, priors.deviation([*members, *named]))
-    precision = np.linalg.inv(sigma[np.ix_(members, members)])
-    schur = precision - np.diag(slab**-2.0)
-    score = precision @ (sigma[members] @ point.score)
-    values, vectors = np.linalg.eigh(schur * np.outer(slab, slab))
-    vector = vectors[:, -1] / slab
-    value = values[-1]  # per floor
-    first = int(np.argmax(np.abs(vectors[:, -1])))
+    sigma = covariance(point.information, priors.deviation([*members, *named]))[members]
+    precision = np.linalg.inv(sigma[:, members])
+    values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
+    best, value = vectors[:, -1], values[-1]
+    mean = float(best @ (slab * (precision @ (sigma @ point.score))) / value)
+    vector = best / slab  # per floor
+    first = int(np.argmax(np.abs(best)))
     scale = vector[first] / priors.floor[members[first]]
-    mean = float(
-        np.linalg.lstsq(schur * np.outer(slab, slab), score * slab, rcond=1e-8)[0] @ vectors[:, -1]
-    )
     unit = effects[members[first]].unit
     parts = [effects[members[first]].name]
     for i in (i for i in range(len(members)) if i != first):
