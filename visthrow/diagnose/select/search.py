@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
+from visthrow.diagnose.likelihood.evidence import VERY_STRONG, estimate, threshold
 from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
@@ -18,6 +18,7 @@ from visthrow.diagnose.select.point import (
     ROUNDS,
     Problem,
     linearise,
+    moved,
     only,
     untracked_windows,
 )
@@ -149,7 +150,7 @@ def explain(
             )
             selection, commands = _selected(Selector(problem, nominal, needed, say, laws), begin)
             begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
-            untracked = untracked_windows(selection.best.point) if further else []
+            untracked = _not_followed(selection) if further else []
             if not untracked:
                 break
         say(f"{len(untracked)} windows are left out, which the simulation does not follow")
@@ -164,6 +165,16 @@ def explain(
             " follow: a cause that acts in these alone does not show",
         )
     return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
+
+
+def _not_followed(selection: Selector) -> list[int]:
+    """Return windows that the simulation does not follow with the causes, at their sizes or where
+    the derivatives would have them.
+    """
+    problem, point, columns = selection.problem, selection.best.point, selection.best.columns
+    goal = estimate(point.information, point.score, problem.priors, columns)
+    leads = moved(problem, point, np.where(problem.switches, point.theta, goal))
+    return untracked_windows(point) or (untracked_windows(leads) if leads else [])
 
 
 def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | None]:
