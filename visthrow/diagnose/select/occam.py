@@ -111,8 +111,8 @@ class Linear:
         c: Candidate,
         sizes: np.ndarray = REACH,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return deviations of a random share that are not negligible, in its prior's, and log Z at
-        each.
+        """Return deviations of a random share that are not negligible, in its prior's, and the nats
+        by which log Z is higher with each than without the share.
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active, statistics = columns_of(chosen), self.statistics
@@ -120,10 +120,10 @@ class Linear:
         days = {share: size for share, size in fixed.items() if share.group == DAY}
         statistics = freed(statistics, varies_of(flights, self.days))
         nats = []
-        for size in sizes.tolist():
-            varied = freed(statistics, varies_of({**days, c: size}, self.days))
+        for shares in (days, *({**days, c: size} for size in sizes.tolist())):
+            varied = freed(statistics, varies_of(shares, self.days))
             nats.append(evidence_of(varied, self.priors, active))
-        return sizes, np.array(nats)
+        return sizes, np.array(nats[1:]) - nats[0]
 
     def value(self, chosen: Names) -> float:
         """Return the value of a set."""

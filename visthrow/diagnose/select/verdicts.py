@@ -49,7 +49,6 @@ from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import (
     DAY,
     FLIGHT,
-    REACH,
     Scatter,
     Varies,
     allowed,
@@ -184,14 +183,12 @@ def share_verdict(
         threshold: of evidence [nats].
     """
     sizes, nats = linear.profile(chosen, fixed_shares, c)
-    silent = replace(c, deviations=(1e-9,) * len(c.columns))
-    none = linear.profile(chosen, fixed_shares, silent, REACH[:1])[1][0]
     flights = by_day(linear.statistics, linear.days) if c.group == DAY else linear.statistics
     informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
     return judged(
         replace(effect, name=c.name),
         sizes * effect.prior_sd,
-        nats - none,
+        nats,
         threshold + c.penalty,
         int(informative.sum()),
         c.group,
