@@ -36,7 +36,7 @@ from visthrow.diagnose.select.candidates import (
     varies_of,
     without_means,
 )
-from visthrow.diagnose.select.excess import acts_on
+from visthrow.diagnose.select.excess import acts_on, compares_phases
 from visthrow.diagnose.select.occam import WINDOW, Linear, window
 from visthrow.diagnose.select.point import (
     ROUNDS,
@@ -115,11 +115,15 @@ class Selector:
         """Return the penalty of a set [nats].
 
         That an effect differs among flights is a second claim beside its being there. What acts in
-        the block of a law may be a part of its form and must be worth more than elsewhere."""
+        the block of a law may be a part of its form and must be worth more than elsewhere. Without
+        a calm phase to compare with, a law stands in place of all names."""
         total = sum(c.claims * self.threshold + c.penalty for c in without_means(chosen))
         forms = laws_of(chosen)
-        if not forms or len(forms) > MOST_LAWS:
-            return np.inf if forms else total
+        if not forms:
+            return total
+        together = len(forms) == len(chosen) or compares_phases(self.nominal)
+        if len(forms) > MOST_LAWS or not together:
+            return np.inf
         blocks = {c.law for c in forms}
         joint = grammar.JOINT in blocks
         charged = [c for c in chosen if not c.law and self.block_of(c.columns[0], joint) in blocks]

@@ -33,7 +33,7 @@ from visthrow.diagnose.select.candidates import (
     laws_of,
     varies_of,
 )
-from visthrow.diagnose.select.excess import acts_on, levels, too_strong
+from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
 from visthrow.diagnose.select.held_out import Work, regrouped, repeated_share, sized
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
@@ -370,6 +370,10 @@ def _overall(
         names = ", ".join(selection.problem.effects[j].name for j in inconsistent)
         reasons.append(f"the size of {names} differs from window to window; the form is another")
         return result.UNKNOWN, selection.block_of(inconsistent[0]), reasons, set(inconsistent)
+    for block, parts in _crowded(selection).items():
+        names = ", ".join(selection.problem.effects[j].name for j in parts)
+        reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
+        return result.UNKNOWN, block, [*reasons, reason], set(parts)
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(selection, excessive)
@@ -387,6 +391,24 @@ def _overall(
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
     return result.NO_EFFECT, "", [nothing], set()
+
+
+def _crowded(selection: Selector) -> dict[str, list[int]]:
+    """Return the blocks whose names cost more together than a law that nobody wrote down, and of
+    which the flights hardly tell some apart, with these names: parts of it are likelier.
+    """
+    by_block: dict[str, list[int]] = {}
+    compared = compares_phases(selection.nominal)  # else what is left over says so
+    for j in selection.names if compared else ():
+        by_block.setdefault(selection.block_of(j), []).append(j)
+    crowded = {}
+    for block, members in by_block.items():
+        part = selection.best.point.information[np.ix_(members, members)]
+        unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
+        law = selection.threshold + terms.LAW
+        if block and len(members) * selection.threshold > law and unlike.min() < 0.5:
+            crowded[block] = members
+    return crowded
 
 
 def _inconsistent(selection: Selector) -> list[int]:
