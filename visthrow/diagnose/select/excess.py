@@ -12,11 +12,8 @@ import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.likelihood.forms import unit_of
-from visthrow.diagnose.likelihood.grammar import through_latents
-from visthrow.diagnose.likelihood.marginal import Gram
 from visthrow.diagnose.likelihood.stack import Stack
-from visthrow.diagnose.models.law_terms import JOINT, JOINT_NEEDS, KnotValues
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import Level
 
@@ -112,53 +109,33 @@ class _Phase:
         return float(best * STEP**step)
 
 
-def acts_on(
-    point: Point, effects: Sequence[int], *, joint: bool = False, free_effects: Sequence[int] = ()
-) -> list[str]:
+def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int] = ()) -> list[str]:
     """Block through which each of some effects moves things, or "" where it moves measurements
     alone.
 
     Its column is laid over the columns of each block's latent forces; the block that explains most
-    of it, and at least half, is it. ``point``: with the latent forces' derivatives; ``joint``:
-    consider the torque between vehicle and rope as well; ``free_effects``: effects that may take
-    any size: what they can stand in for is left out."""
+    of it, and at least half, is it. ``point``: with the latent forces' derivatives;
+    ``free_effects``: effects that may take any size: what they can stand in for is left out."""
     weight = point.noise.scale**-2.0
     total = np.zeros(len(effects))
-    by_block = {name: np.zeros(len(effects)) for name in (*LATENT_BLOCKS, JOINT)}
-    for gram, window in zip(point.grams, point.windows):
+    by_block = {name: np.zeros(len(effects)) for name in LATENT_BLOCKS}
+    for gram in point.grams:
         inner = np.tensordot(weight, gram.inner, 1)
         size = gram.nuisances + gram.latents
         unit = np.eye(len(inner))
         free = unit[:, [*range(gram.nuisances), *(size + k for k in free_effects)]]
         columns = size + np.asarray(effects, dtype=int)
         latents = unit[:, gram.nuisances : size]
-        bases = {
-            LATENT_BLOCKS[block]: latents[:, gram.latent_block == block]
-            for block in np.unique(gram.latent_block)
-        }
-        if joint and (torques := joint_torques(gram, window)) is not None:
-            bases[JOINT] = latents @ torques
         known = _explained(inner, free, columns)
         total += inner[columns, columns] - known
-        for name, basis in bases.items():
-            by_block[name] += _explained(inner, np.hstack((free, basis)), columns) - known
+        for block in np.unique(gram.latent_block):
+            basis = np.hstack((free, latents[:, gram.latent_block == block]))
+            by_block[LATENT_BLOCKS[block]] += _explained(inner, basis, columns) - known
     blocks = []
     for i in range(len(effects)):
         best = max(by_block, key=lambda name: by_block[name][i])
         blocks.append(best if by_block[best][i] > 0.5 * total[i] > 0.0 else "")
     return blocks
-
-
-def joint_torques(gram: Gram, window: Window) -> np.ndarray | None:
-    """Latents of a gram that torques in the rope's joint about each axis at each knot stand for,
-    shape (L, 3k); None without.
-    """
-    values = KnotValues(window.knots)
-    if not set(JOINT_NEEDS) <= set(values) or len(np.unique(gram.latent_block)) < len(
-        LATENT_BLOCKS
-    ):
-        return None
-    return np.linalg.solve(gram.factor, through_latents(window, values, JOINT))
 
 
 def _explained(inner: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> np.ndarray:

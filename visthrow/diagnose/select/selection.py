@@ -7,14 +7,13 @@ What was simulated is remembered: it tells how far short of its promise a move f
 that need the model's own latent forces, terms of laws, are offered once no other set is worth more.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     SPIKE,
@@ -106,10 +105,9 @@ class Selector:
         self._linear.clear()
 
     @cached_property
-    def _acting(self) -> list[list[str]]:
-        """Block that each effect of the model acts in, without the rope's joint and with it."""
-        numbers = range(len(self.problem.model.effects))
-        return [acts_on(self.nominal, numbers, joint=joint) for joint in (False, True)]
+    def _acting(self) -> list[str]:
+        """Block that each effect of the model acts in."""
+        return acts_on(self.nominal, range(len(self.problem.model.effects)))
 
     def penalty(self, chosen: Names) -> float:
         """Return the penalty of a set [nats].
@@ -124,16 +122,13 @@ class Selector:
         together = len(forms) == len(chosen) or compares_phases(self.nominal)
         if len(forms) > MOST_LAWS or not together:
             return np.inf
-        blocks = {c.law for c in forms}
-        joint = grammar.JOINT in blocks
-        charged = [c for c in chosen if not c.law and self.block_of(c.columns[0], joint) in blocks]
+        blocks = terms.acts_in(c.law for c in forms)
+        charged = [c for c in chosen if not c.law and self.block_of(c.columns[0]) in blocks]
         return total + len(charged) * terms.LAW
 
-    def block_of(self, j: int, joint: bool = False) -> str:
-        """Return the block that an effect of the model acts in; ``joint``: of the rope's joint as
-        well.
-        """
-        return self._acting[joint][j]
+    def block_of(self, j: int) -> str:
+        """Return the block that an effect of the model acts in."""
+        return self._acting[j]
 
     def linear(self, point: Point) -> Linear:
         """Return the values of sets by the statistics of a point."""
@@ -157,18 +152,22 @@ class Selector:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
         that is there stays.
         """
-        listed, tried, least = self._listed(), [], -np.inf
-        while shortlist := self._short(listed, tried, least):
-            tried += self._tried(self.best.point, shortlist)
-            leads = [t.lead for t in tried if self._better(t)]
-            least = max([*leads, max(listed.values()) - WINDOW]) if leads else least
-        better = [t for t in tried if self._better(t)]
+        listed, leads, least = self._listed(), {}, -np.inf
+        near: list[Trial] = []  # a trial's matrices are large: others are forgotten
+        better: list[Trial] = []
+        while shortlist := self._short(listed, leads, least):
+            tried = self._tried(self.best.point, shortlist)
+            leads |= dict.fromkeys(shortlist, -np.inf) | {t.chosen: t.lead for t in tried}
+            near += [t for t in tried if t.lead > -STRONG and self.is_admissible(t)]
+            better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
+            if better:
+                least = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
         if better:
             top = max(better, key=lambda t: t.lead)
-            self._record(top, tried, listed)
+            self._record(top, leads, listed)
             self._go(top)
             return True
-        close = [t for t in tried if -t.lead < STRONG and self.is_admissible(t)]
+        close = list(near)
         close += [  # sets that were the best before
             Trial(s, self.best.point, lead=nats)
             for s, nats in self._simulated.items()
@@ -198,13 +197,13 @@ class Selector:
         return ahead_of
 
     def _short(
-        self, listed: Mapping[Names, float], tried: Sequence[Trial], minimum: float
+        self, listed: Mapping[Names, float], tried: Iterable[Names], minimum: float
     ) -> list[Names]:
         """Return the next sets to be simulated, best first: what promises more than ``minimum``
         [nats], and may be possible.
 
         A move is expected to fall short of what derivatives promise as its parts did."""
-        done = {t.chosen for t in tried} | self._visited
+        done = set(tried) | self._visited
         done |= {s for s, nats in self._simulated.items() if nats < -WINDOW}
         present = self.best.chosen
         shortfalls = [
@@ -215,9 +214,8 @@ class Selector:
             if chosen not in done:
                 parts = (nats for part, nats in shortfalls if part < chosen ^ present)
                 expected[chosen] = promised - max(parts, default=0.0)
-        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
-        close = [s for s in ranked if expected[s] > max(minimum, -min(margin, self._doubt(s)))]
+        close = [s for s in ranked if expected[s] > max(minimum, -self._doubt(s))]
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
     def _doubt(self, chosen: Names) -> float:
@@ -254,18 +252,14 @@ class Selector:
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point linearised with the kinds of blocks that a set asks for; once for each
-        place.
+        place in a row.
         """
         theta = switched(self.problem, point, active)
         if theta is None:
             return point
         if theta.tobytes() not in self._turned:
-            self._turned[theta.tobytes()] = self._linearised(theta, point)
+            self._turned = {theta.tobytes(): self._linearised(theta, point)}
         return self._turned[theta.tobytes()]
-
-    def _better(self, trial: Trial) -> bool:
-        new = trial.chosen not in self._visited
-        return new and trial.lead > ENOUGH_NATS and self.is_admissible(trial)
 
     def lead(self, first: Trial, second: Trial) -> float:
         """Return the nats by which a set is worth more than another, each where it was simulated,
@@ -348,9 +342,11 @@ class Selector:
     def _linearised(self, theta: np.ndarray, like: Point) -> Point:
         return linearise(self.problem, theta, like.noise, varies=like.varies)
 
-    def _record(self, top: Trial, tried: Iterable[Trial], listed: Mapping[Names, float]) -> None:
+    def _record(
+        self, top: Trial, leads: Mapping[Names, float], listed: Mapping[Names, float]
+    ) -> None:
         """Say what was selected, and keep what was compared for the report."""
-        nats = {names_of(t.chosen): t.lead for t in tried}
+        nats = {names_of(s): lead for s, lead in leads.items() if np.isfinite(lead)}
         listed_best = {
             names_of(s): n for s, n in sorted(listed.items(), key=lambda i: -i[1])[:REPORTED_SETS]
         }

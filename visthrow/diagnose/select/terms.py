@@ -7,7 +7,7 @@ screened at once without a simulation: a window needs A' G' V^-1 G A alone, with
 effects of the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like
 any other."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -73,6 +73,12 @@ class Screen:
     information: np.ndarray  # shape (T,)
     score: np.ndarray
     cross: np.ndarray  # with the effects, shape (T, K)
+
+
+def acts_in(laws: Iterable[str]) -> set[str]:
+    """Return the latent blocks that laws of these blocks act in; in the rope's joint, all."""
+    blocks = set(laws)
+    return set(LATENT_BLOCKS) if JOINT in blocks else blocks
 
 
 def level_block(block: str) -> str:

@@ -10,7 +10,6 @@ from scipy.stats import chi2
 
 from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.evidence import (
     CALIBRATION_QUANTILE,
     INEXACT,
@@ -261,13 +260,12 @@ def _law(selection: Selector) -> tuple[set[int], str]:
     surely there without those is not told either."""
     best = selection.best
     names = selection.names
-    blocks = {c.law for c in laws_of(best.chosen)}
-    joint = grammar.JOINT in blocks
+    blocks = terms.acts_in(c.law for c in laws_of(best.chosen))
     in_block = set()
     for j in names:
         remaining = [k for k in names if k != j]
-        residual_block = acts_on(best.point, [j], joint=joint, free_effects=remaining)[0]
-        if {selection.block_of(j, joint), residual_block} & blocks:
+        residual_block = acts_on(best.point, [j], free_effects=remaining)[0]
+        if {selection.block_of(j), residual_block} & blocks:
             in_block.add(j)
     point = best.point
     columns = [j for j in best.columns if j not in in_block]
