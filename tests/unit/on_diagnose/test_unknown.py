@@ -260,14 +260,13 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
         assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
 
 
-def test_a_term_that_a_name_says_is_not_proposed_in_its_place():
-    at = beside_a_law(with_a_name_for_the_law(0.1), [1])
-    strongest = terms.strongest_forces(at.nominal)
-    found, beside = (
-        terms.shortlist(at.problem, at.nominal, [], strongest, 4.0, names) for names in ([], [1])
-    )
-    assert DRAG in [effect.term for effect in found]
-    assert DRAG not in [effect.term for effect in beside]
+def test_a_term_that_a_cause_says_is_not_proposed():
+    plain = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    for model, proposed in ((plain, True), (with_a_name_for_the_law(0.1), False)):
+        at = beside_a_law(model, [])
+        strongest = terms.strongest_forces(at.nominal)
+        found = terms.shortlist(at.problem, at.nominal, [], strongest, 4.0)
+        assert (DRAG in [effect.term for effect in found]) == proposed
 
 
 def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
@@ -383,7 +382,11 @@ def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
     priors = Priors.of(effects, ("pos_w", "payload_pos_w"))
     point = SimpleNamespace(information=information, score=score)
     both, name = 0.5 * score @ np.linalg.solve(information, score), 0.5 * score[0] ** 2 / 4.0
-    nats = terms.unexplained_nats(point, priors, [0, 1], 1, 0)
+    screened = terms.Screen((), np.ones(1), *(a[1:] for a in (information[1], score, information)))
+    beside = SimpleNamespace(information=information[:1, :1], score=score[:1])
+    known = replace(priors, **{n: getattr(priors, n)[:1] for n in ("floor", "slab", "low", "high")})
+    screened.cross = screened.cross[:, :1]
+    (nats,) = terms.unsaid(beside, known, [], screened, [0])
     assert nats == approx(both - name, rel=1e-3)
     (law,) = terms.laws(SimpleNamespace(priors=priors, effects=effects), point, [0, 1], 5.0)
     covariance = np.linalg.inv(information + np.diag(priors.slab**-2.0))

@@ -62,6 +62,7 @@ def random_shares(
     priors: Priors,
     statistics: Statistics,
     days: Sequence[int],
+    all_effects: bool = True,
 ) -> list[Candidate]:
     """Return what flights, or days, may have for themselves, where at least two of them show it.
 
@@ -69,6 +70,7 @@ def random_shares(
         effects: of the model, shape (K,).
         statistics: of the flights.
         days: of each flight, by its number; none where the logs do not say.
+        all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2) > 0.0
     groups = [(FLIGHT, flown)]
@@ -81,6 +83,8 @@ def random_shares(
         columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
         deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
         named = effect.name not in effect.of
+        if not (named or all_effects):
+            continue
         offered += [
             Candidate(
                 effect.name if named else f"{effect.name}_by_{group}",

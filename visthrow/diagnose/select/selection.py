@@ -95,12 +95,13 @@ class Selector:
         self._visited = {NOTHING}
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
+        self._every = False  # whether any effect may differ among flights
         self._offer()
 
     def _offer(self) -> None:
         effects, priors = self.problem.effects, self.problem.priors
         self.candidates = shared(effects) + random_shares(
-            effects, priors, self.nominal.plain, self.problem.days
+            effects, priors, self.nominal.plain, self.problem.days, self._every
         )
         self._linear.clear()
 
@@ -144,9 +145,18 @@ class Selector:
         """Select, beginning with a set."""
         for start in self._tried(self.nominal, [begin] if begin else []):
             self._go(start)
-        while self._moved() or self._propose():
+        while self._moved() or self._propose() or self._widen():
             pass
         return self
+
+    def _widen(self) -> bool:
+        """Let any effect differ among flights; False where that was done.
+
+        Before the narrower forms were tried, the bend of an effect that all flights share looks
+        like a difference among them."""
+        widened, self._every = self._every, True
+        self._offer()
+        return not widened
 
     def _moved(self) -> bool:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
@@ -294,12 +304,7 @@ class Selector:
         if np.any((sizes < priors.low - 1.0) | (sizes > priors.high + 1.0), where=sizes != 0.0):
             return False  # a share of a flight has the bounds of its effect, to a floor
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
-        names = {*columns, *self.names} - set(laws)  # a term takes no name away that says the same
-        return all(
-            terms.moves_landing(self.problem, point, j)
-            and all(terms.unexplained_nats(point, priors, columns, j, k) > terms.LAW for k in names)
-            for j in laws
-        )
+        return all(terms.moves_landing(self.problem, point, j) for j in laws)
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
@@ -363,15 +368,11 @@ class Selector:
         if not strongest or present in self._proposed or len(forms) >= MOST_LAWS:
             return False
         self._proposed.add(present)
-        names = columns_of(present - forms)
-        sets = [(self.best.point, self.best.columns, ())]
-        if present - forms:
-            sets.append((self.nominal, columns_of(forms), names))
+        places = [(self.best.point, self.best.columns)]
+        places += [(self.nominal, columns_of(forms))] if present - forms else []
         shortlist: list[TermEffect] = []
-        for point, active, replaced in sets:
-            shortlist += terms.shortlist(
-                self.problem, point, active, strongest, self.threshold, replaced
-            )
+        for point, active in places:
+            shortlist += terms.shortlist(self.problem, point, active, strongest, self.threshold)
         shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())
         if not shortlist:
             return False

@@ -54,6 +54,8 @@ NARROW = 1e-3
 name in that of one of any size.
 """
 
+SAME = 1e-9  # share of a term's information from which what a cause leaves of it is rounding
+
 # terms that become effects to be weighed: as many as other sets that are simulated in their place
 WEIGHED = 6
 
@@ -159,15 +161,22 @@ def _conditional(
     return information, screened.score - screened.cross @ (sigma @ point.score)
 
 
-def _unsaid(
-    point: Point, priors: Priors, deviation: np.ndarray, screened: Screen, name: int
+def unsaid(
+    point: Point, priors: Priors, active: Sequence[int], screened: Screen, causes: Sequence[int]
 ) -> np.ndarray:
-    """Nats of each screened term that a name, whatever its size, does not explain, shape (T,).
+    """Nats of each screened term that no single cause explains, whatever its size, beside a set of
+    names; shape (T,).
 
-    ``deviation``: prior deviations of the effects beside it, shape (K,)."""
-    free = np.where(np.arange(len(deviation)) == name, priors.slab / NARROW, deviation)
-    information, score = _conditional(point, free, screened)
-    return 0.5 * score**2 / np.maximum(information, 1e-300)
+    A term has neither bounds nor a usual size. It must not take the place of a cause that says the
+    same only because the cause lies at its bound, or is larger than was expected."""
+    deviation = priors.deviation(list(active))
+    sigma = covariance(point.information, deviation)
+    information, score = _conditional(point, deviation, screened)
+    shared, mean = (screened.cross @ sigma)[:, causes], (sigma @ point.score)[causes]
+    spread = np.maximum(deviation**2 - sigma.diagonal(), SAME * deviation**2)[causes]
+    alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
+    left = score[:, None] - shared * mean / spread
+    return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
 def distinct(gain: np.ndarray, screened: Screen, count: int) -> list[int]:
@@ -221,13 +230,13 @@ def shortlist(
     active: Sequence[int],
     strongest: Mapping[str, float],
     threshold: float,
-    names: Sequence[int] = (),
 ) -> list[TermEffect]:
-    """The terms that say most beside a set of names, by the linear statistics.
+    """The terms that say most beside a set of names and what no single cause says, by the linear
+    statistics.
 
     ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
-    nats that a term must bring beyond its price; ``names``: that are not in the set: a term that
-    one of these says as well is none."""
+    nats that a term must bring beyond its price."""
+    causes = np.flatnonzero(problem.priors.visible[: len(problem.model.effects)])
     calm, parts = with_capped_gusts(point)
     values = [KnotValues(window.knots) for window in point.windows]
     screens = {
@@ -243,9 +252,7 @@ def shortlist(
             calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
         )
         gain -= [price[term.depth] for term in screened.terms]
-        deviation = problem.priors.deviation(list(active))
-        explained = [_unsaid(calm, problem.priors, deviation, screened, n) < LAW for n in names]
-        gain[np.any(explained, axis=0)] = -np.inf
+        gain[unsaid(calm, problem.priors, active, screened, causes) < LAW] = -np.inf
         ranked += [
             (float(gain[i]), screened.terms[i], float(prior[i]))
             for i in distinct(gain, screened, WEIGHED)
@@ -322,18 +329,3 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
         )
         for i, (j, t) in enumerate((j, effects[j].term) for j in columns)
     )
-
-
-def unexplained_nats(
-    point: Point, priors: Priors, active: Sequence[int], term: int, name: int
-) -> float:
-    """Nats that a term explains and a name, whatever its size, does not; none where both are the
-    same form.
-
-    A term has neither bounds nor a usual size. It must not take the place of a name that says the
-    same only because the name lies at its bound, or is larger than was expected."""
-    deviation = priors.deviation([k for k in active if k != term])
-    deviation[term] = 0.0
-    row = point.information[[term]]
-    single = Screen((), np.ones(1), row[:, term], point.score[[term]], row)
-    return float(_unsaid(point, priors, deviation, single, name)[0])
