@@ -207,7 +207,7 @@ class Selector:
         return ahead_of
 
     def _short(
-        self, listed: Mapping[Names, float], tried: Iterable[Names], minimum: float
+        self, listed: Mapping[Names, float], tried: Mapping[Names, float], minimum: float
     ) -> list[Names]:
         """Return the next sets to be simulated, best first: what promises more than ``minimum``
         [nats], and may be possible.
@@ -224,8 +224,9 @@ class Selector:
             if chosen not in done:
                 parts = (nats for part, nats in shortfalls if part < chosen ^ present)
                 expected[chosen] = promised - max(parts, default=0.0)
+        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
-        close = [s for s in ranked if expected[s] > max(minimum, -self._doubt(s))]
+        close = [s for s in ranked if expected[s] > max(minimum, -min(margin, self._doubt(s)))]
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
 
     def _doubt(self, chosen: Names) -> float:
