@@ -410,13 +410,23 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
 
 
 def _inconsistent(selection: Selector) -> list[int]:
-    """Return the names whose size differs from window to window by more than is :func:`allowed`."""
-    best, priors = selection.best, selection.problem.priors
+    """Return the names whose size differs from window to window by more than is :func:`allowed`,
+    under the noise levels that remain when every window has its own size.
+    """
+    best, names = selection.best, selection.names
     point = replace(best.point, grams=with_shares(best.point, best.point.theta))
-    windows = regrouped(point, range(len(point.windows)))
+    widest = {(j, FLIGHT): DIFFER[-1] * allowed(point.theta[j]) for j in names}
+    apart = replace(
+        point,
+        plain=regrouped(point, range(len(point.windows))),
+        grams=[replace(gram, flight=i) for i, gram in enumerate(point.grams)],
+        windows=[replace(window, flight=i) for i, window in enumerate(point.windows)],
+        varies=Varies((), widest),
+    )
+    windows = with_noise_at(apart, point.theta).plain if names else apart.plain
     nats = {
-        j: differing(windows, priors, best.columns, point.theta, [j], DIFFER)
-        for j in selection.names
+        j: differing(windows, selection.problem.priors, best.columns, point.theta, [j], DIFFER)
+        for j in names
     }
     return [j for j, n in nats.items() if n.max() - n[DIFFER <= 1.0].max() > selection.threshold]
 
