@@ -352,7 +352,8 @@ def _overall(
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
     laws = laws_of(selection.best.chosen)
-    inconsistent = _inconsistent(selection)
+    compared = compares_phases(selection.nominal)  # else what is left over speaks of a wrong form
+    inconsistent = _inconsistent(selection) if compared else []
     if laws:
         unnamed, law_text = _law(selection)
         return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed | set(inconsistent)
@@ -368,7 +369,7 @@ def _overall(
         names = ", ".join(selection.problem.effects[j].name for j in inconsistent)
         reasons.append(f"the size of {names} differs from window to window; the form is another")
         return result.UNKNOWN, selection.block_of(inconsistent[0]), reasons, set(inconsistent)
-    for block, parts in _crowded(selection).items():
+    for block, parts in _crowded(selection).items() if compared else ():
         names = ", ".join(selection.problem.effects[j].name for j in parts)
         reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
         return result.UNKNOWN, block, [*reasons, reason], set(parts)
@@ -396,8 +397,7 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
     which the flights hardly tell some apart, with these names: parts of it are likelier.
     """
     by_block: dict[str, list[int]] = {}
-    compared = compares_phases(selection.nominal)  # else what is left over says so
-    for j in selection.names if compared else ():
+    for j in selection.names:
         by_block.setdefault(selection.block_of(j), []).append(j)
     crowded = {}
     for block, members in by_block.items():
