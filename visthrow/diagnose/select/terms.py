@@ -179,18 +179,6 @@ def unsaid(
     return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
-def distinct(gain: np.ndarray, screened: Screen, count: int) -> list[int]:
-    """The best terms, without those that are a simpler one in other words in these flights."""
-    chosen: list[int] = []
-    unit = screened.score / np.maximum(screened.size, 1e-300)
-    for i in np.argsort(-gain, kind="stable")[: 8 * count]:
-        if len(chosen) == count or not np.isfinite(gain[i]):
-            break
-        if not any(np.isclose(abs(unit[i]), abs(unit[k]), rtol=1e-3) for k in chosen):
-            chosen.append(int(i))
-    return chosen
-
-
 def extended(
     problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]
 ) -> tuple[Problem, list[Point]]:
@@ -251,12 +239,11 @@ def shortlist(
         gain, prior = gains(
             calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
         )
-        gain -= [price[term.depth] for term in screened.terms]
         gain[unsaid(calm, problem.priors, active, screened, causes) < LAW] = -np.inf
-        ranked += [
-            (float(gain[i]), screened.terms[i], float(prior[i]))
-            for i in distinct(gain, screened, WEIGHED)
-        ]
+        # of terms that say the same in other words in these flights, the simplest comes first
+        for i in np.unique(np.round(gain, 3), return_index=True)[1]:
+            term = screened.terms[i]
+            ranked.append((float(gain[i]) - price[term.depth], term, float(prior[i])))
     present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     best = sorted(
         (f for f in ranked if f[0] > threshold and f[1] not in present), key=lambda f: -f[0]
