@@ -395,12 +395,6 @@ def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> 
     return with_noise_at(point, theta)
 
 
-def with_noise_of(point: Point, source: Point) -> Point:
-    """Return the point with its residuals under the noise levels of another."""
-    alike = point.grams[0].inner is source.grams[0].inner  # the same derivatives
-    return regathered(point, source.integrals if alike else None, noise=source.noise)
-
-
 def with_noise_at(point: Point, theta: np.ndarray) -> Point:
     """Return the point with noise levels estimated from the residuals at ``theta``, and each
     flight's random shares beside it.

@@ -49,7 +49,6 @@ from visthrow.diagnose.select.point import (
     switched,
     with_all_effects_noise,
     with_noise_at,
-    with_noise_of,
 )
 from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
@@ -248,18 +247,19 @@ class Selector:
             replace(self._with_blocks(point, active), varies=varies_of(sizes, self.problem.days))
             for active, (sizes, _) in zip(columns, shares)
         ]
-        trials = list(zip(sets, candidates(self.problem, points, columns), shares))
-        for s, simulated, _ in trials:
-            if isinstance(simulated, DiagnoseError):
-                self.progress(f"{names_of(s)}: not simulated, {simulated}")
-        simulated_trials = [
-            Trial(s, p, *size) for s, p, size in trials if not isinstance(p, DiagnoseError)
-        ]
-        simulated_trials = [replace(t, lead=self.lead(t, self.best)) for t in simulated_trials]
-        for t in simulated_trials:  # what may not be named gains nothing
-            nats = t.lead if self.is_admissible(t) else min(t.lead, 0.0)
-            self._simulated[t.chosen] = max(nats, self._simulated.get(t.chosen, -np.inf))
-        return simulated_trials
+        trials = []
+        simulated = candidates(self.problem, points, columns)
+        for s, there, size in zip(sets, simulated, shares):
+            if isinstance(there, DiagnoseError):
+                self.progress(f"{names_of(s)}: not simulated, {there}")
+                continue
+            trial = Trial(s, there, *size)
+            trial = replace(trial, lead=self._value(trial) - self.value)
+            # what may not be named gains nothing
+            nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)
+            self._simulated[s] = max(nats, self._simulated.get(s, -np.inf))
+            trials.append(trial)
+        return trials
 
     def _with_blocks(self, point: Point, active: list[int]) -> Point:
         """Return the point linearised with the kinds of blocks that a set asks for; once for each
@@ -272,23 +272,11 @@ class Selector:
             self._turned = {theta.tobytes(): self._linearised(theta, point)}
         return self._turned[theta.tobytes()]
 
-    def lead(self, first: Trial, second: Trial) -> float:
-        """Return the nats by which a set is worth more than another, each where it was simulated,
-        with the noise levels of whichever of both points suits it better.
-
-        The noise levels of a point were estimated without the floors; a set may do better with the
-        levels of another set."""
-        value = [
-            max(self._value(t), self._value(t, with_noise_of(t.point, rival.point)))
-            for t, rival in ((first, second), (second, first))
-        ]
-        return value[0] - value[1]
-
-    def _value(self, trial: Trial, point: Point | None = None) -> float:
-        """Return what a set is worth at a point [nats]: not what derivatives promise beyond what
-        the simulation gave.
+    def _value(self, trial: Trial) -> float:
+        """Return what a set is worth where it was simulated [nats]: not what derivatives promise
+        beyond what the simulation gave.
         """
-        point = point or trial.point
+        point = trial.point
         evidence = point.evidence(self.problem.priors, trial.columns)
         promised = predicted_gain(self.problem, point, trial.columns, switches=True)
         return evidence - promised - trial.occam - self.penalty(trial.chosen)
