@@ -94,6 +94,7 @@ class Selector:
         self._visited = {NOTHING}
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
+        self._followed: set[Names] = set()
         self._every = False  # whether any effect may differ among flights
         self._offer()
 
@@ -171,6 +172,7 @@ class Selector:
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
             if better:
                 least = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
+        better = better or self._followed_up({s: listed[s] for s in leads})
         if better:
             top = max(better, key=lambda t: t.lead)
             self._record(top, leads, listed)
@@ -294,6 +296,35 @@ class Selector:
             return False  # a share of a flight has the bounds of its effect, to a floor
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         return all(terms.moves_landing(self.problem, point, j) for j in laws)
+
+    def _followed_up(self, promises: Mapping[Names, float]) -> list[Trial]:
+        """Return the set that promises most, simulated from derivatives and initial states of where
+        it leads, if it is worth more there; the present set from there as well, for new states
+        alone are no gain.
+
+        A rope that whips forgets its initial state within a window; what was fitted for another
+        rope explains nothing."""
+        kinds = self.problem.switches
+        new = {
+            s: n
+            for s, n in promises.items()
+            if n > 0.0 and s not in self._followed and not kinds[columns_of(s)].any()
+        }
+        if not new:
+            return []
+        chosen = max(new, key=new.get)
+        self._followed.add(chosen)
+        point, active = self.best.point, columns_of(chosen)
+        goal = estimate(point.information, point.score, self.problem.priors, active)
+        there = self._linearised(goal, point)
+        trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
+        if len(trials) < 2 or not self.is_admissible(trials[chosen]):
+            return []
+        lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
+        if lead <= ENOUGH_NATS:
+            return []
+        self.origin = there
+        return [replace(trials[chosen], lead=lead)]
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
