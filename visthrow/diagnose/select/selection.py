@@ -172,7 +172,7 @@ class Selector:
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
             if better:
                 least = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
-        better = better or self._followed_up({s: listed[s] for s in leads})
+        better = better or self._followed_up(listed)
         if better:
             top = max(better, key=lambda t: t.lead)
             self._record(top, leads, listed)
@@ -297,34 +297,29 @@ class Selector:
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         return all(terms.moves_landing(self.problem, point, j) for j in laws)
 
-    def _followed_up(self, promises: Mapping[Names, float]) -> list[Trial]:
-        """Return the set that promises most, simulated from derivatives and initial states of where
-        it leads, if it is worth more there; the present set from there as well, for new states
-        alone are no gain.
+    def _followed_up(self, listed: Mapping[Names, float]) -> list[Trial]:
+        """Return a set that promises more than it kept, simulated from derivatives and initial
+        states of where it leads, if it is worth more there than the present set from there.
 
         A rope that whips forgets its initial state within a window; what was fitted for another
-        rope explains nothing."""
-        kinds = self.problem.switches
-        new = {
-            s: n
-            for s, n in promises.items()
-            if n > 0.0 and s not in self._followed and not kinds[columns_of(s)].any()
-        }
-        if not new:
-            return []
-        chosen = max(new, key=new.get)
-        self._followed.add(chosen)
-        point, active = self.best.point, columns_of(chosen)
-        goal = estimate(point.information, point.score, self.problem.priors, active)
-        there = self._linearised(goal, point)
-        trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
-        if len(trials) < 2 or not self.is_admissible(trials[chosen]):
-            return []
-        lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
-        if lead <= ENOUGH_NATS:
-            return []
-        self.origin = there
-        return [replace(trials[chosen], lead=lead)]
+        rope explains nothing. New states alone are no gain."""
+        kinds, point = self.problem.switches, self.best.point
+        tried = self._simulated.keys() - self._followed
+        ranked = sorted((s for s in tried if listed.get(s, 0.0) > 0.0), key=listed.get)
+        for chosen in ranked[::-1][:ROUNDS]:
+            self._followed.add(chosen)
+            active = columns_of(chosen)
+            if kinds[active].any():
+                continue
+            goal = estimate(point.information, point.score, self.problem.priors, active)
+            there = self._linearised(goal, point)
+            trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
+            if len(trials) == 2 and self.is_admissible(trials[chosen]):
+                lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
+                if lead > ENOUGH_NATS:
+                    self.origin = there
+                    return [replace(trials[chosen], lead=lead)]
+        return []
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
