@@ -304,8 +304,12 @@ class Selector:
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
         kinds, point = self.problem.switches, self.best.point
-        tried = self._simulated.keys() - self._followed
-        ranked = sorted((s for s in tried if listed.get(s, 0.0) > 0.0), key=listed.get)
+        ranked = [
+            s
+            for s, kept in self._simulated.items()
+            if s not in self._followed and listed.get(s, 0.0) > max(0.0, kept + STRONG)
+        ]
+        ranked.sort(key=listed.get)
         for chosen in ranked[::-1][:ROUNDS]:
             self._followed.add(chosen)
             active = columns_of(chosen)
