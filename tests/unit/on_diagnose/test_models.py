@@ -458,11 +458,13 @@ class TestImu:
         for log in logs:
             rate = log["rate_b"]
             rate.values[:] += 40.0 * np.sin(4.0 * rate.time)[:, None] * [1.0, -1.0, 0.5]
-        model = ImuModel(logs, IMU)
+        strong = tuple(1.8 * c for c in IMU.thrust_map)  # the weight tells of the map's scale
+        model = ImuModel(logs, replace(IMU, thrust_map=strong))
         assert model.channels == ("acc_b",)
         assert "with a correlation of 0." in model.notes[0]
         diagnosis = search.diagnose(logs, model, laws=False)
-        assert diagnosis.named == ("motor_tau",)
+        assert set(diagnosis.named) == {"thrust_gain", "motor_tau"}
+        assert diagnosis.theta["thrust_gain"] == approx(1.0 / 1.8 - 1.0, abs=0.03)
         assert diagnosis["inertia_xy"].missing == ("rate_b",)
         assert any("no torque or inertia" in reason for reason in diagnosis.reasons)
 

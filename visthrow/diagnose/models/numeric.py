@@ -97,6 +97,8 @@ class NumericModel(Model, ABC):
     """A model whose subclasses give :meth:`windows_of`, :meth:`simulate` and :meth:`measure`."""
 
     cheap = True
+    # whether the prior of the unknowns at the start says something: else it is about their fit
+    anchored = False
     latent_step = 1.0  # of the differences by latent forces [N or N m]
     table: str  # file of the catalogue
     needed: Sequence[str] = ()  # channels without which a log holds no window
@@ -247,6 +249,7 @@ class NumericModel(Model, ABC):
             self._slopes_by(size, name) for name in ("nuisance", "theta", "latent")
         )
         self._slopes = slopes
+        residuals = self._from_prior(residuals)
         path = self.simulate(self._lanes(size))
         return [
             replace(
@@ -264,7 +267,14 @@ class NumericModel(Model, ABC):
         self, theta: Mapping[str, float], linearised: Linearised | None = None
     ) -> list[np.ndarray]:
         """See :class:`.model_interface.Model`; initial states are fitted anew."""
-        return self._settle(self.size(theta))
+        return self._from_prior(self._settle(self.size(theta)))
+
+    def _from_prior(self, residuals: list[np.ndarray]) -> list[np.ndarray]:
+        """Return residuals as with the unknowns in the middle of their prior, where that counts."""
+        if not self.anchored:
+            return residuals
+        moves = [start - s.start for start, s in zip(self._start, self.stretches)]
+        return [r + slope @ move for r, slope, move in zip(residuals, self._slopes, moves)]
 
     def _lanes(self, size: np.ndarray, start: np.ndarray | None = None) -> Lanes:
         """One lane a stretch."""

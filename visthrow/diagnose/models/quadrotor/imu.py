@@ -54,6 +54,7 @@ class ImuModel(FlyerModel):
     """Windows of flights of one vehicle; motors and torques are those of the base class."""
 
     table = "imu"
+    anchored = True  # an accelerometer is off by little, which a wrong map is not
     channels = CHANNELS
     lawless = "nothing tells the attitude and the velocity that a law is made of"
 
@@ -98,7 +99,9 @@ class ImuModel(FlyerModel):
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
         if "rate_b" in self.channels:
             rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
-        push = (thrust.sum(2) + latent[:, 0, :, 2])[::2].T / self.params.mass
+        gust = latent[:, 0, :, 2]
+        gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
+        push = (thrust.sum(2) + gust)[::2].T / self.params.mass
         return np.concatenate([rates, (push + lanes.nuisance[:, 3:])[..., None]], 2)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
