@@ -7,14 +7,13 @@ ours: :data:`CHOICES` names each. Numbers that a page gives for a parameter are 
 
 import ast
 import re
-from pathlib import Path
 
 from pytest import mark
 
 from hil.links.backends.audit import RULES
 from hil.links.facts import FOLDER, facts
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 FIRMWARES = [path.stem for path in FOLDER.glob("*.toml")]
 FACTS = {name: fact for firmware in FIRMWARES for name, fact in facts(firmware).items()}
 

@@ -14,8 +14,8 @@ from pytest import mark
 
 from sim.solvers import SOLVERS
 from tests.commands import run_python
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 OURS = {**os.environ, "PYTHONPATH": str(ROOT)}
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 WORLDS = "bench/worlds"

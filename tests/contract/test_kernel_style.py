@@ -5,11 +5,11 @@ headings.
 import ast
 import io
 import tokenize
-from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 GROUPS = ("Params:", "State in:", "In:", "State out:", "Out:")
 """Headings of the argument groups; some may be missing, the order may not differ."""
 

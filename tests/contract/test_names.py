@@ -11,7 +11,8 @@ from pathlib import Path
 
 from pytest import mark
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 
 CEILINGS = {

@@ -14,8 +14,8 @@ from pytest import fixture, mark
 
 from bench.mutations.__main__ import load
 from tests.contract.test_imports import imports_of
+from tests.places import ROOT
 
-ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("camera", "sim", "visthrow", "hil")
 LONGEST = 60
 """Lines of a function."""

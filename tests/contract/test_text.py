@@ -6,7 +6,8 @@ from pathlib import Path
 
 from pytest import mark
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 BINARY = {
     ".bbl",
     ".gz",

@@ -4,7 +4,6 @@ setup, and worth it on flights never seen.
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.linalg import norm
@@ -15,6 +14,7 @@ from bench.diagnose import foreign, small
 from bench.diagnose.flown import ball_log, fly
 from sim.params import LawParams
 from tests.commands import run_command
+from tests.places import DATA
 from tests.unit.on_diagnose.test_models import BALL, FLYER
 from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
@@ -178,13 +178,7 @@ def test_what_cannot_act_is_refused():
 
 def test_an_unknown_of_a_model_without_laws_says_so(capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    tests = (
-        Path(__file__).resolve().parents[1]
-        / "data"
-        / "real"
-        / "motor_prop_stand"
-        / "all_tests.csv.gz"
-    )
+    tests = DATA / "real" / "motor_prop_stand" / "all_tests.csv.gz"
     assert run_command(f"diagnose explain {tests}:a1_* --config motor_stand --no-report") == 0
     said = capsys.readouterr().out
     assert "UNKNOWN" in said

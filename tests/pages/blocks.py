@@ -30,10 +30,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from unittest import mock
 
+from tests.places import ROOT
 from visthrow import cli
 from visthrow.training import trainer
 
-ROOT = Path(__file__).resolve().parents[2]
 REASONS = {
     "a GPU",
     "a vehicle",

@@ -7,11 +7,11 @@ import os
 import shlex
 import shutil
 import subprocess
-from pathlib import Path
 
 from pytest import mark, skip
 
-ROOT = Path(__file__).resolve().parents[2]
+from tests.places import ROOT
+
 IMAGE = "visthrow-test"
 BUILDERS = ("podman", "docker", "buildah")
 LOGS = ROOT / "tests" / "data" / "payload_cf_single"

@@ -2,7 +2,6 @@
 
 import runpy
 import sys
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,10 +12,10 @@ from camera.fisheye import Fisheye
 from camera.params import CameraParams
 from hil.poses.sources import images
 from tests import boards
+from tests.places import ROOT
 from visthrow import config
 from visthrow.training import rewards, trainer
 
-ROOT = Path(__file__).resolve().parents[2]
 BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
 LONGEST = 60
 """Lines of a program."""

@@ -2,7 +2,6 @@
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -16,8 +15,9 @@ from camera.params import FisheyeParams, MountParams
 from tests import lens_files
 from tests.boards import BOARDS, lens_of
 from tests.boards import pictures as draw_boards
+from tests.places import DATA
 
-DATA = Path(__file__).parents[2] / "data" / "basalt_calib"
+BASALT = DATA / "basalt_calib"
 LENS = FisheyeParams(640, 480, 160.1, 150.2, 310.3, 245.4, 0.02, -0.01, 0.002, -0.0002, 200.0)
 FORMATS = {
     "opencv.yaml": lens_files.write_opencv,
@@ -129,7 +129,7 @@ def test_the_place_of_the_imu_is_the_mount(tmp_path, key):
 def test_real_basalt_files_fit(name, camera):
     lenses = []
     for model in ("ds", "eucm"):
-        _, params, report = files.read(DATA / f"{name}_{model}_calib.json", camera)
+        _, params, report = files.read(BASALT / f"{name}_{model}_calib.json", camera)
         assert report.model == model
         assert report.rms_px < FIT_RMS_PX
         assert report.max_px < FIT_MAX_PX
@@ -147,17 +147,17 @@ def test_real_basalt_files_fit(name, camera):
 
 
 def test_fit_is_not_stretched_past_what_the_image_sees():
-    _, params, _ = files.read(DATA / "euroc_ds_calib.json", fov_deg=190.0)
+    _, params, _ = files.read(BASALT / "euroc_ds_calib.json", fov_deg=190.0)
     assert params.fov_deg == approx(113.9, abs=0.1)
-    _, narrower, _ = files.read(DATA / "tumvi_512_ds_calib.json", fov_deg=180.0)
+    _, narrower, _ = files.read(BASALT / "tumvi_512_ds_calib.json", fov_deg=180.0)
     assert narrower.fov_deg == 180.0
 
 
 def test_basalt_refusals(tmp_path):
     with raises(ValueError, match=r"camera 2 was requested; expected a number below 2,"):
-        files.read(DATA / "euroc_ds_calib.json", 2)
+        files.read(BASALT / "euroc_ds_calib.json", 2)
     path = tmp_path / "short.json"
-    path.write_text((DATA / "euroc_ds_calib.json").read_text()[:900])
+    path.write_text((BASALT / "euroc_ds_calib.json").read_text()[:900])
     with raises(ValueError, match=r"short\.json: is no complete YAML .cut short"):
         files.read(path)
     path.write_text(json.dumps([1, 2]))

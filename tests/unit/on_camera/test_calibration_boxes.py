@@ -2,7 +2,6 @@
 
 import math
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -11,8 +10,8 @@ from pytest import approx, mark, raises
 from camera.calibrate.files import read
 from camera.calibrate.foreign import HOLDS_PX
 from camera.fisheye import Fisheye
+from tests.places import DATA
 
-DATA = Path(__file__).parents[2] / "data"
 FILES = tomllib.loads((DATA / "lenses.toml").read_text())
 LENSES = FILES["lens"]
 EXACT_PX = 1e-9

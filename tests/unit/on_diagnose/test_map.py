@@ -11,6 +11,7 @@ from pytest import approx, importorskip, raises
 from scipy.spatial.transform import Rotation
 
 from tests import logfiles
+from tests.places import DATA
 from tests.plants import paper_plant
 from tests.unit.on_logs.test_check import flight, log_of
 from visthrow.common.errors import LogError
@@ -26,7 +27,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
 from visthrow.logs.unit_names import UNITS
 
-REAL = Path(__file__).resolve().parents[2] / "data" / "real"
+REAL = DATA / "real"
 SETS = {
     "payload_cf_single/log204": "cf_payload",
     "payload_cf_two_drones/coltrans_02_cf3": "cf_payload_pair",

@@ -14,6 +14,7 @@ import numpy as np
 from pytest import approx, mark
 
 from tests.commands import run_command
+from tests.places import DATA
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.select.result import (
     CANDIDATE,
@@ -28,7 +29,6 @@ from visthrow.diagnose.select.search import explain
 from visthrow.logs import read_all
 from visthrow.logs.check.run import check, contradictions
 
-DATA = Path(__file__).resolve().parents[2] / "data"
 REAL = DATA / "real"
 FULL = Path(os.environ.get("VISTHROW_REAL_DATA", REAL))
 SETUPS = {

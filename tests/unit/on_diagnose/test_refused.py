@@ -3,16 +3,15 @@ before anything is named.
 """
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from pytest import mark, raises
 
+from tests.places import DATA
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs.readers import table
 
-DATA = Path(__file__).resolve().parents[2] / "data"
 SWING = ("pendulum_encoder", "real/pendulum_single/single_pendulum_id.csv.gz")
 CABLE = ("cf_payload", "real/payload_cf_single/log206.csv.gz")
 CAMERA = ("slungload_camera", "slungload_camera/rosbag_16.csv.gz")

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from numpy.random import default_rng
@@ -10,6 +9,7 @@ from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
 from tests.commands import run_command
+from tests.places import DATA
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
@@ -22,13 +22,7 @@ from visthrow.diagnose.select import result, search
 from visthrow.diagnose.throw.landing import PredictedLandings
 from visthrow.view import page
 
-SWING = str(
-    Path(__file__).resolve().parents[2]
-    / "data"
-    / "real"
-    / "pendulum_single"
-    / "single_pendulum_id.csv.gz"
-)
+SWING = str(DATA / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
 EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 

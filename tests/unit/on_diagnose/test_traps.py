@@ -4,16 +4,16 @@ free of it.
 
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 from pytest import approx, mark
 
+from tests.places import DATA
 from visthrow.diagnose.inputs import setup
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 
-REAL = Path(__file__).resolve().parents[2] / "data" / "real"
+REAL = DATA / "real"
 FLIGHTS = (204, 205, 206)
 """Flights along x, along y, and in place."""
 

@@ -3,7 +3,6 @@
 import re
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from pytest import mark, raises
@@ -15,9 +14,9 @@ from hil.poses.pose import Pose
 from hil.poses.sources.open_source import open_source, read_poses, unit_problems
 from tests.commands import run_command
 from tests.configs import load_run
+from tests.places import DATA
 from visthrow.common import toml_text
 
-DATA = Path(__file__).parents[2] / "data"
 FLIGHTS = {
     "crazyflie_log": "payload_cf_single/log201.csv.gz",
     "crazyflie_pair_log": "payload_cf_two_drones/coltrans_02_cf3.csv.gz",

@@ -18,6 +18,7 @@ from pytest import mark, raises
 
 from tests import logfiles
 from tests.commands import run_command
+from tests.places import DATA
 from visthrow.common.errors import LogError, VisthrowError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
@@ -25,7 +26,7 @@ from visthrow.logs.check.run import check, table
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
-REAL = Path(__file__).resolve().parents[2] / "data" / "real"
+REAL = DATA / "real"
 PATIENCE = 20.0
 """Seconds; the longest of these small files takes one on a busy machine."""
 DAMAGES = 12

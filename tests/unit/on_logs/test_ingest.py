@@ -14,6 +14,7 @@ from pytest import approx, mark, raises
 from scipy.spatial.transform import Rotation
 
 from tests import logfiles
+from tests.places import DATA
 from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
@@ -24,7 +25,7 @@ from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
 from visthrow.logs.readers.blackbox import codec as blackbox_codec
 from visthrow.logs.readers.blackbox import decoder as blackbox
 
-REAL = Path(__file__).resolve().parents[2] / "data" / "real"
+REAL = DATA / "real"
 BBL = REAL / "betaflight_bbl" / "btfl_001_start.bbl"
 
 

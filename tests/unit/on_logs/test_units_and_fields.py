@@ -5,22 +5,20 @@ log: what comes out against numbers worked by hand.
 import math
 import struct
 import tomllib
-from pathlib import Path
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 from pytest import approx, mark, raises
 
 from tests import logfiles
+from tests.places import DATA
 from visthrow.common.errors import ConfigError
 from visthrow.logs import read
 from visthrow.logs.readers import autopilot_logs
 from visthrow.logs.readers.blackbox import channels as blackbox
 from visthrow.logs.unit_names import UNITS, to_si
 
-TABLES = tomllib.loads(
-    (Path(__file__).parents[2] / "data" / "autopilot_fields.toml").read_text(encoding="utf-8")
-)
+TABLES = tomllib.loads((DATA / "autopilot_fields.toml").read_text(encoding="utf-8"))
 ROWS = TABLES["rows"]
 CASES = [(ending, *row) for ending, rows in ROWS.items() for row in rows]
 
