@@ -38,3 +38,16 @@ def refused(capsys):
         assert said in capsys.readouterr().err
 
     return run
+
+
+@fixture
+def printed(capsys):
+    """Function that runs a command, which must end with a status, and returns what it prints."""
+    from tests.commands import run_command
+
+    def run(line, *words, status=0, sets=()):
+        capsys.readouterr()
+        assert run_command(line, *words, sets=sets) == status
+        return capsys.readouterr().out
+
+    return run

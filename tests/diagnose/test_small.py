@@ -176,11 +176,10 @@ def test_what_cannot_act_is_refused():
         setups.Setup("", ball=BALL, laws=(replace(pull, factors=("payload_speed",) * 3),))
 
 
-def test_an_unknown_of_a_model_without_laws_says_so(capsys, tmp_path, monkeypatch):
+def test_an_unknown_of_a_model_without_laws_says_so(tmp_path, monkeypatch, printed):
     monkeypatch.chdir(tmp_path)
     tests = DATA / "real" / "motor_prop_stand" / "all_tests.csv.gz"
-    assert run_command(f"diagnose explain {tests}:a1_* --config motor_stand --no-report") == 0
-    said = capsys.readouterr().out
+    said = printed(f"diagnose explain {tests}:a1_* --config motor_stand --no-report")
     assert "UNKNOWN" in said
     assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
 

@@ -54,10 +54,11 @@ def test_the_check_fails_what_no_run_hovers_on(name, monkeypatch, capsys):
     assert not stream.says or any(waits for _, waits in states), "a run that waits says for what"
 
 
-def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, capsys):
+def test_the_check_fails_where_a_run_would_wait_for_the_autopilot(monkeypatch, printed):
     sent = Sent(loaded(), STREAMS["100 Hz"])
     opened = sent, sent.links[0], ManualClock(sent.start)
     monkeypatch.setattr("hil.check.open_source", lambda *args: opened)
     settings = [*SETTINGS, "backend=ardupilot"]
-    assert run_command(f"hil check --seconds {SECONDS - 0.1}", sets=settings) == 1
-    assert "FAIL  autopilot not ready (no heartbeat)" in capsys.readouterr().out
+    assert "FAIL  autopilot not ready (no heartbeat)" in printed(
+        f"hil check --seconds {SECONDS - 0.1}", sets=settings, status=1
+    )

@@ -56,7 +56,7 @@ def test_poses_are_projected_as_a_picture_shows_them(tmp_path, monkeypatch, caps
     assert "[True, True, True, True" in capsys.readouterr().out
 
 
-def test_a_camera_is_calibrated(tmp_path, monkeypatch, capsys):
+def test_a_camera_is_calibrated(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for i, picture in enumerate(boards.pictures("chessboard")):
         cv2.imwrite(f"{i}.png", picture)

@@ -280,7 +280,7 @@ def test_unknown_names_and_indivisible_batches_are_refused(tmp_path, capsys, ref
     assert "minibatches" in capsys.readouterr().err
 
 
-def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
+def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, printed):
     changes = [
         "ppo.environments=32",
         "ppo.products=float32",
@@ -289,10 +289,9 @@ def test_the_end_says_how_sure_it_is_and_names_the_conditions(tmp_path, capsys):
     ]
     figures = tmp_path / "figures.json"
     command = f"train state --from state --iterations 1 --device cpu --json {figures}"
-    assert run_command(f"{command} --out {tmp_path}/run", sets=changes) == 0
-    printed = capsys.readouterr().out
-    assert "under the faults of its training:" in printed
-    assert re.search(r"target 2\.0 m: error 0\.\d+ \[0\.\d+, 0\.\d+\] m", printed)
+    text = printed(f"{command} --out {tmp_path}/run", sets=changes)
+    assert "under the faults of its training:" in text
+    assert re.search(r"target 2\.0 m: error 0\.\d+ \[0\.\d+, 0\.\d+\] m", text)
     written = json.loads(figures.read_text())
     flown, trained = written["throws"][1], written["throws_under_faults"][1]
     assert flown["throws"] == 5 * trainer.EVALUATED

@@ -28,14 +28,13 @@ def aborted(tmp_path_factory):
     return folder, decisions
 
 
-def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, capsys):
+def test_a_bundle_replays_to_the_bit_and_says_where_it_went_wrong(aborted, printed):
     folder, decisions = aborted
     turn = next(n for n, decision in enumerate(decisions) if decision.state == "abort")
     before = decisions[turn - 1].state
     bundle = pack(folder)
     assert bundle.parent == folder.parent
-    assert run_command(f"hil replay {bundle}") == 0
-    out = capsys.readouterr().out
+    out = printed(f"hil replay {bundle}")
     assert "all bit for bit the same" in out
     told = out.splitlines()[-1]
     assert told.startswith("It went wrong ")
@@ -59,13 +58,13 @@ def test_a_full_disk_leaves_no_half_bundle(aborted, tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["full"]
 
 
-def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, capsys):
+def test_a_run_that_was_killed_leaves_a_bundle_when_it_is_looked_at(tmp_path, printed):
     record_run(tmp_path / "b", saved_policy(tmp_path), seconds=2.0, close=False)
-    assert run_command(f"hil replay {tmp_path}/b") == 1
-    out = capsys.readouterr().out
+    out = printed(f"hil replay {tmp_path}/b", status=1)
     assert "b.zip  what there is of the run" in out
-    assert run_command(f"hil replay {tmp_path}/b.zip") == 1
-    assert "the recording ends" in capsys.readouterr().out.splitlines()[-1]
+    assert (
+        "the recording ends" in printed(f"hil replay {tmp_path}/b.zip", status=1).splitlines()[-1]
+    )
 
 
 def test_of_a_run_without_a_tick_nothing_is_known(aborted, tmp_path, capsys):

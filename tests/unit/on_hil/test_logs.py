@@ -10,7 +10,6 @@ from hil.control.recording.record import lines
 from hil.errors import SourceError
 from hil.poses.sources.player import LogBody, read_autopilot
 from tests import logfiles as files
-from tests.commands import run_command
 
 VEHICLE = (LogBody("vehicle", "VISP"),)
 
@@ -253,7 +252,7 @@ def test_a_topic_without_an_attitude_says_so(tmp_path):
         read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
 
 
-def test_a_log_is_recorded_and_replayed(tmp_path, capsys):
+def test_a_log_is_recorded_and_replayed(tmp_path, printed):
     """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy
     looking on.
     """
@@ -274,11 +273,9 @@ def test_a_log_is_recorded_and_replayed(tmp_path, capsys):
         f"source.logs=[{logs}]",
     )
     out = tmp_path / "run"
-    assert run_command(f"hil record --out {out}", sets=settings) == 0
-    told = capsys.readouterr().out
+    told = printed(f"hil record --out {out}", sets=settings)
     assert "vehicle: 60 poses taken; refused: none" in told
     assert "payload: 60 poses taken; refused: none" in told
-    assert run_command(f"hil replay {out}") == 0
-    assert "all bit for bit the same" in capsys.readouterr().out
+    assert "all bit for bit the same" in printed(f"hil replay {out}")
     tick, *_ = (line for line in lines(out / "ticks.jsonl") if line["observation"] is not None)
     assert tick["observation"][2] == approx(1.333, abs=0.01), "down became up"

@@ -55,23 +55,21 @@ def run_folder(tmp_path_factory):
     return folder
 
 
-def test_one_bit_that_differs_is_found(run_folder, tmp_path, capsys):
+def test_one_bit_that_differs_is_found(run_folder, tmp_path, printed):
     shutil.copytree(run_folder, tmp_path, dirs_exist_ok=True)
     rows = list(lines(tmp_path / "ticks.jsonl"))
     changed = next(row for row in rows if row["action"] is not None)
     changed["action"][1] = float(np.nextafter(np.float32(changed["action"][1]), np.float32(1.0)))
     (tmp_path / "ticks.jsonl").write_text("\n".join(map(json.dumps, rows)))
-    assert run_command(f"hil replay {tmp_path}") == 1
-    assert f"tick {changed['n']}: action was" in capsys.readouterr().out
+    assert f"tick {changed['n']}: action was" in printed(f"hil replay {tmp_path}", status=1)
 
 
-def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys):
+def test_a_folder_cut_short_by_a_kill_replays(run_folder, tmp_path, capsys, printed):
     shutil.copytree(run_folder, tmp_path, dirs_exist_ok=True)
     data = (tmp_path / "ticks.jsonl").read_bytes()
     rows = data.splitlines(keepends=True)
     (tmp_path / "ticks.jsonl").write_bytes(b"".join(rows[:50] + rows[53:]))
-    assert run_command(f"hil replay {tmp_path}") == 1
-    assert f"CUT: 3 of {len(rows)} ticks are missing" in capsys.readouterr().out
+    assert f"CUT: 3 of {len(rows)} ticks are missing" in printed(f"hil replay {tmp_path}", status=1)
     (tmp_path / "ticks.jsonl").write_bytes(data[: len(data) // 2])
     (tmp_path / "summary.json").unlink()
     assert run_command(f"hil replay {tmp_path}") == 1, (
@@ -98,7 +96,7 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
         load_run(tmp_path)
 
 
-def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_path, capsys):
+def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_path, printed):
     shutil.copytree(run_folder, tmp_path / "before")
     ticks = list(lines(run_folder / "ticks.jsonl"))
     poses = [[line["n"], *row] for line in ticks for row in line["poses"]]
@@ -106,15 +104,13 @@ def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_pa
     for name, rows in (("ticks", former), ("poses", poses)):
         text = "".join(json.dumps(row) + "\n" for row in rows)
         (tmp_path / "before" / f"{name}.jsonl").write_text(text)
-    assert run_command(f"hil replay {tmp_path}/before") == 0
-    assert "all bit for bit the same" in capsys.readouterr().out
+    assert "all bit for bit the same" in printed(f"hil replay {tmp_path}/before")
     with raises(RunError, match="leave out --live"):
         follow(tmp_path / "before", None)
     # killed while its poses were behind its ticks
     (tmp_path / "before" / "summary.json").unlink()
     (tmp_path / "before" / "poses.jsonl").write_text(text[: len(text) // 2])
-    assert run_command(f"hil replay {tmp_path}/before") == 1
-    assert "all bit for bit the same" in capsys.readouterr().out
+    assert "all bit for bit the same" in printed(f"hil replay {tmp_path}/before", status=1)
     (tmp_path / "before" / "poses.jsonl").write_text("7\n")
     with raises(RunError, match="ticks or poses are damaged: TypeError"):
         load_run(tmp_path / "before")
@@ -204,7 +200,7 @@ axes = "x,y,z"
 """
 
 
-def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused):
+def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused, printed):
     """``hil run`` on recorded poses: as fast as it goes, the policy asked at every tick, nothing
     released.
     """
@@ -222,17 +218,18 @@ def test_the_policy_on_a_csv_file(tmp_path, monkeypatch, capsys, refused):
     vel = np.array(asked[-1]["observation"][3:6])
     np.testing.assert_allclose(vel, (0.03, 0.0, 0.0), atol=1e-4)
     assert run_command("hil replay run") == 0
-    assert run_command("hil check --config mine.toml --seconds 2") == 0
-    out = capsys.readouterr().out
+    out = printed("hil check --config mine.toml --seconds 2")
     assert "PASS  all checks" in out
     assert "vehicle: 99 poses/s" in out
-    assert run_command("hil check --config mine.toml --seconds 1.2", *HOLD) == 1
-    assert "FAIL  all was well for the last " in capsys.readouterr().out
+    assert "FAIL  all was well for the last " in printed(
+        "hil check --config mine.toml --seconds 1.2", *HOLD, status=1
+    )
     wrong = ["--config", "mine.toml", "--set", "check.heading_deg=90.0"]
     assert main(["hil", "check", *wrong]) == 1
     assert "FAIL  heading" in capsys.readouterr().out
-    assert run_command("hil record --set states.check=0.5 --out looked", *wrong) == 0
-    assert "throws 0" in capsys.readouterr().out, "recorded to the end although the checks fail"
+    assert "throws 0" in printed("hil record --set states.check=0.5 --out looked", *wrong), (
+        "recorded to the end although the checks fail"
+    )
     assert len(load_run("looked")[2]) == len(ticks)
     refused("hil run --config mine.toml --out run", said="holds a run already")
 

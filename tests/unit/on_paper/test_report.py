@@ -8,7 +8,6 @@ from numpy.random import default_rng
 from pytest import approx, fixture
 
 from bench import baseline as baseline_record
-from tests.commands import run_command
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.paper.commands import report_command as command
 from visthrow.paper.report import ablations, beyond, gap, result_set, throws, trade
@@ -196,13 +195,12 @@ def test_the_page_stands_alone(written):
         assert f"({picture.name}.png)" in text
 
 
-def test_the_command_reports_from_records(tmp_path, full, capsys, refused):
+def test_the_command_reports_from_records(tmp_path, full, refused, printed):
     results.pack(full.results[:18], tmp_path / "records" / "throws" / "shipped.json")
     out = tmp_path / "out"
-    assert run_command(f"report --records {tmp_path}/records --out {out}") == 0
-    printed = capsys.readouterr().out
-    assert "realistic reference plant" in printed
-    assert "0 trainings" in printed
+    text = printed(f"report --records {tmp_path}/records --out {out}")
+    assert "realistic reference plant" in text
+    assert "0 trainings" in text
     assert (out / "report.html").stat().st_size > 50_000
     for option in ("--results", "--records"):
         refused(f"report {option} {tmp_path}/none --out {tmp_path}/other", said="no such folder")

@@ -300,9 +300,8 @@ def test_records_join_what_two_machines_did(path, tmp_path):
     assert {r.unit["weights"] for r in again} != {r.unit["weights"] for r in found}
 
 
-def test_status_and_mistakes_on_the_command_line(path, tmp_path, capsys, refused):
-    assert run_command(f"sweep status {path} --out {tmp_path}") == 1
-    out = capsys.readouterr().out
+def test_status_and_mistakes_on_the_command_line(path, tmp_path, refused, printed):
+    out = printed(f"sweep status {path} --out {tmp_path}", status=1)
     assert "state_rigid_cable-2" in out
     assert "23 units left" not in out
     assert "22 units left" in out, "4 trainings, 4 x (2 + 2) throws and 2 of the shipped policy"

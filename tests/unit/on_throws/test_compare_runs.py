@@ -8,7 +8,6 @@ import numpy as np
 from pytest import approx, raises
 
 from hil.control.recording.run_report import finish
-from tests.commands import run_command
 from tests.hil_runs import record_run, saved_policy
 from visthrow.common.errors import LogError
 from visthrow.logs.flightlog import FlightLog, FlightRecorder
@@ -78,7 +77,7 @@ def test_a_goal_to_the_side_of_another_hover_point():
     np.testing.assert_allclose(throws.landing_w, [[2.1, 0.1]], atol=1e-9)
 
 
-def test_the_command(tmp_path, capsys):
+def test_the_command(tmp_path, printed):
     folder = tmp_path / "flown"
     record_run(folder, saved_policy(tmp_path), seconds=6.0)
     finish(folder)
@@ -88,8 +87,7 @@ def test_the_command(tmp_path, capsys):
     log(landed=None).save(other / "throw-02.npz")
     out = tmp_path / "out"
     runs = ["--from", str(folder), str(other)]
-    assert run_command(f"compare --out {out} --json {tmp_path}/t.json", *runs) == 0
-    text = capsys.readouterr().out
+    text = printed(f"compare --out {out} --json {tmp_path}/t.json", *runs)
     assert "3 throws of 2 runs" in text
     assert "0.101 ± 0.106, 1.125 ± 0.029" in text, "the paper's figures beside ours"
     assert "do not say" in text

@@ -230,12 +230,11 @@ def test_a_flight_without_release_fails_and_recovers(tmp_path):
     assert bool(log["attached"].values[-1])
 
 
-def test_fly_writes_its_files(dropper, tmp_path, capsys):
+def test_fly_writes_its_files(dropper, tmp_path, printed):
     out = tmp_path / "out"
     command = f"fly --policy {dropper} --target 0.5 0.3 --seed 4 --out {out} --json {out}/r.json"
     saved = f"--save {tmp_path}/saved.npz --export {tmp_path}/flight.csv"
-    assert run_command(f"{command} {saved}") == 0
-    told = capsys.readouterr().out
+    told = printed(f"{command} {saved}")
     assert "landing at x" in told
     assert {p.name for p in out.iterdir()} == {"flight.npz", "throw.rrd", "throw.png", "r.json"}
     figures = json.loads((out / "r.json").read_text())
@@ -261,11 +260,10 @@ def test_compare_flies_the_state_and_the_vision_policy_unless_others_are_named(m
     assert asked == ["state", "vision", "vision_located"]
 
 
-def test_compare_prints_and_writes(dropper, tmp_path, capsys):
+def test_compare_prints_and_writes(dropper, tmp_path, printed):
     out = tmp_path / "out"
     command = f"compare {dropper} --targets 0.5 1.0 --throws 5 --out {out} --json {out}/c.json"
-    assert run_command(f"{command} --device cpu --seed 3") == 0
-    told = capsys.readouterr().out
+    told = printed(f"{command} --device cpu --seed 3")
     assert "`hybrid`, seed 3" in told
     assert "No vehicle was flown" in told
     rows = list(csv.DictReader((out / "compare-hybrid.csv").open()))
@@ -316,7 +314,7 @@ def test_protocol_on_the_reference_plant(dropper, monkeypatch):
     assert np.ptp(got["landing_w"][:, 0]) > 0.0
 
 
-def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
+def test_demo_without_mujoco(tmp_path, monkeypatch, printed):
     monkeypatch.setattr("visthrow.onboard.shipped.SHIPPED", tmp_path)
     for name in compare.DEFAULT_POLICIES:
         dropping_policy(name).save(tmp_path / f"{name}.npz")
@@ -325,8 +323,7 @@ def test_demo_without_mujoco(tmp_path, capsys, monkeypatch):
         "importlib.util.find_spec",
         lambda name, *parent: None if name == "mujoco" else find(name, *parent),
     )
-    assert run_command(f"demo --throws 3 --out {tmp_path}/out") == 0
-    told = capsys.readouterr().out
+    told = printed(f"demo --throws 3 --out {tmp_path}/out")
     assert "needs MuJoCo" in told
     listed = [
         line.strip() for line in told.partition("Files:")[2].splitlines() if line.startswith("  ")

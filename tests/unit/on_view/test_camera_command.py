@@ -67,28 +67,25 @@ def calibration(kind: str, folder) -> str:
     return str(path)
 
 
-def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, board, capsys, refused):
+def test_check_tells_a_lens_that_fits_from_one_that_does_not(tmp_path, board, refused, printed):
     right = tmp_path / "kalibr.yaml"
     lens_files.write_kalibr(right, LENS)
     assert run_command(f"camera calibrate {right} --out {tmp_path}/right.toml") == 0
-    assert run_command(f"camera check {tmp_path}/right.toml", *board) == 0
-    said = capsys.readouterr().out
+    said = printed(f"camera check {tmp_path}/right.toml", *board)
     assert "the configured lens fits" in said
     text = (tmp_path / "right.toml").read_text()
     (tmp_path / "wrong.toml").write_text(text.replace("fx = 96.0", "fx = 99.0"))
-    assert run_command(f"camera check {tmp_path}/wrong.toml", *board) == 1
-    assert "does NOT fit" in capsys.readouterr().out
+    assert "does NOT fit" in printed(f"camera check {tmp_path}/wrong.toml", *board, status=1)
     refused("camera check fisheye", *board, said="320 x 320 px came; expected 640 x 640")
 
 
-def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, board, capsys):
+def test_show_draws_corners_keypoints_and_a_straight_view(tmp_path, board, printed):
     lens_files.write_ros(tmp_path / "ros.yaml", LENS)
     camera, out = tmp_path / "camera.toml", tmp_path / "seen.png"
     assert run_command(f"camera calibrate {tmp_path}/ros.yaml --out {camera}") == 0
     frame = f"{board[0]}/0.png"
     command = f"camera show {camera} {frame} --straight 100 --out {out}"
-    assert run_command(command, *board[1:]) == 0
-    said = capsys.readouterr().out
+    said = printed(command, *board[1:])
     assert "4 of 4 keypoints of the goal, 4 of 4 of the payload" in said
     assert float(said.split("(blue): ")[1].split()[0]) < 0.2
     before, after = cv2.imread(frame), cv2.imread(str(out))

@@ -152,16 +152,14 @@ def test_the_command_s_status_is_returned(command):
     assert cli.main(["try"]) == 0
 
 
-def test_config_prints_what_loads_back(capsys, tmp_path):
+def test_config_prints_what_loads_back(tmp_path, printed):
     from sim.params import VehicleParams
     from visthrow import config
 
-    assert run_command(f"config vehicle paper --set body.mass=0.25 --json {tmp_path}/a.json") == 0
-    printed = config.loads(VehicleParams, capsys.readouterr().out)
-    assert printed.body.mass == 0.25
+    command = f"config vehicle paper --set body.mass=0.25 --json {tmp_path}/a.json"
+    assert config.loads(VehicleParams, printed(command)).body.mass == 0.25
     assert '"mass": 0.25' in (tmp_path / "a.json").read_text()
-    assert cli.main(["config", "vehicle"]) == 0
-    assert "paper" in capsys.readouterr().out.split()
+    assert "paper" in printed("config vehicle").split()
 
 
 @mark.parametrize(
