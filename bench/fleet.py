@@ -21,7 +21,7 @@ import numpy as np
 
 from bench import start
 from bench.report import Report, Table, finish
-from visthrow.common.arguments import add_common, add_out
+from visthrow.common.arguments import add_common, add_option
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import status
 from visthrow.paper.measurements import body
@@ -352,7 +352,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         help="begin no training that would end later",
     )
     parser.add_argument("--seed", type=int, default=0, help="of starts and noise (default: 0)")
-    add_out(parser, "out/fleet", "for tables and the rivals' policies")
+    text = "for tables and the rivals' policies (default: %(default)s)"
+    add_option(parser, "--out", shared=True, default="out/fleet", help=text)
     add_common(parser, json=False)
     return start.main(parser, run, argv)
 

@@ -24,7 +24,7 @@ from bench import start
 from bench.report import Report, Table, finish
 from bench.world_held import held_in_world
 from sim.effects.setting import Setting, generalised, specialised
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import add_option
 from visthrow.common.workers import status
 from visthrow.config.effects import catalogue
 from visthrow.task import Experiment, plant_of
@@ -275,7 +275,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit status."""
     parser = start.parser_of(__doc__)
     parser.add_argument("policies", nargs="+", help="shipped names or files")
-    add_out(parser, "out/sensitivity", "for the points")
+    folder = {"default": "out/sensitivity", "help": "for the points (default: %(default)s)"}
+    add_option(parser, "--out", shared=True, **folder)
     return start.main(parser, run, argv)
 
 

@@ -110,11 +110,6 @@ def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bo
             add_option(parser, name, shared=True)
 
 
-def add_out(parser: argparse.ArgumentParser, default: str, what: str) -> None:
-    """Add ``--out``: the folder of what a command writes."""
-    add_option(parser, "--out", shared=True, default=default, help=f"{what} (default: %(default)s)")
-
-
 def add_commands(
     parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any
 ) -> None:

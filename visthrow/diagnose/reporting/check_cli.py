@@ -4,33 +4,9 @@ import argparse
 from dataclasses import asdict
 from pathlib import Path
 
-from visthrow.common.arguments import add_out
+from visthrow.common.arguments import declared
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    parser.epilog = (
-        "examples:\n  visthrow diagnose check flight.npz                     a log of ours\n "
-        " visthrow diagnose check LOG00001.BFL                   Betaflight's blackbox, as it"
-        " comes\n  visthrow diagnose check flights/*.csv --config mine.toml    tables, with a"
-        " mapping of their columns\n\nExit status: 0 all logs ok or with warnings, 1 at least one"
-        " is bad.\n"
-    )
-    parser.add_argument("logs", metavar="LOG", nargs="+", help="files, or folders of runs")
-    parser.add_argument(
-        "--config",
-        metavar="NAME",
-        help="of configs/diagnose, or a file: how a table's columns are read",
-    )
-    parser.add_argument(
-        "--plant",
-        metavar="NAME",
-        help="of configs/train, or a file: cable and mass that the logs must have",
-    )
-    parser.add_argument("--all", action="store_true", help="print every row, fine ones too")
-    add_out(parser, "out/check", "of the pictures")
-    parser.add_argument("--no-pictures", action="store_true", help="draw none")
-    parser.add_argument("--json", metavar="FILE", help="write all rows to this file")
+add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
