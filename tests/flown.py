@@ -80,7 +80,7 @@ def fly(
             tracks["voltage"].append(sim.get("voltage"))
             gone = link.random((len(references), 1)) < lost
             arrived = command if arrived is None else np.where(gone, arrived, command)
-            sim.set_command(arrived, np.array([t >= r.release - 1e-9 for r in references]))
+            sim.set_command(arrived, [t >= r.release - 1e-9 for r in references])
         sim.step()
         ball = sim.get("payload_pos_w").copy()
         for e in np.flatnonzero(sim.get("separated")):

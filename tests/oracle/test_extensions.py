@@ -187,7 +187,7 @@ def test_flight_under_drag_and_wind():
     plant = changed(plant, release={"lag": 0.0})
     sim = HybridSim(plant, 1, extensions=EVERYTHING)
     sim.place(pos_w=np.array([[0.0, 0.0, 2.0]]), vel_w=np.array([[2.0, 1.0, 3.0]]))
-    sim.set_command(np.array([[2.0, 0.0, 0.0, 0.0]]), np.array([1]))
+    sim.set_command([[2.0, 0.0, 0.0, 0.0]], [1])
     sim.step()
     pos, vel = sim.get("payload_pos_w")[0], sim.get("payload_vel_w")[0]
 
@@ -312,7 +312,7 @@ def test_ground_effect_lifts_as_the_formula_says():
             vehicle, precision="float64", control_period=1e-3, airs=[air], extensions=GROUND
         )
         sim.place(np.array([[0.0, 0.0, height]]))
-        sim.set_command(np.array([[thrust, 0.0, 0.0, 0.0]]))
+        sim.set_command([[thrust, 0.0, 0.0, 0.0]])
         sim.step()
         rise.append(sim.get("vel_w")[0, 2] / 1e-3)
     ratio = vehicle.rotors.radius / (4 * height)
@@ -324,7 +324,7 @@ def test_asymmetric_motor_is_first_order_one_way():
     sim = bare_quadrotor(vehicle, precision="float64", step=5e-4, extensions=GROUND)
     sim.place(np.array([[0.0, 0.0, 1.0]]))
     before = sim.get("motor_speed")[0, 0]
-    sim.set_command(np.array([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]]))
+    sim.set_command([[0.5 * vehicle.body.mass * GRAVITY, 0.0, 0.0, 0.0]])
     for _ in range(3):
         sim.step()
     acting = 3 * 0.02 - vehicle.queue.delay

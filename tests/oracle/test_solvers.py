@@ -156,7 +156,7 @@ def test_other_payloads_hang_where_the_geometry_says(name):
     sim = hanging(name)
     rope, weight = sim.params.rope, GRAVITY * sim.params.total_mass
     for _ in range(25):
-        sim.set_command(np.array([[weight, 0.0, 0.0, 0.0]]))
+        sim.set_command([[weight, 0.0, 0.0, 0.0]])
         sim.step()
     assert_allclose(sim.get("pos_w"), 0.0, atol=2e-3)
     below = sim.get("pos_w")[0, 2] + rope.mount[2] - sim.get("payload_pos_w")[0, 2]
@@ -172,7 +172,7 @@ def test_two_cables_turn_as_a_bifilar_pendulum():
     solver.qpos.numpy()[0, 10:14] = math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)
     solver._placed(sim._all)
     for _ in range(100):
-        sim.set_command(np.array([[GRAVITY * sim.params.total_mass, 0.0, 0.0, 0.0]]))
+        sim.set_command([[GRAVITY * sim.params.total_mass, 0.0, 0.0, 0.0]])
         sim.step()
         quat = solver.qpos.numpy()[0, 10:14]
         angles.append(2.0 * math.atan2(quat[3], quat[0]))
@@ -194,7 +194,7 @@ def test_a_cable_pulls_or_is_slack():
     weight = GRAVITY * sim.params.total_mass
     for thrust, slack in ((1.5 * weight, False), (-0.75 * weight, True)):
         for _ in range(8):
-            sim.set_command(np.array([[thrust, 0.0, 0.0, 0.0]]))
+            sim.set_command([[thrust, 0.0, 0.0, 0.0]])
             sim.step()
         apart = norm(sim.get("pos_w") - sim.get("payload_pos_w"))
         assert (apart < reach - 0.01) if slack else apart == approx(reach, abs=3e-3)

@@ -15,7 +15,7 @@ def test_the_load_and_both_vehicles_fly_as_on_mujoco():
     for k, command in enumerate(commands(25, 2)):
         command[1, 2] *= 0.7
         for sim in sims:
-            sim.set_command(command, np.array([k == 16, k == 17]))
+            sim.set_command(command, [k == 16, k == 17])
             sim.step()
     tree, referee = sims
     assert not tree.get("attached").any()

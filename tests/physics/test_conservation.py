@@ -129,7 +129,7 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
             [scene.cable_vel_w()],
         )
         sim.place(*map(np.array, place))
-        sim.set_command(np.array([[2.0, 0.0, 0.0, 0.0]]))
+        sim.set_command([[2.0, 0.0, 0.0, 0.0]])
         for _ in range(20):
             sim.step()
         ends.append(

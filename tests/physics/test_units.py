@@ -63,7 +63,7 @@ def flown(p: PlantParams, units: Units) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     for k in range(30):
         thrust, rates = rng.uniform(1.0, 9.0), rng.uniform(-6.0, 6.0, 3)
-        sim.set_command(np.array([[thrust / force, *(rates / rate)]]), np.array([k >= 18]))
+        sim.set_command(np.array([[thrust / force, *(rates / rate)]]), [k >= 18])
         sim.step()
     sizes = {
         "pos_w": units.length,
