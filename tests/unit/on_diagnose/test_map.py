@@ -158,6 +158,7 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
     found = propose(table | {"thrust": other}, "a.csv")
     assert found.flyer["input"] == "motor_command"
+    assert found.flyer["thrust_map"][1] == approx(0.25, rel=0.02)  # four of them carry the vehicle
     assert any("The force follows 'motor_command' best" in q for q in found.questions)
 
 

@@ -299,7 +299,8 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
         )
     if length:
         proposal.questions.append(f"what does the payload weigh? {payload:.3g} kg is a guess")
-    first = 1.0 if mass else whole * physics.GRAVITY / motors / hover
+    newtons = mass is not None and name in ("command", "thrust_command")
+    first = 1.0 if newtons else whole * physics.GRAVITY / motors / hover
     power = [0.0, 0.0, first / hover] if name == "motor_speed" else [0.0, first, 0.0]
     volts = log["battery_voltage"].values if "battery_voltage" in log else [1.0]
     flyer = {
