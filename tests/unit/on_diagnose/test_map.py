@@ -158,7 +158,9 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     other = thrust[::-1] + 0.1 * np.sin(7.0 * columns["time"])
     found = propose(table | {"thrust": other}, "a.csv")
     assert found.flyer["input"] == "motor_command"
-    assert found.flyer["thrust_map"][1] == approx(0.25, rel=0.02)  # four of them carry the vehicle
+    hover = 0.01 * np.median(thrust)  # read as per cent; four of them carry the vehicle
+    lift = 4.0 * found.flyer["thrust_map"][1] * hover
+    assert lift == approx(9.81 * found.flyer["mass"], rel=0.02)
     assert any("The force follows 'motor_command' best" in q for q in found.questions)
 
 
