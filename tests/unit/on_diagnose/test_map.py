@@ -160,7 +160,7 @@ def test_the_input_that_the_force_follows_drives_the_vehicle():
     assert found.flyer["input"] == "motor_command"
     hover = 0.01 * np.median(thrust)  # read as per cent; four of them carry the vehicle
     lift = 4.0 * found.flyer["thrust_map"][1] * hover
-    assert lift == approx(9.81 * found.flyer["mass"], rel=0.02)
+    assert lift == approx(9.81 * found.flyer["mass"], rel=0.1)
     assert any("The force follows 'motor_command' best" in q for q in found.questions)
 
 
