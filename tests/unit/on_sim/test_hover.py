@@ -49,8 +49,10 @@ class LaggingPendulum:
     @property
     def seen(self) -> tuple[np.ndarray, ...]:
         """Position, attitude and velocity of the vehicles, shapes (E, 3), (E, 4) and (E, 3)."""
-        pos_w, vel_w = pm.vehicle(self.model, self.state)
-        return pos_w, self.state[:, pm.QUAT], vel_w
+        direction = self.state[:, pm.DIR]
+        pos_w = self.state[:, pm.POS] - LENGTH * direction
+        turning = np.cross(self.state[:, pm.RATE], direction)
+        return pos_w, self.state[:, pm.QUAT], self.state[:, pm.VEL] - LENGTH * turning
 
     @property
     def swing(self) -> np.ndarray:
