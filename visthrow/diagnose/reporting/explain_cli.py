@@ -79,7 +79,7 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
             [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
         )
     tested = on_others(
-        before, after, diagnosis.theta, diagnosis, refused_of(checked, test_flights.known)
+        before, after, diagnosis.expected, diagnosis, refused_of(checked, test_flights.known)
     )
     print(
         f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
