@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back
-from visthrow.logs.axes import MATRICES, is_mirror
+from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -48,7 +48,6 @@ _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 # correlation that the small forces level with the rotors reach (0.65 to 0.73 in real flights)
 _CORRELATED = 0.5
 _TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
-_COMPARED = 10_000  # samples that a payload's share of the mass is taken from
 _HEAVIEST = 0.9  # share of the mass that a payload may have
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
@@ -372,20 +371,15 @@ def _carried(
 
 def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Return the acceleration of vehicle and payload together [m/s^2]: with the payload's share of
-    the mass that makes it follow the thrust best, in whatever axes.
+    the mass that makes it follow the thrust best.
     """
-    if not np.any(relative):
-        return acc
-    rows = slice(None, None, max(1, len(acc) // _COMPARED))
-    up = matrix_of_quat(turn[rows])[:, :, 2]
+    up = matrix_of_quat(turn)[:, :, 2]
     lean = (up / np.maximum(up[:, 2:], 0.2))[:, :2]
-    moved, added = (np.einsum("kij,nj->kni", MATRICES, a[rows]) for a in (acc, relative))
-    off = moved[..., :2] - lean * (moved[..., 2:] + GRAVITY)
-    slope = added[..., :2] - lean * added[..., 2:]
-    power = np.maximum(np.sum(slope**2, axis=(1, 2)), 1e-12)
-    share = np.clip(-np.sum(off * slope, axis=(1, 2)) / power, 0.0, _HEAVIEST)
-    residual = np.sum((off + share[:, None, None] * slope) ** 2, axis=(1, 2))
-    return acc + share[np.argmin(residual)] * relative
+    off = acc[:, :2] - lean * (acc[:, 2:] + GRAVITY)
+    slope = relative[:, :2] - lean * relative[:, 2:]
+    power = max(float(np.sum(slope**2)), 1e-12)
+    share = np.clip(-float(np.sum(off * slope)) / power, 0.0, _HEAVIEST)
+    return acc + share * relative
 
 
 def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> list[Row]:
