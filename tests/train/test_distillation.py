@@ -178,23 +178,23 @@ def test_a_stop_keeps_what_was_done(whole, tmp_path, signalled):
         np.testing.assert_array_equal(value.numpy(), two.parts()[name].numpy(), err_msg=name)
 
 
-def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, capsys):
+def test_a_training_starts_from_a_distilled_policy_and_no_other(whole, tmp_path, refused):
     policy, start = Policy.load(whole / "policy.npz"), ["--from", str(whole / "policy.npz")]
     trainer = Trainer(config.load(Experiment, whole / "config.toml"), "cpu", 2)
     trainer.algorithm.take_up(policy)
     taken = trainer.algorithm.export(policy.contract, {})
     for name, value in policy.estimator.parts().items():
         assert_close(taken.estimator.parts()[name], value, rtol=0, atol=AGREES)
-    assert cli.main([*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']) == 2
-    assert "the policy is one with a memory" in capsys.readouterr().err
+    memory = [*words(tmp_path / "a"), *start, "--set", 'algorithm="ppo"']
+    refused(*memory, said="the policy is one with a memory")
     # as it was trained
     late = (
         "task.observation.latency=[0.004,0.04]",
         "task.observation.latency_jitter=0.004",
         "task.observation.response=8",
     )
-    assert cli.main([*words(tmp_path / "b"), "--from", "vision_located", *overrides(*late)]) == 2
-    assert "the policy is one without a memory" in capsys.readouterr().err
+    without = [*words(tmp_path / "b"), "--from", "vision_located", *overrides(*late)]
+    refused(*without, said="the policy is one without a memory")
 
 
 @mark.parametrize(
