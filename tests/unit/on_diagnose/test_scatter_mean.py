@@ -106,3 +106,7 @@ def test_an_effect_that_varies_about_nothing_is_not_named():
     diagnosis = search.explain(drawn(sizes, seed=5), laws=False)
     assert not diagnosis.theta
     assert jitter(diagnosis).found
+    mean = jitter(diagnosis).mean["cmd_delay"]
+    assert abs(mean - sizes.mean() * FLOOR) < 3.0 * 6.0 * FLOOR / np.sqrt(12)
+    assert mean != 0.0
+    assert diagnosis.expected == {"cmd_delay": mean}
