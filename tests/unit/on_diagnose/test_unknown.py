@@ -288,6 +288,15 @@ def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
     assert_allclose(off.score, plain.nominal.score, rtol=1e-9)
 
 
+def test_terms_leave_what_differs_among_flights_as_it_was():
+    """Else a set that holds it is no longer known once terms are offered."""
+    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    at, beside = beside_a_law(model, [3]), beside_a_law(model, [3], DRAG)
+    plain = {c for c in at.candidates if c.group != ALL}
+    assert plain
+    assert plain == {c for c in beside.candidates if c.group != ALL}
+
+
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}

@@ -67,12 +67,12 @@ def random_shares(
     """Return what flights, or days, may have for themselves, where at least two of them show it.
 
     Args:
-        effects: of the model, shape (K,).
+        effects: of the model, without terms of laws, shape (K,).
         statistics: of the flights.
         days: of each flight, by its number; none where the logs do not say.
         all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
-    flown = statistics.information.diagonal(axis1=1, axis2=2) > 0.0
+    flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
     groups = [(FLIGHT, flown)]
     if days:
         day_of = np.array([days[f] for f in statistics.flights.tolist()])
@@ -109,7 +109,7 @@ def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:
     yield from ((v, 0.0) for v in named)
     covered = {name for v in named for name in v.of}
     for e in effects:
-        if e.name not in covered and not e.switch and not isinstance(e, TermEffect):
+        if e.name not in covered and not e.switch:
             yield as_random(e), float(np.log(len(effects)))
 
 
@@ -144,7 +144,7 @@ def _events(
             flight=flight,
         )
         for j, e in enumerate(effects)
-        if priors.visible[j] and not e.switch and not isinstance(e, TermEffect)
+        if priors.visible[j] and not e.switch
         for flight in flights[flown[:, j]].tolist()
         if flown[:, j].sum() >= FEWEST_FOR_EVENT
     ]

@@ -227,6 +227,7 @@ class Linear:
             alone = additions(*self.total(subset), self.priors, active)[columns] - price
             both = pair_additions(*self.total(subset), self.priors, active)
             worth = both[np.ix_(columns, columns)] - np.add.outer(price, price)
+            alone = np.maximum(alone, -1e9)  # of a name that cannot be there, as well as none
             synergy = worth - np.maximum.outer(alone, alone)
             synergy[np.tril_indices(len(columns))] = -np.inf
             for place in np.argsort(-synergy, axis=None)[:RANDOM_TRIED].tolist():

@@ -99,9 +99,9 @@ class Selector:
         self._offer()
 
     def _offer(self) -> None:
-        effects, priors = self.problem.effects, self.problem.priors
-        self.candidates = shared(effects) + random_shares(
-            effects, priors, self.nominal.plain, self.problem.days, self._every
+        problem = self.problem
+        self.candidates = shared(problem.effects) + random_shares(
+            problem.model.effects, problem.priors, self.nominal.plain, problem.days, self._every
         )
         self._linear.clear()
 
@@ -154,9 +154,11 @@ class Selector:
 
         Before the narrower forms were tried, the bend of an effect that all flights share looks
         like a difference among them."""
-        widened, self._every = self._every, True
+        if self._every:
+            return False
+        self._every = True
         self._offer()
-        return not widened
+        return True
 
     def _moved(self) -> bool:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
