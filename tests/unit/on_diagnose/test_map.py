@@ -25,6 +25,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
+from visthrow.logs.readers.table import logs_of
 from visthrow.logs.unit_names import UNITS
 
 REAL = DATA / "real"
@@ -120,6 +121,28 @@ def test_brackets_say_units_and_the_lean_says_the_order_of_a_quaternion():
     assert units == {"pos_w": "m", "vel_w": "m/s", "rate_b": "rad/s"}
     assert by["quat_wb"].order == "wxyz"
     assert "by gravity" in found.why["quat_wb"]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
+    rng = np.random.default_rng([2611, seed])
+    columns = flight(15.0, seed=seed, scale=float(rng.choice([0.1, 0.5, 1.0])))
+    flip = np.array([1.0, -1.0, -1.0]) if rng.random() < 0.5 else np.ones(3)
+    quat = columns["quat_wb"] * [*flip, 1.0]
+    first = ["q0", "q1", "q2", "q3"], quat[:, [3, 0, 1, 2]]
+    names, attitude = first if rng.random() < 0.5 else (["qx", "qy", "qz", "qw"], quat)
+    table = {"time": columns["time"] / UNITS[rng.choice(["s", "ms", "us"])][1]}
+    table |= dict(zip(names, attitude.T))
+    drawn = {"pos_w": ("m", "mm", "cm"), "rate_b": ("rad/s", "deg/s"), "acc_b": ("m/s^2", "g")}
+    for stem, (name, units) in zip(("p", "gyro", "acc"), drawn.items()):
+        table |= named(stem, columns[name] * flip / UNITS[rng.choice(units)][1])
+    found = propose(table, "a.csv")
+    assert not found.questions
+    (log,) = logs_of(table, found.mapping, "a.csv")
+    for name in drawn:
+        assert log[name].values == approx(columns[name], rel=1e-6, abs=1e-6)
+    assert np.abs(np.sum(log["quat_wb"].values * columns["quat_wb"], axis=1)) == approx(1.0)
+    assert np.ptp(log["pos_w"].time) == approx(np.ptp(columns["time"]))
 
 
 @pytest.mark.parametrize("angles", [False, True])

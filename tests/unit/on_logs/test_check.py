@@ -246,6 +246,24 @@ def test_a_hover_and_a_force_that_no_model_has_refuse_no_log():
     assert not faults(log_of(columns))
 
 
+@mark.parametrize("seed", range(6))
+def test_a_good_flight_of_any_shape_is_not_refused(seed):
+    """Other rates, sizes, noise, origins and stamps, seldom samples and gaps."""
+    rng = default_rng([2611, seed])
+    rate = float(rng.choice([20.0, 50.0, 120.0]))
+    columns = flight(12.0, rate, seed=seed, scale=float(rng.choice([0.05, 0.3, 1.5])))
+    columns["pos_w"] += rng.uniform(-50.0, 50.0, 3)
+    for name, size in (("pos_w", 2e-3), ("rate_b", 0.1), ("acc_b", 1.0)):
+        columns[name] += rng.uniform() * rng.normal(0.0, size, columns[name].shape)
+    columns["time"] += float(rng.choice([-30.0, 1.7e9]))
+    kept = {}
+    for name, channel in log_of(columns).channels.items():
+        elapsed = channel.time - columns["time"][0]
+        every = np.arange(len(elapsed)) % rng.integers(1, 4) == 0
+        kept[name] = channel.only(every & ((elapsed < 5.0) | (elapsed > 5.5)))
+    assert not contradictions(check([FlightLog(kept)]), VELOCITIES)
+
+
 def test_a_late_channel_that_no_model_reads_refuses_no_log():
     columns = flight(20.0)
     late = Channel(columns["time"] + 0.06, columns.pop("vel_w"), "m/s", "world")
