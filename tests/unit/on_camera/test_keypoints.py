@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from pytest import approx, mark
+from pytest import approx, mark, raises
 
 from camera.fisheye import Fisheye
 from camera.keypoints import (
@@ -222,6 +222,8 @@ def test_what_invalid_points_read(reads):
         corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64)
     )
     assert points.abs().max() <= 1.0 + 1e-12
+    with raises(ValueError, match="expected one of 'edge', 'zero'"):
+        KeypointNoiseParams(invalid_reads="nought")
 
 
 def test_out_of_view_tells_nothing_but_that():
