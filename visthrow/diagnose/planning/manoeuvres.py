@@ -99,9 +99,10 @@ class Manoeuvre:
         moving = (time > SETTLE) & (time < self.seconds - SETTLE)
         rates = np.where(moving[:, None], self.rates(inner), 0.0)
         thrust = np.where(moving, self.thrust(inner), 1.0)
-        return Reference(
-            time, self.path(inner), self.yaw(inner), rates, thrust, time - SETTLE >= self.release
-        )
+        path = self.path(inner)
+        yaw = self.yaw(inner)
+        release = time - SETTLE >= self.release
+        return Reference(time, path, yaw, rates, thrust, release)
 
 
 def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
@@ -175,7 +176,14 @@ def _along(shape: Any) -> Callable[[np.ndarray], np.ndarray]:
     if isinstance(shape, str):
         return SHAPES[shape]
     start, *rises = shape if isinstance(shape, list) else [shape]
-    return lambda t: start + sum((size * rise(t, *span) for size, *span in rises), 0.0 * t)
+
+    def along(t: np.ndarray) -> np.ndarray:
+        total = start + 0.0 * t
+        for size, *span in rises:
+            total = total + size * rise(t, *span)
+        return total
+
+    return along
 
 
 def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
