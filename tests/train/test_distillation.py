@@ -6,7 +6,7 @@ import signal
 
 import numpy as np
 import torch
-from pytest import approx, fixture, mark, param
+from pytest import approx, fixture, mark
 from torch.testing import assert_close
 
 from tests.commands import set_words
@@ -81,10 +81,22 @@ def trained(iterations, sign=1.0, *extra, seed=1):
     return trainer, losses
 
 
-@mark.parametrize("seed", [0, *(param(seed, marks=mark.slow) for seed in range(1, 5))])
-def test_every_seed_learns(seed):
-    _, losses = trained(6, seed=seed)
-    assert losses[-1] < 0.5 * losses[0]
+@mark.parametrize("seed", range(5))
+def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
+    """At this rate the loss comes to 4.3 to 5.4 in four iterations; with Adam to 10.6 to 13.1."""
+    sets = (
+        "ppo.environments=32",
+        "distillation.iterations=14",
+        "distillation.horizon=40",
+        "distillation.hidden=64",
+        "distillation.memory=32",
+        "distillation.epochs=2",
+        "distillation.minibatches=2",
+        "distillation.learning_rate=0.04",
+    )
+    experiment = load_experiment("vision_ideal", [*SMALL[:1], *sets])
+    trainer = Trainer(experiment, "cpu", seed)
+    assert [trainer.step()["value"] for _ in range(4)][-1] < 7.5
 
 
 @mark.slow

@@ -58,8 +58,8 @@ def test_its_policy_is_one_like_any_other(whole):
     trainer.load(whole / CHECKPOINT)
     obs = torch.randn(64, trainer.algorithm.env.layout.dimension)
     with torch.inference_mode():
-        normalized = trainer.algorithm.network.obs_normalizer(obs)
-        action = trainer.algorithm.network.mlp(normalized)
+        network = trainer.algorithm.average.module
+        action = network.mlp(network.obs_normalizer(obs))
     assert (action - policy.act(obs)).abs().max() < 1e-6
 
 

@@ -28,7 +28,7 @@ SAME = {"rtol": 2e-4, "atol": 2e-6}
 gradient's own size.
 """
 
-REACHED = 0.25
+REACHED = 0.075
 """Distance that the small task is brought under; untrained actors are 0.85 off."""
 
 
@@ -185,7 +185,7 @@ def test_a_rollout_keeps_the_memory_that_a_captured_update_reads():
 def test_a_state_that_was_saved_goes_on_the_same():
     first, second = build(params(), own=True), build(params(), own=True)
     iterate(first, 0)
-    second.load(copy.deepcopy(first.save()), None, True)
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
     assert second.learning_rate == first.learning_rate != params().learning_rate
     assert iterate(first, 1) == iterate(second, 1)
     for a, b in zip(first._parameters, second._parameters):
@@ -222,32 +222,39 @@ class Reach:
         return self.draw(), reward, torch.ones(self.num_envs), {}
 
 
-def reached(seed: int, iterations: int = 24) -> tuple[float, list[float]]:
-    """Mean distance of the trained actor's actions from what is seen, and each update's target of
-    the divergence.
+def reached(seed: int, *changes: str) -> tuple[list[float], list[float]]:
+    """Mean distances of the trained actor's actions and of the exported ones from what is seen, and
+    each update's target of the divergence.
     """
     torch.manual_seed(seed)
-    changes = ("environments=64", "steps=8", "hidden=[32,32]", "settled=0.5")
-    words = [f"ppo.{change}" for change in changes]
-    experiment = load_experiment("state", words)
+    changes = ("environments=64", "steps=8", "hidden=[32,32]", "muon=true", *changes)
+    experiment = load_experiment("state", [f"ppo.{change}" for change in changes])
     training = PPOTraining(experiment, "cpu", seed, Ranks("cpu"), build=Reach)
     targets = []
-    for i in range(iterations):
-        training.collect(i / iterations)
-        training.learn(i / iterations)
+    for i in range(24):
+        training.collect(i / 24)
+        training.learn(i / 24)
         targets.append(float(training.alg.target_kl))
     seen = training.env.draw()
     with torch.inference_mode():
-        return float((training.alg.actor(seen) - seen["actor"]).norm(dim=-1).mean()), targets
+        networks = (training.network, training.average.module)
+        off = [float((n(seen) - seen["actor"]).norm(dim=-1).mean()) for n in networks]
+    return off, targets
 
 
-@mark.parametrize("seed", range(3))
-def test_every_seed_learns_with_ever_smaller_steps(seed):
-    distance, targets = reached(seed)
-    assert distance < REACHED
+def test_steps_become_ever_smaller():
+    (distance, _), targets = reached(0, "settled=0.5")
+    assert distance < 0.25
     assert targets[0] == approx(0.015)
     assert targets[:12] == sorted(set(targets[:12]), reverse=True)
     assert targets[12:] == approx([0.003] * 12)
+
+
+@mark.parametrize("seed", range(5))
+def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
+    """At this rate the last weights themselves are 0.08 to 0.17 off."""
+    (_, distance), _ = reached(seed, 'schedule="fixed"', "learning_rate=0.01")
+    assert distance < REACHED
 
 
 @mark.gpu

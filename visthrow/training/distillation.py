@@ -24,6 +24,7 @@ from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import DistillationParams, Experiment, contract_of
 from visthrow.training.env import ThrowEnv
+from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.network import MuonAdam, averaged, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
 
@@ -93,15 +94,17 @@ class EstimatorNetwork(nn.Module):
         return F.pad(obs, (0, 1))[..., self.kept] + self.output(x) * self.learnt
 
 
-class Distillation:
-    """Distillation of a state policy; see :class:`visthrow.training.trainer.Algorithm`.
+class Distillation(Algorithm):
+    """Distillation of a state policy.
 
     Attributes:
         teacher: the state policy. network: what is fitted.
     """
 
+    parts = ("network", "average", "optimizer")
+
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        self.cfg = experiment
+        self.experiment = experiment
         self.p = experiment.distillation
         observation = experiment.task.observation
         if experiment.task.target.moves or observation.layout != "vision":
@@ -186,6 +189,7 @@ class Distillation:
 
     def collect(self, done: float) -> None:
         self.env.clear_totals()
+        self._refresh()
         self.rollout()
 
     def learn(self, done: float) -> dict[str, float]:
@@ -215,14 +219,13 @@ class Distillation:
                 ).detach()  # beyond the limits only the way back counts
                 acted = (wrong * action).sum(-1) if self.p.action_weight else 0.0
                 loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
-                self.optimizer.zero_grad(set_to_none=True)
+                self.network.zero_grad()
                 loss.backward()
                 self._ranks.average(self.network.parameters())
                 nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
                 self.optimizer.step()
                 self.average.update_parameters(self.network)
                 total += (alive * off).sum().detach() / alive.sum()
-        self._refresh()
         return {"value": float(total) / (self.p.epochs * self.p.minibatches)}
 
     def _refresh(self) -> None:
@@ -257,18 +260,6 @@ class Distillation:
         n.output.load_state_dict({"weight": e.output_weight, "bias": e.output_bias})
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
         self.average.module.load_state_dict(n.state_dict())
-        self._refresh()
-
-    def state_dict(self) -> dict:
-        return {
-            name: getattr(self, name).state_dict()
-            for name in ("network", "average", "optimizer", "env")
-        }
-
-    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        for name in ("network", "average", "optimizer", *["env"] * own_throws):
-            getattr(self, name).load_state_dict(saved[name])
-        self._refresh()
 
 
 def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,6 @@ import io
 import math
 import time
 from pathlib import Path
-from typing import Protocol
 
 import torch
 
@@ -20,7 +19,7 @@ from visthrow.task import Experiment, contract_of
 from visthrow.task.measurement import TARGETS, Throws
 from visthrow.training import protocol
 from visthrow.training.compute_device import rounded_products
-from visthrow.training.env import ThrowEnv
+from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ranks import Ranks
 
 CHECKPOINT = "checkpoint.pt"
@@ -42,49 +41,6 @@ TASK = ("observation", "action", "control_period")
 """Parts of a policy's contract that its network cannot do without; plant, camera and release may
 differ from its training's.
 """
-
-
-class Algorithm(Protocol):
-    """A training algorithm, driven an iteration at a time."""
-
-    env: ThrowEnv  # that it learns in
-    iterations: int  # of a whole training
-    samples: int  # environment steps an iteration, over all ranks
-
-    def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        """Build environment, of this seed, and networks; torch's own generators are the caller's to
-        seed.
-
-        Raises ConfigError: what this algorithm cannot train.
-        """
-
-    def collect(self, done: float) -> None:
-        """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for
-        schedules.
-        """
-
-    def learn(self, done: float) -> dict[str, float]:
-        """Learn from the last batch; returns figures for the log, of
-        :data:`visthrow.training.progress.COLUMNS` those that there are.
-
-        Always there are the finished episodes' :meth:`ThrowEnv.episode_means`.
-        """
-
-    def export(self, contract: dict, made_by: dict) -> Policy:
-        """Return the policy as a file's content."""
-
-    def take_up(self, policy: Policy) -> None:
-        """Start from a policy that :func:`fitted` found to fit: its weights, and its normaliser,
-        which hardly moves from there.
-        """
-
-    def state_dict(self) -> dict:
-        """Tensors and numbers that the next iteration depends on, besides torch's generators."""
-
-    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        """Take up a state of :meth:`state_dict`, bit for bit; without ``own_throws`` episodes start
-        anew.
-        """
 
 
 def coarsen(experiment: Experiment) -> Experiment:

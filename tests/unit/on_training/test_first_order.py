@@ -6,7 +6,7 @@ import itertools
 from types import SimpleNamespace
 
 import torch
-from pytest import approx, mark, param
+from pytest import approx, mark
 from torch.testing import assert_close
 
 from sim.params import GRAVITY
@@ -34,9 +34,9 @@ LEAST_COSINE, MOST_BIAS = 0.97, 0.15
 """Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
 rates) lets them differ.
 """
-LEARNT = 0.5
-"""Landing error that the small task is brought under [m]; goals lie within 1 m, dropped payloads
-0.65 m off on average.
+LEARNT = 0.27
+"""Landing error that the small task is brought under [m]: five seeds end at 0.09 to 0.18, with Adam
+in place of Muon at 0.37 to 0.64.
 """
 
 ALIKE = 0.006
@@ -81,7 +81,7 @@ def advance(fo, true, k, x, response, commands):
     """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the
     decay.
     """
-    dt, pl = fo.cfg.sim.control_period, fo.flights
+    dt, pl = fo.experiment.sim.control_period, fo.flights
     M, m = pl.mass[:, None], pl.load_mass[:, None]
     response_of, force, tension = (fo.surrogate[name] for name in ("response", "force", "tension"))
     y = response_of[0] * response[k] + (response_of[1] * response[k - 1] if k else 0.0)
@@ -132,7 +132,7 @@ def reference(fo, by):
     extra = torch.zeros_like(b.layers.action, requires_grad=True)
     rots, late = (
         ob.rotation_from_quat(true.quat),
-        (b.env.delay.age / fo.cfg.sim.control_period)[:, None],
+        (b.env.delay.age / fo.experiment.sim.control_period)[:, None],
     )
     x = {
         name: getattr(true, name)[0].clone()
@@ -160,7 +160,7 @@ def reference(fo, by):
         previous = at(act.clip_action(b.layers.action[k]), action)
         throttle = (0.5 * (b.layers.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
         scale = torch.cat(
-            [fo.cfg.task.action.max_thrust * throttle, fo.env.max_rate.expand(24, -1)], -1
+            [fo.experiment.task.action.max_thrust * throttle, fo.env.max_rate.expand(24, -1)], -1
         )
         commands.append(action[:, :4] * scale)
         x = advance(fo, true, k, x, responses, commands)
@@ -251,7 +251,8 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     time = (
         up
         + (
-            up.square() + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.cfg.release.landing_height)
+            up.square()
+            + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.experiment.release.landing_height)
         ).sqrt()
     ) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
@@ -293,6 +294,14 @@ def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
     assert abs(fine.landing_w.mean(0) - found.landing_w.mean(0)).max() < ALIKE
 
 
+@mark.parametrize("vehicle", ["paper", "x500"])
+def test_a_steady_thrust_of_the_surrogate_is_the_commanded_one(vehicle):
+    """Fitted to commands that saturate its motors, an X500's thrust followed them by a fifth."""
+    changes = (f"vehicle=vehicle/{vehicle}.toml", "first_order.horizon=40")
+    response = first_order("state", *changes).surrogate["response"][:, 0]
+    assert float(response[2:].sum() / (1.0 - response[:2].sum())) == approx(1.0, abs=0.2)
+
+
 def small_task():
     """A gentle task that a small network makes headway in within seconds: one start, near goals, no
     early release.
@@ -304,7 +313,7 @@ def small_task():
     words += [f"task.start.{name}=0" for name in ("mass", "cable_angle_deg", "cable_rate_deg")]
     words += [
         "task.start.goal_radius=1.0",
-        "ppo.environments=32",
+        "ppo.environments=16",
         "ppo.hidden=[32,32]",
         "ppo.minibatches=1",
     ]
@@ -313,7 +322,7 @@ def small_task():
         for word in (
             "horizon=40",
             "iterations=100",
-            "learning_rate=4e-3",
+            "learning_rate=3e-2",
             "initial_release=-0.5",
             "final_width=0.1",
             "first_release=20",
@@ -325,10 +334,10 @@ def small_task():
     return load_experiment("state", ['algorithm="first_order"', *words])
 
 
-@mark.parametrize("seed", [0, *(param(seed, marks=mark.slow) for seed in range(1, 5))])
-def test_every_seed_learns(seed):
-    """Of the last five of 35 iterations nearly all flights release, and land near."""
+@mark.parametrize("seed", range(5))
+def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
+    """Of the last five of 36 iterations nearly all flights release, and land near."""
     trainer = Trainer(small_task(), "cpu", seed)
-    figures = [trainer.step() for _ in range(35)][-5:]
+    figures = [trainer.step() for _ in range(36)][-5:]
     assert sum(row["released"] for row in figures) / 5 > 0.9
     assert sum(row["landing_error"] for row in figures) / 5 < LEARNT

@@ -21,7 +21,8 @@ from visthrow.training import rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, step
 from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit
-from visthrow.training.ppo.network import MuonAdam, Network, cosine_rate
+from visthrow.training.ppo.algorithm import Algorithm
+from visthrow.training.ppo.network import MuonAdam, Network, averaged, cosine_rate
 from visthrow.training.ranks import Ranks
 
 # Reach of the barriers
@@ -37,6 +38,8 @@ is noise where throws are good.
 OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
 NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
 
+AVERAGED = 10  # gradients that the exported weights are a mean of, at most
+
 
 def _require_supported(experiment: Experiment) -> None:
     """Raise ConfigError for a task that flights without release cannot be trained on."""
@@ -51,13 +54,13 @@ def _require_supported(experiment: Experiment) -> None:
         )
 
 
-class FirstOrder:
-    """First-order training by a surrogate that is fitted to the environment's plants;
-    :class:`visthrow.training.trainer.Algorithm`.
-    """
+class FirstOrder(Algorithm):
+    """First-order training by a surrogate that is fitted to the environment's plants."""
+
+    parts = ("network", "average", "optimizer")
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
-        self.cfg = experiment
+        self.experiment = experiment
         self.p = experiment.first_order
         self._ranks = ranks
         p = experiment.ppo
@@ -86,14 +89,18 @@ class FirstOrder:
         self.network = Network(
             env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape
         ).to(device)
-        with torch.no_grad():  # random commands give every observation a spread to start from
-            self.surrogate = fit(env, self.network)
+        self.flights = FlightBatch(env, self.p.horizon)
+        with torch.no_grad():
+            self.surrogate = fit(self.flights)
+            # random commands give every observation a spread to start from
+            self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
             last = self.network.mlp[-1]
             last.weight.mul_(0.1)  # hover with the latch at rest, whatever is seen
             last.bias.copy_(env.start_action)
             last.bias[act.COMMANDS] = self.p.initial_release
         ranks.share(self.network)
-        self.flights = FlightBatch(env, self.p.horizon)
+        self.average = averaged(self.network, AVERAGED)
+        self._requests = torch.zeros_like(self.flights.steps)
         self.layers = Layers(self.network, self.flights.obs)
         self._launches = self._recorded()
         self._adapting = False
@@ -128,31 +135,31 @@ class FirstOrder:
 
     @torch.no_grad()
     def _fly(self) -> None:
-        """Fly one batch without release, on a CPU each flight until nothing that follows has a
+        """Fly one batch without release."""
+        self.flights.fly(self._decide)
+
+    def _decide(self, k: int, obs: Tensor) -> Tensor | None:
+        """Return the policy's actions, on a CPU of each flight until nothing that follows has a
         derivative: its latch asked twice.
         """
+        if k == 0:
+            self._requests.zero_()
         stops = self._latched == 1.0 and self.env.device == "cpu"
-        requests = torch.zeros_like(self.flights.steps)
-
-        def decide(k: int, obs: Tensor) -> Tensor | None:
-            before = k - (self.lag + NODES[-1] + 1)  # all that a release there depends on is known
-            if stops and before >= self._first:
-                requests.add_(
-                    self.layers.action[before, :, act.COMMANDS] > self.cfg.release.threshold
-                )
-                torch.lt(requests, 2, out=self.flights.flying)
-            if not stops or self.flights.flying.any():
-                return self.layers.forward(k, obs, self.flights.flying)
-            return None
-
-        self.flights.fly(decide)
+        before = k - (self.lag + NODES[-1] + 1)  # all that a release there depends on is known
+        if stops and before >= self._first:
+            asked = self.layers.action[before, :, act.COMMANDS] > self.experiment.release.threshold
+            self._requests.add_(asked)
+            torch.lt(self._requests, 2, out=self.flights.flying)
+        if not stops or self.flights.flying.any():
+            return self.layers.forward(k, obs, self.flights.flying)
+        return None
 
     def _rewards_at_release(self, x: SimpleNamespace, count: int) -> tuple[Tensor, Tensor, Tensor]:
         """Reward, landing error [m] and time to impact [s] of a release at each of the first steps,
         shape (count, E).
         """
-        p = self.cfg.task.reward
-        release = self.cfg.release
+        p = self.experiment.task.reward
+        release = self.experiment.release
         flights = self.flights
         up = x.load_vel[..., 2]
         fall = fall_time(x.load_pos[..., 2] - release.landing_height, up, floor=1e-6)
@@ -180,7 +187,7 @@ class FirstOrder:
 
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
-        task = self.cfg.task
+        task = self.experiment.task
         env = self.env
         p = task.reward
         bounds = task.bounds
@@ -200,7 +207,7 @@ class FirstOrder:
             height - bounds.altitude[0] - ALTITUDE,
             bounds.altitude[1] - ALTITUDE - height,
             height - load - ABOVE,
-            load - self.cfg.release.landing_height - GROUND,
+            load - self.experiment.release.landing_height - GROUND,
             bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
             upright - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
         ]
@@ -209,20 +216,20 @@ class FirstOrder:
         return (
             moving
             + acting.view_as(moving)
-            + rewards.carry_time(p, self.cfg.sim.control_period)
+            + rewards.carry_time(p, self.experiment.sim.control_period)
             - barrier
         )
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
-        p = self.cfg.task.reward
+        p = self.experiment.task.reward
         steps = self.flights.steps
         T = self.flights.last
         lag = self.lag
         k = torch.arange(T, device=steps.device)[:, None]
         K = T - lag - 1  # the cubic looks a step past the separation
         reward, error, fall = self._rewards_at_release(x, K)
-        latch_input = x.action[:K, :, act.COMMANDS] - self.cfg.release.threshold
+        latch_input = x.action[:K, :, act.COMMANDS] - self.experiment.release.threshold
         smooth = torch.sigmoid(latch_input / self._width)
         cut = k[:K] + lag + 2 > steps
         # the slope stays that of the smooth one
@@ -240,7 +247,9 @@ class FirstOrder:
         )
         done = (chance * ~cut).detach()
         error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        duration = (k[:K] + 1) * self.cfg.sim.control_period + self.cfg.release.lag + fall
+        duration = (
+            (k[:K] + 1) * self.experiment.sim.control_period + self.experiment.release.lag + fall
+        )
         share = done / done.sum().clamp(min=1e-6)
         figures = {
             "landing_error": (share * error).sum(),
@@ -272,12 +281,12 @@ class FirstOrder:
         env = self.env
         flights = self.flights
         layers = self.layers
-        action = self.cfg.task.action
+        action = self.experiment.task.action
         p = BackwardParams()
         p.max_thrust = action.max_thrust
         p.max_rate = wp.vec3(*action.max_rate)
         p.history = env.layout.history
-        p.period = self.cfg.sim.control_period
+        p.period = self.experiment.sim.control_period
         p.decay = self.p.decay
         plants = {
             "mass": flights.mass,
@@ -343,30 +352,24 @@ class FirstOrder:
         figures["gradient_norm"] = torch.nn.utils.clip_grad_norm_(parameters, p.max_grad_norm)
         self.optimizer.step()
         self.network.update_normalization({"actor": self.flights.obs[self.flights.flown()]})
+        self.average.update_parameters(self.network)
         return {name: float(value) for name, value in figures.items()} | {
             "learning_rate": rate,
             "episodes": float(self.env.num_envs),
         }
 
-    def export(self, contract: dict, made_by: dict) -> Policy:
-        return Policy.from_actor_state(
-            self.network.state_dict(), self.cfg.ppo.activation, contract, made_by
-        )
-
     def take_up(self, policy: Policy) -> None:
         """Start from a policy of the same layers: it releases as it has learnt to, and the rate
         starts at that of adaptation.
         """
-        self.network.take_up(policy)
+        super().take_up(policy)
         self._adapting = True
 
     def state_dict(self) -> dict:
-        parts = {name: getattr(self, name).state_dict() for name in ("network", "optimizer", "env")}
-        return parts | {"adapting": self._adapting, "surrogate": self.surrogate}
+        return super().state_dict() | {"adapting": self._adapting, "surrogate": self.surrogate}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
+        super().load_state_dict(saved, own_throws)
         self._adapting = saved["adapting"]
-        for name in ("network", "optimizer", *["env"] * own_throws):
-            getattr(self, name).load_state_dict(saved[name])
         for name, value in saved["surrogate"].items():
             self.surrogate[name].copy_(value)

@@ -30,9 +30,10 @@ from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
 from visthrow.training import terminations
 from visthrow.training.env import ThrowEnv
-from visthrow.training.ppo.network import Network
 
-EXCITED = (0.35, 0.5, 0.5, 0.5, 0.0)  # spread of the fit's random actions about hover
+# spread of random actions about hover; three times as much saturates the motors of a heavy vehicle,
+# and the fitted thrust follows its command by a fifth
+EXCITED = (0.1, 0.15, 0.15, 0.15, 0.0)
 RETAINED = 0.7  # share of a random action that the next keeps
 FITTED = 8000  # steps of flight that the fit rests on
 TAUT = 0.1  # pull on the payload in its weights above which the rope counts as taut
@@ -160,27 +161,26 @@ class FlightBatch:
         self.steps.clamp_(max=(~ends).view(len(self.obs), -1).int().cumprod(0).sum(0))
 
 
-def fit(env: ThrowEnv, network: Network, steps: int = 40) -> dict[str, Tensor]:
-    """Fit to random flights, whose observations the network's normaliser is shown:
+def fit(flights: FlightBatch) -> dict[str, Tensor]:
+    """Fit to random flights:
 
     ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), ``force``, kappa and drag [N s/m], shape
     (4,), and ``tension``, a and b.
     """
+    env = flights.env
     period = env.cfg.sim.control_period
     lags = max(queue_depth(v.queue.delay, period) for v in env.sim.vehicles)
-    flights = FlightBatch(env, steps)
     parts = []
-    spread = torch.tensor(EXCITED, device=env.device)
     hover = env.previous_action.clone()
+    spread = hover.new_tensor(EXCITED)
     swing = torch.randn_like(hover) * spread
 
     def act(k: int, obs: Tensor) -> Tensor:
         swing.mul_(RETAINED).add_((1.0 - RETAINED**2) ** 0.5 * spread * torch.randn_like(swing))
         return hover + swing
 
-    for _ in range(FITTED // (env.num_envs * steps) + 1):
+    for _ in range(FITTED // flights.obs[..., 0].numel() + 1):
         flights.fly(act)
-        network.update_normalization({"actor": flights.obs[flights.flown()]})
         parts.append(_regressors(flights, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]

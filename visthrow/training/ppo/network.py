@@ -117,11 +117,6 @@ class MuonAdam(torch.optim.Adam):
         rule = {"weight_decay": 0.0, "adjust_lr_fn": "match_rms_adamw"}
         self._muon = torch.optim.Muon(self._matrices, lr=1.0, **rule)
 
-    def zero_grad(self, set_to_none: bool = True) -> None:
-        """Drop the gradients of both."""
-        super().zero_grad(set_to_none)
-        self._muon.zero_grad(set_to_none)
-
     @torch.no_grad()
     def step(self, closure: None = None) -> None:
         """Take a step."""

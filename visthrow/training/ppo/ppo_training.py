@@ -9,9 +9,9 @@ from rsl_rl.algorithms import PPO
 
 from sim.torch_bridge import ReplayedGraph
 from visthrow.common.errors import ConfigError
-from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.env import ThrowEnv
+from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.network import CapturableGaussian, Network, averaged
 from visthrow.training.ppo.update import CapturedPPO
 from visthrow.training.ranks import Ranks
@@ -59,10 +59,10 @@ def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
     }
 
 
-class PPOTraining:
-    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``; see
-    :class:`visthrow.training.trainer.Algorithm`.
-    """
+class PPOTraining(Algorithm):
+    """PPO on :class:`ThrowEnv` by rsl_rl's algorithm object, ``alg``."""
+
+    parts = ("alg", "average")
 
     def __init__(
         self, experiment: Experiment, device: str, seed: int, ranks: Ranks, build: Any = ThrowEnv
@@ -85,7 +85,8 @@ class PPOTraining:
             )
         self.alg.train_mode()
         ranks.share(self.alg.actor, self.alg.critic)
-        self.average = averaged(self.alg.actor, AVERAGED)
+        self.network = self.alg.actor
+        self.average = averaged(self.network, AVERAGED)
         self._obs = self.env.get_observations()
         # a solver whose work cannot be captured is launched
         capturable = device.startswith("cuda") and self.env.sim.capturable
@@ -113,7 +114,7 @@ class PPOTraining:
         self.alg.desired_kl = (1.0 - settled) * p.desired_kl + settled * p.final_kl
         self._warm_up(round(done * p.iterations))
         figures = self.alg.update()
-        self.average.update_parameters(self.alg.actor)
+        self.average.update_parameters(self.network)
         return {**figures, **self.env.episode_means(), "learning_rate": self.alg.learning_rate}
 
     def _warm_up(self, iteration: int) -> None:
@@ -125,27 +126,7 @@ class PPOTraining:
             self.alg.set_rate(WARM_UP_RATE if iteration == 0 else self.experiment.ppo.learning_rate)
         self.alg.actor_learns.fill_(float(iteration >= first))
 
-    def export(self, contract: dict, made_by: dict) -> Policy:
-        return Policy.from_actor_state(
-            self.average.module.state_dict(), self.experiment.ppo.activation, contract, made_by
-        )
-
-    def take_up(self, policy: Policy) -> None:
-        for actor in (self.alg.actor, self.average.module):
-            actor.take_up(policy)
-
-    def state_dict(self) -> dict:
-        return {
-            "networks": self.alg.save(),
-            "average": self.average.state_dict(),
-            "env": self.env.state_dict(),
-            "obs": {k: v.clone() for k, v in self._obs.items()},
-        }
-
-    def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
-        self.alg.load(saved["networks"], None, True)
-        self.average.load_state_dict(saved["average"])
-        if own_throws:
-            self.env.load_state_dict(saved["env"])
-            for key, value in saved["obs"].items():
-                self._obs[key].copy_(value)
+    def load_state_dict(self, saved: dict[str, Any], own_throws: bool = True) -> None:
+        super().load_state_dict(saved, own_throws)
+        for key, value in self.env.get_observations().items():
+            self._obs[key].copy_(value)

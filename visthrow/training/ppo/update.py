@@ -113,14 +113,15 @@ class CapturedPPO(PPO):
         rate = torch.where(small, faster, self.rate)
         self.rate.copy_(torch.where(divergence > 2.0 * self.target_kl, slower, rate))
 
-    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take up a state of :meth:`save`; the rate keeps its place on the device, graphs are
+    state_dict = PPO.save
+
+    def load_state_dict(self, saved: dict) -> None:
+        """Take up a state of :meth:`state_dict`; the rate keeps its place on the device, graphs are
         captured anew.
         """
-        result = super().load(loaded_dict, load_cfg, strict)
+        self.load(saved, None, True)
         self.set_rate(float(self.learning_rate))
         self._capture()
-        return result
 
     def set_rate(self, rate: float) -> None:
         """Go on with this learning rate."""
