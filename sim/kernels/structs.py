@@ -175,7 +175,9 @@ def kinds_of(vehicle: P.VehicleParams) -> tuple[str, str, str, str]:
 
 
 EXTENSIONS = {
+    "ground_effect": "ground_effect",  # thrust near the ground
     "payload_drag": "payload_drag",  # air drag of the payload
+    "mount_damping": "mount_damping",  # friction of the rope's mount
     "swing_damping": "swing_damping",  # friction across the rope
     "downwash": "downwash",  # the rotors' jet on the payload
     "payload_spin": "payload_side payload_lift",  # side force and lift of a payload in flight

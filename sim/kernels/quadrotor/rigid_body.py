@@ -124,8 +124,9 @@ def build_flow(
             p, command, s.rate_b, s.integral, s.setpoint, s.gyro, s.voltage
         )
         speed, speed_rate = motor_rate(p, s.motor_speed, target)
-        still = thrust.rotor_thrust_scaled(p, speed, s.voltage)
-        f = thrust.near_ground(p, air, s.pos_w[2], still)
+        f = thrust.rotor_thrust_scaled(p, speed, s.voltage)
+        if wp.static("ground_effect" in extensions):
+            f = thrust.near_ground(p, air, s.pos_w[2], f)
         charge_rate, voltage_rate = battery_rate(p, s.charge_used, s.voltage, speed, f)
         vel_b = wp.quat_rotate_inv(s.quat_wb, s.vel_w - air.wind_w)
         aero_force, aero_torque = aerodynamics(p, vel_b, s.rate_b, f)

@@ -114,8 +114,9 @@ def build_rods(t: Types, segments: int, extensions: frozenset[str]) -> SimpleNam
         """Damping of the upper joint of rod i [N m s], with the mount's friction in the
         uppermost.
         """
-        if i == 0:
-            return rope.joint_damping + rope.mount_damping
+        if wp.static("mount_damping" in extensions):
+            if i == 0:
+                return rope.joint_damping + rope.mount_damping
         return rope.joint_damping
 
     @wp.func
@@ -231,8 +232,9 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             else:
                 g += -gh * stiffness[i] * ui
             g = rods.with_load(i, g, rope.payload_arm, load)
-            if i == 0:
-                g += rope.mount_damping * above
+            if wp.static("mount_damping" in extensions):
+                if i == 0:
+                    g += rope.mount_damping * above
             if wp.static(giving):
                 if rope.compliance != real(0.0):  # lanes of a replay differ in it
                     growth = growing(rope, ui)
