@@ -94,7 +94,7 @@ class Selector:
         self._visited = {NOTHING}
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
-        self._followed: set[Names] = set()
+        self._followed = {NOTHING}
         self._every = False  # whether any effect may differ among flights
         self._offer()
 
@@ -300,32 +300,33 @@ class Selector:
         return all(terms.moves_landing(self.problem, point, j) for j in laws)
 
     def _followed_up(self, listed: Mapping[Names, float]) -> list[Trial]:
-        """Return a set that promises more than it kept, simulated from derivatives and initial
-        states of where it leads, if it is worth more there than the present set from there.
+        """Return the set that promises most of those that kept far less, simulated from derivatives
+        and initial states of where it leads, if it is worth more there than the present set from
+        there.
 
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
         kinds, point = self.problem.switches, self.best.point
-        ranked = [
+        promising = [
             s
             for s, kept in self._simulated.items()
-            if s not in self._followed and listed.get(s, 0.0) > max(0.0, kept + STRONG)
+            if listed.get(s, 0.0) > max(0.0, kept + STRONG) and not kinds[columns_of(s)].any()
         ]
-        ranked.sort(key=listed.get)
-        for chosen in ranked[::-1][:ROUNDS]:
-            self._followed.add(chosen)
-            active = columns_of(chosen)
-            if kinds[active].any():
-                continue
-            goal = estimate(point.information, point.score, self.problem.priors, active)
-            there = self._linearised(goal, point)
-            trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
-            if len(trials) == 2 and self.is_admissible(trials[chosen]):
-                lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
-                if lead > ENOUGH_NATS:
-                    self.origin = there
-                    return [replace(trials[chosen], lead=lead)]
-        return []
+        chosen = max(promising, key=listed.get, default=NOTHING)
+        if chosen in self._followed:
+            return []
+        self._followed.add(chosen)
+        active = columns_of(chosen)
+        goal = estimate(point.information, point.score, self.problem.priors, active)
+        there = self._linearised(goal, point)
+        trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
+        if len(trials) < 2 or not self.is_admissible(trials[chosen]):
+            return []
+        lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
+        if lead <= ENOUGH_NATS:
+            return []
+        self.origin = there
+        return [replace(trials[chosen], lead=lead)]
 
     def _go(self, trial: Trial) -> None:
         """Take a set as the best, and derivatives where it is."""
