@@ -94,7 +94,7 @@ class Selector:
         self._visited = {NOTHING}
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
-        self._followed = {NOTHING}
+        self._followed: set[Names] = set()
         self._every = False  # whether any effect may differ among flights
         self._offer()
 
@@ -307,18 +307,19 @@ class Selector:
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
         kinds, point = self.problem.switches, self.best.point
-        promising = [
-            s
-            for s, kept in self._simulated.items()
-            if listed.get(s, 0.0) > max(0.0, kept + STRONG) and not kinds[columns_of(s)].any()
-        ]
-        chosen = max(promising, key=listed.get, default=NOTHING)
-        if chosen in self._followed:
+        short = [s for s, kept in self._simulated.items() if listed.get(s, 0.0) > kept + STRONG]
+        promising = [s for s in short if listed[s] > 0.0 and not kinds[columns_of(s)].any()]
+        chosen = max({*promising} - self._followed, key=listed.get, default=NOTHING)
+        if not chosen:
             return []
         self._followed.add(chosen)
         active = columns_of(chosen)
         goal = estimate(point.information, point.score, self.problem.priors, active)
-        there = self._linearised(goal, point)
+        try:
+            there = self._linearised(goal, point)
+        except DiagnoseError as error:
+            self.progress(f"{names_of(chosen)}: not followed, {error}")
+            return []
         trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
         if len(trials) < 2 or not self.is_admissible(trials[chosen]):
             return []
