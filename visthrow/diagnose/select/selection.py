@@ -307,8 +307,12 @@ class Selector:
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
         kinds, point = self.problem.switches, self.best.point
-        short = [s for s, kept in self._simulated.items() if listed.get(s, 0.0) > kept + STRONG]
-        promising = [s for s in short if listed[s] > 0.0 and not kinds[columns_of(s)].any()]
+        promising = [
+            s
+            for s, nats in listed.items()
+            if nats > max(0.0, self._simulated.get(s, np.inf) + STRONG)
+            and not kinds[columns_of(s)].any()
+        ]
         chosen = max({*promising} - self._followed, key=listed.get, default=NOTHING)
         if not chosen:
             return []
