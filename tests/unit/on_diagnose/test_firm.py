@@ -122,18 +122,6 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
     assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
 
 
-def test_a_name_whose_size_differs_from_window_to_window_is_withdrawn():
-    """It stands for another form, such as a force that acts only while the vehicle sinks."""
-    model = SyntheticModel(effects=EFFECTS, throws=8, free=4, seed=2)
-    for i, window in enumerate(model._windows):
-        window.residual[:] += (
-            40.0 * EFFECTS[5].floor * window.effects[:, 5] * (i % 2 - 0.5 * (1 - i % 2))
-        )
-    diagnosis = search.explain(model, laws=False)
-    assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})
-    assert any("effect_05 differs from window to window" in r for r in diagnosis.reasons)
-
-
 def test_names_that_do_harm_are_withdrawn(monkeypatch):
     diagnosis = judged(monkeypatch, {"effect_05": 40.0}, share=-0.1, low=-0.3, high=0.1)
     assert (diagnosis.overall, dict(diagnosis.theta)) == (result.UNKNOWN, {})

@@ -215,27 +215,13 @@ def between_flights(
     """
     information = statistics.information.diagonal(axis1=1, axis2=2)
     share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F of F that say as much
-    value = differing(statistics, priors, active, theta, active)
+    nats = []
+    for u in REACH:
+        varies = Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in active})
+        nats.append(evidence_of(freed(statistics, varies), priors, active))
+    value = np.array(nats)
     weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
     return float(weight @ REACH**2 / weight.sum()) * bool(active), (share**2).sum(0)
-
-
-def differing(
-    statistics: Statistics,
-    priors: Priors,
-    active: Sequence[int],
-    theta: np.ndarray,
-    columns: Sequence[int],
-    deviations: np.ndarray = REACH,
-) -> np.ndarray:
-    """Return log Z of named effects of which some differ from flight to flight by each of these
-    deviations, in what is :func:`allowed`.
-    """
-    nats = []
-    for u in deviations:
-        varies = Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in columns})
-        nats.append(evidence_of(freed(statistics, varies), priors, active))
-    return np.array(nats)
 
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:

@@ -33,7 +33,7 @@ from visthrow.diagnose.select.candidates import (
     varies_of,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
-from visthrow.diagnose.select.held_out import Work, regrouped, repeated_share, sized
+from visthrow.diagnose.select.held_out import Work, repeated_share, sized
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
@@ -42,7 +42,6 @@ from visthrow.diagnose.select.point import (
     moved,
     with_floors_noise,
     with_noise_at,
-    with_shares,
 )
 from visthrow.diagnose.select.result import Diagnosis, Finding, Law, Level
 from visthrow.diagnose.select.scatter import (
@@ -52,7 +51,6 @@ from visthrow.diagnose.select.scatter import (
     Varies,
     allowed,
     by_day,
-    differing,
     freed,
     judged,
     relinearised_per_flight,
@@ -64,9 +62,6 @@ BIT = 0.5
 """An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
 less than a bit about it.
 """
-
-DIFFER = np.array([0.1, 0.3, 1.0, 2.0, 4.0, 8.0])
-"""Deviations of a name's size among windows, in what is allowed, that are compared."""
 
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
@@ -352,11 +347,9 @@ def _overall(
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
     laws = laws_of(selection.best.chosen)
-    compared = compares_phases(selection.nominal)  # else what is left over speaks of a wrong form
-    inconsistent = _inconsistent(selection) if compared else []
     if laws:
         unnamed, law_text = _law(selection)
-        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed | set(inconsistent)
+        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed
     stuck = [j for j in active if _on_bound(selection, j)]
     if stuck:
         names = ", ".join(selection.problem.effects[j].name for j in stuck)
@@ -365,11 +358,7 @@ def _overall(
         )
         block = selection.block_of(stuck[0]) or selection.problem.effects[stuck[0]].block
         return result.UNKNOWN, block, reasons, set(active)
-    if inconsistent:
-        names = ", ".join(selection.problem.effects[j].name for j in inconsistent)
-        reasons.append(f"the size of {names} differs from window to window; the form is another")
-        return result.UNKNOWN, selection.block_of(inconsistent[0]), reasons, set(inconsistent)
-    for block, parts in _crowded(selection).items() if compared else ():
+    for block, parts in _crowded(selection).items():
         names = ", ".join(selection.problem.effects[j].name for j in parts)
         reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
         return result.UNKNOWN, block, [*reasons, reason], set(parts)
@@ -397,7 +386,8 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
     which the flights hardly tell some apart, with these names: parts of it are likelier.
     """
     by_block: dict[str, list[int]] = {}
-    for j in selection.names:
+    compared = compares_phases(selection.nominal)  # else what is left over speaks of a wrong form
+    for j in selection.names if compared else ():
         by_block.setdefault(selection.block_of(j), []).append(j)
     crowded = {}
     for block, members in by_block.items():
@@ -407,28 +397,6 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
         if block and len(members) * selection.threshold > law and unlike.min() < 0.5:
             crowded[block] = members
     return crowded
-
-
-def _inconsistent(selection: Selector) -> list[int]:
-    """Return the names whose size differs from window to window by more than is :func:`allowed`,
-    under the noise levels that remain when every window has its own size.
-    """
-    best, names = selection.best, selection.names
-    point = replace(best.point, grams=with_shares(best.point, best.point.theta))
-    widest = {(j, FLIGHT): DIFFER[-1] * allowed(point.theta[j]) for j in names}
-    apart = replace(
-        point,
-        plain=regrouped(point, range(len(point.windows))),
-        grams=[replace(gram, flight=i) for i, gram in enumerate(point.grams)],
-        windows=[replace(window, flight=i) for i, window in enumerate(point.windows)],
-        varies=Varies((), widest),
-    )
-    windows = with_noise_at(apart, point.theta).plain if names else apart.plain
-    nats = {
-        j: differing(windows, selection.problem.priors, best.columns, point.theta, [j], DIFFER)
-        for j in names
-    }
-    return [j for j, n in nats.items() if n.max() - n[DIFFER <= 1.0].max() > selection.threshold]
 
 
 def _excess(level: Level) -> str:
