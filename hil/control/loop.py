@@ -27,12 +27,6 @@ two alone; earlier by a share of the second number that goes round from tick to 
 link is looked at, and peers are asked for their time, at any point of their periods.
 """
 
-MOST_WARMING = 4e-3
-"""The policy is warmed before a tick, as a core that has slept has lost its caches, and reading the
-weights anew takes most of a tick. It begins twice the time before that this takes; where that is
-more than this [s], the machine is too slow for it.
-"""
-
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in their numbers alone [s]
@@ -83,7 +77,6 @@ class Loop:
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
     _ended: float = -math.inf
-    _warming: float = 0.0  # time that it took to warm the policy [s]
     _state: str = ""
     _waits: str = ""
     # reasons to wait, without their numbers, and when they were said [s]
@@ -134,8 +127,6 @@ class Loop:
         )
         early = source.poll(clock.now())
         runner.take_poses(early)
-        if "policy" in runner.spent:
-            self._warm(runner.spent["observation"] + runner.spent["policy"])
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed
@@ -178,22 +169,6 @@ class Loop:
         self.count += 1
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
-
-    def _warm(self, spent: float) -> None:
-        """Have the policy in the caches when the tick comes; it took a time in the last one [s].
-
-        What the back-end has to do before the tick is not held up.
-        """
-        runner = self.runner
-        tick = self.ticker.due()
-        lead = 2.0 * max(spent, self._warming)
-        self._warming = 0.0
-        due = runner.backend.due()
-        if lead < MOST_WARMING and (due is None or due >= tick):
-            _wait(self.clock, tick - lead, runner.backend, self.source)
-            begin = perf_counter()
-            runner.pilot.warm()
-            self._warming = perf_counter() - begin
 
     def _tick(self, time: float, *inputs: Any) -> TickRecord:
         """Decide one tick by what the team agreed on; tell it what this vehicle is ready for."""

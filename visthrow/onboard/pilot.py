@@ -212,7 +212,6 @@ class Pilot:
         attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
         detected = None if keypoints is None else tuple(map(self._native, keypoints))
-        self._shown = views, detected
         seen = self._see(views, detected)
         if now is not None and self._bridged(now, seen):
             seen = self._see(views, detected)
@@ -235,12 +234,6 @@ class Pilot:
             None if seen.points is None else np.asarray(seen.points),
             None if seen.points is None else np.asarray(seen.valid),
         )
-
-    @torch.inference_mode()
-    def warm(self) -> None:
-        """Decide the last step again and forget it: then its code and weights are in the caches."""
-        seen = self._see(*self._shown)
-        self._decide(torch.as_tensor(seen.observation), self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of

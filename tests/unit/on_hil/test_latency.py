@@ -1,16 +1,12 @@
-"""Percentiles a stage, the report and its picture; what is done before a tick."""
-
-from types import SimpleNamespace
+"""Percentiles a stage, the report and its picture."""
 
 import cv2
 import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark
 
-from hil.control.loop import Loop
 from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
 from hil.control.runner import Runner
-from hil.links.clock import ManualClock
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from tests.hil_flight import Spy, params, simple_policy
 from visthrow.view import parts
@@ -109,19 +105,3 @@ def test_a_detector_is_told_the_payloads_distance_while_it_hangs():
     assert hint.ball_distance == approx((0.5 * runner.hang, 1.4 * runner.hang))
     runner.latch.at = 0.39
     assert runner.estimator.hint(0.39).ball_distance is None
-
-
-@mark.parametrize(
-    ("due", "spent", "warmed"),
-    [(None, 1e-3, [10.018]), (10.03, 1e-3, [10.018]), (10.019, 1e-3, []), (None, 3e-3, [])],
-    ids=["nothing is due", "after the tick", "a release is due before it", "too slow a machine"],
-)
-def test_the_policy_is_warmed_just_before_a_tick(due, spent, warmed):
-    clock, times = ManualClock(10.0), []
-    pilot = SimpleNamespace(period=0.02, warm=lambda: times.append(clock.now()))
-    backend = SimpleNamespace(due=lambda: due, service=lambda time: None)
-    source = SimpleNamespace(wait=lambda clock, until: clock.sleep_until(until))
-    loop = Loop(SimpleNamespace(backend=backend, pilot=pilot), source, clock, None)
-    loop.ticker.take()
-    loop._warm(spent)
-    assert times == approx(warmed)

@@ -4,14 +4,13 @@ in training.
 
 import numpy as np
 import torch
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 from pytest import approx, mark
 
-from tests.configs import load_experiment
 from tests.hil_flight import simple_policy
 from visthrow.onboard.observations import RESPONSE, resampled
 from visthrow.onboard.pilot import Pilot
-from visthrow.onboard.policy import Policy, find_policy
+from visthrow.onboard.policy import Policy
 
 PERIOD = 0.02
 LEVEL = np.array([[0.0, 0.0, 0.0, 1.0]])
@@ -89,13 +88,3 @@ def test_a_release_that_was_not_done_is_not_told():
     seen(pilot, PERIOD, PERIOD)
     pilot.not_released()
     assert pilot.previous_action[0, 4] == before, "nor when it is asked for again"
-
-
-def test_warming_changes_no_step():
-    """The policy's memory, history and previous action are those of the steps alone."""
-    camera = load_experiment("vision").camera
-    pilots = [Pilot(Policy.load(find_policy("vision")), camera) for _ in range(2)]
-    for n in range(6):
-        actions = [seen(pilot, PERIOD * n, PERIOD * n) for pilot in pilots]
-        assert_array_equal(*actions)
-        pilots[0].warm()
