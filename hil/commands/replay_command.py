@@ -1,4 +1,4 @@
-"""``visthrow hil replay``: run a recorded run again and compare every action, bit for bit."""
+"""``visthrow hil replay``: replay a recorded run and compare every action, bit for bit."""
 
 import argparse
 
