@@ -1,4 +1,4 @@
-"""``visthrow bench records``: what was measured, with command, commit and machine."""
+"""``visthrow bench records``: print recorded measurements, with command, commit and machine."""
 
 import argparse
 
