@@ -15,7 +15,7 @@ BLACKBOX = (".bbl", ".bfl", ".bf")
 AUTOPILOTS = (".ulg", ".bin", ".tlog")
 TABLES = (".csv", ".csv.gz", ".csv.xz", ".tsv", ".txt", ".parquet")
 SELF_DESCRIBING = (".npz", *BLACKBOX, *AUTOPILOTS)
-"""What says itself what it holds: no mapping is used for it."""
+"""Endings of logs that describe their own contents and need no mapping."""
 RUN_LOG = "flight.npz"
 """In the folder of a run of ``visthrow hil``: its flight log, written where no throw was flown and
 ``--bare`` was not given.
@@ -87,7 +87,7 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
         for part, logs in zip((first, *further), groups):
             if len(logs) != 1:
                 raise LogError(
-                    f"{part}: {len(logs)} logs in it; joining needs one of each, named as FILE:PART"
+                    f"{part}: holds {len(logs)} logs; joining needs exactly one from each file, named as FILE:PART"
                 )
         return [join([log for logs in groups for log in logs])]
     if Path(file).is_file():
@@ -143,14 +143,14 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
         return recordings.read_recording(path)
     if ending in SELF_DESCRIBING:
         raise LogError(
-            f"{path}: says itself what it holds and needs no mapping; look at it with: visthrow"
+            f"{path}: describes its own contents and needs no mapping; look at it with: visthrow"
             f" diagnose check {path}"
         )
     if _is_text(path):  # .tum, .dat, .log, .asc, ...
         return table.read_table(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS, *SELF_DESCRIBING))
     raise LogError(
-        f"{path}: ending '{path.suffix}', and no text; expected one of {of_tables}, or a table in"
+        f"{path}: ending '{path.suffix}', and not text; expected one of {of_tables}, or a table in"
         " text"
     )
 

@@ -49,8 +49,8 @@ def turn_of(axes: str) -> np.ndarray:
             for one in signs
         )
         raise ValueError(
-            f"axes '{axes}' mirror the world: no rotation turns them into ours; expected one sign"
-            f" less or more: {hint}"
+            f"axes '{axes}' mirror the world: no rotation turns them into ours; flip one"
+            f" sign: {hint}"
         )
     return matrix
 

@@ -150,7 +150,7 @@ class FlightLog:
             expected = (spec.unit, spec.frame)
             if actual != expected:
                 raise LogError(
-                    f"channel '{name}' is in unit and frame {actual}; its name stands for"
+                    f"channel '{name}' is in unit and frame {actual}; expected"
                     f" {expected}"
                 )
             shape = channel.values.shape[1:]
@@ -159,7 +159,7 @@ class FlightLog:
             )
             if not fits:
                 raise LogError(
-                    f"channel '{name}' has samples of shape {shape}; its name stands for"
+                    f"channel '{name}' has samples of shape {shape}; expected"
                     f" {spec.shape}"
                 )
 
@@ -202,7 +202,7 @@ class FlightLog:
                 )
             }
         except (TypeError, ValueError) as error:
-            raise LogError(f"the metadata holds what JSON cannot: {error}") from error
+            raise LogError(f"the metadata cannot be written as JSON: {error}") from error
         for name, channel in self.channels.items():
             arrays |= {
                 f"{name}/time": channel.time,

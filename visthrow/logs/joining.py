@@ -75,15 +75,15 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
             tried.append((method, *_lag(a, b)))
     if not tried:
         raise LogError(
-            f"{second.meta.get('source', 'a log')}: nothing in it that the others measured too;"
+            f"{second.meta.get('source', 'a log')}: no quantity in common with the other logs;"
             " joining needs body rates or attitude, positions, or accelerations in both; it has"
             f" {', '.join(second.channels)}"
         )
     method, offset, correlation = max(tried, key=lambda trial: trial[2])
     if correlation < THRESHOLD:
         raise LogError(
-            f"{second.meta.get('source', 'a log')}: its {method} go with the others' by"
-            f" {correlation:.2f} at best: not one flight"
+            f"{second.meta.get('source', 'a log')}: its {method} correlate with the others' by"
+            f" {correlation:.2f} at best: not the same flight"
         )
     return offset, correlation, method
 

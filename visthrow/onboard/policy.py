@@ -236,7 +236,7 @@ class Policy:
         try:
             arrays = {"header": json_array(header)}
         except (TypeError, ValueError) as error:
-            raise PolicyError(f"contract or made_by holds what JSON cannot: {error}") from error
+            raise PolicyError(f"contract or made_by cannot be written as JSON: {error}") from error
         for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
             arrays[f"layer{i}_weight"] = weight.cpu().numpy()
             arrays[f"layer{i}_bias"] = bias.cpu().numpy()

@@ -304,7 +304,7 @@ def test_what_is_not_known_is_asked(tmp_path):
     assert any("how far are the rows apart" in question for question in found.questions)
     with raises(LogError, match="none of its 2 columns holds numbers that change"):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")
-    with raises(LogError, match=r"a\.ulg: says itself what it holds"):
+    with raises(LogError, match=r"a\.ulg: describes its own contents"):
         table_of(tmp_path / "a.ulg")
 
 
@@ -434,9 +434,9 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     assert log["pos_w"].time == approx(whole["pos_w"].time[300:], abs=0.01)
     assert set(log.channels) == {"rate_b", "acc_b", "command", "pos_w", "quat_wb"}
     stranger = log_of(flight(20.0, seed=9))
-    with raises(LogError, match="not one flight"):
+    with raises(LogError, match="not the same flight"):
         join([onboard, FlightLog({"quat_wb": stranger["quat_wb"]}, {"source": "c.npz"})])
-    with raises(LogError, match="nothing in it that the others measured too"):
+    with raises(LogError, match="no quantity in common with the other logs"):
         join(
             [
                 onboard,

@@ -589,7 +589,7 @@ def test_a_rewrite_leaves_the_statistics(name):
 
 class TestSetups:
     def test_one_model_a_setup(self):
-        with raises(ConfigError, match="ball and stand: a setup has one model"):
+        with raises(ConfigError, match="ball and stand: a setup has only one model"):
             setups.Setup("", ball=BALL, stand=STAND)
         with raises(ConfigError, match="has no model"):
             setups.model_of(setups.Setup("bare"), [])

@@ -661,7 +661,7 @@ def test_a_setup_for_tables_alone_is_refused_where_no_log_is_a_table(
     (tmp_path / "mine.toml").write_text(f'about = "a table"\n{mapping}')
     (tmp_path / "t.csv").write_text("t,i\n" + "".join(f"{0.01 * n},{n % 7}\n" for n in range(200)))
     check_with = "diagnose check --no-pictures --config"
-    unused = "is not used: it says how the columns of a table are read"
+    unused = "is not used: it states how to read the columns of a table"
     for words in ("mine.toml a.npz", "mine.toml a.npz+b.npz", "pendulum_encoder a.npz"):
         refused(f"{check_with} {words}", said=unused)
     refused("diagnose explain a.npz --config mine.toml", said=unused)

@@ -84,7 +84,7 @@ def test_standard_names_keep_their_unit_frame_and_shape():
     time = np.zeros(1)
     with raises(LogError, match=r"'pos_w' is in unit and frame \('mm', 'world'\)"):
         FlightLog({"pos_w": Channel(time, np.zeros((1, 3)), "mm", "world")})
-    with raises(LogError, match=r"samples of shape \(4,\); its name stands for \(3,\)"):
+    with raises(LogError, match=r"samples of shape \(4,\); expected \(3,\)"):
         FlightLog({"pos_w": Channel(time, np.zeros((1, 4)), "m", "world")})
     FlightLog({"cable_points_w": Channel(time, np.zeros((1, 16, 3)), "m", "world")})
 

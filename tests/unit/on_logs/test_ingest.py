@@ -169,7 +169,7 @@ class TestBlackbox:
         with raises(LogError, match="no blackbox log"):
             read(path)
         path.write_bytes(blackbox.MARKER + b"\nH Data version:2\n")
-        with raises(LogError, match="no definition of I and P frames"):
+        with raises(LogError, match="does not define I and P frames"):
             read(path)
         path.write_bytes(BBL.read_bytes().replace(b"encoding:1,1,0", b"encoding:1,4,0"))
         with raises(LogError, match="encoding 4"):

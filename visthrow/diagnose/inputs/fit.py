@@ -127,7 +127,7 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     if setup.stand is not None:
         return _of_stand(setup.stand, size, result.middle_speed, base)
     raise DiagnoseError(
-        f"'{setup.about}' is no vehicle and no motor; a vehicle is fitted by a setup with [flyer]"
+        f"'{setup.about}' is neither a vehicle nor a motor; fit a vehicle with a setup that has [flyer]"
         " or [stand]"
     )
 

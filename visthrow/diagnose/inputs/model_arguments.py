@@ -150,7 +150,7 @@ def numbers(text: str, logs: Sequence[FlightLog]) -> tuple[int, ...]:
         flights = tuple(int(part) for part in text.split(",") if part.strip())
     except ValueError as error:
         raise DiagnoseError(
-            f"--without {text}; expected numbers of flights between commas, such as 0,3"
+            f"--without {text}; expected numbers of flights separated by commas, such as 0,3"
         ) from error
     listed = ", ".join(f"{i} ({label(log, i)})" for i, log in enumerate(logs))
     for number in flights:

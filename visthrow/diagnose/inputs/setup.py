@@ -62,7 +62,7 @@ class Setup:
     def __post_init__(self) -> None:
         named = [name for name in MODELS if getattr(self, name) is not None]
         if len(named) > 1:
-            raise ConfigError(f"{' and '.join(named)}: a setup has one model")
+            raise ConfigError(f"{' and '.join(named)}: a setup has only one model")
         for law in self.laws:
             term_of(law)
 
@@ -140,8 +140,8 @@ def read_logs(
         and not any(map(takes_mapping, paths))
     ):
         raise ConfigError(
-            f"the setup '{name}' is not used: it says how the columns of a table are read, and"
-            f" {', '.join(map(str, paths))} says itself what it holds; expected a table, or no"
+            f"the setup '{name}' is not used: it states how to read the columns of a table, and"
+            f" {', '.join(map(str, paths))} needs no mapping; expected a table, or no"
             " --config"
         )
     return logs

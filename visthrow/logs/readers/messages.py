@@ -299,7 +299,7 @@ class Forward(io.BytesIO):
         if after < before:
             self._returns[after] += 1
             if self._returns[after] > MOST_RETURNS:
-                raise LogError(f"the length of a message leads nowhere, near byte {after}")
+                raise LogError(f"the length of a message is invalid, near byte {after}")
         return after
 
 

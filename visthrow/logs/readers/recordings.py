@@ -53,7 +53,7 @@ def read_recording(path: Path) -> Table:
     except Exception as error:  # readers of others raise what comes
         raise LogError(f"{path}: cannot be read: {error!r}; expected {what}") from error
     if not table:
-        raise LogError(f"{path}: no columns of numbers in it")
+        raise LogError(f"{path}: it has no columns of numbers")
     return table
 
 
@@ -92,7 +92,7 @@ def _card(path: Path) -> Table:
         number, time = struct.unpack_from(form, data, position)
         if number not in events:
             raise LogError(
-                f"{path}: event {number} near byte {position} was not announced; damaged"
+                f"{path}: event {number} near byte {position} was not declared; the file is damaged"
             )
         event = events[number]
         position += struct.calcsize(form)
@@ -113,7 +113,7 @@ def _card_head(path: Path, data: bytes) -> tuple[int, int]:
     """Return the version of a card's log and its number of events."""
     if len(data) < 9 or data[0] != _CARD:
         raise LogError(
-            f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log of a"
+            f"{path}: begins with {data[:1].hex() or 'nothing'}, not bc; expected a log from a"
             " Crazyflie's card"
         )
     if struct.unpack("<I", data[-4:])[0] != zlib.crc32(data[:-4]):
@@ -142,7 +142,7 @@ def _card_events(path: Path, data: bytes, kinds: int) -> tuple[dict[int, _CardEv
             event.form += field[-2]
         if not _CARD_TYPES.issuperset(event.form[1:]):
             raise LogError(
-                f"{path}: a variable of {name} has a type that is not known; known:"
+                f"{path}: a variable of {name} has an unknown type; known:"
                 f" {''.join(sorted(_CARD_TYPES))}"
             )
         events[number] = event
@@ -259,7 +259,7 @@ def _mcap(path: Path) -> Table:
 
 
 def _undecodable(raw: bytes) -> Any:
-    raise ValueError("its encoding is not read")
+    raise ValueError("its encoding is not supported")
 
 
 LARGEST_MESSAGE = 20_000
@@ -311,7 +311,7 @@ class Topics:
                 table[f"{topic}:{name}"] = values - start if clock else values
         table.left_out = list(self._left_out.values())
         if not table and self._left_out:
-            raise LogError("no topic of it can be read: " + "; ".join(self._left_out.values()))
+            raise LogError("none of its topics can be read: " + "; ".join(self._left_out.values()))
         return table
 
 

@@ -201,7 +201,7 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
     if not logs:
         shortest = mapping.split.shortest if mapping.split else 0.0
         raise LogError(
-            f"{source}: {count} rows, but no stretch without a gap that lasts {shortest:g} s"
+            f"{source}: {count} rows, but no stretch of {shortest:g} s without a gap"
         )
     return logs
 

@@ -99,7 +99,7 @@ def read_blackbox(path: str | Path) -> list[BlackboxLog]:
     logs = [log for log in logs if len(log.main)]
     if not logs:
         raise LogError(
-            f"{path}: {len(starts)} log(s), none with a frame in it {'; '.join(problems)}".rstrip()
+            f"{path}: {len(starts)} log(s), none holds a frame {'; '.join(problems)}".rstrip()
         )
     return logs
 
@@ -137,11 +137,11 @@ class _Decoder:
 
     def _prepare(self) -> None:
         if "I" not in self.fields or "P" not in self.fields:
-            raise LogError("no definition of I and P frames in its header")
+            raise LogError("its header does not define I and P frames")
         self.fields["P"].names = self.fields["I"].names
         self.fields["P"].signed = self.fields["I"].signed
         if self.header.get("Data version", "2") != "2":
-            raise LogError(f"data version {self.header['Data version']}; version 2 is read")
+            raise LogError(f"data version {self.header['Data version']}; only version 2 can be read")
         for kind, definition in self.fields.items():
             sizes = {len(definition.names), len(definition.predictor), len(definition.encoding)}
             if len(sizes) > 1:
@@ -326,7 +326,7 @@ def _numbers(text: str, key: str) -> list[int]:
         return [int(word) for word in text.split(",")]
     except ValueError:
         raise LogError(
-            f"header '{key}' is '{text}'; expected whole numbers with commas between"
+            f"header '{key}' is '{text}'; expected whole numbers separated by commas"
         ) from None
 
 
