@@ -24,7 +24,7 @@ from visthrow.onboard.observations import rotation_from_quat
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--config", default="dry_run", help="a configuration in configs/hil, or a file")
+    parser.add_argument("--config", default="dry_run", help="a name in configs/hil, or a file")
     parser.add_argument("--port", type=int, default=14560, help="that MAVLink poses come to")
     parser.add_argument("--seconds", type=float, default=10.0)
     args = parser.parse_args()

@@ -87,7 +87,7 @@ def _named(path: Path, mapping: TableMap | None) -> list[FlightLog]:
         for part, logs in zip((first, *further), groups):
             if len(logs) != 1:
                 raise LogError(
-                    f"{part}: holds {len(logs)} logs; joining needs exactly one from each file, named as FILE:PART"
+                    f"{part}: holds {len(logs)} logs; joining needs one per file: FILE:PART"
                 )
         return [join([log for logs in groups for log in logs])]
     if Path(file).is_file():

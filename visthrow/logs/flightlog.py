@@ -150,8 +150,7 @@ class FlightLog:
             expected = (spec.unit, spec.frame)
             if actual != expected:
                 raise LogError(
-                    f"channel '{name}' is in unit and frame {actual}; expected"
-                    f" {expected}"
+                    f"channel '{name}' is in unit and frame {actual}; expected {expected}"
                 )
             shape = channel.values.shape[1:]
             fits = len(shape) == len(spec.shape) and all(
@@ -159,8 +158,7 @@ class FlightLog:
             )
             if not fits:
                 raise LogError(
-                    f"channel '{name}' has samples of shape {shape}; expected"
-                    f" {spec.shape}"
+                    f"channel '{name}' has samples of shape {shape}; expected {spec.shape}"
                 )
 
     def __getitem__(self, name: str) -> Channel:

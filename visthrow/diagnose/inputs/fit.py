@@ -127,8 +127,7 @@ def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleP
     if setup.stand is not None:
         return _of_stand(setup.stand, size, result.middle_speed, base)
     raise DiagnoseError(
-        f"'{setup.about}' is neither a vehicle nor a motor; fit a vehicle with a setup that has [flyer]"
-        " or [stand]"
+        f"'{setup.about}' is neither a vehicle nor a motor; use a setup with [flyer] or [stand]"
     )
 
 

@@ -131,7 +131,7 @@ def log_of_autopilot(path: str | Path) -> FlightLog:
     _add_sweep(channels, notes, log)
     if not channels:
         raise LogError(
-            f"{path}: it holds no message about a vehicle's motion; known: {', '.join(sorted(tapped))}"
+            f"{path}: no message about a vehicle's motion; known: {', '.join(sorted(tapped))}"
         )
     if (flying := _flying(log)) is not None:
         channels["flying"] = flying

@@ -200,9 +200,7 @@ def logs_of(table: Table, mapping: TableMap, source: str) -> list[FlightLog]:
     logs = [_log(table, mapping, rows, label, source) for rows, label in parts]
     if not logs:
         shortest = mapping.split.shortest if mapping.split else 0.0
-        raise LogError(
-            f"{source}: {count} rows, but no stretch of {shortest:g} s without a gap"
-        )
+        raise LogError(f"{source}: {count} rows, but no stretch of {shortest:g} s without a gap")
     return logs
 
 

@@ -82,7 +82,7 @@ def _raw_meta(log: BlackboxLog, path: str | Path, number: int) -> dict:
 
 def _flight(table: Table, header: dict[str, str], meta: dict) -> FlightLog:
     if "time" not in table:
-        raise LogError(f"{meta['source']}: column 'time' has no numbers; a flight needs time stamps")
+        raise LogError(f"{meta['source']}: column 'time' has no numbers; expected time stamps")
     stamps = table["time"]
     turns = np.concatenate([[0], np.cumsum(np.diff(stamps) < -_CLOCK_TURN / 2)])
     time = (stamps + _CLOCK_TURN * turns) * 1e-6

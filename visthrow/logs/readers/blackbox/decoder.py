@@ -141,7 +141,7 @@ class _Decoder:
         self.fields["P"].names = self.fields["I"].names
         self.fields["P"].signed = self.fields["I"].signed
         if self.header.get("Data version", "2") != "2":
-            raise LogError(f"data version {self.header['Data version']}; only version 2 can be read")
+            raise LogError(f"data version {self.header['Data version']}; expected version 2")
         for kind, definition in self.fields.items():
             sizes = {len(definition.names), len(definition.predictor), len(definition.encoding)}
             if len(sizes) > 1:
