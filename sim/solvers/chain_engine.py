@@ -1,4 +1,4 @@
-"""The chain of :mod:`sim.kernels.rope` behind the exchange: what the exchange itself costs."""
+"""Solver that runs the fused kernel's chain behind the exchange, to measure what the exchange costs."""
 
 import warp as wp
 

@@ -1,5 +1,6 @@
-"""Source of poses: what the runner needs of it, what it may raise, and the one that plays recorded
-poses.
+"""Source of poses: what the runner needs of it, and the one that plays recorded poses.
+
+Sources raise :class:`hil.errors.SourceError` when they are opened, never when they are polled.
 """
 
 from bisect import bisect_right
