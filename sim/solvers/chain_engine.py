@@ -1,4 +1,4 @@
-"""Solver that runs the fused kernel's chain behind the exchange, to measure what the exchange costs."""
+"""Solver that runs the fused kernel's chain behind the exchange, to measure its cost."""
 
 import warp as wp
 
