@@ -72,14 +72,15 @@ def _read(setting: Any, path: str) -> Any:
 
 @dataclass(frozen=True)
 class Lowest(BoundedFields):
-    """A lower limit for a number of the setting: theta is at least ``least - share * number /
-    factor``.
+    """A lower bound of theta, such that a number of the setting, which theta changes, keeps a part.
+
+    At the bound, ``(1 - share) * number + factor * least`` remains of the number.
     """
 
-    path: str
-    share: float = 1.0  # of the number that may go
-    factor: float = 1.0  # of theta in the number's change
-    least: float = 0.0  # that stays [unit of theta]
+    path: str  # of the number
+    share: float = 1.0  # part of the number that theta may take away
+    factor: float = 1.0  # change of the number for each unit of theta
+    least: float = 0.0  # size of theta whose change of the number remains besides [unit of theta]
 
 
 @dataclass(frozen=True)
@@ -98,10 +99,11 @@ class SettingEffect(Effect):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, choices in ((self.needs, CONDITIONS), (self.switch, {"": None, **SWITCHES})):
+        for key, choices in (("needs", CONDITIONS), ("switch", {"": None, **SWITCHES})):
+            name = getattr(self, key)
             if name not in choices:
                 raise ValueError(
-                    f"got '{name}'; expected one of: {', '.join(filter(None, choices))}"
+                    f"{key}: got '{name}'; expected one of: {', '.join(filter(None, choices))}"
                 )
         if bool(self.changes) == bool(self.switch):
             raise ValueError("got both changes and a switch, or neither; expected one of them")
@@ -122,8 +124,10 @@ class SettingEffect(Effect):
         """Return the effect with the lower bound that this setting's own numbers set."""
         if not self.lowest:
             return self
-        limit = min(x.share * _read(setting, x.path) / x.factor - x.least for x in self.lowest)
-        return dataclasses.replace(self, bounds=(max(self.bounds[0], -limit), self.bounds[1]))
+        low, high = self.bounds
+        for x in self.lowest:
+            low = max(low, x.least - x.share * _read(setting, x.path) / x.factor)
+        return dataclasses.replace(self, bounds=(low, high))
 
 
 @dataclass(frozen=True)

@@ -82,8 +82,9 @@ def in_units(
             return item
         if name not in dimension_of:
             raise ValueError(
-                f"{type(value).__name__}.{name} has no dimension; expected one of"
-                f" {sorted(dimension_of)}"
+                f"{type(value).__name__}.{name} has no dimension; expected it in"
+                f" sim/scaling/dimensions.toml, table [{type(value).__name__}], under one of:"
+                f" {', '.join(_EXPONENTS)}"
             )
         if not any(dimension_of[name]):
             return item

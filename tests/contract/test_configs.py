@@ -97,7 +97,9 @@ def test_an_effect_that_changes_nothing_or_names_no_condition_is_refused():
     text = config.find("effects", "numerics").read_text(encoding="utf-8")
     with raises(config.ConfigError, match="neither; expected one"):
         config.loads(kinds.schema_of("effects"), re.sub(r"(?m)^changes = .*$", "", text))
-    with raises(config.ConfigError, match="got 'never'; expected one of: always, aerodynamics"):
+    with raises(
+        config.ConfigError, match="needs: got 'never'; expected one of: always, aerodynamics"
+    ):
         config.loads(kinds.schema_of("effects"), text + 'needs = "never"\n')
 
 

@@ -114,5 +114,8 @@ def numbers(value: object) -> list[float]:
 def test_every_field_of_plant_and_task_has_a_dimension():
     task = load_experiment("any").task
     assert isinstance(in_units(task, UNITS, TASK), TaskParams)
-    with raises(ValueError, match="control_period has no dimension"):
+    missing = (
+        r"control_period has no dimension; .*dimensions.toml, table \[SimParams\], under .*time"
+    )
+    with raises(ValueError, match=missing):
         in_units(plant().sim, UNITS, {})

@@ -75,7 +75,9 @@ def suggest(name: str, existing: Iterable[str]) -> str:
     listed = ", ".join(names)
     label = "known"
     if len(names) > LONG_LIST:
-        similar = get_close_matches(name, names, n=5, cutoff=0.0)
+        similar = get_close_matches(name, names, n=5)
+        if not similar:
+            return f"none of the {len(names)} known names is near it"
         listed = f"{', '.join(similar)}; {len(names) - len(similar)} more exist"
         label = "near it"
     if close:

@@ -43,6 +43,7 @@ def test_a_copied_log_counts_once(flights, tmp_path):
     assert twice["duplicates"] == {"3": 0}
     assert (twice["flights"], once["model"], once["plant"]) == (3, "throw", "state")
     assert once["overrides"] == ["rope.segments=1"]
+    assert "effects out: one of them may be the true cause" in once["reasons"][-1]
     assert twice["theta"] == approx(once["theta"])
 
 

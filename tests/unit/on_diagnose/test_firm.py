@@ -120,6 +120,10 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
     assert wide["effect_05"].verdict == result.CANDIDATE
     assert "holds 0" in wide.reasons[0]
     assert diagnosis["effect_05"].differs > diagnosis["effect_05"].sd
+    findings = [replace(f, nats=-1.0) if f.name == "effect_05" else f for f in findings]
+    unasked = held_out.judged(replace(diagnosis, findings=tuple(findings)))["effect_05"]
+    assert (unasked.verdict, unasked.estimate) == (result.BOUNDED, 0.0)
+    assert unasked.sentence.endswith("if there at all.")
 
 
 def test_names_that_do_harm_are_withdrawn(monkeypatch):
@@ -131,12 +135,21 @@ def test_names_that_do_harm_are_withdrawn(monkeypatch):
 
 def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     """Of two, the other keeps its name, with the size that it has alone."""
-    diagnosis = judged(
-        monkeypatch,
-        {"effect_05": 40.0, "effect_02": 40.0},
-        named_in={"effect_05": 1.0, "effect_02": 2 / 3},
-    )
+    truth, named_in = {"effect_05": 40.0, "effect_02": 40.0}, {"effect_05": 1.0, "effect_02": 2 / 3}
+    near = result.ChannelGain("pos_w", "m", 0.02, 0.0101, 0.01, float("nan"), 0.5, 0.4, 0.6, ())
+    far = replace(near, channel="quat_wb", after=0.027)
+    for channels, error in (
+        ((near,), ", no residual above the noise"),
+        (
+            (near, far),
+            "; on held-out flights the error of quat_wb is 2.7 times that of noise alone",
+        ),
+    ):
+        with monkeypatch.context() as patch:
+            diagnosis = judged(patch, truth, named_in=named_in, channels=channels)
+        assert diagnosis.reasons == (f"1 named, 1 candidate besides{error}",)
     assert diagnosis["effect_02"].verdict == result.CANDIDATE
+    assert "repeated without some flights, does not always" in diagnosis["effect_02"].sentence
     assert set(diagnosis.theta) == {"effect_05"}
     assert np.shape(diagnosis.covariance) == (1, 1)
     assert diagnosis.overall == result.KNOWN

@@ -234,8 +234,10 @@ def test_suggestions():
     assert suggest("mas", ["mass", "inertia"]) == "did you mean 'mass'? Known: inertia, mass"
     assert suggest("xyz", ["mass"]) == "known: mass"
     many = suggest("stat", ["state", *(f"name{i}" for i in range(40))])
-    assert many.startswith("did you mean 'state'? Near it: state, ")
-    assert many.endswith("; 36 more exist")
+    assert many.startswith("did you mean 'state'? Near it: state; ")
+    assert many.endswith(" 40 more exist")
+    none = suggest("battery_used", [f"name{i}" for i in range(41)])
+    assert none == "none of the 41 known names is near it"
     assert suggest("xyz", []) == "nothing is known here"
     assert issubclass(ConfigError, VisthrowError)
     with raises(ConfigError, match="no kind of config 'nothing'"):

@@ -10,7 +10,7 @@ from typing import Any
 from visthrow.common.arguments import declared
 from visthrow.common.errors import ConfigError, DiagnoseError, expect_known
 from visthrow.diagnose.models.model_interface import Model
-from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.select.result import NAMED, Diagnosis
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, label
 from visthrow.logs.flightlog import FlightLog
@@ -86,7 +86,7 @@ class Opened:
             rows = [row for log in check(self.logs, self.known) for row in log.rows]
             bad = [row.name for row in rows if row.verdict == "bad"]
             expect_known(self._args.overrule, bad, "no bad row '{}' of check", DiagnoseError)
-        return diagnose(
+        diagnosis = diagnose(
             self.logs,
             lambda: self.model,
             vehicle=self.known,
@@ -95,6 +95,13 @@ class Opened:
             laws=laws,
             progress=say,
         )
+        if not any(f.verdict in NAMED for f in diagnosis.findings) or not self.model.not_offered:
+            return diagnosis
+        note = (
+            f"--only left {self.model.not_offered} effects out: one of them may be the true cause"
+            " behind what is named here"
+        )
+        return replace(diagnosis, reasons=(*diagnosis.reasons, note))
 
 
 def made_with(args: argparse.Namespace) -> dict[str, Any]:

@@ -98,6 +98,7 @@ class Model(Protocol):
     middle_speed: float = 0.0  # median speed of the rotors [rad/s]; 0 where none is measured
     lawless: str = ""  # why no law outside the catalogue can act in it
     notes: Sequence[str] = ()  # what it does not take of the flights, and why, in sentences
+    not_offered: int = 0  # effects that concern the flights, but were not chosen
 
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """Simulate all windows with the effects at ``theta`` (those not named at 0) and linearise

@@ -184,6 +184,7 @@ class NumericModel(Model, ABC):
         by_name = {effect.name: effect for effect in self.effects}
         expect_known(names, by_name, "no effect '{}' for these logs", DiagnoseError)
         self.effects = tuple(by_name[name] for name in names)
+        self.not_offered = len(by_name) - len(names)
 
     def plain(self) -> "NumericModel":
         """See the base class."""

@@ -295,15 +295,37 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
         alike = (name, *diagnosis[name].partners)
         if sum(measured.named_in.get(member, 0.0) for member in alike) < FIRM + 1e-9:
             unsure.append(name)
-    why = "not all searches that leave flights out name it"
+    why = f"the search, repeated without some {measured.left_out}, does not always name it"
     reason = f"searches that leave {measured.left_out} out do not agree on a name"
     after = _withdrawn(diagnosis, unsure, result.CANDIDATE, why, reason, measured)
     after = replace(after, held_out=measured)
     unexplained = _unexplained(measured.channels) if uncompared else []
-    if after.overall == result.UNKNOWN or not unexplained:
+    if after.overall == result.UNKNOWN:
         return after
+    if not unexplained:
+        return replace(after, reasons=(_known(after),))
     reasons = tuple(_remaining(c, diagnosis.work) for c in unexplained)
     return replace(after, overall=result.IN_PART, reasons=reasons)
+
+
+def _known(diagnosis: Diagnosis) -> str:
+    """Return how many causes are named, and what held-out flights show beyond the noise."""
+    text = f"{len(diagnosis.theta)} named"
+    candidates = sum(f.verdict == result.CANDIDATE for f in diagnosis.findings)
+    if candidates:
+        text += f", {candidates} candidate{'s' if candidates > 1 else ''} besides"
+    gains = diagnosis.held_out.channels
+    ratios = {c.channel: c.after / c.floor for c in gains if c.floor > 0.0}
+    if not ratios:
+        return text
+    worst = max(ratios, key=ratios.get)
+    ratio = f"{ratios[worst]:.1f}"
+    if ratio == "1.0":
+        return f"{text}, no residual above the noise"
+    return (
+        f"{text}; on held-out {diagnosis.held_out.left_out} the error of {worst} is {ratio} times"
+        " that of noise alone"
+    )
 
 
 def _unexplained(gains: Sequence[ChannelGain]) -> list[ChannelGain]:
@@ -348,7 +370,10 @@ def _withdrawn(
     measured: HeldOut | None = None,
 ) -> Diagnosis:
     """Names and the members of their classes with another verdict; what stays named is sized
-    without them.
+    without them. A candidate without evidence where the search ended is bounded.
+
+    The search does not return to a set that it left, but what it takes up later (initial states,
+    derivatives) may explain what a name did. So a name of the last set may have no evidence.
 
     Where no name stays, something is there that no confirmed name explains: in the block of the
     name that promised most."""
@@ -357,12 +382,13 @@ def _withdrawn(
     work = diagnosis.work
     removed = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
     removed -= set(diagnosis.theta) - set(names)
-    findings = [
-        replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
-        if f.name in removed and f.verdict in (result.FOUND, result.CLASS)
-        else f
-        for f in diagnosis.findings
-    ]
+    findings = []
+    for f in diagnosis.findings:
+        if f.name in removed and f.verdict in (result.FOUND, result.CLASS):
+            f = replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
+        if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
+            f = result.bounded(f)
+        findings.append(f)
     numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
     active = tuple(numbers[name] for name in diagnosis.theta if name not in names)
     theta, spread, _ = sized(work.problem, work.after, active)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from math import isnan
 from typing import Any
 
-from visthrow.diagnose.select.scatter import Scatter
+from visthrow.diagnose.select.scatter import Scatter, unit_suffix
 from visthrow.diagnose.throw.command_mistakes import Mistake
 
 FOUND = "FOUND"
@@ -22,8 +22,8 @@ VERDICTS = {
     FOUND: "the model lacks it, and nothing else in the catalogue says the same",
     CLASS: "this or one of its partners; these flights cannot tell which",
     CANDIDATE: (
-        "the flights ask for it, but held-out flights do not confirm it, or not all searches"
-        " name it"
+        "the flights ask for it, but held-out flights do not confirm it, or the search does not"
+        " always name it without some of them"
     ),
     BOUNDED: "if it is there, then within these limits",
     NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
@@ -74,6 +74,15 @@ class Finding:
     manoeuvres: tuple[str, ...] = ()  # that would separate or show it
     sentence: str = ""
     differs: float = 0.0  # deviation by which another flight may differ from these [unit]
+
+
+def bounded(finding: Finding) -> Finding:
+    """Return the finding as a bound on an effect that need not exist."""
+    unit = unit_suffix(finding.unit)
+    sentence = (
+        f"{finding.name}: between {finding.low:.3g} and {finding.high:.3g}{unit}, if there at all."
+    )
+    return replace(finding, verdict=BOUNDED, estimate=0.0, partners=(), joint="", sentence=sentence)
 
 
 @dataclass(frozen=True)

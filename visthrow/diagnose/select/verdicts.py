@@ -374,7 +374,7 @@ def _overall(
     besides = [m.name for m in selection.problem.model.mistakes]
     besides += [s.name for s in scatter if s.found]
     if active:
-        return result.KNOWN, "", [f"{len(active)} named, no residual above the noise"], set()
+        return result.KNOWN, "", [], set()  # held-out flights give the reason
     nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
@@ -478,15 +478,15 @@ def _finding(
             f" {effect.prior_sd:.2g}{unit_suffix(effect.unit)})."
         )
         return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    unit = unit_suffix(effect.unit)
-    text = f"{effect.name}: between {low:.3g} and {high:.3g}{unit}, if there at all."
-    if low == high:
-        comparison = "less" if mean * effect.floor < low else "more"
-        text = (
-            f"{effect.name}: on its bound of {low:.3g}{unit}; these flights ask for"
-            f" {comparison} than is possible."
-        )
-    return replace(blank, verdict=result.BOUNDED, sentence=text)
+    finding = result.bounded(blank)
+    if low < high:
+        return finding
+    comparison = "less" if mean * effect.floor < low else "more"
+    text = (
+        f"{effect.name}: on its bound of {low:.3g}{unit_suffix(effect.unit)}; these flights ask for"
+        f" {comparison} than is possible."
+    )
+    return replace(finding, sentence=text)
 
 
 def _averaged(
@@ -562,9 +562,10 @@ def _named(
         sentence = f"{blank.cause}: {blank.name} = {text}, an interval that holds 0."
         return replace(blank, verdict=result.CANDIDATE, sentence=sentence)
     if len(members) < 2:
+        digits = 0 if blank.nats >= 10.0 else 1
         sentence = (
             f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
-            f" {blank.nats:.0f} nats; another flight may differ by {blank.differs:.2g}."
+            f" {blank.nats:.{digits}f} nats; another flight may differ by {blank.differs:.2g}."
         )
         return replace(blank, verdict=result.FOUND, sentence=sentence)
     effects = problem.effects

@@ -155,6 +155,7 @@ class ThrowModel(Model):
         """
         expect_known(names, concerned, "no effect '{}' for these flights", DiagnoseError)
         effects = [concerned[name] for name in names]
+        self.not_offered = len(concerned) - len(effects)
         self._sighted = [e for e in effects if needs_no_flight(e)]
         self._graded = [e for e in effects if not e.switch and e not in self._sighted]
         self._switched = [e for e in effects if e.switch]
