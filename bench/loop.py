@@ -353,13 +353,13 @@ def _fly_one(policy: str, base: str, text: str, flight: tuple[int, Path]) -> Non
 
 def recorded(log: FlightLog, rng: np.random.Generator) -> FlightLog:
     """What motion capture and the radio's log would hold of a simulated flight: noisy poses,
-    commands, nothing true.
+    commands, the battery's voltage, nothing else true.
     """
     start = log.meta["times"]["policy_start"] - BEFORE
     end = log.meta["times"].get("landing", log.meta["times"]["end"])
     channels = {
         name: _between(log[name], start, end + AFTER)
-        for name in ("command", "release_command", "pos_w", "quat_wb")
+        for name in ("command", "release_command", "battery_voltage", "pos_w", "quat_wb")
     }
     channels["payload_pos_w"] = _between(log["payload_pos_w"], start, end)
     seen = mocap.measured(

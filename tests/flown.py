@@ -36,6 +36,7 @@ def fly(
     seconds: float = 4.0,
     noise: float = 1.0,
     lost: float = 0.0,
+    used: float = 0.2,
 ) -> list[FlightLog]:
     """Fly a plant and record it as motion capture would.
 
@@ -49,6 +50,7 @@ def fly(
         noise: times :data:`NOISE`.
         lost: share of the commands that never arrive, where the last one stays; the log holds what
             was sent.
+        used: fraction of the battery's charge at the start.
     """
     rng = default_rng(seed)
     references = [FreeFlight(rng) for _ in range(free)]
@@ -62,7 +64,7 @@ def fly(
     pilot = Tracker(
         references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng
     )
-    sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=0.2)
+    sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=used)
     tracks: dict[str, list] = {
         name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")
     }

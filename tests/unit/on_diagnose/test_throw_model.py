@@ -24,6 +24,7 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
+from visthrow.diagnose.select.search import explain
 from visthrow.diagnose.throw import landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -332,6 +333,21 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
     assert told["voltage"][0] == approx(16.5, abs=0.02)
     assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
     assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
+
+
+def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
+    """It was: with nothing hidden, thrust 0.7 % too high was named. The voltage tells."""
+    names = ["thrust_gain", "air_density", "mass_quad"]
+    logs = fly(setting_with({}), used=0.0, seconds=3.0)
+    assert not explain(ThrowModel(logs, paper_plant(), only=names), laws=False).theta
+    for log in logs:
+        del log.channels["battery_voltage"]
+    model = ThrowModel(logs, paper_plant(), only=[*names, "battery_charge"])
+    diagnosis = explain(model, laws=False)
+    assert set(diagnosis.theta) == {"battery_charge"}
+    found = diagnosis["battery_charge"]
+    assert found.low < (16.8 - 16.18) / 15.2 < found.high  # open voltage: full, a fifth used
+    assert any("no log holds battery_voltage" in text for text in model.notes)
 
 
 def test_a_path_comes_down_between_two_points():

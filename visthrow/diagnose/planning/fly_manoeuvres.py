@@ -109,7 +109,7 @@ def _(model: ThrowModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
     requested = {e.name for e in model.effects}
 
     def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
-        log = flight.log(noise)
+        log = flight.log(noise, model.has_voltage)
         manoeuvre = flight.manoeuvre
         carries = manoeuvre.payload
         setting = model.setting
@@ -235,8 +235,10 @@ class SimulatedFlight:
         cosine = np.einsum("ni,ni->n", hangs, axes) / np.linalg.norm(hangs, axis=1)
         return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
 
-    def log(self, noise: Mapping[str, float]) -> FlightLog:
-        """Return a flight log like the throw's: poses from motion capture, commands as sent."""
+    def log(self, noise: Mapping[str, float], voltage: bool = True) -> FlightLog:
+        """Return a flight log like the throw's: poses from motion capture, commands as sent, and
+        the battery's ``voltage`` if the vehicle logs it.
+        """
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
         measured = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         sent = self.reference.time
@@ -247,6 +249,8 @@ class SimulatedFlight:
             "command": Channel(sent, self.commands, "N, rad/s", "body"),
             "release_command": Channel(sent, self.reference.release.astype(float), "1"),
         }
+        if voltage:
+            channels["battery_voltage"] = Channel(self.time, self.truth["voltage"], "V")
         return self._log(channels)
 
     def setup_log(

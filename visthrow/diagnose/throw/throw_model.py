@@ -49,6 +49,10 @@ from visthrow.diagnose.throw.replay import (
 )
 from visthrow.logs.flightlog import FlightLog
 
+UNKNOWN_CHARGE = (
+    "no log holds battery_voltage: a fifth of the charge is assumed to be used at the start;"
+    " battery_charge stands for a fuller or emptier pack"
+)
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 
 
@@ -103,8 +107,11 @@ class ThrowModel(Model):
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
         self.channels = [*_measured(flights, carries), *(kind.channel for kind in self._direct)]
         thrown = any(f.latch != NEVER for f in flights)
-        concerned = effects_for(self.setting, set(self.channels), carries, thrown, simpler)
+        measured = {*self.channels, *(["battery_voltage"] if self.has_voltage else [])}
+        concerned = effects_for(self.setting, measured, carries, thrown, simpler)
         self._choose(concerned, concerned if only is None else only)
+        if "battery_charge" in self.entries:
+            self.notes = (*self.notes, UNKNOWN_CHARGE)
         fitter = self._initial_fit(self.setting, self.flights)
         begun = fitter.fit(states)
         # states at theta = 0, and the samples' derivatives by them
@@ -114,6 +121,11 @@ class ThrowModel(Model):
         self._latest[frozenset()] = begun, self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
+
+    @property
+    def has_voltage(self) -> bool:
+        """Return whether any flight's log holds the battery's voltage."""
+        return any(f.voltage is not None for f in self.flights.flights)
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
         """Cut flights into windows, fewer of long flights."""
@@ -451,6 +463,8 @@ def effects_for(
         if e.block in ("rope", "rope mount", "payload", "payload air") and not payload:
             continue
         if (e.block in ("release", "ballistic") and not releases) or not e.applies(setting):
+            continue
+        if name == "battery_charge" and "battery_voltage" in channels:
             continue
         if any(c in e.channels and c not in channels for c in ("rate_b", "landing")):
             continue
