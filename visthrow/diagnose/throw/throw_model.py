@@ -51,7 +51,7 @@ from visthrow.logs.flightlog import FlightLog
 
 UNKNOWN_CHARGE = (
     "no log holds battery_voltage: a fifth of the charge is assumed to be used at the start;"
-    " battery_charge stands for a fuller or emptier pack"
+    " battery_charge stands for a fuller or emptier pack, which intervals of thrust leave out"
 )
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 
