@@ -64,7 +64,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     scatter = [
         {"name": "lag_jitter", "found": True, "size": 0.01, "unit": "s", "of": ["release_lag"]}
     ]
-    own = {"name": "wind_x", "estimate": 0.21, "low": 0.16, "high": 0.26, "unit": "m/s"}
+    own = {"name": "wind_x", "estimate": 0.2, "low": 0.16, "high": 0.24, "unit": "m/s"}
     given = diagnosis(scatter=scatter, findings=[own, own | {"name": "wind_y"}])
     assert run_command(f"diagnose apply {given} --out {out} --plants 8") == 0
     capsys.readouterr()
@@ -93,7 +93,7 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
     assert 'base = "train/state.toml"' in text
     assert "Landing error of 9 throws: 0.11 m before, 0.02 m after" in text
     assert "lag_jitter 0.01 s" in text
-    assert "wind_x = 0.21 m/s (95 %: 0.16 to 0.26)" in text  # beside what is set
+    assert "wind_x = 0.2 m/s (95 %: 0.16 to 0.24)" in text
     assert "wind_y" not in text
     for line in text.splitlines():
         assert " = " not in line or "#" in line or line.startswith("base"), line

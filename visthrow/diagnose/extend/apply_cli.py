@@ -190,8 +190,8 @@ def origin(report: dict, path: str) -> list[str]:
     ]
     if causes:
         lines.append(
-            "The sizes are those with which these causes alone explain the flights. With everything"
-            " else below its floor:"
+            "Sizes and intervals as `explain` printed them. The deviations below also allow for"
+            " differences between flights."
         )
         lines += [
             f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"

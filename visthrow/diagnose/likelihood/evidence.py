@@ -245,6 +245,42 @@ def estimate(
     return theta
 
 
+def mean_sizes(
+    information: np.ndarray,
+    score: np.ndarray,
+    priors: Priors,
+    active: Sequence[int],
+) -> np.ndarray:
+    """Return posterior means of the named effects within their bounds, all others free below their
+    floors; 0 for effects that are not named. In floors, shape (K,).
+    """
+    columns = list(active)
+    sigma = covariance(information, priors.deviation(columns))
+    theta = np.zeros(len(score))
+    theta[columns] = np.clip(sigma[columns] @ score, priors.low[columns], priors.high[columns])
+    return theta
+
+
+def averaged(
+    information: np.ndarray,
+    score: np.ndarray,
+    priors: Priors,
+    j: int,
+    sets: Sequence[tuple[tuple[int, ...], float]],
+) -> tuple[float, float]:
+    """Return mean and deviation of an effect over the possible sets that hold it, all other effects
+    free below their floors, in floors.
+
+    ``sets``: effects of each set, and its nats behind."""
+    estimates = []
+    for members, distance in sets:
+        sigma = covariance(information, priors.deviation(members))
+        estimates.append((float(sigma[j] @ score), float(sigma[j, j]), np.exp(-distance)))
+    means, variances, weights = np.array(estimates).T
+    mean = np.average(means, weights=weights)
+    return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
+
+
 def certainty(
     information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
 ) -> np.ndarray:

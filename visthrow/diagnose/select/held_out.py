@@ -17,10 +17,8 @@ from scipy.special import stdtrit
 from visthrow.diagnose.likelihood.correlation import components
 from visthrow.diagnose.likelihood.evidence import (
     NORMAL_95,
-    OWN_FLOOR,
     STRONG,
-    covariance,
-    estimate,
+    averaged,
 )
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
@@ -39,7 +37,7 @@ from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
-from visthrow.diagnose.select.scatter import allowed, between_flights, freed
+from visthrow.diagnose.select.scatter import freed
 
 MOST_FOLDS = 12
 PARTS = 3
@@ -78,6 +76,7 @@ class Work:
     after: Point
     active: tuple[int, ...]
     crossed: Crossed | None = None  # searches without some of the flights
+    candidates: tuple[int, ...] = ()  # that were free when the active effects were sized
 
 
 def groups_of(point: Point) -> tuple[list[int], str]:
@@ -128,7 +127,17 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         if window_sets[chosen] < linear.value(selected) + STRONG:
             chosen = selected  # the training cannot tell it from others, and does not deny it
         active = columns_of(chosen)
-        trained[fold] = estimate(*linear.total(chosen), priors, active)
+        value = linear.value(chosen)
+        behind = {s: value - v for s, v in window_sets.items()} | {chosen: 0.0}
+        sets = [
+            ((*columns_of(s), *work.candidates), nats)
+            for s, nats in behind.items()
+            if nats < STRONG
+        ]
+        for j in active:
+            homes = [(members, nats) for members, nats in sets if j in members]
+            mean = averaged(*linear.total(chosen), priors, j, homes)[0]
+            trained[fold, j] = np.clip(mean, priors.low[j], priors.high[j])
         named.update(active)
     shares = {effects[j].name: n / len(folds) for j, n in named.items()}
     return Crossed(groups, left_out, statistics, folds, trained, shares)
@@ -369,8 +378,8 @@ def _withdrawn(
     reason: str,
     measured: HeldOut | None = None,
 ) -> Diagnosis:
-    """Names and the members of their classes with another verdict; what stays named is sized
-    without them. A candidate without evidence where the search ended is bounded.
+    """Names and the members of their classes with another verdict; what stays named keeps
+    its size and deviation. A candidate without evidence where the search ended is bounded.
 
     The search does not return to a set that it left, but what it takes up later (initial states,
     derivatives) may explain what a name did. So a name of the last set may have no evidence.
@@ -389,11 +398,14 @@ def _withdrawn(
         if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
             f = result.bounded(f)
         findings.append(f)
+    theta = {name: size for name, size in diagnosis.theta.items() if name not in names}
+    rows = [row for row, name in enumerate(diagnosis.theta) if name in theta]
+    spread = tuple(tuple(diagnosis.covariance[i][k] for k in rows) for i in rows)
     numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
-    active = tuple(numbers[name] for name in diagnosis.theta if name not in names)
-    theta, spread, _ = sized(work.problem, work.after, active)
+    active = tuple(numbers[name] for name in theta)
     after = work.after if active else work.before
-    work = replace(work, after=after, active=active, crossed=None)
+    candidates = (*work.candidates, *(numbers[name] for name in names))
+    work = replace(work, after=after, active=active, crossed=None, candidates=candidates)
     left = replace(diagnosis, findings=tuple(findings), theta=theta, covariance=spread, work=work)
     if active:
         return left
@@ -406,26 +418,6 @@ def _withdrawn(
         reasons=(reason, *earlier),
         held_out=measured,
     )
-
-
-def sized(
-    problem: Problem, point: Point, active: Sequence[int]
-) -> tuple[dict[str, float], tuple[tuple[float, ...], ...], float]:
-    """Sizes with which named effects alone explain the flights, and their covariance with what
-    numerics and differences among flights add.
-
-    Returns both in the effects' units, and the variance that effects may have among flights,
-    in what is allowed, see :func:`visthrow.diagnose.select.scatter.between_flights`."""
-    priors = problem.priors
-    named = list(active)
-    theta = estimate(point.information, point.score, priors, named)
-    unlike, mean_part = between_flights(point.statistics, priors, named, theta)
-    spread = covariance(point.information, priors.deviation(named)) + np.diag(
-        OWN_FLOOR**2 + unlike * mean_part * allowed(theta) ** 2
-    )
-    variance = spread[np.ix_(named, named)] * np.outer(priors.floor[named], priors.floor[named])
-    sizes = {problem.effects[j].name: float(theta[j] * priors.floor[j]) for j in named}
-    return sizes, tuple(tuple(map(float, row)) for row in variance), unlike
 
 
 def _share(measured: HeldOut) -> str:

@@ -182,8 +182,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]  # one an effect, in the model's order
     theta: Mapping[
         str, float
-        # what to set in the model: sizes with which named effects alone, one of each class, explain
-        # most
+        # what to set in the model: the findings' sizes of named effects, one of each class
     ]
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]

@@ -15,8 +15,9 @@ from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     NORMAL_95,
     OWN_FLOOR,
-    Priors,
+    averaged,
     covariance,
+    mean_sizes,
     surely_there,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
@@ -33,7 +34,7 @@ from visthrow.diagnose.select.candidates import (
     varies_of,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
-from visthrow.diagnose.select.held_out import Work, repeated_share, sized
+from visthrow.diagnose.select.held_out import Work, repeated_share
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
@@ -50,6 +51,7 @@ from visthrow.diagnose.select.scatter import (
     Scatter,
     Varies,
     allowed,
+    between_flights,
     by_day,
     freed,
     judged,
@@ -91,24 +93,24 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         point = nominal
     statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
     reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
-    theta, spread, unlike = sized(problem, reported_point, active)
     varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
-    means = sized(problem, reported_point, sorted({*active, *varying}))[0]
-    scatter = tuple(
-        replace(s, mean={name: means[name] for name in s.of if name in means}) for s in scatter
-    )
+    sized = sorted({*active, *varying})
+    sizes = mean_sizes(reported_point.information, reported_point.score, problem.priors, sized)
+    scatter = _with_means(problem, scatter, sized, sizes)
+    unlike, mean_part = between_flights(reported_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
     findings = tuple(
         _finding(problem, reported_point, j, active, sets, unlike, withdrawn)
         for j in range(len(model.effects))
     )
+    named = [findings[j] for j in active]
     return Diagnosis(
         overall,
         block,
         tuple(reasons),
         findings,
-        theta,
-        spread,
+        {f.name: f.estimate for f in named},
+        _covariance(problem, reported_point, named, active, mean_part),
         selection.threshold,
         tuple(selection.steps),
         tuple((tuple(sorted(c.name for c in t.chosen)), nats) for t, nats in selection.window),
@@ -124,6 +126,36 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         samples=int(point.statistics.samples.sum()),
         work=Work(problem, nominal, point if active else nominal, tuple(active)),
     )
+
+
+def _with_means(
+    problem: Problem, scatter: Sequence[Scatter], sized: Sequence[int], sizes: np.ndarray
+) -> tuple[Scatter, ...]:
+    """Return verdicts on what varies with the means of these flights; ``sizes`` are in floors."""
+    means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
+    return tuple(
+        replace(s, mean={name: means[name] for name in s.of if name in means}) for s in scatter
+    )
+
+
+def _covariance(
+    problem: Problem,
+    point: Point,
+    named: Sequence[Finding],
+    active: Sequence[int],
+    mean_part: np.ndarray,
+) -> tuple[tuple[float, ...], ...]:
+    """Return the joint covariance of the findings' sizes, with what the mean of these flights keeps
+    of the differences between flights.
+
+    ``mean_part``: share of the variance between flights that the mean keeps, shape (K,)."""
+    columns = list(active)
+    sigma = covariance(point.information, problem.priors.deviation(columns))
+    spread = sigma[np.ix_(columns, columns)] + OWN_FLOOR**2 * np.eye(len(columns))
+    scale = np.array([f.sd for f in named]) / np.sqrt(np.diag(spread))
+    differs = np.array([f.differs for f in named])
+    variance = spread * np.outer(scale, scale) + np.diag(mean_part[columns] * differs**2)
+    return tuple(map(tuple, variance.tolist()))
 
 
 def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
@@ -453,7 +485,8 @@ def _finding(
     partners, together = _class_of(j, active, sets)
     remaining = [k for k in together if k != j]
     homes = [(members, nats) for members, nats in sets if j in members] if active else []
-    mean, sd = _averaged(point, priors, j, homes or [((*remaining, j), 0.0)])
+    homes = homes or [((*remaining, j), 0.0)]
+    mean, sd = averaged(point.information, point.score, priors, j, homes)
     deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
     nats = point.evidence(priors, [*remaining, j]) - point.evidence(priors, remaining)
     blank = replace(blank, sd=deviation, nats=nats)
@@ -487,21 +520,6 @@ def _finding(
         f" {comparison} than is possible."
     )
     return replace(finding, sentence=text)
-
-
-def _averaged(
-    point: Point, priors: Priors, j: int, sets: Sequence[tuple[tuple[int, ...], float]]
-) -> tuple[float, float]:
-    """Return mean and deviation of an effect over the possible sets that hold it, all other effects
-    free below their floors, in floors.
-    """
-    estimates = []
-    for members, distance in sets:
-        sigma = covariance(point.information, priors.deviation(list(members)))
-        estimates.append((float(sigma[j] @ point.score), float(sigma[j, j]), np.exp(-distance)))
-    means, variances, weights = np.array(estimates).T
-    mean = np.average(means, weights=weights)
-    return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
 
 
 def _blank(effect: Effect) -> Finding:
