@@ -1,8 +1,8 @@
 """Keypoints that the vision policy sees: corners of the goal square and the bounding box of the
 ball.
 
-`keypoints` is the one function that the training environment calls with a batch of thousands and
-the HIL runner with a batch of one."""
+`keypoints` serves the training environment with a batch of thousands. For the single vehicle of the
+HIL runner, `visthrow.onboard.row_keypoints` computes the same on arrays."""
 
 import copy
 

@@ -2,8 +2,8 @@
 camera.
 
 Products are written out elementwise: a batched matrix product would round differently with the
-batch size (and in TF32 where the trainer turns that on), and the training environment must equal
-the onboard batch of one bit for bit."""
+batch size (and in TF32 where the trainer turns that on), and a vehicle must see the same alone and
+in a batch, bit for bit."""
 
 import math
 

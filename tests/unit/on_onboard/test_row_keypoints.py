@@ -50,3 +50,20 @@ def test_keypoints_are_those_of_the_batch(lens, reads):
     assert_array_equal(np.concatenate([seen_valid for _, seen_valid in seen]), valid)
     assert_allclose(np.concatenate([place for place, _ in seen]), points, rtol=0.0, atol=SINGLE)
     assert 0.1 < valid.float().mean() < 0.9, "points inside and outside of the field of view"
+
+
+@mark.parametrize("reads", ["zero", "edge"])
+def test_a_payload_at_the_lens_reads_as_in_the_batch(reads):
+    params = load_experiment("vision").camera
+    params = replace(
+        params,
+        mount=replace(params.mount, position_b=(0.0, 0.0, 0.0)),
+        noise=replace(params.noise, invalid_reads=reads),
+    )
+    camera = KeypointCamera(params)
+    pos = torch.tensor([[0.0, 0.0, 2.0]])
+    view = pos, torch.eye(3)[None], torch.tensor([[1.0, 0.5, 0.0]]), pos
+    points, valid = keypoints(camera, *view)
+    place, seen_valid = row_keypoints(camera.on_arrays(), *(value.numpy() for value in view))
+    assert_array_equal(seen_valid, valid)
+    assert_allclose(place, points, rtol=0.0, atol=SINGLE)

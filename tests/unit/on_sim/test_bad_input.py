@@ -1,13 +1,13 @@
 """What the simulators refuse, and that the message names what came, what was expected and where."""
 
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 
 import numpy as np
 from pytest import mark, raises
 
 from sim.hybrid import HybridSim, tether_lengths
-from sim.kernels.structs import types
-from sim.params import PlantParams, changed
+from sim.kernels.structs import EXTENSIONS, types
+from sim.params import AirParams, PlantParams, ReleaseParams, RopeParams, changed
 from tests.plants import paper_plant
 from tests.simulators import bare_quadrotor
 from visthrow import config
@@ -66,6 +66,23 @@ def test_other_kinds_of_blocks_in_one_batch():
         HybridSim(plant, 2, vehicles=[plant.vehicle, other])
     with raises(ValueError, match=r"'none'.*expected the same blocks"):
         bare_quadrotor(plant.vehicle, 2, vehicles=[plant.vehicle, other])
+
+
+def test_every_optional_number_reaches_the_kernel():
+    """A number that needs an extension and is not in its row would be ignored in silence."""
+    optional = {
+        f.name
+        for part in (RopeParams, AirParams, ReleaseParams)
+        for f in fields(part)
+        if f.default is not MISSING
+    }
+    of_extensions = set(" ".join(EXTENSIONS.values()).split())
+    in_every_kernel = {"wind_w", "kick_w", "kick_along"}
+    refused = {"payload_sides", "cables_apart", "gripper_mass"}
+    assert optional == of_extensions | in_every_kernel | refused
+    plant = plant_with("rope.gripper_mass", 0.01)
+    with raises(ValueError, match="gripper_mass"):
+        HybridSim(plant, 1)
 
 
 def test_ropes_of_different_segments_in_one_batch():

@@ -3,14 +3,15 @@ ordinary one for each.
 """
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import torch
 from numpy.testing import assert_allclose
 from pytest import approx, mark, raises
 
-from sim.params import GRAVITY
-from sim.scaling.vehicle_class import draw
+from sim.params import GRAVITY, AeroParams
+from sim.scaling.vehicle_class import SCALES, draw
 from tests.configs import QUIET, load_experiment
 from visthrow import config
 from visthrow.common.errors import PolicyError
@@ -104,6 +105,8 @@ def test_drawn_vehicles_lie_in_the_ranges_and_follow_size():
         near = 0.15 * (high - low)  # both ends are reached
         assert low * (1 - 1e-9) <= factor.min() < low + near, name
         assert high - near < factor.max() <= high * (1 + 1e-9), name
+    with_drag = {path for path, factors in SCALES["vehicle"].items() if factors == "drag"}
+    assert with_drag == {f"aero.{f.name}" for f in fields(AeroParams) if f.name != "kind"}
 
 
 def test_the_environment_flies_every_vehicle_with_its_own_limits_and_tells_them():
