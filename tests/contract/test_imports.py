@@ -33,6 +33,7 @@ OPTIONAL_ROOMS = ("visthrow.paper", "visthrow.detector_training", "hil.rehearsal
 EXTRAS = (  # packages that an installation without extras lacks
     *("mujoco", "piqp", "pyulog", "rosbags", "h5py", "mcap", "skimage", "submitit", "serial"),
     *("cflib", "cyclonedds", "natnet", "motioncapture", "mujoco_warp", "aeroid"),
+    *("onnx", "onnxscript"),
 )
 ON_THE_GROUND = (  # extras train, view, pictures
     *("warp", "rsl_rl", "tensordict", "kornia", "rerun", "pyarrow", "cv2", "matplotlib", "scipy"),
@@ -151,6 +152,7 @@ def test_what_flies_needs_neither_train_nor_view(tmp_path):
         "hil replay run",
     ]
     refused = {"fly": "train", "train laptop": "train", "hil view run": "pictures"}
+    refused["policy export state --out p.onnx"] = "onnx"
     code = f"""
 import contextlib, io, sys
 sys.modules.update(dict.fromkeys({(*ON_THE_GROUND, *EXTRAS)!r}))

@@ -1,5 +1,6 @@
 """What every training algorithm is to the trainer that drives it."""
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 from torch.optim.swa_utils import AveragedModel
@@ -10,7 +11,7 @@ from visthrow.training.env import ThrowEnv
 from visthrow.training.ppo.network import Network
 
 
-class Algorithm:
+class Algorithm(ABC):
     """A training algorithm, driven an iteration at a time.
 
     Its constructor takes experiment, device, seed and ranks, builds environment, of this seed, and
@@ -26,19 +27,19 @@ class Algorithm:
     # attributes whose state the next iteration depends on, besides the environment's
     parts: tuple[str, ...]
 
+    @abstractmethod
     def collect(self, done: float) -> None:
         """Fly one batch; ``done``: share of the whole training that lies behind, 0 to 1, for
         schedules.
         """
-        raise NotImplementedError
 
+    @abstractmethod
     def learn(self, done: float) -> dict[str, float]:
         """Learn from the last batch; returns figures for the log, of
         :data:`visthrow.training.progress.COLUMNS` those that there are.
 
         Always there are the finished episodes' :meth:`ThrowEnv.episode_means`.
         """
-        raise NotImplementedError
 
     def export(self, contract: dict, made_by: dict) -> Policy:
         """Return the policy as a file's content."""

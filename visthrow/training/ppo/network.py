@@ -103,7 +103,7 @@ class Network(MLPModel):
 
 class MuonAdam(torch.optim.Adam):
     """Adam whose weight matrices step along their orthogonalised momentum, at the same learning
-    rate.
+    rate. Zero the gradients on the network: ``zero_grad`` leaves those of the matrices.
 
     Source: K. Jordan et al., Muon, 2024; the steps' size: Liu et al., arXiv:2502.16982."""
 
