@@ -95,6 +95,8 @@ class SettingEffect(Effect):
     needs: str = "always"  # what the setting must have: a name of sim.effects.blocks.CONDITIONS
     # a switch to a simpler block: left out unless asked for, as each compiles a kernel
     simpler: bool = False
+    # whether it is a state of these flights only, which no configuration of the vehicle takes over
+    transient: bool = False
     lowest: tuple[Lowest, ...] = ()  # beside the bounds: no negative mass, delay or drag
 
     def __post_init__(self) -> None:

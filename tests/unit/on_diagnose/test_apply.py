@@ -99,6 +99,25 @@ def test_apply_writes_what_training_reads(diagnosis, tmp_path, capsys):
         assert " = " not in line or "#" in line or line.startswith("base"), line
 
 
+def test_the_charge_of_the_flights_is_not_written_to_the_vehicle(diagnosis, tmp_path, printed):
+    out = tmp_path / "mine.toml"
+    theta = {"battery_charge": 0.04, "thrust_gain": 0.03}
+    found = diagnosis(theta=theta, covariance=[[1e-4, 9e-5], [9e-5, 4e-4]])
+    said = printed(f"diagnose apply {found} --out {out}")
+    assert "Not written: battery_charge" in said
+    assert "Not written: battery_charge" in out.read_text()
+    after = config.load(Experiment, out)
+    assert after.vehicle.battery == shipped().vehicle.battery
+    assert after.diagnosed.effects == ("thrust_gain",)
+    assert after.diagnosed.covariance == ((4e-4,),)
+    assert_allclose(after.vehicle.thrust.gain, 1.03)
+    alone = diagnosis(theta={"battery_charge": 0.04}, covariance=[[1e-4]])
+    said = printed(f"diagnose apply {alone} --out {tmp_path}/none.toml")
+    assert "Not written: battery_charge" in said
+    assert "the configuration stands as it is" in said
+    assert not (tmp_path / "none.toml").exists()
+
+
 def test_sizes_count_from_the_model_that_was_diagnosed(diagnosis, tmp_path, refused):
     """The plant and the overrides that the diagnosis was made with, whatever the shipped one says;
     of another nothing is written.
@@ -211,7 +230,7 @@ def test_mistakes_are_told(diagnosis, changes, message, tmp_path, refused):
 
 def test_nothing_named_writes_nothing(diagnosis, tmp_path, printed):
     nothing = diagnosis(theta={}, covariance=[])
-    assert "nothing was named" in printed(f"diagnose apply {nothing} --out {tmp_path}/x.toml")
+    assert "nothing to write" in printed(f"diagnose apply {nothing} --out {tmp_path}/x.toml")
 
 
 BALL = {

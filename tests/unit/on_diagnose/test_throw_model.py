@@ -347,7 +347,20 @@ def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():
     assert set(diagnosis.theta) == {"battery_charge"}
     found = diagnosis["battery_charge"]
     assert found.low < (16.8 - 16.18) / 15.2 < found.high  # open voltage: full, a fifth used
-    assert any("no log holds battery_voltage" in text for text in model.notes)
+    assert f"{len(logs)} of {len(logs)} logs hold no battery_voltage" in model.notes[0]
+    assert "battery_charge stands for" in model.notes[0]
+
+
+def test_logs_without_the_voltage_beside_one_that_holds_it_are_counted():
+    logs = fly(setting_with({}), throws=0, seconds=1.0)
+    assert not ThrowModel(logs, paper_plant(), only=["thrust_gain"]).notes
+    del logs[0].channels["battery_voltage"]
+    model = ThrowModel(logs, paper_plant(), only=["thrust_gain"])
+    assert model.notes == (
+        "1 of 2 logs hold no battery_voltage: the charge at their start is assumed",
+    )
+    with raises(DiagnoseError, match="battery_charge"):
+        ThrowModel(logs, paper_plant(), only=["battery_charge"])
 
 
 def test_a_path_comes_down_between_two_points():

@@ -41,18 +41,21 @@ def run(args: argparse.Namespace) -> int:
     if of_throw:
         patch.refuse_strange(report, args.diagnosis, theta)
     theta, covariance = patch.with_scatter(theta, covariance, report)
+    account = origin(report, args.diagnosis)
+    if of_throw:
+        theta, covariance, transient = patch.without_transient(theta, covariance)
+        account += _report_transient(transient)
     if not theta and not laws:
         unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         unused = unused if report.get("laws") else ""
         what = "configuration" if of_throw else "setup"
-        print(f"nothing was named{unused}; the {what} stands as it is")
+        print(f"nothing to write{unused}; the {what} stands as it is")
         return 0
     _bear_out(report, args.anyway)
     folder, option, schema = (
         ("train", "plant", Experiment) if of_throw else ("diagnose", "config", setup.Setup)
     )
     name = _made_with(report, args, option, folder)
-    account = origin(report, args.diagnosis)
     base = _named(folder, name)
     diagnosed = config.load(
         schema, config.find(folder, name), report.get("overrides", ()) if of_throw else ()
@@ -63,14 +66,20 @@ def run(args: argparse.Namespace) -> int:
         else patch.of_setup(base, diagnosed, report, args.diagnosis, account, args.laws)
     )
     atomic_write(args.out, content)
-    config.load(
-        schema, Path(args.out)
-    )  # what was written is what training, or the next diagnosis, will read
+    config.load(schema, Path(args.out))  # as training, or the next diagnosis, will read it
     named = list(theta)
     for law in laws:
         named.append(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})")
     print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
+
+
+def _report_transient(names: list[str]) -> list[str]:
+    """Print and return the line on effects that the file leaves out, none without such effects."""
+    lines = [f"Not written: {', '.join(names)}; a state of these flights only."] if names else []
+    for line in lines:
+        print(line)
+    return lines
 
 
 def _apply_firmware(args: argparse.Namespace) -> int:

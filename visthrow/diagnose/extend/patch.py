@@ -150,6 +150,20 @@ def with_scatter(
     return sizes, whole + np.diag([scatter.get(name, 0.0) for name in sizes])
 
 
+def without_transient(
+    theta: Mapping[str, float], covariance: np.ndarray
+) -> tuple[dict[str, float], np.ndarray, list[str]]:
+    """Leave out effects that belong to the diagnosed flights and not to the vehicle.
+
+    Returns the other sizes, their covariance, and the names that were left out.
+    """
+    transient = [catalogue()[name].transient for name in theta]
+    rows = np.flatnonzero(np.logical_not(transient))
+    names = list(theta)
+    sizes = {names[i]: theta[names[i]] for i in rows}
+    return sizes, covariance[np.ix_(rows, rows)], [n for n in names if n not in sizes]
+
+
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
     """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0.
 

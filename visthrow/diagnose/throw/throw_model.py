@@ -49,9 +49,9 @@ from visthrow.diagnose.throw.replay import (
 )
 from visthrow.logs.flightlog import FlightLog
 
-UNKNOWN_CHARGE = (
-    "no log holds battery_voltage: a fifth of the charge is assumed to be used at the start;"
-    " battery_charge stands for a fuller or emptier pack, which intervals of thrust leave out"
+UNKNOWN_CHARGE = "{} of {} logs hold no battery_voltage: the charge at their start is assumed"
+OTHER_CHARGE = (
+    "; battery_charge stands for a fuller or emptier pack, which intervals of thrust leave out"
 )
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 
@@ -110,8 +110,10 @@ class ThrowModel(Model):
         measured = {*self.channels, *(["battery_voltage"] if self.has_voltage else [])}
         concerned = effects_for(self.setting, measured, carries, thrown, simpler)
         self._choose(concerned, concerned if only is None else only)
-        if "battery_charge" in self.entries:
-            self.notes = (*self.notes, UNKNOWN_CHARGE)
+        silent = sum(f.voltage is None for f in flights)
+        if silent and plant.vehicle.battery.kind == "sag":
+            other = OTHER_CHARGE if "battery_charge" in self.entries else ""
+            self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + other)
         fitter = self._initial_fit(self.setting, self.flights)
         begun = fitter.fit(states)
         # states at theta = 0, and the samples' derivatives by them
