@@ -6,8 +6,8 @@ import json
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ MASS = 0.21  # of configs/vehicle/paper.toml [kg]
 DRAG = 0.06  # of the rotors, from the same file [kg/s]
 WANDER = 0.15
 """Of a hover, to either side [m]."""
+VOLTAGE = 15.2  # at which that vehicle's thrust is as commanded [V]
 FULL_THRUST = 14.0
 """What the configured controller calls full: four times ``max_thrust`` of configs/vehicle [N]."""
 
@@ -94,7 +95,7 @@ def still(seconds: float, thrust: float, height: float, rate: float = 100.0) -> 
 
 def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
     """A hover that is never quite still, for so long: paths, attitudes and commands of a vehicle
-    whose blades do not flap.
+    whose blades do not flap, whose rates follow at once, and whose battery never drains.
     """
     rng = np.random.default_rng(1)
     t = np.arange(0.0, seconds, 1.0 / rate)
@@ -130,6 +131,7 @@ def wandering(seconds: float, rate: float = 100.0) -> FlightLog:
                 "N, rad/s",
                 "body",
             ),
+            "battery_voltage": Channel(t[::100], np.full(len(t[::100]), VOLTAGE), "V"),
         },
         {},
     )
@@ -147,7 +149,7 @@ class Bad:
     spoil: Callable[[Logs], Logs]
     cut_to: float = 1.0  # share of each file's bytes that is left
     flown: bool = True  # whether it needs a world's flights
-    right: frozenset[str] = frozenset()  # effects that the logs really ask for
+    right: Mapping[str, float] = field(default_factory=dict)  # signs of effects that the logs have
 
     def run(self, recipe: Recipe, folder: Path) -> dict:
         """Fly a world without effect, spoil its logs, ask."""
@@ -179,11 +181,13 @@ class Bad:
         }
 
 
-def fair(
-    done: subprocess.CompletedProcess, verdict: dict, right: frozenset[str] = frozenset()
-) -> bool:
-    """No traceback, no name that is not right; and either a verdict or an error of one sentence."""
-    if "Traceback" in done.stderr or set(verdict.get("theta") or {}) - right:
+def fair(done: subprocess.CompletedProcess, verdict: dict, right: Mapping[str, float]) -> bool:
+    """No traceback, no name or sign that is not right; and either a verdict or an error of one
+    sentence.
+    """
+    theta = verdict.get("theta") or {}
+    wrong = [name for name, size in theta.items() if right.get(name, 0.0) * size <= 0.0]
+    if "Traceback" in done.stderr or wrong:
         return False
     return (
         done.returncode == 2 and bool(done.stderr.strip())
@@ -246,6 +250,6 @@ BAD = {
     "empty_files": Bad(as_they_are, cut_to=0.0),
     "standing": Bad(standing, flown=False),
     # its blades do not flap, and its rates follow the commands at once
-    "two_hours": Bad(hours, flown=False, right=frozenset({"flapping", "rate_gain"})),
+    "two_hours": Bad(hours, flown=False, right={"flapping": -1.0, "rate_gain": 1.0}),
     "two_hours_still": Bad(hours_still, flown=False),
 }

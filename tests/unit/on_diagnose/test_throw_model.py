@@ -25,7 +25,7 @@ from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
 from visthrow.diagnose.select.search import explain
-from visthrow.diagnose.throw import landing
+from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.diagnose.throw.throw_model import ThrowModel
@@ -361,6 +361,14 @@ def test_logs_without_the_voltage_beside_one_that_holds_it_are_counted():
     )
     with raises(DiagnoseError, match="battery_charge"):
         ThrowModel(logs, paper_plant(), only=["battery_charge"])
+
+
+def test_the_answer_counts_the_windows_that_are_left_out(monkeypatch):
+    monkeypatch.setattr(cutting, "WINDOW_LIMIT", 2)
+    logs = fly(setting_with({}), throws=0, seconds=2.0)
+    model = ThrowModel(logs, paper_plant(), only=["thrust_gain"])
+    assert len(model.windows({})) == 2
+    assert model.notes[0].startswith("2 of 6 windows are looked at")
 
 
 def test_a_path_comes_down_between_two_points():

@@ -130,7 +130,7 @@ class ThrowModel(Model):
         return any(f.voltage is not None for f in self.flights.flights)
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
-        """Cut flights into windows, fewer of long flights."""
+        """Cut flights into windows, fewer where there are many."""
         release = self.setting.plant.release
         known = release.lag, release.landing_height
         cuts = [c for i, f in enumerate(flights) for c in cut(f, i, *known, hangs[i])]
@@ -141,7 +141,8 @@ class ThrowModel(Model):
             )
         chosen = thinned(cuts, flights)
         if len(chosen) < len(cuts):
-            self.notes = (f"long flights: {len(chosen)} of {len(cuts)} windows are looked at",)
+            count = f"{len(chosen)} of {len(cuts)} windows"
+            self.notes = (f"{count} are looked at: all throws, and where commands vary most",)
         return chosen
 
     def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
