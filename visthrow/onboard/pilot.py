@@ -211,7 +211,9 @@ class Pilot:
         goal_w = np.asarray(goal_w).reshape(-1, 3)
         attached = np.asarray(attached).reshape(-1, 1)
         views = self._measured(pos_w, quat_wb, vel_w, rate_b, payload_w, goal_w, attached)
-        detected = None if keypoints is None else tuple(map(self._native, keypoints))
+        detected = None
+        if keypoints is not None:  # copies: a detector may reuse its arrays
+            detected = tuple(self._native(np.array(array)) for array in keypoints)
         seen = self._see(views, detected)
         if now is not None and self._bridged(now, seen):
             seen = self._see(views, detected)

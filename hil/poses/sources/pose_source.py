@@ -47,9 +47,7 @@ class Source:
         clock.sleep_until(until)
 
     def pump(self) -> int:
-        """Hand on all that has arrived on the links; returns the number of chunks that
-        were read.
-        """
+        """Hand on all that has arrived on the links; returns 0 where nothing has."""
         return sum([link.pump(self._clock) for link in self.links])
 
     def hold(self, flying: bool) -> None:

@@ -33,6 +33,7 @@ def observations(name, seed, drop=0.3):
             keypoints=(points.astype(np.float32), valid),
         )
         shown.append(out.observation[0])
+        assert not np.shares_memory(out.valid, valid)
     return np.array(shown), pilot.layout, valid[0]
 
 
