@@ -154,8 +154,10 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     assert diagnosis.theta == {"effect_05": printed.estimate}
     assert printed.sd**2 <= diagnosis.covariance[0][0] < printed.sd**2 + printed.differs**2
     work = diagnosis.work
-    trained = held_out.crossed(diagnosis).trained[:, work.active[0]] * EFFECTS[5].floor
-    assert np.all(np.abs(trained - printed.estimate) < 3.0 * printed.sd)
+    trained = held_out.crossed(diagnosis).trained
+    sizes = trained[:, work.active[0]] * EFFECTS[5].floor
+    assert np.all(np.abs(sizes - printed.estimate) < 3.0 * printed.sd)
+    assert not trained[:, 2].any()  # nor is the candidate written
     assert diagnosis.overall == result.KNOWN
 
 

@@ -245,22 +245,6 @@ def estimate(
     return theta
 
 
-def mean_sizes(
-    information: np.ndarray,
-    score: np.ndarray,
-    priors: Priors,
-    active: Sequence[int],
-) -> np.ndarray:
-    """Return posterior means of the named effects within their bounds, all others free below their
-    floors; 0 for effects that are not named. In floors, shape (K,).
-    """
-    columns = list(active)
-    sigma = covariance(information, priors.deviation(columns))
-    theta = np.zeros(len(score))
-    theta[columns] = np.clip(sigma[columns] @ score, priors.low[columns], priors.high[columns])
-    return theta
-
-
 def averaged(
     information: np.ndarray,
     score: np.ndarray,
@@ -279,6 +263,24 @@ def averaged(
     means, variances, weights = np.array(estimates).T
     mean = np.average(means, weights=weights)
     return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
+
+
+def mean_sizes(
+    information: np.ndarray,
+    score: np.ndarray,
+    priors: Priors,
+    active: Sequence[int],
+    sets: Sequence[tuple[tuple[int, ...], float]],
+) -> np.ndarray:
+    """Return the means of some effects as :func:`averaged`, within their bounds, and 0 for all
+    others; in floors, shape (K,).
+    """
+    theta = np.zeros(len(score))
+    for j in active:
+        homes = [(members, nats) for members, nats in sets if j in members]
+        mean = averaged(information, score, priors, j, homes)[0]
+        theta[j] = np.clip(mean, priors.low[j], priors.high[j])
+    return theta
 
 
 def certainty(

@@ -15,11 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
-from visthrow.diagnose.likelihood.evidence import (
-    NORMAL_95,
-    STRONG,
-    averaged,
-)
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG, mean_sizes
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
     READABLE,
@@ -98,7 +94,7 @@ def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
     """Repeat a selection without each of the flights, by statistics, unless that was done; random
-    shares are integrated out.
+    shares are integrated out. Candidates are sized as in the diagnosis, but predict nothing.
     """
     work = diagnosis.work
     if work.crossed is not None:
@@ -126,7 +122,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         chosen = max(window_sets, key=window_sets.get)
         if window_sets[chosen] < linear.value(selected) + STRONG:
             chosen = selected  # the training cannot tell it from others, and does not deny it
-        active = columns_of(chosen)
+        written = [j for j in columns_of(chosen) if j not in work.candidates]
         value = linear.value(chosen)
         behind = {s: value - v for s, v in window_sets.items()} | {chosen: 0.0}
         sets = [
@@ -134,11 +130,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
             for s, nats in behind.items()
             if nats < STRONG
         ]
-        for j in active:
-            homes = [(members, nats) for members, nats in sets if j in members]
-            mean = averaged(*linear.total(chosen), priors, j, homes)[0]
-            trained[fold, j] = np.clip(mean, priors.low[j], priors.high[j])
-        named.update(active)
+        trained[fold] = mean_sizes(*linear.total(chosen), priors, written, sets)
+        named.update(columns_of(chosen))
     shares = {effects[j].name: n / len(folds) for j, n in named.items()}
     return Crossed(groups, left_out, statistics, folds, trained, shares)
 
@@ -149,7 +142,8 @@ def borne_out(
     """Return the part of what names promise on held-out flights that they bring there, with a 95 %
     interval.
 
-    A right size promises theta' I theta / 2 nats with a variance of twice that. The interval is
+    A right size promises theta' I theta / 2 nats with a variance of twice that. It brings more, and
+    the part exceeds 1, where unnamed effects below their floors push the same way. The interval is
     that of the flights' scatter (Student, over flights that can tell), or of this chance where it
     is wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
     sizes that all flights gave, shape (K,)."""
@@ -378,14 +372,19 @@ def _withdrawn(
     reason: str,
     measured: HeldOut | None = None,
 ) -> Diagnosis:
-    """Names and the members of their classes with another verdict; what stays named keeps
-    its size and deviation. A candidate without evidence where the search ended is bounded.
+    """Return the diagnosis with another verdict on names and the members of their classes.
 
-    The search does not return to a set that it left, but what it takes up later (initial states,
-    derivatives) may explain what a name did. So a name of the last set may have no evidence.
+    Other names keep their sizes and deviations. A candidate becomes BOUNDED if it has no evidence
+    where the search ended: initial states and derivatives that were fitted since it was selected
+    may explain what it did.
 
-    Where no name stays, something is there that no confirmed name explains: in the block of the
-    name that promised most."""
+    If no name stays, the overall verdict is UNKNOWN, in the block of the name with most evidence.
+
+    Args:
+        why: ends the sentence of each finding.
+        reason: of the overall verdict, if no name stays.
+        measured: what held-out flights say, if no name stays.
+    """
     if not names:
         return diagnosis
     work = diagnosis.work

@@ -81,8 +81,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         selection.threshold,
     )
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
-    laws = _explanations(selection) if overall == result.UNKNOWN else ([], "")
-    explanations, unrepeated = laws
+    explanations, unrepeated = _explanations(selection) if overall == result.UNKNOWN else ([], "")
     reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
     problem, point = terms.without_laws(selection.problem, point)
     nominal = terms.without_laws(selection.problem, selection.nominal)[1]
@@ -94,8 +93,9 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
     reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
     varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
-    sized = sorted({*active, *varying})
-    sizes = mean_sizes(reported_point.information, reported_point.score, problem.priors, sized)
+    sized = tuple(sorted({*active, *varying}))
+    total = reported_point.information, reported_point.score
+    sizes = mean_sizes(*total, problem.priors, sized, [(sized, 0.0)])
     scatter = _with_means(problem, scatter, sized, sizes)
     unlike, mean_part = between_flights(reported_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
