@@ -180,10 +180,8 @@ class Diagnosis:
     block: str  # of an unknown effect, else empty
     reasons: tuple[str, ...]  # for the overall verdict
     findings: tuple[Finding, ...]  # one an effect, in the model's order
-    theta: Mapping[
-        str, float
-        # what to set in the model: the findings' sizes of named effects, one of each class
-    ]
+    # what to set in the model: the findings' sizes of named effects, one of each class
+    theta: Mapping[str, float]
     covariance: tuple[tuple[float, ...], ...]  # of theta's entries, in their units
     threshold: float  # [nats]
     steps: tuple[SelectionStep, ...] = ()
