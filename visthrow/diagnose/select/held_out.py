@@ -1,9 +1,9 @@
 """What held-out flights say of the names: they decide.
 
 Each flight is left out in turn, the search repeated on the others by their statistics, and its
-answer predicts the one left out, with gusts integrated out. A set of names is confirmed where the
-interval of what it brings there excludes nothing; names that the searches do not find again are
-candidates, and all are where that interval holds nothing; names that do harm there are withdrawn.
+answer predicts the one left out, with gusts integrated out. A set of names is confirmed if the
+interval of what it brings there lies above 0. If the interval holds 0, all its names are
+candidates. So are names that the searches do not find again. Names that do harm are withdrawn.
 A law outside the catalogue is kept only where flights that had no say in its coefficient repeat it.
 """
 
