@@ -87,7 +87,7 @@ RULES = [
     ],
     *[(f"(?!{room.replace('.', '/')}/)", (room,), ()) for room in OPTIONAL_ROOMS],
 ]
-"""Where no import may be of certain packages, and what of these may be imported all the same."""
+"""Pattern of modules, packages that they must not import, and exceptions."""
 
 
 def begins(name: str, known: Iterable[str]) -> bool:

@@ -15,7 +15,6 @@ LANDING = 0.05
 loss; 0.10 m is asked for.
 """
 
-
 READ_BACK = 0.01
 """Landing by the payload's noisy poses against the truth [m]."""
 

@@ -184,6 +184,12 @@ def test_hover_is_an_equilibrium():
     _, _, centres, velocities, _ = rods(sim)
     assert np.abs(velocities).max() < 1e-9
     assert centres[0, -1, 2] == approx(2.0 - 0.02 - 0.33 - 0.033, abs=1e-9)
+    # Pushed, all of the mass is accelerated, the rope's and the ball's as well.
+    sim.set_wrench([[0.2, 0.0, 0.0]], [[0.0, 0.0, 0.0]])
+    advance(sim, 1)
+    masses, _, _, velocities, _ = rods(sim)
+    momentum = plant.vehicle.body.mass * sim.get("vel_w")[0, 0] + masses @ velocities[0, :, 0]
+    assert momentum == approx(0.2 * 0.02, rel=1e-2)
 
 
 def test_external_wrench():

@@ -386,6 +386,7 @@ def test_a_fence_that_is_left_with_the_payload_on_still_aborts():
     pilot = runner(NEVER, "states.throw=1.0")
     decisions = fly(pilot, 20.0, watch=narrowed(pilot, -0.5))
     safe(pilot, decisions)
+    assert dict(changes(decisions))["recover"] == "the policy did not release in time"
     assert dict(changes(decisions))["abort"].startswith("fence: vehicle x")
 
 
