@@ -189,7 +189,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         "--out",
         metavar="FOLDER",
         default="runs/sweep",
-        help="of the sweep (default: runs/sweep)",
+        help="of the sweep (default: %(default)s)",
     )
     add_common(parser, json=False)
     return start.main(parser, run, argv)
