@@ -453,6 +453,14 @@ class TestImu:
             assert abs(found[name] - size) < 3.0 * sd[name] + 0.02 * abs(size), name
             assert sd[name] < 0.15 * abs(size), name
 
+    def test_a_voltage_that_only_some_logs_hold_is_not_used(self):
+        logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(2)]
+        assert not ImuModel(logs, IMU).notes
+        logs[0].channels["battery_voltage"] = Channel(np.arange(9.0), np.full(9, 3.8), "V")
+        model = ImuModel(logs, IMU)
+        assert not model.has_voltage
+        assert model.notes == ("battery_voltage is not used: only 1 of 2 logs hold it",)
+
     def test_torques_are_left_out_where_the_air_turns_the_vehicle(self):
         logs = [self.log(0.05, 0.0, (0.0, 0.0), seed) for seed in range(2)]
         for log in logs:

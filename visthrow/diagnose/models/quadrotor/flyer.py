@@ -95,6 +95,11 @@ class FlyerModel(NumericModel):
         """
         stretches = super().cut(logs)
         limit = self.params.most_windows
+        for name in ("battery_voltage", NEIGHBOUR):
+            count = sum(name in log for log in logs)
+            if 0 < count < len(logs):
+                note = f"{name} is not used: only {count} of {len(logs)} logs hold it"
+                self.notes = (*self.notes, note)
         if stretches:
             expect_thrust(stretches, self.params)
         if len(stretches) <= limit:
