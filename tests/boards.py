@@ -56,15 +56,16 @@ POSES = (
 def pictures(name: str) -> list[np.ndarray]:
     """Draw a board in each of the poses, shape (H, W) of its lens."""
     board, lens = BOARDS[name], Fisheye(lens_of(name))
-    middle = torch.from_numpy(board.corners_m().mean(0))
+    middle = torch.from_numpy(board.corners_m().mean(0)).float()
     samples, scale = 3, 60
     page = texture(board, scale)
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
     rays, seen = pixel_rays(lens, samples)
+    rays = rays.float()
     found = []
     for *tilt, x, y in POSES:
-        rot_cm = rotation_from_vector(torch.tensor(tilt, dtype=torch.float64))
-        origin = torch.tensor([x, y, 0.18], dtype=torch.float64) - rot_cm @ middle
+        rot_cm = rotation_from_vector(torch.tensor(tilt))
+        origin = torch.tensor([x, y, 0.18]) - rot_cm @ middle
         normal = rot_cm[:, 2]
         depth = (normal @ origin) / (rays @ normal)
         on_board = (rays * depth[..., None] - origin) @ rot_cm / board.square_size
@@ -72,8 +73,8 @@ def pictures(name: str) -> list[np.ndarray]:
         inside = (seen & (depth > 0.0)).numpy()
         drawn = cv2.remap(
             page,
-            u.float().numpy(),
-            v.float().numpy(),
+            u.numpy(),
+            v.numpy(),
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_CONSTANT,
             borderValue=110,
