@@ -1,5 +1,5 @@
 """Every way for a run to end, in hover and in throw, with each autopilot's fake: it lands or does
-what its table says, nothing is released, and the summary is there. Lock step; `test_processes` does
+what its table says, nothing is released, and the summary is there. Lock step; `bench.faults` does
 the same with processes.
 """
 

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+from dataclasses import replace
 
 import numpy as np
 from pytest import fixture, raises
@@ -10,32 +11,13 @@ from pytest import fixture, raises
 from bench.processes import free_port
 from hil.control.recording.record import RunRecorder, lines, load_run
 from hil.control.recording.view import follow
-from hil.control.runner import Runner
 from hil.errors import RunError
 from tests.commands import run_command
-from tests.hil_flight import Spy, fly, params
+from tests.hil_flight import params
+from tests.hil_runs import record_run
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
 from visthrow.onboard.policy import Policy, find_policy
-
-
-def recorded(folder, policy="state", seconds=8.0, spoil=lambda time, poses: poses):
-    """A run of a shipped policy on the simple vehicle, recorded tick by tick."""
-    wanted = params(f"policy={policy}", "observe=true")
-    runner = Runner(wanted, Policy.load(find_policy(policy)), Spy())
-    recorder = RunRecorder(folder, wanted)
-    inputs = []
-
-    def keep(time, poses, status, words, recording=True):
-        decision = type(runner).tick(runner, time, poses, status, words, recording)
-        recorder.tick(len(inputs), poses, status, words, recording, decision, {})
-        inputs.append(decision)
-        return decision
-
-    runner.tick = keep
-    fly(runner, seconds, poses=spoil)
-    recorder.close({**runner.summary(), "ticks": len(inputs)})
-    return inputs
 
 
 @fixture(scope="module")
@@ -45,13 +27,10 @@ def run_folder(tmp_path_factory):
     def spoil(time, poses):
         """A few poses that no gate lets through: these must read back as well."""
         if int(time * 100) % 50 == 7:
-            return [
-                type(p)(p.stamp, p.arrival, p.body, (math.nan, math.inf, 0.0), p.quat)
-                for p in poses
-            ]
+            return [replace(pose, pos=(math.nan, math.inf, 0.0)) for pose in poses]
         return poses
 
-    recorded(folder, "vision", spoil=spoil)
+    record_run(folder, "policy=vision", "observe=true", poses=spoil)
     return folder
 
 

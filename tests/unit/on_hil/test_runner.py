@@ -76,43 +76,13 @@ def test_a_throw_from_idle_to_done():
     assert not pilot.errors
 
 
-def test_nothing_is_released_without_the_operators_word():
-    pilot, decisions = thrown(words=lambda time, state: OperatorInput(), seconds=8.0)
-    assert changes(decisions)[-1][0] == "ready"
-    assert not pilot.backend.release_times
-    pilot, decisions = thrown(
-        overrides=("throws=2",),
-        seconds=20.0,
-        words=lambda t, s: OperatorInput(arm=s == "ready" and t < 3),
-    )
-    assert decisions[-1].state == "ready", "one word, one throw"
+def test_one_word_of_the_operator_is_one_throw():
+    words = lambda time, state: OperatorInput(arm=state == "ready" and time < 3)  # noqa: E731
+    _, decisions = thrown(overrides=("throws=2",), seconds=20.0, words=words)
+    assert decisions[-1].state == "ready"
 
 
 START = 3.0  # the policy that never releases throws from about 2.1 s to 7.1 s
-
-
-def lost(bodies, repeat=False, until=99.0):
-    last = {}
-
-    def spoil(time, poses):
-        out = []
-        for pose in poses:
-            gone = START < time < until and pose.body in bodies
-            if not gone:
-                last[pose.body] = pose
-                out.append(pose)
-            elif repeat:
-                out.append(replace(last[pose.body], stamp=pose.stamp, arrival=pose.arrival))
-        return out
-
-    return spoil
-
-
-SWAP = {"vehicle": "payload", "payload": "vehicle"}
-
-
-def swap(pose):
-    return replace(pose, body=SWAP[pose.body])
 
 
 def test_a_body_that_was_reset_on_the_ground_is_taken_again():
@@ -199,19 +169,6 @@ def test_a_hover_has_a_share_after_a_second_and_descends_to_the_ground():
     assert hovering.place_w == (0.0, 0.0, 0.0)
 
 
-def test_poses_at_5_hz_never_start_a_throw():
-    kept = {}
-
-    def slow(time, poses):
-        out = [p for p in poses if time - kept.get(p.body, -1.0) >= 0.2 - 1e-9]
-        kept.update({p.body: time for p in out})
-        return out
-
-    pilot, decisions = thrown(poses=slow, seconds=8.0)
-    assert "throw" not in {d.state for d in decisions}
-    assert not pilot.backend.release_times
-
-
 @mark.parametrize(
     ("overrides", "message"),
     [
@@ -221,10 +178,17 @@ def test_poses_at_5_hz_never_start_a_throw():
         ),
         (('frames.vehicle.axes="y,-x,z"', 'frames.payload.axes="y,-x,z"'), "heading"),
         (("home_w=[1.0, 0.0, 1.333]",), "from its hover point"),
+        ((), "bodies exchanged"),
     ],
 )
 def test_the_checks_before_a_throw(overrides, message):
-    pilot, decisions = thrown(overrides=(*overrides, "states.check=1.5"), seconds=4.0)
+    def poses(time, poses):
+        if "bodies exchanged" not in message:
+            return poses
+        vehicle, payload = poses
+        return [replace(vehicle, body=payload.body), replace(payload, body=vehicle.body)]
+
+    pilot, decisions = thrown(overrides=(*overrides, "states.check=1.5"), seconds=4.0, poses=poses)
     state, reason = changes(decisions)[2]
     assert state == "abort"
     assert any(word in reason for word in message.split("|")), reason
@@ -298,36 +262,31 @@ def test_no_throw_on_pictures_that_do_not_show(name):
     assert any(f"the pictures show no {name}" in d.waits for d in decisions)
 
 
-def test_bodies_exchanged_from_the_start_are_noticed():
-    _, decisions = thrown(
-        poses=lambda t, poses: [swap(p) for p in poses],
-        overrides=("states.check=1.5",),
-        seconds=4.0,
-    )
-    assert "bodies exchanged" in changes(decisions)[2][1]
+def broken_policy(pilot: Runner, act):
+    """Replace what the policy does from `START` on; returns what watches a flight for that."""
+
+    def watch(time, decision):
+        if time > START:
+            pilot.pilot.act = act
+
+    return watch
 
 
-def test_an_autopilot_in_another_mode_never_leads_to_a_throw():
-    pilot, decisions = thrown(
-        status=lambda t: Status(False, "mode"), overrides=("states.idle=2.0",), seconds=5.0
-    )
-    assert ("abort", "autopilot not ready (mode), for 2 s") in changes(decisions)
-    assert decisions[-1].state == "done", "what was never ours needs no descent"
-    assert not pilot.backend.sent
+def not_finite(pilot: Runner, value: float):
+    """A policy's step whose command is no number, and which asks for the release."""
+    act = pilot.pilot.act
+
+    def broken(*args):
+        command = np.full((1, 4), value, np.float32)
+        return replace(act(*args), command=command, release=np.array([True]))
+
+    return broken
 
 
 @mark.parametrize("value", [math.nan, math.inf])
 def test_a_policy_that_puts_out_no_numbers(value):
     pilot = runner(NEVER)
-    act = pilot.pilot.act
-
-    def broken(*args):
-        out = act(*args)
-        return replace(out, command=np.full((1, 4), value, np.float32), release=np.array([True]))
-
-    decisions = fly(
-        pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None
-    )
+    decisions = fly(pilot, 5.0, watch=broken_policy(pilot, not_finite(pilot, value)))
     safe(pilot, decisions)
     assert "is not finite" in changes(decisions)[-1][1]
     assert not pilot.backend.release_times, "what it says of the release counts for nothing either"
@@ -338,22 +297,28 @@ def test_a_policy_that_puts_out_no_numbers(value):
 def test_an_abort_in_mid_throw_holds_the_place_where_it_happened():
     """Pitching slowly, the vehicle has gone some way ahead when the policy's numbers end."""
     pilot = runner((HOVER, 0.0, 0.02, 0.0, -1.0))
-    act = pilot.pilot.act
-
-    def broken(*args):
-        return replace(act(*args), command=np.full((1, 4), math.nan, np.float32))
-
-    places = []
+    spoil, places = broken_policy(pilot, not_finite(pilot, math.nan)), []
 
     def watch(time, decision):
-        if time > START:
-            pilot.pilot.act = broken
+        spoil(time, decision)
         if decision.state == "abort":
             places.append((pilot.tracks["vehicle"].state(time).pos[0], pilot.hovering.place_w[0]))
 
     fly(pilot, START + 0.2, watch=watch)
     assert places[0][0] > 0.15
     assert places[1][1] == approx(places[1][0], abs=0.02)
+
+
+def test_no_exception_leaves_the_runner():
+    pilot = runner(NEVER)
+
+    def broken(*args):
+        raise ZeroDivisionError("in flight")
+
+    decisions = fly(pilot, 5.0, watch=broken_policy(pilot, broken))
+    safe(pilot, decisions)
+    assert changes(decisions)[-1] == ("abort", "ZeroDivisionError: in flight")
+    assert "in flight" in pilot.errors[0]
 
 
 def narrowed(pilot, high):
@@ -423,20 +388,6 @@ def test_a_throw_that_does_not_begin_says_what_is_in_the_way():
     assert all(d.waits == "" for d in decisions if d.state == "throw")
 
 
-def test_no_exception_leaves_the_runner():
-    pilot = runner(NEVER)
-
-    def broken(*args):
-        raise ZeroDivisionError("in flight")
-
-    decisions = fly(
-        pilot, 5.0, watch=lambda t, d: setattr(pilot.pilot, "act", broken) if t > START else None
-    )
-    safe(pilot, decisions)
-    assert changes(decisions)[-1] == ("abort", "ZeroDivisionError: in flight")
-    assert "in flight" in pilot.errors[0]
-
-
 def test_a_release_outside_of_the_fence_is_refused():
     """The payload hangs outside of its own fence from the moment that the policy asks."""
     pilot = runner(AT_ONCE)
@@ -478,20 +429,6 @@ def test_a_release_outside_of_the_fence_is_refused():
 def test_wrong_configs(override, message):
     with raises(ConfigError, match=message):
         load_run("dry_run", [override])
-
-
-@mark.parametrize("repeat", [False, True])
-def test_motion_capture_stops_or_repeats_its_last_pose(repeat):
-    _, decisions = thrown(action=NEVER, poses=lost({"vehicle", "payload"}, repeat), seconds=6.0)
-    assert changes(decisions)[-2:] == [
-        ("recover", "stale poses"),
-        ("abort", "no new pose of the vehicle"),
-    ]
-    assert when(decisions, "recover") == approx(START + 0.10, abs=1.5 * TICK)
-    assert when(decisions, "abort") == approx(START + 0.25, abs=1.5 * TICK)
-    levelled = [d for d in decisions if d.note.startswith("level")]
-    assert levelled[0].command[1:] == approx((0.0, 0.0, 0.0), abs=0.2)
-    assert decisions[-1].command is None, "silent in the end: the autopilot's failsafes act"
 
 
 class HoldingSpy(Spy):
@@ -550,3 +487,11 @@ def test_a_payload_that_returns_farther_off_than_its_cable_is_refused():
 
     pilot, _ = thrown(action=NEVER, poses=spoil, seconds=START + 0.4)
     assert pilot.tracks["payload"].gate.refused["cable"] > 10
+
+
+def test_without_poses_it_is_levelled_and_falls_silent_in_the_end():
+    gone = lambda time, poses: poses if time <= START else []  # noqa: E731
+    _, decisions = thrown(action=NEVER, poses=gone, seconds=6.0)
+    levelled = [d for d in decisions if d.note.startswith("level")]
+    assert levelled[0].command[1:] == approx((0.0, 0.0, 0.0), abs=0.2)
+    assert decisions[-1].command is None, "the autopilot's failsafes act"
