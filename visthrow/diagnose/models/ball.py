@@ -10,7 +10,6 @@ import numpy as np
 
 from visthrow.common.rotations import cross
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -20,7 +19,6 @@ from visthrow.diagnose.models.numeric import (
     latent_force,
     latent_layout,
     sigma_of,
-    triangles,
 )
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
@@ -83,7 +81,7 @@ class BallModel(NumericModel):
         """
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
-        sideways, spans = self.tables(lanes, "across", "span")
+        sideways = self.of_windows(lanes, "across")
         spin = top[:, None] * sideways + side[:, None] * np.array([0.0, 0.0, 1.0])
         push = latent_force(lanes.latent, STEPS, 1)[:, 0]
         gravity = np.array([0.0, 0.0, -self.params.gravity])
@@ -95,17 +93,14 @@ class BallModel(NumericModel):
             air = vel - wind
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
             acc = gravity - (quadratic * speed + linear) * air + cross(spin, air) + push[index]
-            if self.laws:
-                acc = acc + exerted(self.laws, _knot_values(state[:, 0], state))["payload force"]
-            return np.concatenate([vel, acc], 1)
+            return np.concatenate([vel, acc + self.exerted("payload force", state)], 1)
 
-        step = spans[:, None] / STEPS * (1.0 + clock[:, None])
-        return integrate(slope, lanes.nuisance.copy(), STEPS, step)
+        step = self.of_windows(lanes, "span")[:, None] / STEPS * (1.0 + clock[:, None])
+        return integrate(slope, lanes.nuisance, STEPS, step)
 
-    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+    def quantities(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
         """See the base class; a law's coefficient is that of a ball of 1 kg."""
-        time = np.unique(stretch.latent_time)
-        return _knot_values(time, triangles(time, np.linspace(time[0], time[-1], STEPS + 1)) @ path)
+        return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -117,11 +112,6 @@ class BallModel(NumericModel):
         first = pos[:, :1]
         turned = pos + cross(np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)[:, None], pos - first)
         return (first + (turned - first) * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
-
-
-def _knot_values(time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
-    """Quantities of a law at states, shape (k, 6)."""
-    return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:

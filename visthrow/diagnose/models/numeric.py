@@ -16,7 +16,7 @@ import numpy as np
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
-from visthrow.diagnose.models.law_terms import carries, term_of
+from visthrow.diagnose.models.law_terms import carries, exerted, term_of
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -64,17 +64,14 @@ class Stretch(Window):
         ``channels``: stamps, shape (n,), values, shape (n, C), and their deviations, which
         broadcast to the values; ``layout``: of :func:`latent_layout`.
         """
-        samples = [
-            (np.repeat(time, values.shape[1]), values, np.broadcast_to(sigma, values.shape))
-            for time, values, sigma in channels
-        ]
-        time, measured, sigma = (
-            np.concatenate([part.ravel() for part in parts]) for parts in zip(*samples)
-        )
-        number = np.repeat(np.arange(len(channels)), [values.size for _, values, _ in channels])
+        rows = []
+        for number, (stamps, values, deviation) in enumerate(channels):
+            columns = np.broadcast_arrays(stamps[:, None], number, values, deviation)
+            rows.append([column.ravel() for column in columns])
+        time, channel, measured, sigma = np.concatenate(rows, axis=1)
         none = np.zeros((len(time), 0))
         spread = np.array(start_sd, dtype=float)
-        columns = time, number, measured, sigma, none, none, spread
+        columns = time, channel.astype(int), measured, sigma, none, none, spread
         guess = np.array(start, dtype=float)
         return Stretch(flight, phase, *columns, **layout, start=guess, data=data)
 
@@ -164,9 +161,9 @@ class NumericModel(Model, ABC):
             if beyond := beyond_bounds(effect, size):
                 raise LogError(f"{beyond} in this model")
         first = self.stretches[0]
-        path = self.simulate(self._lanes(base).part([0]))[0] if laws else None
+        lanes = self._lanes(base)
         for term in map(term_of, laws):
-            lacking = sorted(term.needs - self.knots(first, path).keys())
+            lacking = sorted(term.needs - self.knots(lanes, self.simulate(lanes))[0].keys())
             if not lacking and not carries(first.latent_block, term.block):
                 lacking = [term.block]
             if lacking:
@@ -202,21 +199,39 @@ class NumericModel(Model, ABC):
         return self._flown
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
-        """Simulate lanes; the result has the lane as its first axis.
+        """Simulate lanes; returns the states on each one's grid, shape (B, T, S).
 
         Models without a state need not override it.
         """
-        return np.empty((len(lanes.owner), 0))
+        return np.zeros((len(lanes.owner), 2, 0))
 
     @abstractmethod
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """Return the sensors' measurements in lanes of one stretch, shape (L, N)."""
 
-    def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
-        """Simulated quantities at the knots of the latent forces, for laws outside the catalogue;
-        none by default.
+    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+        """Return quantities of laws at the knots of each stretch's latent forces.
+
+        ``lanes``: one a stretch; ``paths``: the states on their grids, shape (S, T, states).
+        """
+        knots = []
+        for stretch, path in zip(self.stretches, paths):
+            time = np.unique(stretch.latent_time)
+            weights = triangles(time, np.linspace(time[0], time[-1], len(path)))
+            knots.append(self.quantities(time, weights @ path))
+        return knots
+
+    def quantities(self, time: np.ndarray, state: np.ndarray) -> Mapping[str, np.ndarray]:
+        """Return quantities of laws outside the catalogue at states, shape (k, S); none by
+        default.
         """
         return {}
+
+    def exerted(self, block: str, state: np.ndarray) -> np.ndarray:
+        """Return what the model's laws exert in a latent block at states of lanes, shape (B, 3)."""
+        if not self.laws:
+            return np.zeros((len(state), 3))
+        return exerted(self.laws, self.quantities(np.zeros(len(state)), state))[block]
 
     def size(self, theta: Mapping[str, float]) -> np.ndarray:
         """Sizes of all effects in order, with those it had before, shape (K,).
@@ -226,9 +241,11 @@ class NumericModel(Model, ABC):
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
         return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
 
-    def tables(self, lanes: Lanes, *names: str) -> list[np.ndarray]:
-        """Return entries of the windows' data, of one shape in all windows, a row for each lane."""
-        return [np.array([s.data[name] for s in self.stretches])[lanes.owner] for name in names]
+    def of_windows(self, lanes: Lanes, name: str) -> np.ndarray:
+        """Return an entry of the windows' data, of one shape in all windows, a row for each
+        lane.
+        """
+        return np.array([s.data[name] for s in self.stretches])[lanes.owner]
 
     def size_of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
@@ -245,24 +262,25 @@ class NumericModel(Model, ABC):
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         size = self.size(theta)
-        residuals = self._settle(size, fresh=True)
-        slopes, effects, latent = (
-            self._slopes_by(size, name) for name in ("nuisance", "theta", "latent")
-        )
-        self._slopes = slopes
+        self._slopes = None
+        residuals = self._settle(size)
+        self._slopes = self._slopes_by_start(size)
         residuals = self._from_prior(residuals)
-        path = self.simulate(self._lanes(size))
-        return [
-            replace(
-                s,
-                residual=residuals[i],
-                effects=effects[i],
-                nuisance=slopes[i],
-                latent=latent[i],
-                knots=self.knots(s, path[i]),
-            )
-            for i, s in enumerate(self.stretches)
-        ]
+        numbers = [self.numbers[effect.name] for effect in self.effects]
+        steps = EFFECT_STEP * np.array([effect.prior_sd for effect in self.effects])
+        effects = self._slopes_by(size, "theta", steps, numbers)
+        steps = np.full(len(self.stretches[0].latent_block), self.latent_step)
+        latent = self._slopes_by(size, "latent", steps, range(len(steps)))
+        lanes = self._lanes(size)
+        parts = {
+            "residual": residuals,
+            "effects": effects,
+            "nuisance": self._slopes,
+            "latent": latent,
+            "knots": self.knots(lanes, self.simulate(lanes)),
+        }
+        rows = zip(self.stretches, zip(*parts.values()))
+        return [replace(stretch, **dict(zip(parts, row))) for stretch, row in rows]
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
@@ -281,109 +299,110 @@ class NumericModel(Model, ABC):
         """One lane a stretch."""
         count = len(self.stretches)
         start = self._start if start is None else start
-        return Lanes(
-            np.arange(count),
-            np.tile(size, (count, 1)),
-            start,
-            np.zeros((count, len(self.stretches[0].latent_block))),
-        )
+        latent = np.zeros((count, len(self.stretches[0].latent_block)))
+        return Lanes(np.arange(count), np.tile(size, (count, 1)), start, latent)
 
-    def _run(self, lanes: Lanes) -> list[np.ndarray]:
-        """Measurements of all lanes, in batches; lane by lane, as windows differ in their number of
-        samples.
-        """
-        out: list[np.ndarray] = [np.empty(0)] * len(lanes.owner)
-        for first in range(0, len(lanes.owner), MOST_LANES):
-            part = lanes.part(slice(first, first + MOST_LANES))
-            path = self.simulate(part)
-            for i in np.unique(part.owner):
-                rows = np.flatnonzero(part.owner == i)
-                samples = self.measure(self.stretches[i], path[rows], part.part(rows))
-                for row, of_lane in zip(rows, samples):
-                    out[first + row] = of_lane
-        return out
+    def _measured(self, lanes: Lanes) -> list[np.ndarray]:
+        """Return what lanes measure, (lanes of it, N) a stretch; all have as many, in turn."""
+        each = len(lanes.owner) // len(self.stretches)
+        batch = max(1, MOST_LANES // each)
+        measured = []
+        for first in range(0, len(self.stretches), batch):
+            part = lanes.part(slice(first * each, (first + batch) * each))
+            paths = self.simulate(part)
+            for i, stretch in enumerate(self.stretches[first : first + batch]):
+                rows = slice(i * each, (i + 1) * each)
+                measured.append(self.measure(stretch, paths[rows], part.part(rows)))
+        return measured
 
     def _off(self, size: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
-        samples = self._run(self._lanes(size, start))
-        return [s.measured - out for s, out in zip(self.stretches, samples)]
+        """Return the residuals of all stretches from states at their starts, shape (N,) each."""
+        measured = self._measured(self._lanes(size, start))
+        return [s.measured - only for s, (only,) in zip(self.stretches, measured)]
 
-    def _settle(self, size: np.ndarray, fresh: bool = False) -> list[np.ndarray]:
+    def _settle(self, size: np.ndarray) -> list[np.ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
         residuals = self._off(size, self._start)
         if not self._start.shape[1]:
             return residuals
-        if self._slopes is None or fresh:
-            self._slopes = self._slopes_by(size, "nuisance")
-        costs = self._costs(residuals, self._start)
+        if self._slopes is None:
+            self._slopes = self._slopes_by_start(size)
+        aims = self._aims(residuals, self._start)
         for _ in range(SETTLE_STEPS):
-            steps = np.array(list(map(self._newton, range(len(residuals)), residuals)))
-            if not np.any(steps):
-                break
-            before = costs
+            steps = np.array([self._newton(i, aim) for i, aim in enumerate(aims)])
+            before = costs = _costs(aims)
             for shrink in (1.0, 0.3):
                 if not np.any(steps):
                     break
                 trial = self._start + shrink * steps
-                after = self._off(size, trial)
-                costs_after = self._costs(after, trial)
-                better = costs_after < costs
-                self._start = np.where(better[:, None], trial, self._start)
-                residuals = [new if yes else old for new, old, yes in zip(after, residuals, better)]
-                costs = np.where(better, costs_after, costs)
-                steps = np.where(better[:, None], 0.0, steps)
+                residuals_after = self._off(size, trial)
+                aims_after = self._aims(residuals_after, trial)
+                costs_after = _costs(aims_after)
+                for i in np.flatnonzero(costs_after < costs):
+                    residuals[i] = residuals_after[i]
+                    aims[i] = aims_after[i]
+                better = (costs_after < costs)[:, None]
+                self._start = np.where(better, trial, self._start)
+                steps = np.where(better, 0.0, steps)
+                costs = np.minimum(costs, costs_after)
             if np.max(before - costs) < 2 * SETTLED:
                 break
         return residuals
 
-    def _costs(self, residuals: list[np.ndarray], start: np.ndarray) -> np.ndarray:
-        costs = []
-        for s, residual, state in zip(self.stretches, residuals, start):
-            value = np.sum((residual / s.sigma) ** 2) + np.sum(
-                ((state - s.start) / s.nuisance_sd) ** 2
-            )
-            costs.append(value if np.isfinite(value) else np.inf)
-        return np.array(costs)
-
-    def _newton(self, i: int, residual: np.ndarray) -> np.ndarray:
-        s = self.stretches[i]
-        slope = self._slopes[i]
-        weight = 1.0 / s.sigma
-        prior = 1.0 / s.nuisance_sd
-        if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(slope))):
-            return np.zeros(len(s.start))  # no step mends that; the search says which window it is
-        rows = np.concatenate([slope * weight[:, None], np.diag(prior)])
-        aim = np.concatenate([residual * weight, (s.start - self._start[i]) * prior])
-        step = np.linalg.lstsq(rows, aim, rcond=None)[0]
-        return step if 0.5 * aim @ rows @ step > SETTLED else np.zeros_like(step)
-
-    def _slopes_by(self, size: np.ndarray, name: str) -> list[np.ndarray]:
-        """Derivatives of the samples by the unknowns of one name of :class:`Lanes`, by central
-        differences; (N, directions) a stretch.
+    def _aims(self, residuals: list[np.ndarray], start: np.ndarray) -> list[np.ndarray]:
+        """Return residuals, and behind them the way back to the prior's middle, in their
+        deviations.
         """
-        stretches = len(self.stretches)
+        aims = []
+        for s, residual, state in zip(self.stretches, residuals, start):
+            back = (s.start - state) / s.nuisance_sd
+            aims.append(np.concatenate([residual / s.sigma, back]))
+        return aims
+
+    def _newton(self, i: int, aim: np.ndarray) -> np.ndarray:
+        """Return the Gauss-Newton step of a window's unknowns; 0 where it promises little."""
+        s = self.stretches[i]
+        none = np.zeros(len(s.start))
+        rows = np.concatenate([self._slopes[i] / s.sigma[:, None], np.diag(1.0 / s.nuisance_sd)])
+        if not (np.all(np.isfinite(aim)) and np.all(np.isfinite(rows))):
+            return none  # no step mends that; the search says which window it is
+        step = np.linalg.lstsq(rows, aim, rcond=None)[0]
+        return step if 0.5 * aim @ rows @ step > SETTLED else none
+
+    def _slopes_by_start(self, size: np.ndarray) -> list[np.ndarray]:
+        """Return the derivatives of the samples by what is not known at the start."""
+        steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
+        return self._slopes_by(size, "nuisance", steps, range(steps.shape[1]))
+
+    def _slopes_by(
+        self, size: np.ndarray, name: str, steps: np.ndarray, columns: Sequence[int]
+    ) -> list[np.ndarray]:
+        """Return derivatives of the samples by central differences, (N, C) a stretch.
+
+        Args:
+            size: of the effects.
+            name: of the field of :class:`Lanes` that is moved.
+            steps: of its columns, for all stretches or each, shape (C,) or (S, C).
+            columns: those that are moved.
+        """
+        stretches = self.stretches
+        count = len(columns)
+        if not count:
+            return [np.zeros((len(s.measured), 0)) for s in stretches]
         lanes = self._lanes(size)
-        width = getattr(lanes, name).shape[1]
-        axes = np.arange(width)
-        if name == "theta":
-            axes = np.array([self.numbers[effect.name] for effect in self.effects], dtype=int)
-            steps = EFFECT_STEP * np.array([effect.prior_sd for effect in self.effects])
-        elif name == "nuisance":
-            steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
-        else:
-            steps = np.full(width, self.latent_step)
-        count = len(axes)
-        steps = np.broadcast_to(steps, (stretches, count))
-        moves = (steps[:, :, None] * np.eye(width)[axes]).reshape(stretches * count, width)
-        at_rest = lanes.part(np.repeat(np.arange(stretches), count))
-        sides = [
-            self._run(replace(at_rest, **{name: getattr(at_rest, name) + sign * moves}))
-            for sign in (1.0, -1.0)
-        ]
-        slopes = [0.5 * (a - b) / step for a, b, step in zip(*sides, steps.ravel())]
-        return [
-            np.reshape(slopes[i * count : (i + 1) * count], (count, len(s.measured))).T
-            for i, s in enumerate(self.stretches)
-        ]
+        steps = np.broadcast_to(steps, (len(stretches), count))
+        axes = np.eye(getattr(lanes, name).shape[1])[list(columns)]
+        moves = np.concatenate([step[:, None] * axes for step in steps])
+        lanes = lanes.part(np.repeat(lanes.owner, count))
+        middle = getattr(lanes, name)
+        above = self._measured(replace(lanes, **{name: middle + moves}))
+        below = self._measured(replace(lanes, **{name: middle - moves}))
+        return [(0.5 * (a - b)).T / step for a, b, step in zip(above, below, steps)]
+
+
+def _costs(aims: list[np.ndarray]) -> np.ndarray:
+    """Return the sum of squares of each window; infinite where a simulation ran away."""
+    return np.nan_to_num([aim @ aim for aim in aims], nan=np.inf, posinf=np.inf)
 
 
 def _holds(log: FlightLog, name: str) -> bool:

@@ -8,7 +8,6 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
@@ -18,7 +17,6 @@ from visthrow.diagnose.models.numeric import (
     latent_force,
     latent_layout,
     sigma_of,
-    triangles,
 )
 from visthrow.logs.flightlog import FlightLog
 
@@ -120,62 +118,37 @@ class PendulumModel(NumericModel):
 
         def slope(index: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T
-            sine, friction = (
-                np.sin(angle),
-                viscous * rate + coulomb * np.tanh(rate / SMOOTH) + quadratic * np.abs(rate) * rate,
-            )
-            force = push[index]
-            if self.laws:
-                force = (
-                    force
-                    + exerted(self.laws, self._knot_values(angle, state))["payload force"][:, ::2]
-                )
+            sine = np.sin(angle)
+            dry = coulomb * np.tanh(rate / SMOOTH)
+            friction = viscous * rate + dry + quadratic * np.abs(rate) * rate
+            force = push[index] + self.exerted("payload force", state)[:, ::2]
             pull = (np.cos(angle) * force[:, 0] + sine * force[:, 1]) / p.length
             return np.stack([rate, -stiffness * sine - spring * angle - friction + pull], 1)
 
         step = p.window / self._steps * (1.0 + clock[:, None])
-        return integrate(slope, lanes.nuisance.copy(), self._steps, step)
+        return integrate(slope, lanes.nuisance, self._steps, step)
 
-    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
-        """See the base class."""
-        time = np.unique(stretch.latent_time)
-        grid = stretch.data["start"] + self.params.window * np.linspace(0.0, 1.0, len(path))
-        return self._knot_values(time, triangles(time, grid) @ path)
-
-    def _knot_values(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
-        """Quantities of a law at angles and rates, shape (k, 2); the pivot stands upright and
-        still.
-        """
+    def quantities(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+        """See the base class; the pivot stands upright and still."""
         length = self.params.length
         angle, rate = state.T
-        direction = np.zeros((len(state), 3))
-        vel = np.zeros((len(state), 3))
-        upright = np.zeros((len(state), 4))
-        direction[:, 0] = np.sin(angle)
-        direction[:, 2] = -np.cos(angle)
-        upright[:, 3] = 1.0
-        vel[:, 0] = -length * rate * direction[:, 2]
-        vel[:, 2] = length * rate * direction[:, 0]
-        tension = np.maximum(length * rate**2 - self.params.gravity * direction[:, 2], 0.0)
+        zero = np.zeros(len(state))
+        direction = np.stack([np.sin(angle), zero, -np.cos(angle)], axis=1)
+        tangent = np.stack([np.cos(angle), zero, np.sin(angle)], axis=1)
+        tension = length * rate**2 - self.params.gravity * direction[:, 2]
         return {
             "time": time,
             "payload_pos_w": length * direction,
-            "payload_vel_w": vel,
+            "payload_vel_w": length * rate[:, None] * tangent,
             "cable_dir_w": direction,
-            "quat_wb": upright,
-            "under": -direction[:, 2],
-            "tension": tension,
+            "quat_wb": np.tile([0.0, 0.0, 0.0, 1.0], (len(state), 1)),
+            "tension": np.maximum(tension, 0.0),
         }
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         offset, scale, clock = lanes.theta.T[4:7]
         rate = path[..., 1:] * (1.0 + clock[:, None, None])
-        angle = hermite(
-            stretch.time,
-            stretch.data["start"],
-            self.params.window / self._steps,
-            path[..., :1],
-            rate,
-        )[..., 0]
+        step = self.params.window / self._steps
+        angle = hermite(stretch.time, stretch.data["start"], step, path[..., :1], rate)[..., 0]
         return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging

@@ -12,7 +12,6 @@ from dataclasses import replace
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation, Slerp
 
 from visthrow.common.rotations import cross
 from visthrow.diagnose.models.catalogue import ModelEffect
@@ -52,6 +51,8 @@ class FlyerModel(NumericModel):
 
     table = "flyer"
     latent_step = 1e-2
+    # channels that are states, and which: behind them come the motors' thrusts
+    columns: Mapping[str, slice] = {}
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
         """Cut the flights into windows.
@@ -63,10 +64,6 @@ class FlyerModel(NumericModel):
         self.blocks = (0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF])
         super().__init__(logs, params)
         self.steps = round(params.window / params.step)
-        # see flyer_windows; the stretch is the first axis
-        names = in_all([s.data for s in self.stretches], *self.stretches[0].data)
-        self._data = {name: np.array([s.data[name] for s in self.stretches]) for name in names}
-        self._commanded = params.thrust(self._data["input"])  # [N], (S, fine steps, motors)
         self._spare = spare(params.step)
 
     def describe(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
@@ -77,6 +74,13 @@ class FlyerModel(NumericModel):
         drivers = in_all(logs, "battery_voltage", "acc_b", "rate_b", NEIGHBOUR)
         self.inputs = (params.attitude, params.input, *drivers)
         self.needed = (params.position, params.attitude, params.input, *simulated)
+        turned = 6 if params.cable is None else 12
+        self.columns = {"rate_b": slice(turned, turned + 3)}
+
+    @property
+    def motors(self) -> int:
+        """Return the number of columns of the inputs."""
+        return self.stretches[0].data["input"].shape[1]
 
     @property
     def has_voltage(self) -> bool:
@@ -120,38 +124,35 @@ class FlyerModel(NumericModel):
         step's own mean: commands switch there."""
         p = self.params
         fine = self.params.step / FINE
+        commanded = p.thrust(np.array([s.data["input"] for s in self.stretches]))
+        first = commanded[:, :1]
         delay = p.command_delay + self.size_of(lanes, "cmd_delay")
         tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
         tau = np.maximum(tau, SHORTEST)
-        position = (
-            p.window + 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None] - delay
-        ) / fine  # tables begin one window early
-        index = np.clip(position.astype(int), 0, self._commanded.shape[1] - 1)
+        grid = 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None]
+        position = (p.window + grid - delay) / fine  # tables begin one window early
+        index = np.clip(position.astype(int), 0, commanded.shape[1] - 1)
         share = (position - index)[..., None]
-        out = np.empty((2, *position.shape, self._commanded.shape[2]))
+        thrust = np.empty((*position.shape, self.motors))
+        whole = np.empty_like(thrust)
         for lag in np.unique(tau):
             keep = np.exp(-fine / lag)
             members = np.flatnonzero(tau == lag)
-            after, _ = lfilter(
-                [1.0 - keep], [1.0, -keep], self._commanded, 1, keep * self._commanded[:, :1]
-            )
-            thrust = np.concatenate([self._commanded[:, :1], after], 1)
-            whole = cumulative_trapezoid(thrust, axis=1, initial=0.0)
+            after, _ = lfilter([1.0 - keep], [1.0, -keep], commanded, 1, keep * first)
+            table = np.concatenate([first, after], 1)
+            integral = cumulative_trapezoid(table, axis=1, initial=0.0)
             which = lanes.owner[members]
             rows = index[:, members]
             part = share[:, members]
-            begin = thrust[which, rows]
-            rise = thrust[which, rows + 1] - thrust[which, rows]
-            out[:, :, members] = (
-                begin + part * rise,
-                whole[which, rows] + part * (begin + 0.5 * part * rise),
-            )
-        thrust, whole = out
+            begin = table[which, rows]
+            rise = part * (table[which, rows + 1] - begin)
+            thrust[:, members] = begin + rise
+            whole[:, members] = integral[which, rows] + part * (begin + 0.5 * rise)
         mean = np.diff(whole[::2], axis=0) * (fine / p.step)
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
         curve = self.size_of(lanes, "thrust_curve")[:, None]
-        hover = p.total_mass * p.gravity / thrust.shape[2]  # of one input channel [N]
-        since = self._data["since"][lanes.owner] + 0.5 * p.step * np.arange(len(thrust))[:, None]
+        hover = p.total_mass * p.gravity / self.motors  # of one input channel [N]
+        since = self.of_windows(lanes, "since") + grid
         faded = 1.0 + self.size_of(lanes, "thrust_fade") * since
         curved = 1.0 + curve * (thrust / hover - 1.0)
         return thrust * self._scale(lanes) * curved * faded[..., None]
@@ -162,102 +163,73 @@ class FlyerModel(NumericModel):
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
         thrust = self._thrusts(lanes)
-        step = np.full((len(lanes.owner), 1), self.params.step)
         rot = self._rotations(lanes)
         mount = self._mount(rot)
-        slope = self._slope(lanes, thrust, rot, mount)
+        slope, _ = self._dynamics(lanes, thrust, rot, mount)
+        step = np.full((len(lanes.owner), 1), self.params.step)
         path = integrate(slope, self._begin(lanes, mount), self.steps, step)
         return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
-    def _rise(self, thrust: np.ndarray) -> np.ndarray:
-        """Slope of the whole thrust at the half steps as knots tell it [N/s], shape (half steps,
-        B).
-        """
-        knots = np.linspace(0.0, self.params.window, KNOTS)
-        grid = np.linspace(0.0, self.params.window, len(thrust))
-        slope = np.gradient(triangles(knots, grid[::2]) @ thrust[::2].sum(2), knots, axis=0)
-        return triangles(grid, knots) @ slope
-
-    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
-        """See the base class; the cable's tension is what accelerates the payload
-        against gravity.
-        """
-        p = self.params
-        time = np.unique(stretch.latent_time)
-        grid = stretch.data["start"] + p.step * np.arange(len(path))
-        halves = np.arange(2 * self.steps + 1) + self._spare
-        at_knots = triangles(time, grid)
-        values = at_knots @ path
-        rot = Rotation.from_matrix(stretch.data["rot"][halves])
-        stamps = stretch.data["start"] + 0.5 * p.step * np.arange(len(halves))
-        turned = Slerp(stamps, rot)
-        rates = (rot[:-1].inv() * rot[1:]).as_rotvec() / (0.5 * p.step)
-        rate = triangles(time, grid[:-1] + 0.5 * p.step) @ (0.5 * (rates[::2] + rates[1::2]))
-        thrust = values[:, -self._commanded.shape[2] :].sum(1)
-        hung = None
-        pose = {"time": time, "quat_wb": turned(time).as_quat()}
-        if NEIGHBOUR in self.inputs:
-            pose[NEIGHBOUR] = on_grid(stamps, stretch.data[NEIGHBOUR][halves], time)
-        if p.cable is not None:
-            gap = path[:, 6:9] - stretch.data["rot"][halves[::2]] @ np.array(p.cable.mount)
-            vel = path[:, 3:6] + path[:, 9:12]
-            direction = gap / np.linalg.norm(gap, axis=1, keepdims=True)
-            force = p.cable.mass * (np.gradient(vel, p.step, axis=0) + [0.0, 0.0, p.gravity])
-            tension = np.maximum(-np.sum(direction * force, 1, keepdims=True), 0.0)
-            hung = at_knots @ direction, at_knots @ tension
-        return pose | self._quantities(values, rate, thrust, hung)
+    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+        """See the base class."""
+        rot = self._rotations(lanes)
+        _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
+        moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
+        grid = self.params.step * np.arange(len(moments))
+        knots = []
+        for i, stretch in enumerate(self.stretches):
+            time = np.unique(stretch.latent_time)
+            weights = triangles(time, stretch.data["start"] + grid)
+            values = {name: weights @ [m[name][i] for m in moments] for name in moments[0]}
+            knots.append(values | {"time": time})
+        return knots
 
     def _scale(self, lanes: Lanes) -> np.ndarray:
         """Thrust over what the map says, shape (B, motors)."""
         p = self.params
-        volts = (
-            (self._data["volts"][lanes.owner] - p.reference_voltage)
-            if self.has_voltage
-            else np.zeros(len(lanes.owner))
-        )
+        volts = np.zeros(len(lanes.owner))
+        if self.has_voltage:
+            volts = self.of_windows(lanes, "volts") - p.reference_voltage
         sag = p.voltage_coefficient + self.size_of(lanes, "battery_sag")
         scale = (1.0 + self.size_of(lanes, "thrust_gain")) * (1.0 + sag * volts)
-        motors = self._commanded.shape[2]
-        if motors == 1 or p.torque is None:
-            return np.repeat(scale[:, None], motors, 1)
+        if p.torque is None:
+            return scale[:, None]
         scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
         return scale[:, None] * (1.0 + scales)
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
-        p = self.params
-        start = stretch.data["start"]
-        out = np.empty((len(path), len(stretch.time)))
+        measured = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
             rows = stretch.channel == channel
-            if not np.any(rows):
-                continue
-            time = stretch.time[rows].reshape(-1, 3)[:, 0]
-            if name == "rate_b":
-                grid = start + p.step * np.arange(path.shape[1])
-                last = path.shape[2] - self._commanded.shape[2]
-                rates = [on_grid(grid, x[:, last - 3 : last], time) for x in path]
-                out[:, rows] = np.reshape(rates, (len(path), -1))
-                continue
-            late = (
-                time[None] - self.size_of(lanes, ("pose_delay", "payload_delay")[channel])[:, None]
-            )
-            value = path[..., 0:3]
-            rate = path[..., 3:6]
-            if name == "payload_pos_w":
-                value = value + path[..., 6:9]
-                rate = rate + path[..., 9:12]
-            pos = hermite(late, start, p.step, value, rate)
-            if channel == 0 and "marker_z" in self.numbers:
-                lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
-                rate_index = np.clip(
-                    ((time - start) / (0.5 * p.step)).round().astype(int), 0, 2 * self.steps
-                )
-                pos = pos + np.einsum(
-                    "nij,bj->bni", stretch.data["rot"][rate_index + self._spare], lever
-                )
-            out[:, rows] = pos.reshape(len(path), -1)
-        return out
+            values = self._sampled(name, stretch.time[rows], stretch, path, lanes)
+            measured[:, rows] = values.reshape(len(path), -1)
+        return measured
+
+    def _sampled(
+        self, name: str, time: np.ndarray, stretch: Stretch, path: np.ndarray, lanes: Lanes
+    ) -> np.ndarray:
+        """Return what lanes of a stretch show of a channel, shape (L, n, C); ``time``: of all
+        components of its samples, shape (n C,).
+        """
+        start = stretch.data["start"]
+        step = self.params.step
+        if name in self.columns:
+            states = path[..., self.columns[name]]
+            grid = start + step * np.arange(path.shape[1])
+            time = time[:: states.shape[2]]
+            return np.array([on_grid(grid, lane, time) for lane in states])
+        time = time[::3]
+        value = path[..., 0:3]
+        rate = path[..., 3:6]
+        if name == "payload_pos_w":
+            late = time - self.size_of(lanes, "payload_delay")[:, None]
+            return hermite(late, start, step, value + path[..., 6:9], rate + path[..., 9:12])
+        late = time - self.size_of(lanes, "pose_delay")[:, None]
+        pos = hermite(late, start, step, value, rate)
+        lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
+        half = np.clip(((time - start) / (0.5 * step)).round().astype(int), 0, 2 * self.steps)
+        return pos + np.einsum("nij,bj->bni", stretch.data["rot"][half + self._spare], lever)
 
     def without_commands(
         self, theta: Mapping[str, float], windows: Sequence[int]
@@ -272,13 +244,13 @@ class FlyerModel(NumericModel):
         (N, T).
         """
         stretch = self.stretches[i]
-        data = stretch.data
-        inputs = [data["input"], *without_each(data["sent"], self.params, data["start"])]
+        inputs = without_each(stretch.data["sent"], self.params, stretch.data["start"])
         model = copy(self)
-        model._commanded = self.params.thrust(np.array(inputs))
-        one = self._lanes(size).part(np.full(len(inputs), i))
-        model._data = {name: values[one.owner] for name, values in self._data.items()}
-        lanes = replace(one, owner=np.arange(len(inputs)))
+        model.stretches = [stretch]
+        for held in inputs:
+            model.stretches.append(replace(stretch, data={**stretch.data, "input": held}))
+        start = np.tile(self._start[i], (len(model.stretches), 1))
+        lanes = model._lanes(size, start)
         seen = self.measure(stretch, model.simulate(lanes), lanes)
         return (seen[1:] - seen[:1]).T
 
@@ -301,7 +273,7 @@ class FlyerModel(NumericModel):
         if self.params.cable is None:
             return unknown
         length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
-        down = self._data["direction"][lanes.owner]
+        down = self.of_windows(lanes, "direction")
         level = ((0, 0), (0, 1))  # a third component of 0
         side = np.pad(unknown[:, 6:8], level)
         direction = down + side - down * np.sum(down * side, 1, keepdims=True)
@@ -312,8 +284,13 @@ class FlyerModel(NumericModel):
         rate = length * swing + mount[1, 0]
         return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
 
-    def _slope(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: np.ndarray) -> Slope:
-        """Return the derivative of the states under thrusts [N], shape (half steps, B, motors)."""
+    def _dynamics(
+        self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: np.ndarray
+    ) -> tuple[Slope, Callable[[int, np.ndarray], dict[str, np.ndarray]]]:
+        """Return what gives the derivative of states, and what gives the quantities of laws there,
+        by the half step.
+
+        ``thrust``: [N], shape (half steps, B, motors)."""
         p = self.params
         mass = (p.mass + self.size_of(lanes, "mass_quad"))[:, None]
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
@@ -322,37 +299,64 @@ class FlyerModel(NumericModel):
         latent = latent_force(lanes.latent, self.steps, len(self.blocks))
         names = [LATENT_BLOCKS[block] for block in self.blocks]
         force_of = self._force(lanes, thrust, rot)
-        exerted_of = self._exerted(lanes, thrust, rot)
         pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
+        tables = {"rate_b": "rate", "quat_wb": "quat"}
+        if NEIGHBOUR in self.inputs:
+            tables[NEIGHBOUR] = NEIGHBOUR
+        measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
+        total = thrust.sum(2)
+        rise = _slope_by_knots(total, p.window)
+
+        def loads_at(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
+            loads = dict(zip(names, latent[half]))
+            loads["vehicle force"] = loads["vehicle force"] + force_of(half, state[:, 3:6] - wind)
+            return loads
+
+        def quantities(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
+            values = {name: table[:, half + self._spare] for name, table in measured.items()}
+            values |= {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "thrust": total[half]}
+            if pulled is not None:
+                loads = loads_at(half, state)
+                _, _, direction, pull = pulled(half, state, state[:, 3:6] - wind, loads)
+                values |= {
+                    "payload_pos_w": state[:, :3] + state[:, 6:9],
+                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
+                    "cable_dir_w": direction,
+                    "tension": pull[:, 0],
+                    "mount_b": np.tile(p.cable.mount, (len(state), 1)),
+                }
+            return values
 
         def slope(half: int, state: np.ndarray) -> np.ndarray:
             vel = state[:, 3:6]
-            loads = dict(zip(names, latent[half]))
-            loads["vehicle force"] = loads["vehicle force"] + force_of(half, vel - wind)
+            loads = loads_at(half, state)
             if self.laws:
-                hung = pulled and pulled(half, state, vel - wind, loads)
-                for block, load in exerted_of(half, state, hung).items():
+                moment = {"time": np.zeros(len(state)), "slope": rise[half]}
+                values = moment | quantities(half, state)
+                for block, load in exerted(self.laws, values).items():
                     loads[block] = loads.get(block, 0.0) + load
-            parts = [vel, loads["vehicle force"] / mass + gravity]
             if pulled is not None:
                 acc, acc_payload, *_ = pulled(half, state, vel - wind, loads)
                 parts = [vel, acc, state[:, 9:12], acc_payload - acc]
+            else:
+                parts = [vel, loads["vehicle force"] / mass + gravity]
             if turning is not None:
                 parts.append(turning(half, state[:, -3:], loads["vehicle torque"]))
             return np.concatenate(parts, 1)
 
-        return slope
+        return slope, quantities
 
     def _rotations(self, lanes: Lanes) -> np.ndarray:
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
         late = self._spare + self.size_of(lanes, "attitude_delay") / (0.5 * self.params.step)
         position = np.arange(2 * self.steps + 1)[:, None] + late
-        measured = self._data["rot"]
+        measured = self.of_windows(lanes, "rot")
         index = np.clip(position.astype(int), 0, measured.shape[1] - 2)
-        before = measured[lanes.owner, index]
+        lane = np.arange(len(lanes.owner))
+        before = measured[lane, index]
         share = (position - index)[..., None, None]
-        return before + share * (measured[lanes.owner, index + 1] - before)
+        return before + share * (measured[lane, index + 1] - before)
 
     def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
         """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
@@ -364,6 +368,7 @@ class FlyerModel(NumericModel):
         lift = self.size_of(lanes, "translational_lift")[:, None]
         turn = self.stack(lanes, "marker_rot_x", "marker_rot_y", "")
         lean = self.size_of(lanes, "estimator_lean")[:, None]
+        leaning = self.of_windows(lanes, "lean")
         turns = np.any(turn) or np.any(lean)
 
         def force(half: int, air: np.ndarray) -> np.ndarray:
@@ -373,7 +378,7 @@ class FlyerModel(NumericModel):
             force_b = -(drag + parasitic * speed) * vel_b
             force_b[:, 2:3] += total[half] * (1.0 + lift * level)
             if turns:
-                off = turn + lean * self._data["lean"][lanes.owner, half + self._spare]
+                off = turn + lean * leaning[:, half + self._spare]
                 force_b = force_b + cross(off, force_b)
             return np.einsum("bij,bj->bi", rot[half], force_b)
 
@@ -408,46 +413,6 @@ class FlyerModel(NumericModel):
 
         return pulled
 
-    def _exerted(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Callable:
-        """Return what gives the forces and torques of the laws in each latent block, by the half
-        step, states and what :meth:`_pulled` gives without them.
-        """
-        rise = self._rise(thrust) if self.laws else None
-        total = thrust.sum(2)
-
-        def loads(half: int, state: np.ndarray, hung: tuple | None) -> dict[str, np.ndarray]:
-            row = half + self._spare
-            before, after = (self._data["rot"][lanes.owner, row + side] for side in (-1, 1))
-            turn = np.einsum("bji,bjk->bik", before, after)
-            skew = turn[:, [2, 0, 1], [1, 2, 0]] - turn[:, [1, 2, 0], [2, 0, 1]]
-            rate = skew / (2.0 * self.params.step)
-            values = {
-                "time": np.zeros(len(state)),
-                "slope": rise[half],
-                **{f"axis_{a}": rot[half, :, :, i] for i, a in enumerate("xyz")},
-                **self._quantities(state, rate, total[half], hung and hung[2:]),
-            }
-            if NEIGHBOUR in self.inputs:
-                values[NEIGHBOUR] = self._data[NEIGHBOUR][lanes.owner, row]
-            return exerted(self.laws, values)
-
-        return loads
-
-    def _quantities(
-        self, state: np.ndarray, rate: np.ndarray, thrust: np.ndarray, hung: tuple | None
-    ) -> dict[str, np.ndarray]:
-        """Return quantities of laws at states; ``hung``: direction and pull [N] of the cable."""
-        values = {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "rate_b": rate, "thrust": thrust}
-        if hung is None:
-            return values
-        return values | {
-            "payload_pos_w": state[:, :3] + state[:, 6:9],
-            "payload_vel_w": state[:, 3:6] + state[:, 9:12],
-            "cable_dir_w": hung[0],
-            "tension": hung[1][:, 0],
-            "mount_b": np.tile(self.params.cable.mount, (len(state), 1)),
-        }
-
     def _turning(self, lanes: Lanes, thrust: np.ndarray) -> Callable:
         """Return what gives the angular acceleration from the motors' thrusts and the offset of the
         centre of mass, by the half step, rates and a torque [N m].
@@ -469,6 +434,16 @@ class FlyerModel(NumericModel):
 def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
     """Return the names that all logs hold."""
     return [name for name in names if all(name in log for log in logs)]
+
+
+def _slope_by_knots(total: np.ndarray, window: float) -> np.ndarray:
+    """Return the slope of thrusts at the half steps of a window [N/s] as knots show it.
+
+    ``total``: [N], shape (half steps, B); ``window``: its length [s]."""
+    knots = np.linspace(0.0, window, KNOTS)
+    grid = np.linspace(0.0, window, len(total))
+    slope = np.gradient(triangles(knots, grid[::2]) @ total[::2], knots, axis=0)
+    return triangles(grid, knots) @ slope
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
@@ -101,10 +102,13 @@ def windows_of(
         if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
             continue
         times = start + 0.5 * params.step * halves
-        rot = _attitudes(log[params.attitude], times)
+        quat = attitude_at(*log[params.attitude].samples(), times)
+        rot = matrix_of_quat(quat)
         guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
         data = read_common(log, params, start, inputs) | {
             "rot": rot,
+            "quat": quat,
+            "rate": _rates(quat, params.step),
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, times),
             "sent": log[params.input],
@@ -177,11 +181,13 @@ def without_each(channel: Channel, params: FlyerParams, start: float) -> list[np
     return inputs
 
 
-def _attitudes(channel: Channel, times: np.ndarray) -> np.ndarray:
-    """Rotations at the half steps, shape (half steps, 3, 3)."""
-    time, quat = channel.samples()
-    span = slice(max(np.searchsorted(time, times[0]) - 2, 0), np.searchsorted(time, times[-1]) + 2)
-    return matrix_of_quat(attitude_at(time[span], quat[span], times))
+def _rates(quat: np.ndarray, step: float) -> np.ndarray:
+    """Return body rates at half steps by the attitudes about them [rad/s], shape (half steps,
+    3).
+    """
+    rot = Rotation.from_quat(quat)
+    turn = (rot[:-2].inv() * rot[2:]).as_rotvec()
+    return np.pad(turn / step, ((1, 1), (0, 0)), mode="edge")
 
 
 def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:

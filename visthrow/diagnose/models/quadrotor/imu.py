@@ -26,7 +26,7 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
     read_common,
     take_samples,
 )
-from visthrow.logs.check.relations import Relation, derivative, on_grid, relate
+from visthrow.logs.check.relations import Relation, derivative, relate
 from visthrow.logs.flightlog import FlightLog
 
 CHANNELS = ("acc_b", "rate_b")
@@ -64,6 +64,7 @@ class ImuModel(FlyerModel):
         """
         self.needed = (params.input, *CHANNELS)
         self.inputs = (params.input, *in_all(logs, "battery_voltage"))
+        self.columns = {"acc_b": slice(3, 4), "rate_b": slice(0, 3)}
         turned = [r for log in logs if (r := _turned(log, params)) is not None]
         if turned and np.median([r.correlation for r in turned]) < FOLLOWS:
             self.channels = CHANNELS[:1]
@@ -84,6 +85,10 @@ class ImuModel(FlyerModel):
             stretches.append(Stretch.laid_out(number, "flight", tables, data, layout, *begin))
         return stretches
 
+    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+        """See the base class; none."""
+        return [{} for _ in paths]
+
     def simulate(self, lanes: Lanes) -> np.ndarray:
         """See the base class; the state: body rates, and behind them the force along the rotors'
         axis over the mass [m/s^2], with the accelerometer's offset.
@@ -103,23 +108,6 @@ class ImuModel(FlyerModel):
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
         return np.concatenate([rates, (push + lanes.nuisance[:, 3:])[..., None]], 2)
-
-    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
-        """See the base class."""
-        grid = stretch.data["start"] + self.params.step * np.arange(path.shape[1])
-        out = np.empty((len(path), len(stretch.time)))
-        parts = {"acc_b": path[..., 3:], "rate_b": path[..., :3]}
-        for channel, name in enumerate(self.channels):
-            rows = stretch.channel == channel
-            states = parts[name]
-            time = stretch.time[rows][:: states.shape[2]]
-            values = [on_grid(grid, lane, time) for lane in states]
-            out[:, rows] = np.reshape(values, (len(path), -1))
-        return out
-
-    def knots(self, stretch: Stretch, path: np.ndarray) -> Mapping[str, np.ndarray]:
-        """See the base class."""
-        return {}
 
 
 def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
