@@ -45,7 +45,7 @@ KNOTS = (
 
 
 def table(terms_: list, knots: dict) -> np.ndarray:
-    return laws.TermLayout.of(terms_).table(laws.KnotValues(knots))
+    return np.stack([term.read(laws.KnotValues(knots)) for term in terms_], axis=-1)
 
 
 def turned(knots: dict, angle: float) -> dict:
@@ -96,6 +96,8 @@ def test_terms_turn_with_the_world(block):
     every = laws.terms_of(block, KNOTS)
     assert len(every) > 300
     values = table(every, knots)
+    together = laws.table(every, laws.KnotValues(knots))
+    assert_allclose(together, values, atol=1e-12 * np.abs(values).max())
     again = table(every, turned(knots, angle))
     assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 

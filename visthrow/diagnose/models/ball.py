@@ -14,10 +14,9 @@ from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
     Stretch,
+    halves,
     hermite,
     integrate,
-    latent_force,
-    latent_layout,
     sigma_of,
 )
 from visthrow.logs.check.relations import derivative
@@ -31,7 +30,6 @@ FALLS = 0.7
 """Acceleration besides gravity's, in its, below which a ball is in flight: drag and lift of fast,
 spinning balls; at rest it is 1.
 """
-KNOTS = 9  # of the latent force over a free flight
 
 
 @dataclass(frozen=True)
@@ -49,6 +47,8 @@ class BallModel(NumericModel):
     """Free flights of a ball, one window each."""
 
     table = "ball"
+    pushes = ((2, 0), (2, 1), (2, 2))
+    knot_count = 9
     channels = needed = (CHANNEL,)
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
@@ -68,10 +68,10 @@ class BallModel(NumericModel):
             horizontal = horizontal / max(np.linalg.norm(horizontal), 1e-6)
             sideways = np.array([-horizontal[1], horizontal[0], 0.0])
             data = {"time": time, "across": sideways, "span": np.ptp(time)}
-            layout = latent_layout(time[0], time[-1], KNOTS, (2,))
             begin = [*fit[0], *fit[1]], [0.1, 0.1, 0.1, 1.0, 1.0, 1.0]
             table = time, pos, sigma
-            flights.append(Stretch.laid_out(number, "ballistic", [table], data, layout, *begin))
+            span = time[0], time[-1]
+            flights.append(self.lay_out(number, "ballistic", [table], span, data, *begin))
         return flights
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
@@ -83,7 +83,7 @@ class BallModel(NumericModel):
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
         sideways = self.of_windows(lanes, "across")
         spin = top[:, None] * sideways + side[:, None] * np.array([0.0, 0.0, 1.0])
-        push = latent_force(lanes.latent, STEPS, 1)[:, 0]
+        push = self.pushes_at(lanes, halves(STEPS))
         gravity = np.array([0.0, 0.0, -self.params.gravity])
         quadratic = (self.params.drag + drag)[:, None]
         linear = linear[:, None]

@@ -12,14 +12,13 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"
 NEEDED = (CHANNEL, "pos_w", "quat_wb", "payload_pos_w")
 MOST_APART = 0.25  # share of the detections that may be of something else than the payload
-KNOTS = 11  # of the slow wander of detections over a window
 # poses are kept this long before and after a window [s], so that a delay can look them up
 MARGIN = 1.0
 
@@ -48,6 +47,8 @@ class GimbalModel(NumericModel):
     lawless = "it is geometry, in which no force moves anything"
 
     table = "gimbal"
+    pushes = ((2, 0), (2, 1), (2, 2))
+    knot_count = 11
     channels = (CHANNEL,)
     needed = inputs = NEEDED
 
@@ -81,8 +82,7 @@ class GimbalModel(NumericModel):
             sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
             measured = marker.time[rows][fits], point[fits], sigma
             data = {"table_time": table_time[in_table], "table": poses}
-            layout = latent_layout(start, end, KNOTS, (2,))
-            stretches.append(Stretch.laid_out(number, "view", [measured], data, layout))
+            stretches.append(self.lay_out(number, "view", [measured], (start, end), data))
         if rejected > MOST_APART * frames:
             raise LogError(
                 f"the marker's distance is more than {params.largest:g} m from the payload's in"
@@ -112,10 +112,9 @@ class GimbalModel(NumericModel):
         axes = Rotation.from_euler("xyz", self.params.camera_axes_deg, degrees=True)
         point = points @ axes.as_matrix()
         point = point + cross(tilt[:, None], point) - lever[:, None]
-        weights = triangles(
-            time, np.unique(stretch.latent_time)
-        )  # what gimbal and detection err by, slowly
-        point = point + np.einsum("bak,nk->bna", lanes.latent.reshape(len(late), 3, -1), weights)
+        # what gimbal and detection err by, slowly
+        shares = (time - stretch.latent_time[0]) / self.params.window
+        point = point + self.pushes_at(lanes, shares).swapaxes(0, 1)
         scale = 1.0 + self.stack(lanes, "focal_scale", "focal_scale", "range_scale")
         return (point * scale[:, None]).reshape(len(lanes.owner), -1)
 

@@ -20,7 +20,6 @@ from dataclasses import dataclass
 from itertools import chain, combinations_with_replacement
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
@@ -94,8 +93,8 @@ class Term:
 
     def read(self, values: KnotValues) -> np.ndarray:
         """Return what it exerts at the knots with a coefficient of 1, shape (k, 3)."""
-        *scalars, vector = (factor.read(values) for factor in self.parts)
-        return math.prod(scalars, start=np.ones(len(vector)))[:, None] * vector
+        vector = VECTORS[self.block][self.vector].read(values)
+        return _product(self.factors, values)[:, None] * vector
 
     def law(self, coefficient: float) -> LawParams:
         """The law that it is with a coefficient."""
@@ -155,17 +154,26 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
 
 def carries(latent_block: np.ndarray, block: str) -> bool:
     """Whether a window has all latents that terms of a block act through."""
-    return set(map(LATENT_BLOCKS.index, LATENT_BLOCKS if block == JOINT else (block,))) <= set(
-        np.unique(latent_block).tolist()
-    )
+    latent_blocks = LATENT_BLOCKS if block == JOINT else (block,)
+    return all(LATENT_BLOCKS.index(name) in latent_block for name in latent_blocks)
+
+
+def _product(factors: Sequence[str], values: KnotValues) -> np.ndarray:
+    """Return the product of scalars at the knots, shape (k,)."""
+    scalars = (SCALARS[name].read(values) for name in factors)
+    return math.prod(scalars, start=np.ones(len(values["time"])))
 
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("ki,ki->k", a, b)
 
 
-def _axis(i: int) -> Callable[[KnotValues], np.ndarray]:
-    return lambda k: rotate(k["quat_wb"], np.tile(np.eye(3)[i], (len(k["quat_wb"]), 1)))
+def _in_world(name: str) -> Callable[[KnotValues], np.ndarray]:
+    return lambda k: rotate(k["quat_wb"], k[name])
+
+
+def _in_body(name: str) -> Callable[[KnotValues], np.ndarray]:
+    return lambda k: rotate_back(k["quat_wb"], k[name])
 
 
 def _unit(i: int) -> Callable[[KnotValues], np.ndarray]:
@@ -213,12 +221,9 @@ def _size(value: np.ndarray) -> np.ndarray:
 
 
 DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
-    "quat_wb": (
-        lambda k: Rotation.from_matrix(np.stack([k[f"axis_{i}"] for i in "xyz"], axis=-1)).as_quat()
-    ),
-    "axis_x": _axis(0),
-    "axis_y": _axis(1),
-    "axis_z": _axis(2),
+    "axis_x": _in_world("unit_x"),
+    "axis_y": _in_world("unit_y"),
+    "axis_z": _in_world("unit_z"),
     "unit_x": _unit(0),
     "unit_y": _unit(1),
     "unit_z": _unit(2),
@@ -227,16 +232,16 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
     "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
     "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]),
-    "vel_b": lambda k: rotate_back(k["quat_wb"], k["vel_w"]),
-    "cable_dir_b": lambda k: rotate_back(k["quat_wb"], k["cable_dir_w"]),
+    "vel_b": _in_body("vel_w"),
+    "cable_dir_b": _in_body("cable_dir_w"),
     "reach_w": _reach,
     "joint_rate_b": _joint_rate,
     "friction": _friction,
     "spring": _spring,
     "speed_across_squared": lambda k: k["|across|"] ** 2,
     "rate_yaw": lambda k: k["rate_b"][:, 2],
-    "rate_w": lambda k: rotate(k["quat_wb"], k["rate_b"]),
-    "swing_b": lambda k: rotate_back(k["quat_wb"], k["swing"]),
+    "rate_w": _in_world("rate_b"),
+    "swing_b": _in_body("swing"),
     "inverse_height": lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST),
     "apart": lambda k: k["pos_w"] - k["neighbour_pos_w"],
     "inverse_distance": lambda k: 1.0 / np.maximum(k["|apart|"], LOWEST),
@@ -290,54 +295,17 @@ def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     ]
 
 
-@dataclass(frozen=True)
-class TermLayout:
-    """Which factors many terms of one block consist of; the scalar before the first is 1."""
-
-    block: str
-    scalars: tuple[str, ...]
-    vectors: tuple[str, ...]
-    scalar: np.ndarray  # of each term, shape (MOST_SCALARS, T); 0 for none
-    vector: np.ndarray  # shape (T,)
-
-    @staticmethod
-    def of(members: Sequence[Term]) -> "TermLayout":
-        """Sort out the factors of terms."""
-        scalars = tuple(dict.fromkeys(f for t in members for f in t.factors))
-        vectors = tuple(dict.fromkeys(t.vector for t in members))
-        scalar_index = {f: i + 1 for i, f in enumerate(scalars)}
-        place = {v: i for i, v in enumerate(vectors)}
-        rows = [
-            ([scalar_index[f] for f in t.factors] + [0] * MOST_SCALARS)[:MOST_SCALARS]
-            for t in members
-        ]
-        return TermLayout(
-            members[0].block,
-            scalars,
-            vectors,
-            np.array(rows).T,
-            np.array([place[t.vector] for t in members]),
-        )
-
-    def factors(self, values: KnotValues) -> tuple[np.ndarray, np.ndarray]:
-        """Values of the scalars, shape (k, 1 + scalars), and of the vectors, shape (k, 3, vectors);
-        each is computed once.
-        """
-        scalars = np.stack(
-            (np.ones(len(values["time"])), *(SCALARS[f].read(values) for f in self.scalars)),
-            axis=-1,
-        )
-        return scalars, np.stack(
-            [VECTORS[self.block][v].read(values) for v in self.vectors], axis=-1
-        )
-
-    def table(self, knots: KnotValues) -> np.ndarray:
-        """Values of the terms, shape (k, 3, T)."""
-        scalars, vectors = self.factors(knots)
-        values = vectors[:, :, self.vector]
-        for which in self.scalar:
-            values *= scalars[:, None, which]
-        return values
+def table(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
+    """Return what all terms of :func:`terms_of` exert at the knots with a coefficient of 1, shape
+    (k, 3, T); the scalars of each are multiplied once.
+    """
+    vectors = VECTORS[terms[0].block]
+    names = dict.fromkeys(term.vector for term in terms)
+    factors = dict.fromkeys(term.factors for term in terms)
+    directions = np.stack([vectors[name].read(values) for name in names], axis=-1)
+    products = np.stack([_product(scalars, values) for scalars in factors], axis=-1)
+    every = products[:, None, :, None] * directions[:, :, None, :]
+    return every.reshape(len(directions), 3, len(terms))
 
 
 def loads(block: str, knots: KnotValues, values: np.ndarray) -> dict[str, np.ndarray]:

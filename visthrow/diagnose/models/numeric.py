@@ -49,32 +49,6 @@ class Stretch(Window):
         """Return the measurements, shape (N,)."""
         return self.residual
 
-    @staticmethod
-    def laid_out(
-        flight: int,
-        phase: str,
-        channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
-        data: Mapping[str, Any],
-        layout: Mapping[str, np.ndarray],
-        start: Sequence[float] = (),
-        start_sd: Sequence[float] = (),
-    ) -> "Stretch":
-        """Lay out the samples of channels.
-
-        ``channels``: stamps, shape (n,), values, shape (n, C), and their deviations, which
-        broadcast to the values; ``layout``: of :func:`latent_layout`.
-        """
-        rows = []
-        for number, (stamps, values, deviation) in enumerate(channels):
-            columns = np.broadcast_arrays(stamps[:, None], number, values, deviation)
-            rows.append([column.ravel() for column in columns])
-        time, channel, measured, sigma = np.concatenate(rows, axis=1)
-        none = np.zeros((len(time), 0))
-        spread = np.array(start_sd, dtype=float)
-        columns = time, channel.astype(int), measured, sigma, none, none, spread
-        guess = np.array(start, dtype=float)
-        return Stretch(flight, phase, *columns, **layout, start=guess, data=data)
-
 
 @dataclass(frozen=True)
 class Lanes:
@@ -97,6 +71,9 @@ class NumericModel(Model, ABC):
     # whether the prior of the unknowns at the start says something: else it is about their fit
     anchored = False
     latent_step = 1.0  # of the differences by latent forces [N or N m]
+    # latent block and axis of each latent force, and the number of its knots over a window
+    pushes: Sequence[tuple[int, int]]
+    knot_count: int
     table: str  # file of the catalogue
     needed: Sequence[str] = ()  # channels without which a log holds no window
     inputs: Sequence[str] = ()  # channels that are there and drive the simulation
@@ -149,6 +126,52 @@ class NumericModel(Model, ABC):
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """Cut one log, the flight of a number, into windows."""
         raise NotImplementedError
+
+    def lay_out(
+        self,
+        flight: int,
+        phase: str,
+        channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        span: tuple[float, float],
+        data: Mapping[str, Any],
+        start: Sequence[float] = (),
+        start_sd: Sequence[float] = (),
+    ) -> Stretch:
+        """Lay out the samples of channels and the knots of latent forces over a span of time.
+
+        ``channels``: stamps, shape (n,), values, shape (n, C), and their deviations, which
+        broadcast to the values; ``span``: [s]; ``start, start_sd``: guess of what is not known at
+        the start, and its deviation.
+        """
+        rows = []
+        for number, (stamps, values, deviation) in enumerate(channels):
+            columns = np.broadcast_arrays(stamps[:, None], number, values, deviation)
+            rows.append([column.ravel() for column in columns])
+        time, channel, measured, sigma = np.concatenate(rows, axis=1)
+        none = np.zeros((len(time), 0))
+        block, axis = np.repeat(self.pushes, self.knot_count, axis=0).T
+        return Stretch(
+            flight,
+            phase,
+            time,
+            channel.astype(int),
+            measured,
+            sigma,
+            effects=none,
+            nuisance=none,
+            nuisance_sd=np.array(start_sd, dtype=float),
+            latent_block=block,
+            latent_axis=axis,
+            latent_time=np.tile(np.linspace(*span, self.knot_count), len(self.pushes)),
+            start=np.array(start, dtype=float),
+            data=data,
+        )
+
+    def pushes_at(self, lanes: Lanes, shares: np.ndarray) -> np.ndarray:
+        """Return latent forces of lanes at shares of a window's span, shape (T, B, pushes)."""
+        weights = triangles(shares, np.linspace(0.0, 1.0, self.knot_count))
+        latent = lanes.latent.reshape(len(lanes.latent), -1, self.knot_count)
+        return np.einsum("bpk,tk->tbp", latent, weights)
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
         """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws
@@ -418,6 +441,18 @@ def sigma_of(channel: Channel, floor: float) -> np.ndarray:
     return np.maximum(np.where(np.isfinite(estimate), estimate, 10.0 * floor), floor)
 
 
+def take_samples(channel: Channel, params: Any, start: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return stamps and values of every n-th sample in a window of a model's parameters."""
+    inside = (channel.time >= start) & (channel.time < start + params.window)
+    rows = np.flatnonzero(channel.valid & inside)[:: params.every]
+    return channel.time[rows], channel.values[rows].astype(float).reshape(len(rows), -1)
+
+
+def halves(steps: int) -> np.ndarray:
+    """Return the half steps of a window as shares of it."""
+    return np.linspace(0.0, 1.0, 2 * steps + 1)
+
+
 def integrate(
     slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray
 ) -> np.ndarray:
@@ -466,35 +501,3 @@ def hermite(
 def triangles(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
     return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])
-
-
-def latent_layout(
-    start: float, end: float, count: int, blocks: Sequence[int], axes: Sequence[int] = (0, 1, 2)
-) -> dict[str, np.ndarray]:
-    """Knots of latent forces over a stretch: arguments of :class:`Stretch`.
-
-    Args:
-        start: [s].
-        end: [s].
-        count: Of the knots, the same in all stretches.
-        blocks: Indices into :data:`visthrow.diagnose.models.model_interface.LATENT_BLOCKS`.
-        axes: Of each block.
-    """
-    times = np.linspace(start, end, count)
-    layout = [(block, axis, time) for block in blocks for axis in axes for time in times]
-    block, axis, time = (np.array(column) for column in zip(*layout))
-    return {
-        "latent_block": block.astype(int),
-        "latent_axis": axis.astype(int),
-        "latent_time": time.astype(float),
-    }
-
-
-def latent_force(latent: np.ndarray, steps: int, blocks: int, axes: int = 3) -> np.ndarray:
-    """Latent forces at the half steps of the grid.
-
-    ``latent``: coefficients, shape (B, G), ordered by :func:`latent_layout`; ``blocks``: number of
-    blocks in the layout; ``axes``: of each block. Returns shape (2 steps + 1, blocks, B, axes)."""
-    knots = latent.shape[1] // (blocks * axes)
-    weights = triangles(np.linspace(0.0, 1.0, 2 * steps + 1), np.linspace(0.0, 1.0, knots))
-    return np.einsum("xbak,tk->tbxa", latent.reshape(len(latent), blocks, axes, knots), weights)

@@ -12,16 +12,15 @@ from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
     Stretch,
+    halves,
     hermite,
     integrate,
-    latent_force,
-    latent_layout,
     sigma_of,
+    take_samples,
 )
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "angle"
-KNOTS = 11  # of the latent force on the bob over a window
 FEWEST = 20  # samples of a window
 FARTHEST = (
     2.0 * np.pi
@@ -61,6 +60,8 @@ class PendulumModel(NumericModel):
     at the pendulum's length."""
 
     table = "pendulum"
+    pushes = ((2, 0), (2, 2))
+    knot_count = 11
     channels = needed = (CHANNEL,)
     latent_step = 0.1
     bends = True
@@ -76,7 +77,6 @@ class PendulumModel(NumericModel):
         """
         params = self.params
         time, angle = log[CHANNEL].samples()
-        angle = angle[:, 0]
         if len(time) < FEWEST:
             return []
         distance = np.median(np.abs(angle - params.hanging))
@@ -88,19 +88,15 @@ class PendulumModel(NumericModel):
         sigma = sigma_of(log[CHANNEL], 1e-5)
         stretches = []
         for start in np.arange(time[0], time[-1] - 0.5 * params.window, params.window):
-            rows = np.flatnonzero((time >= start) & (time < start + params.window))
-            rows = rows[:: params.every]
-            if len(rows) < FEWEST:
+            t, y = take_samples(log[CHANNEL], params, start)
+            if len(t) < FEWEST:
                 continue
-            t = time[rows]
-            y = angle[rows]
-            fit = np.polynomial.polynomial.polyfit(t[:12] - start, y[:12] - params.hanging, 2)
-            layout = latent_layout(start, start + params.window, KNOTS, (2,), (0, 2))
-            table = t, y[:, None], sigma
-            begin = fit[:2], [0.2, 1.0]
-            stretches.append(
-                Stretch.laid_out(number, "swing", [table], {"start": start}, layout, *begin)
-            )
+            away = y[:12, 0] - params.hanging
+            guess = np.polynomial.polynomial.polyfit(t[:12] - start, away, 2)[:2]
+            span = start, start + params.window
+            table = t, y, sigma
+            data = {"start": start}
+            stretches.append(self.lay_out(number, "swing", [table], span, data, guess, [0.2, 1.0]))
         return stretches
 
     def simulate(self, lanes: Lanes) -> np.ndarray:
@@ -114,7 +110,7 @@ class PendulumModel(NumericModel):
         viscous = p.viscous + viscous
         coulomb = p.coulomb + coulomb
         quadratic = p.quadratic + quadratic
-        push = latent_force(lanes.latent, self._steps, 1, 2)[:, 0]
+        push = self.pushes_at(lanes, halves(self._steps))
 
         def slope(index: int, state: np.ndarray) -> np.ndarray:
             angle, rate = state.T

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout, triangles
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
 from visthrow.logs.flightlog import FlightLog
 
 NEEDED = ("rotor_speed", "thrust", "supply_voltage", "current")
@@ -41,6 +41,8 @@ class StandModel(NumericModel):
     )
 
     table = "stand"
+    pushes = ((0, 0), (0, 1))
+    knot_count = 2
     channels = ("thrust", "current")
     needed = NEEDED
     inputs = ("rotor_speed", "supply_voltage")
@@ -67,8 +69,7 @@ class StandModel(NumericModel):
             for values, sd in ((thrust, thrust_sd), (current, current_sd))
         ]
         data = {"speed": speed, "volts": volts}
-        layout = latent_layout(0.0, len(rows) - 1.0, 2, (0,), (0, 1))
-        return [Stretch.laid_out(number, "steps", channels, data, layout)]
+        return [self.lay_out(number, "steps", channels, (0.0, len(rows) - 1.0), data)]
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class: thrusts [N], then currents [A]."""
@@ -90,14 +91,9 @@ class StandModel(NumericModel):
         )
         ohm = np.maximum(p.resistance + resistance, 1e-6)
         root = np.sqrt(np.maximum(volts**2 - 4.0 * ohm * power, 0.0))
-        share = (
-            lanes.latent.reshape(len(lanes.owner), 2, 2)
-            @ triangles(np.arange(len(speed)), np.array([0, len(speed) - 1])).T
-        )
-        return np.concatenate(
-            [thrust * (1.0 + share[:, 0]), (volts - root) / (2.0 * ohm) * (1.0 + share[:, 1])],
-            axis=1,
-        )
+        share = 1.0 + self.pushes_at(lanes, np.linspace(0.0, 1.0, len(speed)))
+        currents = (volts - root) / (2.0 * ohm)
+        return np.concatenate([thrust * share[..., 0].T, currents * share[..., 1].T], axis=1)
 
 
 def settled(log: FlightLog, params: StandParams) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.law_terms import exerted
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, latent_layout
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
@@ -44,6 +44,8 @@ class TrimModel(NumericModel):
     """Means over windows of slow level flight."""
 
     table = "trim"
+    pushes = ((0, 2), (1, 0), (1, 1), (1, 2))  # a push along the vertical, then three torques
+    knot_count = 2
 
     def __init__(self, logs: Sequence[FlightLog], params: TrimParams) -> None:
         """See the base class."""
@@ -56,37 +58,36 @@ class TrimModel(NumericModel):
         """See the base class."""
         params = self.params
         window = params.slowest_window
-        nothing = (np.zeros(0), np.zeros(0))
-        stamps = log[params.command].time
-        time, sent = log[params.command].samples()
-        time_p, pos = log[params.position].samples()
-        time_v, vel = derivative(time_p, pos, 0.2)
+        names = [params.command, params.position]
+        channels = [log[name].samples() for name in names]
         if params.velocity in log:
-            time_v, vel = log[params.velocity].samples()
-        time_u, volts = log["battery_voltage"].samples() if "battery_voltage" in log else nothing
+            channels.append(log[params.velocity].samples())
+        else:
+            channels.append(derivative(*channels[1], 0.2))
+        if "battery_voltage" in log:
+            channels.append(log["battery_voltage"].samples())
+        stamps = log[params.command].time
         stretches = []
         for start in np.arange(stamps[0], stamps[-1] - window, window):
-            spans = [(t >= start) & (t < start + window) for t in (time, time_p, time_v, time_u)]
-            if min(map(np.count_nonzero, spans[:3])) < 20:
+            sent, pos, vel, *volts = [
+                values[(time >= start) & (time < start + window)] for time, values in channels
+            ]
+            if min(len(sent), len(pos), len(vel)) < 20:
                 continue
-            sent_here, pos_here, vel_here, volts_here = (
-                values[span] for values, span in zip((sent, pos, vel, volts), spans)
-            )
-            fast = np.mean(np.linalg.norm(vel_here, axis=1)) > params.fastest
-            if fast or np.min(pos_here[:, 2]) < params.lowest:
+            fast = np.mean(np.linalg.norm(vel, axis=1)) > params.fastest
+            if fast or np.min(pos[:, 2]) < params.lowest:
                 continue
-            rise = vel_here[-5:, 2].mean() - vel_here[:5, 2].mean()
+            rise = vel[-5:, 2].mean() - vel[:5, 2].mean()
+            known = len(volts) and len(volts[0])
             data = {
-                "volts": float(np.mean(volts_here))
-                if len(volts_here)
-                else params.reference_voltage,
+                "volts": float(np.mean(volts[0])) if known else params.reference_voltage,
                 "lift": 1.0 + rise / window / params.gravity,
-                "pos": np.mean(pos_here, axis=0),
-                "vel": np.mean(vel_here, axis=0),
+                "pos": np.mean(pos, axis=0),
+                "vel": np.mean(vel, axis=0),
             }
-            table = np.array([start]), np.mean(sent_here, axis=0)[None], np.array(params.spread)
-            layout = _latent(start, start + window)
-            stretches.append(Stretch.laid_out(number, "hover", [table], data, layout))
+            table = np.array([start]), np.mean(sent, axis=0)[None], np.array(params.spread)
+            span = start, start + window
+            stretches.append(self.lay_out(number, "hover", [table], span, data))
         return stretches
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
@@ -98,49 +99,42 @@ class TrimModel(NumericModel):
         mass, gain, sag, com_x, com_y, yaw = theta[:, 8:].T
         x = p.arm * np.array([1.0, 1.0, -1.0, -1.0])
         y = p.arm * np.array([1.0, -1.0, 1.0, -1.0])
-        weight = (p.mass + mass + added.sum(1)) * p.gravity
-        total = p.mass + mass + added.sum(1)
-        off_x = ((p.mass + mass) * com_x + added @ x) / total
-        off_y = ((p.mass + mass) * com_y + added @ y) / total
-        spin = np.array(p.spin)
-        lift = stretch.data["lift"]
-        draught = lanes.latent.reshape(len(theta), 4, 2).mean(
-            2
-        )  # a push along the vertical, then three torques
-        if self.laws:
-            predictions = {
-                block: np.mean(value, axis=0)
-                for block, value in exerted(self.laws, self.knots(stretch, path)).items()
-            }
-            draught = draught + np.append(
-                predictions.get("vehicle force", np.zeros(3))[2],
-                predictions.get("vehicle torque", np.zeros(3)),
-            )
+        bare = p.mass + mass
+        total = bare + added.sum(1)
+        off_x = (bare * com_x + added @ x) / total
+        off_y = (bare * com_y + added @ y) / total
+        draught = self.pushes_at(lanes, np.array([0.5]))[0]
+        for block, loads in exerted(self.laws, self._means(stretch)).items():
+            load = np.mean(loads, axis=0)
+            if block == "vehicle force":
+                draught[:, 0] += load[2]
+            else:
+                draught[:, 1:] += load
         push, roll, pitch, turn = draught.T
-        lifting = weight * lift
+        lifting = total * p.gravity * stretch.data["lift"]
         wrench = [
             lifting - push,
             (lifting * off_x + pitch) / p.arm**2,
             (lifting * off_y - roll) / p.arm**2,
             -(lifting * yaw + turn / p.torque_ratio),
         ]
-        thrust = 0.25 * np.stack(wrench, axis=1) @ np.stack([np.ones(4), x, y, spin])
+        thrust = 0.25 * np.stack(wrench, axis=1) @ np.stack([np.ones(4), x, y, p.spin])
         volts = 1.0 + (p.voltage_coefficient + sag) * (stretch.data["volts"] - p.reference_voltage)
-        per_map = thrust / (
-            np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None]
-        )
-        return command_of(p.thrust_map, per_map)
+        scale = np.array(p.motor_scale) * (1.0 + motors) * ((1.0 + gain) * volts)[:, None]
+        return command_of(p.thrust_map, thrust / scale)
 
-    def knots(self, stretch: Stretch, path: np.ndarray) -> dict[str, np.ndarray]:
+    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[dict[str, np.ndarray]]:
         """See the base class; nothing tells the attitude, hence not the body's velocity either."""
+        return [self._means(stretch) for stretch in self.stretches]
+
+    def _means(self, stretch: Stretch) -> dict[str, np.ndarray]:
+        """Return quantities of laws at both ends of a window: its means."""
         data = stretch.data
-        start, end = np.unique(stretch.latent_time)
-        thrust = self.params.mass * self.params.gravity * data["lift"]
         return {
-            "time": np.array([start, end]),
+            "time": np.unique(stretch.latent_time),
             "pos_w": np.tile(data["pos"], (2, 1)),
             "vel_w": np.tile(data["vel"], (2, 1)),
-            "thrust": np.full(2, thrust),
+            "thrust": np.full(2, self.params.mass * self.params.gravity * data["lift"]),
         }
 
 
@@ -150,10 +144,3 @@ def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
     if c2 == 0.0:
         return (thrust - c0) / c1
     return (-c1 + np.sqrt(np.maximum(c1 * c1 - 4.0 * c2 * (c0 - thrust), 0.0))) / (2.0 * c2)
-
-
-def _latent(start: float, end: float) -> dict[str, np.ndarray]:
-    """Draught in a window: a push along the vertical and three torques."""
-    push = latent_layout(start, end, 2, (0,), (2,))
-    torque = latent_layout(start, end, 2, (1,))
-    return {name: np.concatenate([push[name], torque[name]]) for name in push}

@@ -83,13 +83,7 @@ class Limits:
 
     def hold(self, path: np.ndarray) -> bool:
         """Tell whether a path keeps within them; its rows are ``PERIOD`` apart, shape (N, 3)."""
-        half, lowest, highest, speed, acceleration = _extremes(path)
-        return bool(
-            np.all(half <= np.add(self.half, ROUNDING))
-            and self.lowest - ROUNDING <= lowest <= highest <= self.highest + ROUNDING
-            and speed <= self.speed + ROUNDING
-            and acceleration <= self.acceleration + ROUNDING
-        )
+        return bool(np.all(_extremes(path) <= self._most + ROUNDING))
 
     def share(self, path: np.ndarray, added: np.ndarray) -> float:
         """Largest share of a further way, 1 at most, with which a path keeps within them."""
@@ -104,27 +98,24 @@ class Limits:
 
     def around(self, path: np.ndarray) -> "Limits":
         """Limits that hold a path that is known to be safe too."""
-        half, lowest, highest, speed, acceleration = _extremes(path)
-        return replace(
-            self,
-            half=tuple(np.maximum(self.half, half).tolist()),
-            lowest=min(self.lowest, lowest),
-            highest=max(self.highest, highest),
-            speed=max(self.speed, speed),
-            acceleration=max(self.acceleration, acceleration),
-        )
+        x, y, depth, highest, *motion = np.maximum(self._most, _extremes(path)).tolist()
+        return Limits((x, y), -depth, highest, *motion, self.rate, self.thrust)
+
+    @property
+    def _most(self) -> np.ndarray:
+        """Return the limits in the order of :func:`_extremes`."""
+        return np.array([*self.half, -self.lowest, self.highest, self.speed, self.acceleration])
 
 
-def _extremes(path: np.ndarray) -> tuple[np.ndarray, float, float, float, float]:
-    """Farthest from the hall's middle along x and y, lowest and highest [m], speed [m/s] and
-    acceleration [m/s^2] of a path.
+def _extremes(path: np.ndarray) -> np.ndarray:
+    """Return how far a path goes from the hall's middle along x and y, down and up [m], its speed
+    [m/s] and acceleration [m/s^2], shape (6,).
     """
+    x, y, z = path.T
     vel = np.gradient(path, PERIOD, axis=0)
     acc = np.gradient(vel, PERIOD, axis=0)
-    speed = np.linalg.norm(vel, axis=1).max()
-    push = np.linalg.norm(acc, axis=1).max()
-    height = path[:, 2]
-    return np.abs(path[:, :2]).max(0), height.min(), height.max(), speed, push
+    reach = [np.abs(x).max(), np.abs(y).max(), -z.min(), z.max()]
+    return np.array(reach + [np.linalg.norm(motion, axis=1).max() for motion in (vel, acc)])
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from visthrow.diagnose.models.law_terms import (
     JOINT,
     KnotValues,
     Term,
-    TermLayout,
     carries,
+    table,
     terms_of,
 )
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
@@ -61,9 +61,8 @@ WEIGHED = 6
 
 
 @lru_cache(maxsize=32)
-def _laid(block: str, quantities: tuple[str, ...]) -> tuple[tuple[Term, ...], TermLayout | None]:
-    terms = tuple(terms_of(block, quantities))
-    return terms, TermLayout.of(terms) if terms else None
+def _terms(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
+    return tuple(terms_of(block, quantities))
 
 
 @dataclass
@@ -115,15 +114,15 @@ def screen(
     carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in carriers]
     shared = tuple(sorted(set.intersection(*names))) if names else ()
-    terms, layout = _laid(block, shared) if "time" in shared else ((), None)
-    if layout is None:
+    terms = _terms(block, shared) if "time" in shared else ()
+    if not terms:
         return None
     latent_block = LATENT_BLOCKS.index(level_block(block))
 
     def in_window(w: int) -> tuple[np.ndarray, ...]:
         """Square, information, score and cross information of all terms."""
         part, transfer = parts[w], through_latents(point.windows[w], quantities[w], block)
-        values = layout.table(quantities[w]).reshape(transfer.shape[1], -1)
+        values = table(terms, quantities[w]).reshape(transfer.shape[1], -1)
         exerted = transfer[point.grams[w].latent_block == latent_block] @ values
         loads = transfer @ values
         information = (loads * (part.latent_information @ loads)).sum(0)

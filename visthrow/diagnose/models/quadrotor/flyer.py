@@ -21,15 +21,14 @@ from visthrow.diagnose.models.numeric import (
     Lanes,
     NumericModel,
     Stretch,
+    halves,
     hermite,
     integrate,
-    latent_force,
     triangles,
 )
 from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
     FINE,
-    KNOTS,
     NEIGHBOUR,
     expect_thrust,
     spare,
@@ -51,6 +50,7 @@ class FlyerModel(NumericModel):
 
     table = "flyer"
     latent_step = 1e-2
+    knot_count = 8
     # channels that are states, and which: behind them come the motors' thrusts
     columns: Mapping[str, slice] = {}
 
@@ -60,8 +60,8 @@ class FlyerModel(NumericModel):
         Raises LogError where no log has the channels, or none flies.
         """
         self.describe(logs, params)
-        # numbers of the latent blocks, in the order of their forces
-        self.blocks = (0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF])
+        blocks = [0, *[BLOCK_OF[name] for name in self.channels if name in BLOCK_OF]]
+        self.pushes = [(block, axis) for block in blocks for axis in range(3)]
         super().__init__(logs, params)
         self.steps = round(params.window / params.step)
         self._spare = spare(params.step)
@@ -114,7 +114,7 @@ class FlyerModel(NumericModel):
 
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
-        return windows_of(log, number, self.params, self.channels, self.blocks)
+        return windows_of(self, log, number)
 
     def _thrusts(self, lanes: Lanes) -> np.ndarray:
         """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held
@@ -296,8 +296,9 @@ class FlyerModel(NumericModel):
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
         gravity = p.gravity * (tilt - [0.0, 0.0, 1.0])
         wind = self.stack(lanes, "wind_x", "wind_y", "")
-        latent = latent_force(lanes.latent, self.steps, len(self.blocks))
-        names = [LATENT_BLOCKS[block] for block in self.blocks]
+        pushes = self.pushes_at(lanes, halves(self.steps))
+        names = [LATENT_BLOCKS[block] for block, _ in self.pushes[::3]]
+        latent = dict(zip(names, np.split(pushes, len(names), axis=2)))
         force_of = self._force(lanes, thrust, rot)
         pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
@@ -306,10 +307,10 @@ class FlyerModel(NumericModel):
             tables[NEIGHBOUR] = NEIGHBOUR
         measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
         total = thrust.sum(2)
-        rise = _slope_by_knots(total, p.window)
+        rise = self._rise(total)
 
         def loads_at(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
-            loads = dict(zip(names, latent[half]))
+            loads = {name: push[half] for name, push in latent.items()}
             loads["vehicle force"] = loads["vehicle force"] + force_of(half, state[:, 3:6] - wind)
             return loads
 
@@ -346,6 +347,13 @@ class FlyerModel(NumericModel):
             return np.concatenate(parts, 1)
 
         return slope, quantities
+
+    def _rise(self, total: np.ndarray) -> np.ndarray:
+        """Return the slope of whole thrusts [N], shape (half steps, B), as knots show it [N/s]."""
+        knots = np.linspace(0.0, self.params.window, self.knot_count)
+        grid = self.params.window * halves(self.steps)
+        slope = np.gradient(triangles(knots, grid[::2]) @ total[::2], knots, axis=0)
+        return triangles(grid, knots) @ slope
 
     def _rotations(self, lanes: Lanes) -> np.ndarray:
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
@@ -434,16 +442,6 @@ class FlyerModel(NumericModel):
 def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
     """Return the names that all logs hold."""
     return [name for name in names if all(name in log for log in logs)]
-
-
-def _slope_by_knots(total: np.ndarray, window: float) -> np.ndarray:
-    """Return the slope of thrusts at the half steps of a window [N/s] as knots show it.
-
-    ``total``: [N], shape (half steps, B); ``window``: its length [s]."""
-    knots = np.linspace(0.0, window, KNOTS)
-    grid = np.linspace(0.0, window, len(total))
-    slope = np.gradient(triangles(knots, grid[::2]) @ total[::2], knots, axis=0)
-    return triangles(grid, knots) @ slope
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:

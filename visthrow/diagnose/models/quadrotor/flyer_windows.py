@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.common.rotations import matrix_of_quat
-from visthrow.diagnose.models.numeric import Stretch, latent_layout, sigma_of
+from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -21,7 +21,6 @@ from visthrow.logs.flightlog import Channel, FlightLog
 # their own times
 FINE = 16
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
-KNOTS = 8  # of the latent forces over a window
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
 # median thrust over the weight, by the map: a map may be far off, a unit is off by more
@@ -73,24 +72,10 @@ def read_common(
     return {"start": start, "input": inputs, "volts": float(volts), "since": since}
 
 
-def take_samples(channel: Channel, params: QuadrotorParams, start: float) -> tuple[np.ndarray, ...]:
-    """Return stamps and values of a channel's samples in a window."""
-    inside = (channel.time >= start) & (channel.time < start + params.window)
-    rows = np.flatnonzero(channel.valid & inside)[:: params.every]
-    return channel.time[rows], channel.values[rows].astype(float)
-
-
-def windows_of(
-    log: FlightLog,
-    number: int,
-    params: FlyerParams,
-    channels: Sequence[str],
-    blocks: Sequence[int],
-) -> list[Stretch]:
-    """Cut a log, the flight of a number, into windows that fly.
-
-    ``blocks``: numbers of the latent blocks.
-    """
+def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch]:
+    """Cut a log, the flight of a number, into windows of a model that fly."""
+    params = model.params
+    channels = model.channels
     # no less is believed
     sigma = [sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels]
     driving = (params.position, params.attitude, params.input, *[NEIGHBOUR] * (NEIGHBOUR in log))
@@ -116,8 +101,8 @@ def windows_of(
         if NEIGHBOUR in log:
             data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
         tables = [(*row, sd) for row, sd in zip(rows, sigma)]
-        layout = latent_layout(start, start + params.window, KNOTS, blocks)
-        stretches.append(Stretch.laid_out(number, "flight", tables, data, layout, guess, spread))
+        span = start, start + params.window
+        stretches.append(model.lay_out(number, "flight", tables, span, data, guess, spread))
     return stretches
 
 

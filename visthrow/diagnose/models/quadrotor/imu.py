@@ -13,18 +13,16 @@ import numpy as np
 from visthrow.diagnose.models.numeric import (
     Lanes,
     Stretch,
+    halves,
     integrate,
-    latent_force,
-    latent_layout,
     sigma_of,
+    take_samples,
 )
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
-    KNOTS,
     cut_flying,
     read_common,
-    take_samples,
 )
 from visthrow.logs.check.relations import Relation, derivative, relate
 from visthrow.logs.flightlog import FlightLog
@@ -79,10 +77,10 @@ class ImuModel(FlyerModel):
             (time, acc), (gyro_time, rate) = (take_samples(log[n], p, start) for n in CHANNELS)
             tables = [(time, acc[:, 2:], sigma[0][2:]), (gyro_time, rate, sigma[1])]
             data = read_common(log, p, start, inputs)
-            layout = latent_layout(start, start + p.window, KNOTS, self.blocks)
             begin = [*rate[0], 0.0], [1.0, 1.0, 1.0, OFFSET]
+            span = start, start + p.window
             tables = tables[: len(self.channels)]
-            stretches.append(Stretch.laid_out(number, "flight", tables, data, layout, *begin))
+            stretches.append(self.lay_out(number, "flight", tables, span, data, *begin))
         return stretches
 
     def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
@@ -94,17 +92,17 @@ class ImuModel(FlyerModel):
         axis over the mass [m/s^2], with the accelerometer's offset.
         """
         thrust = self._thrusts(lanes)
-        latent = latent_force(lanes.latent, self.steps, len(self.blocks))
+        pushes = self.pushes_at(lanes, halves(self.steps))
         turning = self._turning(lanes, thrust)
 
         def slope(half: int, rate: np.ndarray) -> np.ndarray:
-            return turning(half, rate, latent[half, -1])
+            return turning(half, rate, pushes[half, :, -3:])
 
         step = np.full((len(lanes.owner), 1), self.params.step)
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
         if "rate_b" in self.channels:
             rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
-        gust = latent[:, 0, :, 2]
+        gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
         return np.concatenate([rates, (push + lanes.nuisance[:, 3:])[..., None]], 2)
