@@ -41,6 +41,9 @@ from visthrow.logs.flightlog import FlightLog
 Slope = Callable[[int, np.ndarray], np.ndarray]
 """Of the half step, and states or velocities of lanes."""
 
+Quantities = Callable[[int, np.ndarray], dict[str, np.ndarray]]
+"""Of laws, by the half step and states of lanes."""
+
 SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
 BLOCK_OF = {"payload_pos_w": 2, "rate_b": 1}  # number of the latent block that a channel shows
 
@@ -175,12 +178,13 @@ class FlyerModel(NumericModel):
         rot = self._rotations(lanes)
         _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
         moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
+        names = moments[0].keys() - {"slope"}  # which follows from the thrusts at the knots
         grid = self.params.step * np.arange(len(moments))
         knots = []
         for i, stretch in enumerate(self.stretches):
             time = np.unique(stretch.latent_time)
             weights = triangles(time, stretch.data["start"] + grid)
-            values = {name: weights @ [m[name][i] for m in moments] for name in moments[0]}
+            values = {name: weights @ [m[name][i] for m in moments] for name in names}
             knots.append(values | {"time": time})
         return knots
 
@@ -286,7 +290,7 @@ class FlyerModel(NumericModel):
 
     def _dynamics(
         self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: np.ndarray
-    ) -> tuple[Slope, Callable[[int, np.ndarray], dict[str, np.ndarray]]]:
+    ) -> tuple[Slope, Quantities]:
         """Return what gives the derivative of states, and what gives the quantities of laws there,
         by the half step.
 
@@ -302,40 +306,24 @@ class FlyerModel(NumericModel):
         force_of = self._force(lanes, thrust, rot)
         pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
-        tables = {"rate_b": "rate", "quat_wb": "quat"}
-        if NEIGHBOUR in self.inputs:
-            tables[NEIGHBOUR] = NEIGHBOUR
-        measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
-        total = thrust.sum(2)
-        rise = self._rise(total)
 
         def loads_at(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
             loads = {name: push[half] for name, push in latent.items()}
             loads["vehicle force"] = loads["vehicle force"] + force_of(half, state[:, 3:6] - wind)
             return loads
 
-        def quantities(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
-            values = {name: table[:, half + self._spare] for name, table in measured.items()}
-            values |= {"pos_w": state[:, :3], "vel_w": state[:, 3:6], "thrust": total[half]}
-            if pulled is not None:
-                loads = loads_at(half, state)
-                _, _, direction, pull = pulled(half, state, state[:, 3:6] - wind, loads)
-                values |= {
-                    "payload_pos_w": state[:, :3] + state[:, 6:9],
-                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
-                    "cable_dir_w": direction,
-                    "tension": pull[:, 0],
-                    "mount_b": np.tile(p.cable.mount, (len(state), 1)),
-                }
-            return values
+        def hung_at(half: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            loads = loads_at(half, state)
+            _, _, direction, pull = pulled(half, state, state[:, 3:6] - wind, loads)
+            return direction, pull
+
+        quantities = self._quantities(lanes, thrust.sum(2), hung_at)
 
         def slope(half: int, state: np.ndarray) -> np.ndarray:
             vel = state[:, 3:6]
             loads = loads_at(half, state)
             if self.laws:
-                moment = {"time": np.zeros(len(state)), "slope": rise[half]}
-                values = moment | quantities(half, state)
-                for block, load in exerted(self.laws, values).items():
+                for block, load in exerted(self.laws, quantities(half, state)).items():
                     loads[block] = loads.get(block, 0.0) + load
             if pulled is not None:
                 acc, acc_payload, *_ = pulled(half, state, vel - wind, loads)
@@ -354,6 +342,35 @@ class FlyerModel(NumericModel):
         grid = self.params.window * halves(self.steps)
         slope = np.gradient(triangles(knots, grid[::2]) @ total[::2], knots, axis=0)
         return triangles(grid, knots) @ slope
+
+    def _quantities(self, lanes: Lanes, total: np.ndarray, hung_at: Callable) -> Quantities:
+        """Return what gives the quantities of laws by the half step and states.
+
+        ``total``: thrust [N], shape (half steps, B); ``hung_at``: gives direction and pull [N] of
+        the cable by the half step and states."""
+        cable = self.params.cable
+        tables = {"rate_b": "rate", "quat_wb": "quat"}
+        if NEIGHBOUR in self.inputs:
+            tables[NEIGHBOUR] = NEIGHBOUR
+        measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
+        rise = self._rise(total)
+
+        def quantities(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
+            values = {name: table[:, half + self._spare] for name, table in measured.items()}
+            values |= {"time": np.zeros(len(state)), "thrust": total[half], "slope": rise[half]}
+            values |= {"pos_w": state[:, :3], "vel_w": state[:, 3:6]}
+            if cable is not None:
+                direction, pull = hung_at(half, state)
+                values |= {
+                    "payload_pos_w": state[:, :3] + state[:, 6:9],
+                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
+                    "cable_dir_w": direction,
+                    "tension": pull[:, 0],
+                    "mount_b": np.tile(cable.mount, (len(state), 1)),
+                }
+            return values
+
+        return quantities
 
     def _rotations(self, lanes: Lanes) -> np.ndarray:
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
