@@ -29,8 +29,7 @@ from visthrow.diagnose.planning.fly_manoeuvres import Simulate, Simulated
 from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, rise
 from visthrow.diagnose.planning.plan import PlanningGoal
 
-SLOWEST = 0.08
-FASTEST = 2.0
+PATH = 0.08, 2.0
 """Frequencies of a path's sweep [Hz]: once through the hall and back, and what a position loop
 still follows.
 """
@@ -118,24 +117,35 @@ def _extremes(path: np.ndarray) -> np.ndarray:
     return np.array(reach + [np.linalg.norm(motion, axis=1).max() for motion in (vel, acc)])
 
 
-@dataclass(frozen=True)
-class Sweep:
-    """A sine that runs from one frequency to another over a time and fades in and out."""
+def sweep(
+    t: np.ndarray,
+    seconds: float,
+    low: float,
+    high: float,
+    limit: Callable[[np.ndarray], np.ndarray] = np.ones_like,
+    phase: float = 0.0,
+) -> np.ndarray:
+    """Return a sine that runs from one frequency to another over a time and fades in and out, shape
+    (N,).
 
-    low: float  # [Hz]
-    high: float  # [Hz]
-    seconds: float
-    phase: float = 0.0  # at the start [rad]
+    Args:
+        t: times after its start [s], shape (N,).
+        seconds: its length [s].
+        low: frequency at its start [Hz].
+        high: frequency at its end [Hz].
+        limit: gives the amplitude at frequencies [Hz].
+        phase: at its start [rad].
+    """
+    slope = (high - low) / seconds
+    turned = 2.0 * np.pi * (low + 0.5 * slope * t) * t
+    fade = rise(t, 0.0, FADE) * (1.0 - rise(t, seconds - FADE, FADE))
+    return limit(low + slope * t) * fade * np.sin(turned + phase)
 
-    def at(self, t: np.ndarray, limit: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Values at times after its start [s], with the amplitude that ``limit`` gives for a
-        frequency [Hz].
-        """
-        slope = (self.high - self.low) / self.seconds
-        frequency = self.low + slope * t
-        turned = 2.0 * np.pi * (self.low + 0.5 * slope * t) * t
-        fade = rise(t, 0.0, FADE) * (1.0 - rise(t, self.seconds - FADE, FADE))
-        return limit(frequency) * fade * np.sin(turned + self.phase)
+
+def _between(range_hz: tuple[float, float], share: float) -> float:
+    """Return the frequency at a share of the way through a range, by its logarithm [Hz]."""
+    low, high = range_hz
+    return low * (high / low) ** share
 
 
 NUMBERS = (
@@ -167,15 +177,14 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     def swept(axis: str, t: np.ndarray) -> np.ndarray:
         reach, speed, acceleration = most[axis]
-        low = SLOWEST * (FASTEST / SLOWEST) ** x[f"from_{axis}"]
-        high = SLOWEST * (FASTEST / SLOWEST) ** x[f"to_{axis}"]
+        low, high = (_between(PATH, x[f"{end}_{axis}"]) for end in ("from", "to"))
 
         def farthest(frequency: np.ndarray) -> np.ndarray:
             turned = 2.0 * np.pi * frequency
             within = np.minimum(reach, speed / turned)
             return np.minimum(within, acceleration / turned**2)
 
-        return x[f"share_{axis}"] * Sweep(low, high, seconds).at(t, farthest)
+        return x[f"share_{axis}"] * sweep(t, seconds, low, high, farthest)
 
     def ramped(t: np.ndarray) -> np.ndarray:
         return middle + x["kept"] * (base.path(t) - middle)
@@ -185,18 +194,19 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
 
     rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
     fitting = limits.share(ramped(rows), moved(rows))
-    top = ADDED[0] * (ADDED[1] / ADDED[0]) ** x["added_to"]
-    added = [Sweep(ADDED[0], top, seconds, phase=2.0 * np.pi * i / 3.0) for i in range(3)]
-    pushed = Sweep(top, ADDED[0], seconds)
+    slow = ADDED[0]
+    fast = _between(ADDED, x["added_to"])
 
     def rates(t: np.ndarray) -> np.ndarray:
-        sweeps = [x[f"rate_{axis}"] * s.at(t, np.ones_like) for axis, s in zip("xyz", added)]
-        swept_rates = limits.rate * np.column_stack(sweeps)
-        return x["kept"] * base.rates(t) + swept_rates
+        sweeps = []
+        for i, axis in enumerate("xyz"):
+            added = sweep(t, seconds, slow, fast, phase=2.0 * np.pi * i / 3.0)
+            sweeps.append(x[f"rate_{axis}"] * added)
+        return x["kept"] * base.rates(t) + limits.rate * np.column_stack(sweeps)
 
     def thrust(t: np.ndarray) -> np.ndarray:
         kept = 1.0 + x["kept"] * (base.thrust(t) - 1.0)
-        return kept + limits.thrust * x["thrust"] * pushed.at(t, np.ones_like)
+        return kept + limits.thrust * x["thrust"] * sweep(t, seconds, fast, slow)
 
     return replace(
         base,

@@ -343,13 +343,15 @@ def fly(
             for name in SAMPLED if row >= 0 else ():
                 sampled[name].append(sim.get(name).astype(float))
             sim.step()
+    truth = {name: np.array(values) for name, values in sampled.items()}
+    commands = np.array(sent)
     flights = []
     for e, (r, m) in enumerate(zip(references, manoeuvres)):
-        steps = len(r.time) * round(PERIOD / SAMPLE_PERIOD)
-        truth = {name: np.array([x[e] for x in sampled[name][:steps]]) for name in SAMPLED}
-        commands = np.array([command[e] for command in sent[: len(r.time)]])
+        rows = len(r.time)
+        steps = rows * round(PERIOD / SAMPLE_PERIOD)
+        states = {name: values[:steps, e] for name, values in truth.items()}
         rng = np.random.default_rng([seed, e])
-        flights.append(SimulatedFlight(m, r, plant, truth, commands, rng))
+        flights.append(SimulatedFlight(m, r, plant, states, commands[:rows, e], rng))
     return flights
 
 

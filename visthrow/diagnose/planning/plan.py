@@ -254,22 +254,22 @@ def expected_information(
     loudest: dict[int, float] = {}
     for (block, _), level in noise.latent_sd.items():
         loudest[block] = max(level, loudest.get(block, 0.0))
-    # of a payload that has not been flown: as strongly as the vehicle [N]
-    usual = loudest.get(0, 1.0)
     levels = {}
     for block, phase in product(range(len(LATENT_BLOCKS)), {w.phase for w in windows}):
-        level = loudest.get(block, usual)
+        # of a payload that has not been flown: as strongly as the vehicle [N]
+        level = loudest.get(block, loudest.get(0, 1.0))
         levels[block, phase] = noise.latent_sd.get((block, phase), level)
     alike = np.ones((len(windows), len(LATENT_BLOCKS)))
     expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
     parts = integrals(grams, expected).shares(grams, expected)
     information = np.sum([part.information for part in parts], axis=0)
-    rows = [i for i, name in enumerate(names) if name in flown]
-    columns = [flown[names[i]] for i in rows]
-    ratio = priors.floor[rows] / floors[columns]  # both catalogues name the same effects
-    total = np.zeros((len(names), len(names)))
-    total[np.ix_(rows, rows)] = information[np.ix_(columns, columns)] * np.outer(ratio, ratio)
-    return total
+    # both catalogues name the same effects, each in floors of its own
+    places = np.zeros((len(names), len(floors)))
+    for i, name in enumerate(names):
+        if name in flown:
+            j = flown[name]
+            places[i, j] = priors.floor[i] / floors[j]
+    return places @ information @ places.T
 
 
 def _fewest_flights(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
