@@ -20,6 +20,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 # entries of the commands' table in a step of the integration: between them, commands switch at
 # their own times
 FINE = 16
+LEAST_SIGMA = {"rate_b": 2e-3}  # noise below which none is believed; of other channels 1e-4
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
@@ -76,9 +77,10 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
     """Cut a log, the flight of a number, into windows of a model that fly."""
     params = model.params
     channels = model.channels
-    # no less is believed
-    sigma = [sigma_of(log[name], 2e-3 if name == "rate_b" else 1e-4) for name in channels]
-    driving = (params.position, params.attitude, params.input, *[NEIGHBOUR] * (NEIGHBOUR in log))
+    sigma = [sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels]
+    driving = [params.position, params.attitude, params.input]
+    if NEIGHBOUR in log:
+        driving.append(NEIGHBOUR)
     margin = spare(params.step)
     halves = np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
     stretches = []
@@ -128,18 +130,18 @@ def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.n
     """Means of the held commands over fine steps, from one window before the start to its end,
     shape (fine steps, motors).
     """
-    edges = (
-        start
-        - params.window
-        + params.step / FINE * np.arange(2 * FINE * round(params.window / params.step) + 1)
-    )
+    fine = params.step / FINE
+    steps = 2 * FINE * round(params.window / params.step)  # of two windows
+    edges = start - params.window + fine * np.arange(steps + 1)
     time, values = channel.samples()
-    values = values[:, : 1 if params.input == "command" else None]
-    ends = np.concatenate([[min(time[0], edges[0])], time[1:], [max(time[-1], edges[-1]) + 1.0]])
-    whole = np.concatenate(
-        [np.zeros((1, values.shape[1])), np.cumsum(values * np.diff(ends)[:, None], axis=0)]
-    )
-    return np.diff(on_grid(ends, whole, edges), axis=0) / (params.step / FINE)
+    if params.input == "command":
+        values = values[:, :1]
+    first = min(time[0], edges[0])
+    last = max(time[-1], edges[-1]) + 1.0
+    ends = np.concatenate([[first], time[1:], [last]])
+    integral = np.cumsum(values * np.diff(ends)[:, None], axis=0)
+    integral = np.pad(integral, ((1, 0), (0, 0)))
+    return np.diff(on_grid(ends, integral, edges), axis=0) / fine
 
 
 def find_acting(
@@ -190,13 +192,12 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
         return np.zeros((len(times), 3))
     time, force = log["acc_b"].samples()
     share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
+    share = share - np.median(share, axis=0)
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1], step)
     keep = np.exp(-rate * step)
-    tilt = lfilter(
-        [1.0 - keep], [1.0, -keep], on_grid(time, share - np.median(share, axis=0), even), axis=0
-    )
-    turn = np.column_stack([tilt[:, 1], -tilt[:, 0], 0.0 * tilt[:, 0]])
+    tilt = lfilter([1.0 - keep], [1.0, -keep], on_grid(time, share, even), axis=0)
+    turn = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
     if "rate_b" in log and np.any(log["rate_b"].valid):
         turn[:, :2] -= _offset(log, attitude)[:2] / rate
     return on_grid(even, turn, times)
@@ -223,27 +224,27 @@ def _guess(
 
     ``rot``: attitudes at the start and half a step later, shape (2, 3, 3).
     """
+    tables = dict(zip(channels, rows))
     start = float(rows[0][0][0])
     pos, vel = _line(*rows[0], start)
     guess = [*pos, *vel]
     spread = [0.1] * 3 + [1.0] * 3
     direction = np.array([0.0, 0.0, -1.0])
+    swing = np.zeros(3)
     if params.cable is not None:
-        first_row = rows[channels.index("payload_pos_w")]
-        if len(first_row[0]) >= 4:
-            pos_p, vel_p = _line(*first_row, start)
-            mount = rot @ np.array(params.cable.mount)
-            gap = pos_p - pos - mount[0]
+        table = tables["payload_pos_w"]
+        if len(table[0]) >= 4:
+            pos_p, vel_p = _line(*table, start)
+            arm, next_arm = rot @ np.array(params.cable.mount)
+            gap = pos_p - pos - arm
             direction = gap / np.linalg.norm(gap)
-            mount_rate = (mount[1] - mount[0]) / (0.5 * params.step)
-            rate = (vel_p - vel - mount_rate) / params.cable.length
-            swing = (rate - direction * np.dot(direction, rate))[:2]
-        else:
-            swing = np.zeros(2)
-        guess += [0.0, 0.0, *swing]
+            arm_rate = (next_arm - arm) / (0.5 * params.step)
+            rate = (vel_p - vel - arm_rate) / params.cable.length
+            swing = rate - direction * np.dot(direction, rate)
+        guess += [0.0, 0.0, *swing[:2]]
         spread += [0.1, 0.1, 1.0, 1.0]
     if params.torque is not None:
-        time, rate = rows[channels.index("rate_b")]
-        guess += list(rate[0]) if len(time) else [0.0] * 3
+        _, rate = tables["rate_b"]
+        guess += list(rate[0]) if len(rate) else [0.0] * 3
         spread += [1.0] * 3
     return np.array(guess), np.array(spread), direction
