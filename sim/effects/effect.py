@@ -34,8 +34,7 @@ class Effect(BoundedFields):
     floor: Positive
     channels: tuple[str, ...]  # channels of the log without which it cannot be seen
     source: str  # of equation and prior
-    confused_with: tuple[str, ...] = ()  # effects that look alike in ordinary flights
-    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from those
+    manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from effects that look alike
     # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says
     # little
     switch: str = ""
@@ -145,7 +144,6 @@ class RandomEffect(BoundedFields):
     prior_sd: Positive  # of the half-normal deviation, where the quantity varies
     floor: Positive
     source: str
-    confused_with: tuple[str, ...] = ()
     manoeuvres: tuple[str, ...] = ()
 
 

@@ -65,7 +65,7 @@ def test_of_what_flights_hardly_show_no_size_is_claimed():
     assert diagnosis["effect_01"].verdict != result.NOT_IDENTIFIABLE
 
 
-def judged(monkeypatch, truth, **changes):
+def judged(monkeypatch, truth, same=(), **changes):
     """A diagnosis whose held-out flights say something else."""
     plain = held_out.measure
 
@@ -74,7 +74,8 @@ def judged(monkeypatch, truth, **changes):
 
     monkeypatch.setattr(held_out, "measure", measure)
     return search.explain(
-        SyntheticModel(effects=EFFECTS, truth=truth, throws=8, free=4, seed=2), laws=False
+        SyntheticModel(effects=EFFECTS, truth=truth, same=dict(same), throws=8, free=4, seed=2),
+        laws=False,
     )
 
 
@@ -159,6 +160,26 @@ def test_a_name_that_few_searches_find_again_is_a_candidate(monkeypatch):
     assert np.all(np.abs(sizes - printed.estimate) < 3.0 * printed.sd)
     assert not trained[:, 2].any()  # nor is the candidate written
     assert diagnosis.overall == result.KNOWN
+
+
+def test_held_out_figures_are_those_of_the_names_that_stay(monkeypatch):
+    plain = held_out.measure
+    truth, named_in = {"effect_05": 40.0, "effect_02": 40.0}, {"effect_05": 1.0}
+    diagnosis = judged(monkeypatch, truth, named_in=named_in)
+    assert list(diagnosis.theta) == ["effect_05"]
+    again = plain(replace(diagnosis, work=replace(diagnosis.work, crossed=None)))
+    assert diagnosis.held_out.share == again.share
+    gains = [(c.channel, c.after, c.gain) for c in again.channels]
+    assert [(c.channel, c.after, c.gain) for c in diagnosis.held_out.channels] == gains
+
+
+def test_a_withdrawn_class_is_one_candidate(monkeypatch):
+    truth = {"effect_05": 40.0, "effect_03": 12.0}
+    same = {"effect_07": ("effect_03", 0.5)}
+    diagnosis = judged(monkeypatch, truth, same, named_in={"effect_05": 1.0})
+    assert diagnosis["effect_03"].partners == ("effect_07",)
+    assert diagnosis["effect_03"].verdict == diagnosis["effect_07"].verdict == result.CANDIDATE
+    assert diagnosis.reasons[0].startswith("1 named, 1 candidate besides")
 
 
 @mark.parametrize(

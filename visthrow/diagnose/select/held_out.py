@@ -271,10 +271,20 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
     reason = f"{', '.join(spanning)}: every interval holds 0"
     why = "its interval holds 0"
     diagnosis = _withdrawn(diagnosis, spanning, result.CANDIDATE, why, reason)
-    if not diagnosis.theta or diagnosis.overall not in (result.KNOWN, result.UNKNOWN):
-        return diagnosis
-    diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
-    measured = measure(diagnosis)
+    while diagnosis.theta and diagnosis.overall in (result.KNOWN, result.UNKNOWN):
+        diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
+        measured = measure(diagnosis)
+        named = diagnosis.theta
+        diagnosis = _confirmed(diagnosis, measured)
+        if diagnosis.theta == named:
+            return _explained(replace(diagnosis, held_out=measured))
+    return diagnosis
+
+
+def _confirmed(diagnosis: Diagnosis, measured: HeldOut) -> Diagnosis:
+    """Return the diagnosis without the names that held-out flights deny, do not confirm, or that
+    searches without some of them do not find again.
+    """
     uncompared = not compares_phases(diagnosis.work.after)
     names = list(diagnosis.theta)
     text = ", ".join(names)
@@ -300,23 +310,31 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
             unsure.append(name)
     why = f"the search, repeated without some {measured.left_out}, does not always name it"
     reason = f"searches that leave {measured.left_out} out do not agree on a name"
-    after = _withdrawn(diagnosis, unsure, result.CANDIDATE, why, reason, measured)
-    after = replace(after, held_out=measured)
-    unexplained = _unexplained(measured.channels) if uncompared else []
-    if after.overall == result.UNKNOWN:
-        return after
+    return _withdrawn(diagnosis, unsure, result.CANDIDATE, why, reason, measured)
+
+
+def _explained(diagnosis: Diagnosis) -> Diagnosis:
+    """Return a diagnosis of confirmed names that says how much of the error is left."""
+    if diagnosis.overall == result.UNKNOWN:
+        return diagnosis
+    gains = diagnosis.held_out.channels
+    unexplained = [] if compares_phases(diagnosis.work.after) else _unexplained(gains)
     if not unexplained:
-        return replace(after, reasons=(_known(after),))
+        return replace(diagnosis, reasons=(_known(diagnosis),))
     reasons = tuple(_remaining(c, diagnosis.work) for c in unexplained)
-    return replace(after, overall=result.IN_PART, reasons=reasons)
+    return replace(diagnosis, overall=result.IN_PART, reasons=reasons)
 
 
 def _known(diagnosis: Diagnosis) -> str:
     """Return how many causes are named, and what held-out flights show beyond the noise."""
     text = f"{len(diagnosis.theta)} named"
-    candidates = sum(f.verdict == result.CANDIDATE for f in diagnosis.findings)
+    candidates = {
+        frozenset((f.name, *f.partners))
+        for f in diagnosis.findings
+        if f.verdict == result.CANDIDATE
+    }
     if candidates:
-        text += f", {candidates} candidate{'s' if candidates > 1 else ''} besides"
+        text += f", {len(candidates)} candidate{'s' if len(candidates) > 1 else ''} besides"
     gains = diagnosis.held_out.channels
     ratios = {c.channel: c.after / c.floor for c in gains if c.floor > 0.0}
     if not ratios:

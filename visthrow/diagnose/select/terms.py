@@ -77,9 +77,15 @@ class Screen:
 
 
 def acts_in(laws: Iterable[str]) -> set[str]:
-    """Return the latent blocks that laws of these blocks act in; in the rope's joint, all."""
+    """Return the latent blocks that laws of these blocks act in.
+
+    A law of the rotors or of the air turns the vehicle as well as it pushes it. In the rope's joint
+    a law acts in all blocks."""
     blocks = set(laws)
-    return set(LATENT_BLOCKS) if JOINT in blocks else blocks
+    if JOINT in blocks:
+        return set(LATENT_BLOCKS)
+    bodies = {block.partition(" ")[0] for block in blocks}
+    return {block for block in LATENT_BLOCKS if block.partition(" ")[0] in bodies}
 
 
 def level_block(block: str) -> str:
