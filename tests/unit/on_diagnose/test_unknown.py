@@ -326,6 +326,16 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     assert verdicts._law(at)[0] == {6, 8}
 
 
+def test_a_law_of_the_vehicle_may_turn_it_as_well():
+    """Rotors whose thrust grows with the speed also turn the vehicle harder, which looks like
+    another gain of its rates.
+    """
+    vehicle = {"vehicle force", "vehicle torque"}
+    assert terms.acts_in(["vehicle force"]) == terms.acts_in(["vehicle torque"]) == vehicle
+    assert terms.acts_in(["payload force"]) == {"payload force"}
+    assert terms.acts_in([laws.JOINT]) == set(LATENT_BLOCKS)
+
+
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(
         effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
