@@ -19,7 +19,6 @@ from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG, mean_sizes
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
     READABLE,
-    Errors,
     errors,
     predicted,
     unit_of,
@@ -169,60 +168,51 @@ def channel_gains(
 
     ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C,
     H)."""
-    before = work.before
-    after = work.after
+    before, after = work.before, work.after
     names = work.problem.model.channels
-    change = (after.theta - cross.trained)[
-        np.unique(cross.groups, return_inverse=True)[1]
-    ] * work.problem.priors.floor
+    row = np.unique(cross.groups, return_inverse=True)[1]
+    change = (after.theta - cross.trained)[row] * work.problem.priors.floor
     named = [w.residual + w.effects @ shift for w, shift in zip(after.windows, change)]
-    shift = errors(after.windows, cross.groups, after.noise, named, len(names))
-    plain = errors(
-        before.windows, cross.groups, after.noise, [w.residual for w in before.windows], len(names)
-    )
-    return tuple(
-        _channel(name, c, after, shift, plain.square[:, c], None if box is None else box[:, c])
-        for c, name in enumerate(names)
-        if shift.count[:, c].sum() > 0
-    )
+    plain = [w.residual for w in before.windows]
+    left = errors(after.windows, cross.groups, after.noise, named, len(names))
+    earlier = errors(before.windows, cross.groups, after.noise, plain, len(names)).square
+    # squares before, after, of noise alone, and of the black box, shape (F, C, H) each
+    squares = [earlier, left.square, left.floor]
+    squares += [] if box is None else [box]
+    gains = []
+    for c, name in enumerate(names):
+        count = left.count[:, c].sum(0)
+        if count.sum() > 0:
+            of_channel = [square[:, c] for square in squares]
+            gains.append(_channel(name, after.sigma(c), count, of_channel))
+    return tuple(gains)
 
 
 def _channel(
-    name: str,
-    c: int,
-    after: Point,
-    errors_named: Errors,
-    before: np.ndarray,
-    box: np.ndarray | None,
+    name: str, sigma: float, count: np.ndarray, squares: Sequence[np.ndarray]
 ) -> ChannelGain:
-    error = errors_named.square[:, c]
-    count = errors_named.count[:, c].sum()
-    sigma = after.sigma(c)
-
-    def rms(square: np.ndarray) -> float:
-        return float(np.sqrt(np.maximum(square.sum(), 0.0) / max(count, 1.0)) * sigma)
-
-    value, low, high = jackknifed(before.sum(1), error.sum(1))
-    by_horizon = errors_named.count[:, c].sum(0)
-    measured = by_horizon > 0
-    curves = [
-        np.sqrt(np.maximum(x.sum(0)[measured], 0.0) / by_horizon[measured])
-        for x in (before, error, errors_named.floor[:, c])
-    ]
-    horizons = tuple(
-        (h, *map(float, row)) for h, *row in zip(np.array(HORIZONS)[measured].tolist(), *curves)
-    )
+    """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums by
+    flight and horizon, shape (F, H) each.
+    """
+    totals = [square.sum() for square in squares]
+    before, after, floor, *box = sigma * np.sqrt(np.maximum(totals, 0.0) / count.sum())
+    value, low, high = jackknifed(squares[0].sum(1), squares[1].sum(1))
+    measured = count > 0
+    curves = [np.array(HORIZONS)[measured]]
+    for square in squares[:3]:
+        left = np.maximum(square.sum(0)[measured], 0.0)
+        curves.append(np.sqrt(left / count[measured]))
     return ChannelGain(
         name,
         unit_of(name),
-        rms(before),
-        rms(error),
-        min(rms(errors_named.floor[:, c]), rms(error)),
-        float("nan") if box is None else rms(box),
+        float(before),
+        float(after),
+        float(min(floor, after)),
+        float(box[0]) if box else float("nan"),
         value,
         low,
         high,
-        horizons,
+        tuple(map(tuple, np.transpose(curves).tolist())),
     )
 
 
@@ -253,14 +243,21 @@ def measure(diagnosis: Diagnosis) -> HeldOut:
     """Ask held-out flights about the names of a search."""
     work = diagnosis.work
     cross = crossed(diagnosis)
-    sizes = (
-        np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
-        / work.problem.priors.floor
-    )
-    share = borne_out(cross.statistics, cross.trained, sizes)
-    return HeldOut(
-        *share, channel_gains(work, cross), cross.named, len(cross.folds), cross.left_out
-    )
+    floors = work.problem.priors.floor
+    sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
+    share = borne_out(cross.statistics, cross.trained, sizes / floors)
+    gains = channel_gains(work, cross)
+    return HeldOut(*share, gains, cross.named, len(cross.folds), cross.left_out)
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """What is held against names."""
+
+    names: Sequence[str] = ()
+    verdict: str = result.CANDIDATE  # that their findings get instead
+    why: str = ""  # ends the sentence of each finding
+    reason: str = ""  # of the overall verdict, if no name stays
 
 
 def judged(diagnosis: Diagnosis) -> Diagnosis:
@@ -269,40 +266,39 @@ def judged(diagnosis: Diagnosis) -> Diagnosis:
         return _innovations(diagnosis)
     spanning = [n for n in diagnosis.theta if diagnosis[n].low <= 0.0 <= diagnosis[n].high]
     reason = f"{', '.join(spanning)}: every interval holds 0"
-    why = "its interval holds 0"
-    diagnosis = _withdrawn(diagnosis, spanning, result.CANDIDATE, why, reason)
+    doubt = Doubt(spanning, why="its interval holds 0", reason=reason)
+    diagnosis = _withdrawn(diagnosis, doubt)
     while diagnosis.theta and diagnosis.overall in (result.KNOWN, result.UNKNOWN):
         diagnosis = replace(diagnosis, work=replace(diagnosis.work, crossed=crossed(diagnosis)))
-        measured = measure(diagnosis)
-        named = diagnosis.theta
-        diagnosis = _confirmed(diagnosis, measured)
-        if diagnosis.theta == named:
-            return _explained(replace(diagnosis, held_out=measured))
+        diagnosis = replace(diagnosis, held_out=measure(diagnosis))
+        doubt = _doubt(diagnosis, diagnosis.held_out)
+        if not doubt.names:
+            return _explained(diagnosis)
+        diagnosis = _withdrawn(diagnosis, doubt)
     return diagnosis
 
 
-def _confirmed(diagnosis: Diagnosis, measured: HeldOut) -> Diagnosis:
-    """Return the diagnosis without the names that held-out flights deny, do not confirm, or that
-    searches without some of them do not find again.
+def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
+    """Return which names held-out flights deny or do not confirm, or searches without some of them
+    do not find again.
     """
     uncompared = not compares_phases(diagnosis.work.after)
-    names = list(diagnosis.theta)
+    names, flights = list(diagnosis.theta), f"held-out {measured.left_out}"
     text = ", ".join(names)
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
     if measured.share <= 0.0 or harmed:
         how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(measured)
-        reason = f"held-out {measured.left_out} are explained worse with {text} ({how}); withdrawn"
         why = "held-out flights are explained worse with it"
-        return _withdrawn(diagnosis, names, result.NOT_IDENTIFIABLE, why, reason, measured)
+        reason = f"{flights} are explained worse with {text} ({how}); withdrawn"
+        return Doubt(names, result.NOT_IDENTIFIABLE, why, reason)
     falls = [c.low if uncompared else c.gain for c in measured.channels]
-    confirmed = not measured.channels or any(fall > 0.0 for fall in falls)
-    if not (measured.low > 0.0 and confirmed):
-        failed = _share(measured) if not measured.low > 0.0 else _no_gain(measured)
-        reason = f"held-out {measured.left_out} do not confirm {text} ({failed})"
+    fallen = not falls or any(fall > 0.0 for fall in falls)
+    if not (measured.low > 0.0 and fallen):
+        failed = _no_gain(measured) if measured.low > 0.0 else _share(measured)
+        reason = f"{flights} do not confirm {text} ({failed})"
         if np.isnan(measured.low) or measured.folds < PARTS:
             reason += f"; {_one_more(diagnosis, names)}"
-        why = "held-out flights do not confirm it"
-        return _withdrawn(diagnosis, names, result.CANDIDATE, why, reason, measured)
+        return Doubt(names, why="held-out flights do not confirm it", reason=reason)
     unsure = []
     for name in names:  # what names one of a class names it
         alike = (name, *diagnosis[name].partners)
@@ -310,7 +306,7 @@ def _confirmed(diagnosis: Diagnosis, measured: HeldOut) -> Diagnosis:
             unsure.append(name)
     why = f"the search, repeated without some {measured.left_out}, does not always name it"
     reason = f"searches that leave {measured.left_out} out do not agree on a name"
-    return _withdrawn(diagnosis, unsure, result.CANDIDATE, why, reason, measured)
+    return Doubt(unsure, why=why, reason=reason)
 
 
 def _explained(diagnosis: Diagnosis) -> Diagnosis:
@@ -382,59 +378,51 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     )
 
 
-def _withdrawn(
-    diagnosis: Diagnosis,
-    names: Sequence[str],
-    verdict: str,
-    why: str,
-    reason: str,
-    measured: HeldOut | None = None,
-) -> Diagnosis:
-    """Return the diagnosis with another verdict on names and the members of their classes.
+def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
+    """Return the diagnosis with another verdict on doubted names and the members of their classes.
 
     Other names keep their sizes and deviations. A candidate becomes BOUNDED if it has no evidence
     where the search ended: initial states and derivatives that were fitted since it was selected
     may explain what it did.
 
     If no name stays, the overall verdict is UNKNOWN, in the block of the name with most evidence.
-
-    Args:
-        why: ends the sentence of each finding.
-        reason: of the overall verdict, if no name stays.
-        measured: what held-out flights say, if no name stays.
     """
-    if not names:
+    if not doubt.names:
         return diagnosis
-    work = diagnosis.work
-    removed = {*names, *(partner for name in names for partner in diagnosis[name].partners)}
-    removed -= set(diagnosis.theta) - set(names)
+    work, names = diagnosis.work, set(doubt.names)
+    remaining = [name for name in diagnosis.theta if name not in names]
+    removed = names.union(*(diagnosis[name].partners for name in names)) - set(remaining)
     findings = []
     for f in diagnosis.findings:
         if f.name in removed and f.verdict in (result.FOUND, result.CLASS):
-            f = replace(f, verdict=verdict, sentence=f"{f.sentence} But {why}.")
+            sentence = f"{f.sentence} But {doubt.why}."
+            f = replace(f, verdict=doubt.verdict, sentence=sentence)
         if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
             f = result.bounded(f)
         findings.append(f)
-    theta = {name: size for name, size in diagnosis.theta.items() if name not in names}
-    rows = [row for row, name in enumerate(diagnosis.theta) if name in theta]
-    spread = tuple(tuple(diagnosis.covariance[i][k] for k in rows) for i in rows)
+    rows = [row for row, name in enumerate(diagnosis.theta) if name in remaining]
+    spread = np.array(diagnosis.covariance)[np.ix_(rows, rows)]
     numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
-    active = tuple(numbers[name] for name in theta)
-    after = work.after if active else work.before
-    candidates = (*work.candidates, *(numbers[name] for name in names))
-    work = replace(work, after=after, active=active, crossed=None, candidates=candidates)
-    left = replace(diagnosis, findings=tuple(findings), theta=theta, covariance=spread, work=work)
-    if active:
-        return left
-    strongest = max((diagnosis[name] for name in names), key=lambda f: f.nats)
-    earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
-    return replace(
-        left,
-        overall=result.UNKNOWN,
-        block=diagnosis.block or strongest.block,
-        reasons=(reason, *earlier),
-        held_out=measured,
+    left = replace(
+        diagnosis,
+        findings=tuple(findings),
+        theta={name: diagnosis.theta[name] for name in remaining},
+        covariance=tuple(map(tuple, spread.tolist())),
+        work=replace(
+            work,
+            after=work.after if remaining else work.before,
+            active=tuple(numbers[name] for name in remaining),
+            crossed=None,
+            candidates=(*work.candidates, *(numbers[name] for name in doubt.names)),
+        ),
     )
+    if remaining:
+        return left
+    strongest = max((diagnosis[name] for name in doubt.names), key=lambda f: f.nats)
+    block = diagnosis.block or strongest.block
+    earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
+    reasons = (doubt.reason, *earlier)
+    return replace(left, overall=result.UNKNOWN, block=block, reasons=reasons)
 
 
 def _share(measured: HeldOut) -> str:
