@@ -203,6 +203,8 @@ def answer(args: argparse.Namespace) -> None:
     """Answer the banks until the time is over; a line for each world."""
     worlds = worlds_of(args.banks, args.foreign)
     worlds = [w for w in worlds if w[0] == "foreign" or w[2].seed not in args.skip][: args.worlds]
+    first = {kind: place for place, kind in enumerate(args.longest)}
+    worlds.sort(key=lambda world: first.get(kind_of(world).split()[0], len(first)))
     now = time.time()
     limits = now + args.seconds - args.last, now + args.seconds
     trees = [str(Path(tree).resolve()) for tree in args.trees]
@@ -397,6 +399,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     ask.add_argument("--banks", nargs="*", default=[], help="files of arguments of sealed")
     ask.add_argument("--foreign", nargs="*", default=[], help="lists of seeds of foreign")
     ask.add_argument("--skip", nargs="*", type=int, default=[], help="seeds seen in development")
+    ask.add_argument("--longest", nargs="*", default=[], help="kinds of worlds that begin first")
     ask.add_argument("--jobs", type=int, default=2)
     ask.add_argument("--worlds", type=int, help="so many of them alone")
     ask.add_argument("--seconds", type=float, default=1e6, help="of wall clock, in all")
