@@ -13,15 +13,13 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import (
     CALIBRATION_QUANTILE,
     INEXACT,
-    NORMAL_95,
     OWN_FLOOR,
-    averaged,
     covariance,
     mean_sizes,
     surely_there,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
-from visthrow.diagnose.models.model_interface import Effect, Model, Window
+from visthrow.diagnose.models.model_interface import Model, Window
 from visthrow.diagnose.select import result, terms
 from visthrow.diagnose.select.candidates import (
     ALL,
@@ -34,6 +32,7 @@ from visthrow.diagnose.select.candidates import (
     varies_of,
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
+from visthrow.diagnose.select.findings import Reading, blank
 from visthrow.diagnose.select.held_out import Work, repeated_share
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
@@ -50,7 +49,6 @@ from visthrow.diagnose.select.scatter import (
     FLIGHT,
     Scatter,
     Varies,
-    allowed,
     between_flights,
     by_day,
     freed,
@@ -60,11 +58,6 @@ from visthrow.diagnose.select.scatter import (
 )
 from visthrow.diagnose.select.selection import Selector
 
-BIT = 0.5
-"""An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
-less than a bit about it.
-"""
-
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
@@ -73,52 +66,52 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     if varies or point.varies:
         point = with_noise_at(replace(point, varies=varies), point.theta)
         selection.best = replace(selection.best, point=point)
-    scatter = (*scatter, *([commands] if commands else []))
-    block_levels = levels(
-        selection.problem,
-        selection.nominal,
-        with_floors_noise(selection.problem, point, selection.best.columns),
-        selection.threshold,
-    )
+    if commands:
+        scatter = (*scatter, commands)
+    calm = with_floors_noise(selection.problem, point, selection.best.columns)
+    block_levels = levels(selection.problem, selection.nominal, calm, selection.threshold)
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
-    explanations, unrepeated = _explanations(selection) if overall == result.UNKNOWN else ([], "")
-    reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
+    explanations: list[tuple[Law, ...]] = []
+    if overall == result.UNKNOWN:
+        explanations, unrepeated = _explanations(selection)
+        reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
     problem, point = terms.without_laws(selection.problem, point)
     nominal = terms.without_laws(selection.problem, selection.nominal)[1]
-    names = selection.names
-    active = [j for j in names if j not in withdrawn]
-    has_laws = bool(laws_of(selection.best.chosen))
-    if names and not active:
+    active = [j for j in selection.names if j not in withdrawn]
+    if selection.names and not active:
         point = nominal
-    statistics = point.plain if has_laws else _about_means(problem, point, active, varies)
-    reported_point = replace(point, plain=freed(statistics, varies), varies=Varies())
+    statistics = point.plain
+    if not laws_of(selection.best.chosen):
+        statistics = _about_means(problem, point, active, varies)
+    shared_point = replace(point, plain=freed(statistics, varies), varies=Varies())
     varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
     sized = tuple(sorted({*active, *varying}))
-    total = reported_point.information, reported_point.score
+    total = shared_point.information, shared_point.score
     sizes = mean_sizes(*total, problem.priors, sized, [(sized, 0.0)])
-    scatter = _with_means(problem, scatter, sized, sizes)
-    unlike, mean_part = between_flights(reported_point.statistics, problem.priors, active, sizes)
+    means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
+    unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
-    findings = tuple(
-        _finding(problem, reported_point, j, active, sets, unlike, withdrawn)
-        for j in range(len(model.effects))
-    )
+    reading = Reading(problem, shared_point, active, withdrawn, sets, unlike)
+    findings = tuple(reading.finding(j) for j in range(len(model.effects)))
     named = [findings[j] for j in active]
+    window = []
+    for trial, nats in selection.window:
+        window.append((tuple(sorted(c.name for c in trial.chosen)), nats))
     return Diagnosis(
         overall,
         block,
         tuple(reasons),
         findings,
-        {f.name: f.estimate for f in named},
-        _covariance(problem, reported_point, named, active, mean_part),
-        selection.threshold,
-        tuple(selection.steps),
-        tuple((tuple(sorted(c.name for c in t.chosen)), nats) for t, nats in selection.window),
-        block_levels,
-        _different(explanations),
-        _events(selection, point),
-        sensor_scale={name: float(point.noise.scale[c]) for c, name in enumerate(model.channels)},
-        scatter=scatter,
+        theta={f.name: f.estimate for f in named},
+        covariance=_covariance(problem, shared_point, named, active, mean_part),
+        threshold=selection.threshold,
+        steps=tuple(selection.steps),
+        sets=tuple(window),
+        levels=block_levels,
+        laws=_different(explanations),
+        events=_events(selection, point),
+        sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
+        scatter=tuple(_with_means(s, means) for s in scatter),
         mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
         flights=len(point.plain.flights),
@@ -128,14 +121,9 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     )
 
 
-def _with_means(
-    problem: Problem, scatter: Sequence[Scatter], sized: Sequence[int], sizes: np.ndarray
-) -> tuple[Scatter, ...]:
-    """Return verdicts on what varies with the means of these flights; ``sizes`` are in floors."""
-    means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
-    return tuple(
-        replace(s, mean={name: means[name] for name in s.of if name in means}) for s in scatter
-    )
+def _with_means(scatter: Scatter, means: Mapping[str, float]) -> Scatter:
+    """Return a verdict on what varies with the means of its effects in these flights."""
+    return replace(scatter, mean={name: means[name] for name in scatter.of if name in means})
 
 
 def _covariance(
@@ -337,7 +325,7 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
     )
     findings = tuple(
         replace(
-            _blank(e),
+            blank(e),
             verdict=result.NOT_IDENTIFIABLE,
             manoeuvres=(),
             sentence=(
@@ -461,163 +449,3 @@ def _on_bound(selection: Selector, j: int) -> bool:
         and push * point.theta[j] > 0.0
         and 0.5 * push**2 / point.information[j, j] > selection.threshold
     )
-
-
-def _finding(
-    problem: Problem,
-    point: Point,
-    j: int,
-    active: list[int],
-    sets: Sequence[tuple[tuple[int, ...], float]],
-    unlike: float,
-    withdrawn: set[int],
-) -> Finding:
-    """Return the verdict on an effect.
-
-    ``sets``: effects of each possible set, and its nats behind; ``unlike``: variance among flights,
-    in what is allowed."""
-    priors = problem.priors
-    effect, blank = problem.effects[j], _blank(problem.effects[j])
-    if not priors.visible[j]:
-        missing = tuple(c for c in effect.channels if c not in problem.model.channels)
-        sentence = f"{effect.name}: not to be seen without {', '.join(missing)}."
-        return replace(blank, missing=missing, sentence=sentence)
-    partners, together = _class_of(j, active, sets)
-    remaining = [k for k in together if k != j]
-    homes = [(members, nats) for members, nats in sets if j in members] if active else []
-    homes = homes or [((*remaining, j), 0.0)]
-    mean, sd = averaged(point.information, point.score, priors, j, homes)
-    deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
-    nats = point.evidence(priors, [*remaining, j]) - point.evidence(priors, remaining)
-    blank = replace(blank, sd=deviation, nats=nats)
-    if j in active or partners:
-        differs = float(np.sqrt(unlike) * allowed(mean)) * effect.floor
-        members = sorted({j, *partners})
-        return _named(problem, point, replace(blank, differs=differs), mean, members, active)
-    low, high = (
-        float(np.clip(mean * effect.floor + side * NORMAL_95 * deviation, *effect.bounds)) + 0.0
-        for side in (-1.0, 1.0)
-    )  # no -0
-    blank = replace(blank, low=low, high=high)
-    if j in withdrawn:
-        text = (
-            f"{effect.name}: explains a part of what is missing, but not its form; the name is"
-            " withdrawn."
-        )
-        return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    if sd > BIT * priors.slab[j]:
-        text = (
-            f"{effect.name}: these flights say hardly more than was known ({deviation:.2g} of"
-            f" {effect.prior_sd:.2g}{unit_suffix(effect.unit)})."
-        )
-        return replace(blank, verdict=result.NOT_IDENTIFIABLE, sentence=text)
-    finding = result.bounded(blank)
-    if low < high:
-        return finding
-    comparison = "less" if mean * effect.floor < low else "more"
-    text = (
-        f"{effect.name}: on its bound of {low:.3g}{unit_suffix(effect.unit)}; these flights ask for"
-        f" {comparison} than is possible."
-    )
-    return replace(finding, sentence=text)
-
-
-def _blank(effect: Effect) -> Finding:
-    """Return the finding on an effect before any flight."""
-    return Finding(
-        effect.name,
-        result.UNOBSERVABLE,
-        effect.block,
-        effect.cause,
-        effect.equation,
-        effect.unit,
-        0.0,
-        effect.prior_sd,
-        *effect.bounds,
-        effect.floor,
-        0.0,
-        manoeuvres=tuple(effect.manoeuvres),
-    )
-
-
-def _class_of(
-    j: int, active: Sequence[int], sets: Sequence[tuple[tuple[int, ...], float]]
-) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """Return the partners of an effect, and the set that it belongs to: the best, or another that
-    explains the flights as well.
-
-    Partners are a named effect and the new ones of sets of as many that do without it.
-    """
-    named, alike = set(active), [set(members) for members, _ in sets if len(members) == len(active)]
-    for home in active:
-        rivals = [members for members in alike if home not in members]
-        partners = {home}.union(*rivals) - (named - {home})
-        if j in partners and len(partners) > 1:
-            together = active if j == home else next(m for m in rivals if j in m)
-            return tuple(sorted(partners - {j})), tuple(together)
-    return (), tuple(active)
-
-
-def _named(
-    problem: Problem,
-    point: Point,
-    blank: Finding,
-    mean: float,
-    members: list[int],
-    active: list[int],
-) -> Finding:
-    """The verdict on a cause that the flights ask for; ``mean`` is in floors, ``members`` are those
-    of its class.
-    """
-    low = blank.low
-    high = blank.high
-    size = float(np.clip(mean * blank.floor, low, high)) + 0.0  # no -0
-    low = max(low, size - NORMAL_95 * blank.sd) + 0.0
-    high = min(high, size + NORMAL_95 * blank.sd) + 0.0
-    text = f"{size:.3g} ± {blank.sd:.2g}{unit_suffix(blank.unit)}"
-    blank = replace(blank, estimate=size, low=low, high=high)
-    if low <= 0.0 <= high:
-        sentence = f"{blank.cause}: {blank.name} = {text}, an interval that holds 0."
-        return replace(blank, verdict=result.CANDIDATE, sentence=sentence)
-    if len(members) < 2:
-        digits = 0 if blank.nats >= 10.0 else 1
-        sentence = (
-            f"{blank.cause}: {blank.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
-            f" {blank.nats:.{digits}f} nats; another flight may differ by {blank.differs:.2g}."
-        )
-        return replace(blank, verdict=result.FOUND, sentence=sentence)
-    effects = problem.effects
-    names = tuple(effects[k].name for k in members if effects[k].name != blank.name)
-    joint = _joint(problem, point, members, [k for k in active if k not in members])
-    sentence = (
-        f"{blank.cause}: {blank.name} = {text} if it is the cause; these flights cannot tell it"
-        f" from {', '.join(names)}. Only this combination is determined: {joint}."
-    )
-    return replace(blank, verdict=result.CLASS, partners=names, joint=joint, sentence=sentence)
-
-
-def _joint(problem: Problem, point: Point, members: list[int], named: list[int]) -> str:
-    """The best known combination of a class: first eigenvector of its members' information in prior
-    deviations.
-    """
-    priors, effects = problem.priors, problem.effects
-    slab = priors.slab[members]
-    sigma = covariance(point.information, priors.deviation([*members, *named]))[members]
-    precision = np.linalg.inv(sigma[:, members])
-    values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
-    best, value = vectors[:, -1], values[-1]
-    mean = float(best @ (slab * (precision @ (sigma @ point.score))) / value)
-    vector = best / slab  # per floor
-    first = int(np.argmax(np.abs(best)))
-    scale = vector[first] / priors.floor[members[first]]
-    unit = effects[members[first]].unit
-    parts = [effects[members[first]].name]
-    for i in (i for i in range(len(members)) if i != first):
-        effect = effects[members[i]]
-        coefficient = vector[i] / priors.floor[members[i]] / scale
-        parts.append(
-            f"{'+' if coefficient > 0 else '-'} {abs(coefficient):.3g} {unit}/({effect.unit})"
-            f" {effect.name}"
-        )
-    sd = 1.0 / np.sqrt(max(value, 1e-300)) / abs(scale)
-    return f"{' '.join(parts)} = {mean / scale:.4g} ± {sd:.2g}{unit_suffix(unit)}"

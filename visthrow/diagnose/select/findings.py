@@ -1,0 +1,174 @@
+"""Verdicts on single effects: found, one of a class, bounded, or not to be seen."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from visthrow.diagnose.likelihood.evidence import (
+    NORMAL_95,
+    OWN_FLOOR,
+    averaged,
+    covariance,
+)
+from visthrow.diagnose.models.model_interface import Effect
+from visthrow.diagnose.select import result
+from visthrow.diagnose.select.point import Point, Problem
+from visthrow.diagnose.select.result import Finding
+from visthrow.diagnose.select.scatter import allowed, unit_suffix
+
+BIT = 0.5
+"""An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
+less than a bit about it.
+"""
+
+
+def blank(effect: Effect) -> Finding:
+    """Return the finding on an effect before any flight."""
+    return Finding(
+        effect.name,
+        result.UNOBSERVABLE,
+        effect.block,
+        effect.cause,
+        effect.equation,
+        effect.unit,
+        0.0,
+        effect.prior_sd,
+        *effect.bounds,
+        effect.floor,
+        0.0,
+        manoeuvres=tuple(effect.manoeuvres),
+    )
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What flights say of each effect beside the names."""
+
+    problem: Problem
+    point: Point  # with random shares integrated out
+    active: Sequence[int]  # effects that are named
+    withdrawn: set[int]  # those whose names were withdrawn
+    sets: Sequence[tuple[tuple[int, ...], float]]  # effects of each possible set, its nats behind
+    unlike: float  # variance among flights, in what is allowed
+
+    def finding(self, j: int) -> Finding:
+        """Return the verdict on an effect."""
+        priors, effect = self.problem.priors, self.problem.effects[j]
+        finding = blank(effect)
+        if not priors.visible[j]:
+            missing = tuple(c for c in effect.channels if c not in self.problem.model.channels)
+            sentence = f"{effect.name}: not to be seen without {', '.join(missing)}."
+            return replace(finding, missing=missing, sentence=sentence)
+        partners, together = self._class_of(j)
+        remaining = [k for k in together if k != j]
+        homes = [home for home in self.sets if j in home[0] and self.active]
+        homes = homes or [((*remaining, j), 0.0)]
+        mean, sd = averaged(self.point.information, self.point.score, priors, j, homes)
+        deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
+        evidence = self.point.evidence(priors, [*remaining, j])
+        nats = evidence - self.point.evidence(priors, remaining)
+        finding = replace(finding, sd=deviation, nats=nats)
+        if j in self.active or partners:
+            differs = float(np.sqrt(self.unlike) * allowed(mean)) * effect.floor
+            named = replace(finding, differs=differs)
+            return self._named(named, mean, sorted({j, *partners}))
+        reach = NORMAL_95 * deviation
+        ends = np.clip([mean * effect.floor - reach, mean * effect.floor + reach], *effect.bounds)
+        low, high = (ends + 0.0).tolist()  # no -0
+        finding = replace(finding, low=low, high=high)
+        if j in self.withdrawn:
+            text = (
+                f"{effect.name}: explains a part of what is missing, but not its form; the name is"
+                " withdrawn."
+            )
+            return replace(finding, verdict=result.NOT_IDENTIFIABLE, sentence=text)
+        unit = unit_suffix(effect.unit)
+        if sd > BIT * priors.slab[j]:
+            text = (
+                f"{effect.name}: these flights say hardly more than was known ({deviation:.2g} of"
+                f" {effect.prior_sd:.2g}{unit})."
+            )
+            return replace(finding, verdict=result.NOT_IDENTIFIABLE, sentence=text)
+        finding = result.bounded(finding)
+        if low < high:
+            return finding
+        comparison = "less" if mean * effect.floor < low else "more"
+        text = (
+            f"{effect.name}: on its bound of {low:.3g}{unit}; these flights ask for {comparison}"
+            " than is possible."
+        )
+        return replace(finding, sentence=text)
+
+    def _class_of(self, j: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the partners of an effect, and the set that it belongs to: the best, or another
+        that explains the flights as well.
+
+        Partners are a named effect and the new ones of sets of as many that do without it.
+        """
+        active = self.active
+        alike = [members for members, _ in self.sets if len(members) == len(active)]
+        for home in active:
+            rivals = [members for members in alike if home not in members]
+            partners = {home}.union(*rivals) - ({*active} - {home})
+            if j in partners and len(partners) > 1:
+                together = active if j == home else next(m for m in rivals if j in m)
+                return tuple(sorted(partners - {j})), tuple(together)
+        return (), tuple(active)
+
+    def _named(self, finding: Finding, mean: float, members: list[int]) -> Finding:
+        """Return the verdict on a cause that the flights ask for; ``mean`` is in floors,
+        ``members`` are those of its class.
+        """
+        bounds = finding.low, finding.high
+        size = float(np.clip(mean * finding.floor, *bounds)) + 0.0  # no -0
+        reach = NORMAL_95 * finding.sd
+        low = max(bounds[0], size - reach) + 0.0
+        high = min(bounds[1], size + reach) + 0.0
+        finding = replace(finding, estimate=size, low=low, high=high)
+        text = f"{size:.3g} ± {finding.sd:.2g}{unit_suffix(finding.unit)}"
+        if low <= 0.0 <= high:
+            sentence = f"{finding.cause}: {finding.name} = {text}, an interval that holds 0."
+            return replace(finding, verdict=result.CANDIDATE, sentence=sentence)
+        if len(members) < 2:
+            digits = 0 if finding.nats >= 10.0 else 1
+            sentence = (
+                f"{finding.cause}: {finding.name} = {text} (95 %: {low:.3g} to {high:.3g}),"
+                f" {finding.nats:.{digits}f} nats; another flight may differ by"
+                f" {finding.differs:.2g}."
+            )
+            return replace(finding, verdict=result.FOUND, sentence=sentence)
+        names = [self.problem.effects[k].name for k in members]
+        partners = tuple(name for name in names if name != finding.name)
+        joint = self._joint(members)
+        sentence = (
+            f"{finding.cause}: {finding.name} = {text} if it is the cause; these flights cannot"
+            f" tell it from {', '.join(partners)}. Only this combination is determined: {joint}."
+        )
+        finding = replace(finding, partners=partners, joint=joint)
+        return replace(finding, verdict=result.CLASS, sentence=sentence)
+
+    def _joint(self, members: list[int]) -> str:
+        """Return the best known combination of a class: first eigenvector of its members'
+        information in prior deviations.
+        """
+        priors, point = self.problem.priors, self.point
+        effects = [self.problem.effects[k] for k in members]
+        slab = priors.slab[members]
+        named = [k for k in self.active if k not in members]
+        sigma = covariance(point.information, priors.deviation([*members, *named]))[members]
+        precision = np.linalg.inv(sigma[:, members])
+        values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
+        best, value = vectors[:, -1], values[-1]
+        mean = float(best @ (slab * (precision @ (sigma @ point.score))) / value)
+        coefficients = best / slab / priors.floor[members]
+        first = int(np.argmax(np.abs(best)))
+        scale, unit = coefficients[first], effects[first].unit
+        text = effects[first].name
+        for i, effect in enumerate(effects):
+            if i != first:
+                share = coefficients[i] / scale
+                sign = "+" if share > 0 else "-"
+                text += f" {sign} {abs(share):.3g} {unit}/({effect.unit}) {effect.name}"
+        sd = 1.0 / np.sqrt(max(value, 1e-300)) / abs(scale)
+        return f"{text} = {mean / scale:.4g} ± {sd:.2g}{unit_suffix(unit)}"
