@@ -10,6 +10,7 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import lfilter
 
 from visthrow.common.rotations import cross
@@ -128,26 +129,29 @@ class FlyerModel(NumericModel):
         fine = self.params.step / FINE
         commanded = p.thrust(np.array([s.data["input"] for s in self.stretches]))
         first = commanded[:, :1]
-        summed = np.cumsum(commanded, axis=1) - commanded
         delay = p.command_delay + self.size_of(lanes, "cmd_delay")
         tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
-        tau = np.maximum(tau, SHORTEST) / fine
+        tau = np.maximum(tau, SHORTEST)
         grid = 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None]
         position = (p.window + grid - delay) / fine  # tables begin one window early
         index = np.clip(position.astype(int), 0, commanded.shape[1] - 1)
         share = (position - index)[..., None]
-        held = commanded[lanes.owner, index]
-        before = np.empty_like(held)
+        thrust = np.empty((*position.shape, self.motors))
+        whole = np.empty_like(thrust)
         for lag in np.unique(tau):
-            keep = np.exp(-1.0 / lag)
-            members = tau == lag
-            lagged, _ = lfilter([0.0, 1.0 - keep], [1.0, -keep], commanded, 1, first)
-            before[:, members] = lagged[lanes.owner[members], index[:, members]]
-        lag = tau[:, None]
-        thrust = held + (before - held) * np.exp(-share / lag)
-        # what came in, less what the lag holds back
-        passed = summed[lanes.owner, index] + share * held - lag * thrust
-        mean = np.diff(passed[::2], axis=0) * (fine / p.step)
+            keep = np.exp(-fine / lag)
+            members = np.flatnonzero(tau == lag)
+            after, _ = lfilter([1.0 - keep], [1.0, -keep], commanded, 1, keep * first)
+            table = np.concatenate([first, after], 1)
+            integral = cumulative_trapezoid(table, axis=1, initial=0.0)
+            which = lanes.owner[members]
+            rows = index[:, members]
+            part = share[:, members]
+            begin = table[which, rows]
+            rise = part * (table[which, rows + 1] - begin)
+            thrust[:, members] = begin + rise
+            whole[:, members] = integral[which, rows] + part * (begin + 0.5 * rise)
+        mean = np.diff(whole[::2], axis=0) * (fine / p.step)
         thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
         curve = self.size_of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / self.motors  # of one input channel [N]
