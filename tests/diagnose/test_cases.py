@@ -10,7 +10,7 @@ import numpy as np
 from pytest import fixture, mark
 
 from bench.diagnose import cases
-from bench.diagnose.bad import BAD, fair
+from bench.diagnose.bad import BAD
 from bench.diagnose.degenerate import PAIRS
 from bench.worlds.world import Recipe
 from visthrow.diagnose.throw.cutting import ATTACHED, Cut, thinned
@@ -73,14 +73,6 @@ def told(line: dict) -> str:
         f"{line['kind']} {line['recipe']}: {line.get('said')} {line.get('error', '')}"
         f" {line.get('output', '')}"
     )
-
-
-@mark.parametrize(
-    ("theta", "passes"), [({}, True), ({"a": 0.1}, True), ({"a": -0.1}, False), ({"b": 0.1}, False)]
-)
-def test_a_name_that_the_logs_ask_for_needs_its_sign(theta, passes):
-    done = argparse.Namespace(stderr="", returncode=0)
-    assert fair(done, {"overall": "KNOWN", "theta": theta}, {"a": 1.0}) == passes
 
 
 @mark.slow

@@ -14,53 +14,27 @@ from tests.scenes import Scene
 
 @dataclass(frozen=True)
 class OracleRun:
-    """States of one run at the asked times; T times, L segments, world frame, quaternions xyzw."""
+    """Places of one run at the asked times; T times, world frame."""
 
-    time: np.ndarray  # [s], shape (T,)
     pos_w: np.ndarray  # of the quadrotor's centre of mass [m], shape (T, 3)
-    quat_wb: np.ndarray  # shape (T, 4)
-    vel_w: np.ndarray  # [m/s], shape (T, 3)
-    rate_b: np.ndarray  # [rad/s], shape (T, 3)
     ball_pos_w: np.ndarray  # [m], shape (T, 3)
     ball_vel_w: np.ndarray  # [m/s], shape (T, 3)
-    # mount, every joint and the end of the last segment [m], shape (T, L+1, 3)
-    cable_points_w: np.ndarray
-    cable_dir_w: np.ndarray  # shape (T, L, 3)
-    cable_vel_w: np.ndarray  # time derivative of the directions [1/s], shape (T, L, 3)
-    energy: np.ndarray  # kinetic and potential [J], shape (T, 2)
 
 
-def _record(
-    model: "mujoco.MjModel", data: "mujoco.MjData", scene: Scene, rows: dict[str, list[np.ndarray]]
-) -> None:
+def _places(
+    model: "mujoco.MjModel", data: "mujoco.MjData", scene: Scene
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the position of the vehicle, and position and velocity of the ball."""
     # After mj_step the derived fields describe the state before it.
     mujoco.mj_forward(model, data)
-    count, length = scene.segments, scene.segment_length
-    rotations = data.xmat[2:].reshape(count, 3, 3)
-    directions = -rotations[:, :, 2]
-    top = data.xpos[2:]
-    end = top[-1] + length * directions[-1]
-    twist = np.empty((count, 6))
-    for i in range(count):
-        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, 2 + i, twist[i], 0)
-    cable_vel = np.cross(twist[:, :3], directions)
-    mujoco.mj_energyPos(model, data)
-    mujoco.mj_energyVel(model, data)
-    values = {
-        "time": np.array(data.time),
-        "pos_w": data.qpos[:3],
-        "quat_wb": np.roll(data.qpos[3:7], -1),
-        "vel_w": data.qvel[:3],
-        "rate_b": data.qvel[3:6],
-        "ball_pos_w": end + scene.ball_offset * directions[-1],
-        "ball_vel_w": twist[-1, 3:] + (length + scene.ball_offset) * cable_vel[-1],
-        "cable_points_w": np.vstack((top, end)),
-        "cable_dir_w": directions,
-        "cable_vel_w": cable_vel,
-        "energy": np.array([data.energy[1], data.energy[0]]),
-    }
-    for key, value in values.items():
-        rows.setdefault(key, []).append(np.array(value))
+    last = 1 + scene.segments  # world, vehicle, segments
+    direction = -data.xmat[last].reshape(3, 3)[:, 2]
+    reach = scene.segment_length + scene.ball_offset
+    twist = np.empty(6)
+    mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, last, twist, 0)
+    ball = data.xpos[last] + reach * direction
+    ball_vel = twist[3:] + reach * np.cross(twist[:3], direction)
+    return data.qpos[:3].copy(), ball, ball_vel
 
 
 def _step_index(time: float, step: float, what: str) -> int:
@@ -74,45 +48,38 @@ def converged(
     scene: Scene,
     step: float = CONVERGED_STEP,
     times: np.ndarray | None = None,
-    joints: str = "universal",
     armature: float = 0.0,
     integrator: str = "RK4",
 ) -> OracleRun:
-    """Run a scene in MuJoCo C with a fixed step.
+    """Run a scene in MuJoCo C with universal joints, damped inside MuJoCo, and a fixed step.
 
     Args:
         scene: the scene; each switch of its schedule must fall on a step edge.
         step: integration step [s].
-        times: times to record at [s], ascending multiples of the step; by default start and end.
-        joints: ``universal`` (damping inside MuJoCo).
+        times: times to record at [s], ascending multiples of the step; by default the end.
         armature: of the hinges [kg m^2].
         integrator: ``RK4`` or ``implicitfast``.
 
     Returns:
-        The recorded states.
+        The recorded places.
 
     Raises:
-        ValueError: a time or a switch off the step edges, or another kind of joint.
+        ValueError: a time or a switch off the step edges.
     """
-    if joints != "universal":
-        raise ValueError(
-            f"oracle: joints {joints!r}, expected 'universal'; ball joints are run by"
-            " sim.reference.plant"
-        )
-    model = build_attached(*vehicle_and_rope(scene), joints, armature)
+    model = build_attached(*vehicle_and_rope(scene), "universal", armature)
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data = initial_data(model, scene)
-    asked = (0.0, scene.duration) if times is None else times
+    asked = (scene.duration,) if times is None else times
     records = [_step_index(t, step, "time") for t in asked]
     switches = {_step_index(w.t_start, step, "switch"): w for w in scene.schedule}
-    rows: dict[str, list[np.ndarray]] = {}
+    rows = []
     now = 0
     for index in sorted(set(records) | {s for s in switches if s <= max(records)}):
         mujoco.mj_step(model, data, index - now)
         now = index
         if index in records:
-            _record(model, data, scene, rows)
+            rows.append(_places(model, data, scene))
         if index in switches:
             data.ctrl[:] = (*switches[index].force_b, *switches[index].torque_b)
-    return OracleRun(**{key: np.stack(value) for key, value in rows.items()})
+    return OracleRun(*map(np.stack, zip(*rows)))

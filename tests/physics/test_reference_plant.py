@@ -41,6 +41,20 @@ def test_steps_of_the_plant_have_converged():
     assert_allclose(ends[0].attached, False)
 
 
+def test_a_rope_folds_beyond_a_right_angle():
+    """Directions along +-y of the parent are where universal joints are singular; the plant's rope
+    passes them.
+    """
+    ends = []
+    for step in (5e-4, 1e-4):
+        reference = ReferencePlant(plain_plant(), step=step)
+        direction = np.tile([0.0, 1.0, 0.02], (1, reference.params.rope.segments, 1))
+        reference.reset(HIGH, LEVEL, STILL, STILL, direction)
+        reference.step(np.array([[2.6, 0.0, 0.0, 0.0]]))
+        ends.append(reference.state.payload_pos_w)
+    assert_allclose(ends[0], ends[1], atol=1e-7)
+
+
 @mark.parametrize("step", [2e-3, 1.3e-3])  # a landing lies within a step, of whatever length
 def test_landing_equals_the_closed_form_without_rope_mass(step):
     """A rope of 10 mg: the ball flies a parabola from separation."""

@@ -11,8 +11,6 @@ import torch
 from numpy.linalg import norm
 from pytest import mark, raises
 
-from bench import detector
-from camera.detectors.contours import Prior
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
 from camera.params import CameraParams
@@ -20,8 +18,8 @@ from sim.params import RopeParams
 from tests.commands import run_command, set_words
 from visthrow import config
 from visthrow.cli.fly import _rendered_eyes
-from visthrow.detector_training.eyes import HANGING, RenderedEyes
-from visthrow.detector_training.scenes.scene import Nuisances, Truth
+from visthrow.detector_training.eyes import RenderedEyes
+from visthrow.detector_training.scenes.scene import Nuisances
 from visthrow.throws.flight import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
@@ -165,25 +163,6 @@ def test_a_throw_is_refused_where_the_hover_does_not_see(name):
     assert off[0] < 0.3, "it hovers on"
 
 
-def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
-    """The ball hangs 0.4 m below the first lens and flies 1.5 m beside the second."""
-    rot = torch.linalg.qr(
-        torch.randn(2, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    )[0]
-    ball = torch.tensor([[0.1, 0.2, 0.3], [1.5, 0.0, 0.1]], dtype=torch.float64)
-    truth = Truth(ball, torch.zeros(2, 4, 3), rot, torch.ones(2), torch.ones(2))
-    asked = [("nothing", 0), ("pose", 1), ("track", 0), ("track", 1)]
-    nothing, pose, *tracks = (
-        detector.known_of(known, truth, 1.2, e, np.random.default_rng(e)) for known, e in asked
-    )
-    assert nothing == Prior()
-    np.testing.assert_allclose([pose.up_c, pose.north_c], rot[1, [2, 0]])
-    assert (pose.height, pose.ball_ray_c, pose.ball_distance) == (1.2, None, None)
-    assert [track.ball_distance for track in tracks] == [HANGING, None]
-    for track, ray in zip(tracks, truth.ball_ray.numpy()):
-        assert 1e-3 < np.arccos(track.ball_ray_c @ ray) < track.ball_within
-
-
 @mark.parametrize(
     ("words", "said"),
     [
@@ -194,16 +173,3 @@ def test_what_a_detector_is_told_is_true_but_for_the_ball_a_frame_ago():
 )
 def test_what_cannot_be_done_is_refused(refused, words, said):
     refused("detector", *words, said=said)
-
-
-@mark.parametrize(
-    ("words", "said"),
-    [
-        (["--frames", "0"], "--frames 0"),
-        (["--out", "sheet.bin"], "--out sheet.bin; expected"),
-        (["--weights", "none.npz"], "no detector written by"),
-    ],
-)
-def test_what_cannot_be_measured_is_refused(capsys, words, said):
-    assert detector.main(words) == 2
-    assert said in capsys.readouterr().err

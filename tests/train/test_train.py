@@ -9,9 +9,6 @@ import math
 import os
 import re
 import signal
-import subprocess
-import sys
-import time
 from types import SimpleNamespace
 
 import torch
@@ -336,31 +333,3 @@ def test_the_end_compares_the_seed_with_recorded_ones(capsys):
     assert re.search(r"at 2\.0 m (\d+) of \1 recorded seeds landed farther off", printed)
     session._compare("mine.toml", [{"target": 2.0, "error_mean": 0.0001}])
     assert not capsys.readouterr().out
-
-
-def test_a_process_that_is_killed_goes_on_bit_for_bit(whole, tmp_path):
-    folder = tmp_path / "run"
-    words = f"train laptop --device cpu --out {folder} --checkpoint-every 1".split()
-    changes = [
-        word for item in [*SMALL[:3], "ppo.iterations=4", SMALL[4]] for word in ("--set", item)
-    ]
-    slowed = (
-        "import sys, time; from visthrow import cli; from visthrow.training.trainer import Trainer;"
-        " step = Trainer.step; Trainer.step = lambda self: (time.sleep(1.0 if self.iteration == 2"
-        " else 0.0), step(self))[1]; cli.main(sys.argv[1:])"
-    )
-    run = subprocess.Popen(
-        [sys.executable, "-c", slowed, *words, *changes],
-        stdout=subprocess.DEVNULL,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    while run.poll() is None and not (
-        (folder / "progress.csv").exists() and len(iterations_of(folder)) == 2
-    ):
-        time.sleep(0.01)
-    run.kill()
-    assert run.wait() == -signal.SIGKILL
-    assert train(folder, "--resume") == 0
-    assert iterations_of(folder) == [1, 2, 3, 4]
-    for a, b in zip(weights(whole), weights(folder), strict=True):
-        assert_array_equal(a, b)

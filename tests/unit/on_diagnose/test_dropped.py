@@ -2,17 +2,12 @@
 what else there is.
 """
 
-from dataclasses import replace
 from functools import cache
-
-import numpy as np
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from tests.synthetic_diagnosis import SyntheticModel
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select import search
-from visthrow.diagnose.select.point import Problem, linearise
 from visthrow.diagnose.throw.throw_model import ThrowModel
 
 SHARE = 0.12
@@ -43,34 +38,3 @@ def test_lost_commands_are_found_beside_a_cause():
     found = told(diagnosis)[0]
     assert found.low < SHARE < found.high
     assert found.nats > 50.0
-
-
-class Lossy(SyntheticModel):
-    """A model of which each window has eight commands, two of which did not come."""
-
-    def windows(self, theta):
-        return [
-            replace(w, residual=w.residual + columns[:, :2].sum(1))
-            for w, columns in zip(super().windows(theta), self.without_commands(theta))
-        ]
-
-    def without_commands(self, theta, windows=None):
-        rng = np.random.default_rng(0)
-        drawn = [
-            3.0 * w.sigma[:, None] * rng.normal(size=(len(w.residual), 8)) for w in self._windows
-        ]
-        return drawn if windows is None else [drawn[i] for i in windows]
-
-
-def command_verdict(model):
-    windows = model.windows({})
-    problem = Problem.of(model, windows, range(len(windows)))
-    point = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    return dropped.verdict(problem, point, (), 5.0)
-
-
-def test_lost_commands_are_found_where_a_model_has_commands():
-    verdict = command_verdict(Lossy())
-    assert verdict.found
-    assert verdict.low < 0.25 < verdict.high
-    assert command_verdict(SyntheticModel()) is None

@@ -8,7 +8,7 @@ from pytest import approx, mark
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.reporting.diagnosis_report import instead, landing_sentence
+from visthrow.diagnose.reporting.diagnosis_report import instead
 from visthrow.diagnose.select import held_out, result, scatter, search, verdicts
 
 EFFECTS = catalogue(12)
@@ -180,29 +180,6 @@ def test_a_withdrawn_class_is_one_candidate(monkeypatch):
     assert diagnosis["effect_03"].partners == ("effect_07",)
     assert diagnosis["effect_03"].verdict == diagnosis["effect_07"].verdict == result.CANDIDATE
     assert diagnosis.reasons[0].startswith("1 named, 1 candidate besides")
-
-
-@mark.parametrize(
-    ("after", "verb"),
-    [
-        (0.050, "rises from 34 to 50 mm"),
-        (0.012, "falls from 34 to 12 mm"),
-        (0.0341, "stays at 34 mm"),
-    ],
-)
-def test_the_landing_error_goes_where_it_goes(after, verb):
-    gain = SimpleNamespace(
-        throws=3,
-        held_out=True,
-        before=0.034,
-        after=after,
-        low=0.9 * after,
-        high=1.1 * after,
-        released_before=0.01,
-        released_after=0.01,
-        moved={"lag": 0.01},
-    )
-    assert verb in landing_sentence(gain)
 
 
 def test_two_causes_that_may_be_two_others_are_told():

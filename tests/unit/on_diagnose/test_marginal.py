@@ -197,16 +197,6 @@ def test_a_model_without_latent_forces_works():
     assert np.linalg.solve(part.information, part.score) == approx([0.3, 0.0], abs=0.05)
 
 
-def test_information_that_is_negative_beyond_rounding_is_an_error(fitted):
-    *_, levels, grams = fitted
-    part = alone(grams[0], levels, 0)
-    wrong = 1e6 * np.array([[1.0, 1.01], [1.01, 1.0]])
-    with raises(DiagnoseError, match=r"eigenvalue -1\.0e-02 relative to its diagonal"):
-        marginal.gather(
-            grams[:1], [replace(part, information=wrong, score=np.zeros(2))], np.zeros(2)
-        )
-
-
 def test_estimates_stay_within_their_bounds_to_the_last_digit():
     """A lower bound of 0 that rounding leaves would be a compliance below 0."""
     worst = 0.0

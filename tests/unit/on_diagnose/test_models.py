@@ -272,30 +272,6 @@ class TestFlyer:
         assert worst[0] < 1e-4
         assert worst[1] > 3e-3
 
-    def test_a_command_that_does_not_come_shows_by_its_column(self):
-        log = fly(4.0, noise=1e-6)
-        share = np.sin(np.arange(0.0, 4.0, 0.05))
-        thrust = 0.03 * G * (1.0 + 0.2 * share)
-        sent = Channel(np.arange(0.0, 4.0, 0.05), np.column_stack([thrust] * 4), "N, rad/s", "body")
-        params = replace(FLYER, input="command", thrust_map=(0.0, 1.0, 0.0))
-        model = FlyerModel([FlightLog({**log.channels, "command": sent})], params)
-        (columns,) = model.without_commands({}, [1])
-        number = 5
-        start = model.stretches[1].data["start"]
-        k = np.searchsorted(sent.time, start, "right") - 1 + number
-        lost = sent.values.copy()
-        lost[k] = lost[k - 1]
-        other = FlyerModel(
-            [FlightLog({**log.channels, "command": replace(sent, values=lost)})], params
-        )
-        other._start = model._start.copy()
-        truth = (other.stretches[1].measured - other._off(other.size({}), other._start)[1]) - (
-            model.stretches[1].measured - model._off(model.size({}), model._start)[1]
-        )
-        assert np.abs(truth).max() > 1e-4
-        assert np.abs(columns[:, number] - truth).max() < 1e-9
-        assert not FlyerModel([log], FLYER).without_commands({}, [1])
-
     def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
         logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
         diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))

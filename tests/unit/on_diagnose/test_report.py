@@ -76,25 +76,9 @@ def test_landings_are_told_in_millimetres(found, measured):
     assert report.to_json(found[1], measured)["gain"]["landing"]["after"] == landing.after
 
 
-def test_a_share_of_nothing_has_no_sign():
-    texts = [report.percent(share) for share in (-1e-6, -0.0, 0.496, -0.02)]
-    assert texts == ["0", "0", "50", "-2"]
-
-
 @fixture(scope="module")
 def measured(found):
     return gain.measure(found[1])
-
-
-def test_one_diverging_window_does_not_set_the_floor(found):
-    point = found[1].work.after
-    first = point.windows[0]
-    late = first.time > first.time.min() + forms.HEAD_SECONDS
-    wild = replace(first, nuisance=1e4 * first.nuisance * late[:, None])  # the head tells nothing
-    windows = [wild, *point.windows[1:]]
-    groups, residuals = [0] * len(windows), [w.residual for w in windows]
-    errors = forms.errors(windows, groups, point.noise, residuals, len(point.noise.scale))
-    assert np.all(errors.floor <= forms.FAR_ABOVE * errors.square)
 
 
 def test_prediction_does_not_look_at_what_it_predicts(found):
@@ -147,6 +131,19 @@ def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
     assert ranked[0].repeats == 1
     assert ranked[0].separates
     assert ranked[1].repeats == 0
+
+
+def test_a_session_holds_what_separates_more_than_what_stands_before_it():
+    said = (
+        ("circle", (("a", "b"), ("a", "c"))),
+        ("swing", (("a", "c"),)),
+        ("hover", ()),
+        ("weigh", (("a", "d"),)),
+    )
+    proposals = [
+        plan.FlightProposal(name, "", 10.0, 12.0, separates, 1, "") for name, separates in said
+    ]
+    assert [p.name for p in plan.session(proposals)] == ["circle", "weigh"]
 
 
 def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
@@ -272,20 +269,6 @@ def test_an_event_is_left_out_or_weighs_little(found):
     assert out.endswith("left out")
     parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
     assert sum(text.startswith("**EVENT.**") for text in parts) == 2
-
-
-@mark.parametrize(
-    ("channel", "unit"),
-    [
-        ("pos_w", "m"),
-        ("quat_wb", "rad"),
-        ("marker_pos_c", "m"),
-        ("current", "A"),
-        ("motor_wanted", ""),
-    ],
-)
-def test_residuals_have_units(channel, unit):
-    assert forms.unit_of(channel) == unit
 
 
 def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):

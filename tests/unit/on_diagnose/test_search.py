@@ -263,12 +263,6 @@ def test_catalogues_that_contradict_themselves_are_refused():
         replace(EFFECTS[0], floor=0.0)
 
 
-def test_flights_without_a_window_are_counted(monkeypatch):
-    monkeypatch.setattr(search, "check", lambda *_: [])
-    diagnosis = search.diagnose([None] * 9, world(truth={"effect_03": 12.0}, seed=4), laws=False)
-    assert "3 of 9 flights have no window in this answer" in diagnosis.reasons
-
-
 def _priors(count: int) -> Priors:
     return Priors(
         np.ones(count),
@@ -277,18 +271,6 @@ def _priors(count: int) -> Priors:
         np.full(count, np.inf),
         np.ones(count, bool),
     )
-
-
-@mark.parametrize("bad", [np.nan, np.inf, -3.0])
-@mark.parametrize("where", [(0, 0), (1, 0)])
-def test_information_that_no_flights_can_give_is_refused(bad, where):
-    information = np.eye(3) * 4.0
-    information[where] = information[where[::-1]] = 9.0 * bad
-    priors = evidence.Priors(
-        np.ones(3), np.full(3, 6.0), np.full(3, -9.0), np.full(3, 9.0), np.ones(3, dtype=bool)
-    )
-    with raises(DiagnoseError, match="information on the effects is not finite or not positive"):
-        evidence.log_evidence(information, np.ones(3), priors, [0, 1])
 
 
 def test_evidence_is_the_integral():
@@ -388,20 +370,6 @@ def test_a_window_that_no_force_explains_is_left_out():
     diagnosis = search.explain(model, laws=False)
     assert diagnosis.windows == len(model.windows({})) - 1
     assert tuple(diagnosis.theta) == ("effect_03",)
-
-
-def test_a_set_that_is_not_admissible_does_not_end_the_search(monkeypatch):
-    plain = Selector.is_admissible
-
-    def refusing(self, trial):
-        return not any(c.name == "effect_03" for c in trial.chosen) and plain(self, trial)
-
-    monkeypatch.setattr(Selector, "is_admissible", refusing)
-    diagnosis = search.explain(
-        world(truth={"effect_03": 12.0, "effect_07": 8.0}, seed=4), laws=False
-    )
-    assert "effect_07" in diagnosis.theta
-    assert "effect_03" not in diagnosis.theta
 
 
 def test_a_set_that_was_the_best_before_stays_possible():

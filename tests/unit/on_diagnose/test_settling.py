@@ -9,7 +9,6 @@ from pytest import fixture
 
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.throw.linearising import exact
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import FlightLog
 
@@ -63,15 +62,6 @@ def test_states_do_not_depend_on_what_was_fitted_before(logs):
     model.landings({"com_x": -5e-4})
     for a, b in zip(first, model.windows(theta)):
         np.testing.assert_array_equal(a.residual, b.residual)
-
-
-def test_what_long_steps_do_not_tell_keeps_the_nominal_ones(logs):
-    model = ThrowModel(logs, paper_plant())
-    assert {name for name, e in model.entries.items() if exact(e)} == {
-        "d_filter",
-        "payload_inertia",
-        "step_error",
-    }
 
 
 def bend(states) -> np.ndarray:

@@ -55,19 +55,3 @@ def test_another_kind_of_block_must_explain_the_flights_itself():
         SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False
     ).named == ("effect_03",)
     assert not search.explain(Promising(effects=EFFECTS, truth=truth, seed=4), laws=False).named
-
-
-def test_a_part_of_another_kind_of_block_is_not_named_and_not_linearised_twice():
-    """It was linearised where it leads to be weighed at all."""
-    taken = []
-
-    class Counting(SyntheticModel):
-        def windows(self, theta):
-            taken.append(dict(theta))
-            return super().windows(theta)
-
-    diagnosis = search.explain(
-        Counting(effects=EFFECTS, truth={"effect_03": 0.4 / EFFECTS[3].floor}, seed=4), laws=False
-    )
-    assert "effect_03" not in diagnosis.named
-    assert len(taken) == len({tuple(at.items()) for at in taken}) <= 2

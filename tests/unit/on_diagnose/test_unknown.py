@@ -262,43 +262,6 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
         assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
 
 
-def test_a_term_that_a_cause_says_is_not_proposed():
-    plain = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    for model, proposed in ((plain, True), (with_a_name_for_the_law(0.1), False)):
-        at = beside_a_law(model, [])
-        strongest = terms.strongest_forces(at.nominal)
-        found = terms.shortlist(at.problem, at.nominal, [], strongest, 4.0)
-        assert (DRAG in [effect.term for effect in found]) == proposed
-
-
-def test_a_term_is_an_effect_of_the_model_that_can_be_taken_off_again():
-    """Appended to what the windows say it is the column that a linearisation gives; without it
-    nothing has changed.
-    """
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    at, plain = beside_a_law(model, [3], DRAG), beside_a_law(model, [3])
-    again = linearise(at.problem, np.zeros(len(EFFECTS) + 1))
-    assert_allclose(at.nominal.information, again.information, rtol=1e-2)
-    law = terms.laws(at.problem, at.best.point, at.best.columns, 0.0)[0]
-    assert law.coefficient == approx(-0.02, rel=0.05)
-    assert at.best.point.theta[-1] * at.problem.priors.floor[-1] == approx(
-        law.coefficient, rel=0.05
-    )
-    problem, off = terms.without_laws(at.problem, at.nominal)
-    assert problem.model is model
-    assert_allclose(off.information, plain.nominal.information, rtol=1e-9)
-    assert_allclose(off.score, plain.nominal.score, rtol=1e-9)
-
-
-def test_terms_leave_what_differs_among_flights_as_it_was():
-    """Else a set that holds it is no longer known once terms are offered."""
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
-    at, beside = beside_a_law(model, [3]), beside_a_law(model, [3], DRAG)
-    plain = {c for c in at.candidates if c.group != ALL}
-    assert plain
-    assert plain == {c for c in beside.candidates if c.group != ALL}
-
-
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}

@@ -27,7 +27,7 @@ from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
-from visthrow.throws.recorded import _Full, fly
+from visthrow.throws.recorded import fly
 from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
@@ -191,21 +191,6 @@ def test_a_flight_goes_from_hover_to_hover(flown):
     assert "measured_pos_w" in flown
 
 
-def test_a_rope_keeps_its_speed_when_the_ball_lands():
-    """A rope that stands on the ball and tips over goes on tipping for 10 ms."""
-    recording, height = _Full(None, {}), np.linspace(0.5, 0.1, 5)
-    upright, leaning = (
-        np.column_stack((lean * height, 0.0 * height, height)) for lean in (0, 0.02)
-    )
-    ball = np.array([[0.0, 0.0, 0.04]])
-    recording._before = SimpleNamespace(time=1.0, cable_points_w=upright[None])
-    now = SimpleNamespace(time=1.03, cable_points_w=leaning[None], payload_pos_w=ball)
-    landing = SimpleNamespace(landed=[True], time=[1.02])
-    plant = SimpleNamespace(landing=landing, period=0.02)
-    moved = recording._rope(SimpleNamespace(now=now, plant=plant)) - leaning
-    assert_allclose(moved[:-1, 0], 0.01 * height[:-1], rtol=0.15)
-
-
 def test_a_flights_modes_and_commands(flown):
     times = flown.meta["times"]
     mode = flown["mode"]
@@ -278,19 +263,6 @@ def test_compare_prints_and_writes(dropper, tmp_path, printed):
 
 def test_a_policy_that_is_compared_with_itself_is_numbered(dropper):
     assert unique_names([load_policy(dropper)] * 2) == ["dropper 1", "dropper 2"]
-
-
-def test_compare_throws_under_the_conditions_of_its_options(
-    dropper, tmp_path, refused, monkeypatch
-):
-    def throw(loaded, *conditions):
-        raise ConfigError(f"thrown {len(loaded)} {conditions}")
-
-    monkeypatch.setattr("visthrow.cli.compare.throw_hybrid", throw)
-    options = f"--targets 0.5 1 --throws 7 --seed 3 --device cpu --calibrate --out {tmp_path}"
-    refused(
-        f"compare {dropper} {dropper} {options}", said="thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)"
-    )
 
 
 def test_protocol_on_the_reference_plant(dropper, monkeypatch):
