@@ -119,11 +119,10 @@ def flown(vehicle: VehicleParams, step: float, steps: int, precision: str) -> Hy
     return sim
 
 
-@mark.parametrize("precision", ["float32", "float64"])
-def test_a_second_of_full_range_commands(precision):
+def test_a_second_of_full_range_commands():
     vehicle = vehicle_with()
     body, _ = reference(vehicle, 5e-4, STEPS)  # 0.03 mm from half of it
-    apart = norm(flown(vehicle, SUBSTEP, STEPS, precision).get("pos_w") - body[:, :3], axis=1)
+    apart = norm(flown(vehicle, SUBSTEP, STEPS, "float32").get("pos_w") - body[:, :3], axis=1)
     assert apart.max() < WITHIN
     assert norm(body[:, :3], axis=1).min() > 0.1, "the vehicles must have gone somewhere"
 

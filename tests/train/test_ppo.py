@@ -5,6 +5,7 @@ gradients, rates.
 import contextlib
 import copy
 import io
+from dataclasses import replace
 from types import SimpleNamespace
 
 import torch
@@ -14,7 +15,6 @@ from tensordict import TensorDict
 from torch.testing import assert_close
 
 from tests.configs import load_experiment
-from visthrow import config
 from visthrow.task import Experiment, PPOParams
 from visthrow.training.ppo.network import CapturableGaussian
 from visthrow.training.ppo.ppo_training import PPOTraining, rsl_rl_config
@@ -33,32 +33,22 @@ REACHED = 0.075
 
 
 def params(**changes) -> PPOParams:
-    table = {
+    """Return the shipped numbers, of a small network and batch."""
+    small = {
         "environments": ENVIRONMENTS,
         "steps": STEPS,
-        "iterations": 10,
-        "hidden": [16, 16],
-        "activation": "elu",
-        "normalize": True,
+        "hidden": (16, 16),
         "initial_std": 0.5,
         "epochs": 3,
         "minibatches": 4,
         "learning_rate": 1e-3,
-        "schedule": "adaptive",
         "desired_kl": 0.01,
         "final_kl": 0.01,
-        "discount": 0.99,
-        "gae_lambda": 0.95,
-        "clip": 0.2,
         "entropy": 0.01,
-        "value_coefficient": 1.0,
         "max_grad_norm": 0.5,
+        "products": "float32",
     }
-    text = "\n".join(
-        f"{k} = {str(v).lower() if isinstance(v, bool) else repr(v)}"
-        for k, v in (table | changes).items()
-    )
-    return config.loads(PPOParams, text, (), name="test")
+    return replace(load_experiment("state").ppo, **small | changes)
 
 
 def observations(device: str = "cpu") -> TensorDict:
@@ -250,7 +240,7 @@ def test_steps_become_ever_smaller():
     assert targets[12:] == approx([0.003] * 12)
 
 
-@mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(3))
 def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
     """At this rate the last weights themselves are 0.08 to 0.17 off."""
     (_, distance), _ = reached(seed, 'schedule="fixed"', "learning_rate=0.01")

@@ -11,6 +11,7 @@ from pytest import fixture, mark
 from scipy.spatial.transform import Rotation
 
 from sim.params import GRAVITY
+from tests.flightlogs import log_at, with_channels
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
 from visthrow.diagnose.select.search import correct_interface_mistakes
@@ -41,14 +42,9 @@ def flown(seed: int, lag: float = 0.05) -> FlightLog:
     for rate in real:
         turn = turn * Rotation.from_rotvec(0.005 * rate)
         quats.append((turn * Rotation.from_rotvec(3e-3 * rng.normal(size=3))).as_quat())
-    return FlightLog(
-        {
-            "quat_wb": Channel(time, np.array(quats), "1", "world"),
-            "pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world"),
-            "command": Channel(sent, np.column_stack((thrust, rates)), "N, rad/s", "body"),
-        },
-        {},
-    )
+    log = log_at(time, quat_wb=np.array(quats), pos_w=np.zeros((len(time), 3)))
+    command = Channel(sent, np.column_stack((thrust, rates)), "N, rad/s", "body")
+    return with_channels(log, command=command)
 
 
 FULL = 4.0 * PLANT.vehicle.controller.max_thrust
@@ -68,9 +64,7 @@ def logs():
 
 def changed(log, change):
     c = log["command"]
-    return FlightLog(
-        {**log.channels, "command": Channel(c.time, change(c.values), c.unit, c.frame)}, log.meta
-    )
+    return with_channels(log, command=Channel(c.time, change(c.values), c.unit, c.frame))
 
 
 @mark.parametrize("name", WRONG)

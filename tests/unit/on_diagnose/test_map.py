@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pytest import approx, importorskip, raises
+from pytest import approx, raises
 from scipy.spatial.transform import Rotation
 
-from tests import logfiles
+from tests.flightlogs import flight, log_at, log_of
 from tests.places import DATA
 from tests.plants import paper_plant
-from tests.unit.on_logs.test_check import flight, log_of
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.inputs.map_cli import toml_of
@@ -417,13 +416,9 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     onboard = FlightLog(
         {name: whole[name] for name in ("rate_b", "acc_b", "command")}, {"source": "a.npz"}
     )
-    late = {
-        n: Channel(
-            whole[n].time[300:] + 37.42, whole[n].values[300:], whole[n].unit, whole[n].frame
-        )
-        for n in ("pos_w", "quat_wb")
-    }
-    seen = FlightLog(late, {"source": "b.npz"})
+    late = {name: columns[name][300:] for name in ("pos_w", "quat_wb")}
+    seen = log_at(whole["pos_w"].time[300:] + 37.42, **late)
+    seen.meta["source"] = "b.npz"
     offset, correlation, by = offset_of(onboard, seen)
     assert offset == approx(-37.42, abs=0.01)
     assert correlation > 0.9
@@ -437,15 +432,7 @@ def test_logs_of_one_flight_are_joined_on_one_clock(tmp_path):
     with raises(LogError, match="not the same flight"):
         join([onboard, FlightLog({"quat_wb": stranger["quat_wb"]}, {"source": "c.npz"})])
     with raises(LogError, match="no quantity in common with the other logs"):
-        join(
-            [
-                onboard,
-                FlightLog(
-                    {"battery_voltage": Channel(np.arange(9.0), np.ones(9), "V")},
-                    {"source": "d.npz"},
-                ),
-            ]
-        )
+        join([onboard, log_at(np.arange(9.0), battery_voltage=np.ones(9))])
 
 
 NEAR = 1e-3
@@ -468,18 +455,13 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
     rate = np.stack(
         [np.interp(time - 0.006, columns["time"], x) for x in columns["rate_b"].T], axis=1
     )
-    seen = {
-        "quat_wb": Channel(time, quat, "1", "world"),
-        "rate_b": Channel(time, rate, "rad/s", "body"),
-    }
+    run = log_at(time, quat_wb=quat, rate_b=rate)
+    run.meta.update(estimated=["vel_w", "rate_b"], ingest={"rate_b": {}, "quat_wb": {}})
     gyro = np.round(
         np.degrees(columns["rate_b"])
     )  # whole degrees a second, as Betaflight's blackbox has them
-    box = FlightLog({"rate_b": Channel(columns["time"] + 5.0, np.radians(gyro), "rad/s", "body")})
+    box = log_at(columns["time"] + 5.0, rate_b=np.radians(gyro))
     box.meta.update(source="box", ingest={"rate_b": {}})
-    run = FlightLog(
-        seen, {"estimated": ["vel_w", "rate_b"], "ingest": {"rate_b": {}, "quat_wb": {}}}
-    )
     log = join([run, box])
     assert log.meta["joined"][0]["offset_s"] == approx(-5.0, abs=NEAR)
     assert np.array_equal(log["rate_b"].values, box["rate_b"].values)
@@ -491,58 +473,19 @@ def test_a_gyro_joins_by_attitudes_and_takes_the_place_of_estimated_rates(seed):
     assert "estimated" not in again.meta
 
 
-def test_a_throttle_becomes_a_command_in_newtons(tmp_path):
-    """A ULog holds ``thrust_body`` and rates; hover is at 0.37 of full, with a slope of 0.8 about
-    it.
+def test_a_throttle_becomes_a_command_in_newtons():
+    """A log of PX4 holds a throttle and rates; hover is at 0.37 of full, with a slope of 0.8 about
+    it; attitudes come 3 ms after positions.
     """
-    importorskip("pyulog")
     columns, plant = flight(20.0), paper_plant()
     weight = 9.81 * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
     force = np.linalg.norm(columns["acc_b"], axis=1) / 9.81
     smooth = np.convolve(np.pad(force, 5, mode="edge"), np.ones(11) / 11, "valid")
     share = 0.37 * (1.0 + (smooth - 1.0) / 0.8)
     ahead = np.interp(columns["time"] + 0.05, columns["time"], share)
-    stamps = (1_000_000 + np.round(1e6 * columns["time"])).astype(int).tolist()
-    flip = np.array([1.0, -1.0, -1.0])
-    quat = (columns["quat_wb"] * [1, -1, -1, 1])[:, [3, 0, 1, 2]]
-    logfiles.write_ulg(
-        tmp_path / "a.ulg",
-        {
-            ("vehicle_local_position", 0): (
-                ["uint64_t timestamp", *(f"float {n}" for n in ("x", "y", "z", "vx", "vy", "vz"))],
-                [
-                    (t, *(p * flip), *(v * flip))
-                    for t, p, v in zip(stamps, columns["pos_w"], columns["vel_w"])
-                ],
-            ),
-            ("vehicle_attitude", 0): (
-                ["uint64_t timestamp", "float[4] q"],
-                [(t + 3000, *q) for t, q in zip(stamps, quat)],
-            ),
-            ("sensor_combined", 0): (
-                ["uint64_t timestamp", "float[3] gyro_rad", "float[3] accelerometer_m_s2"],
-                [
-                    (t, *(w * flip), *(a * flip))
-                    for t, w, a in zip(stamps, columns["rate_b"], columns["acc_b"])
-                ],
-            ),
-            ("vehicle_rates_setpoint", 0): (
-                [
-                    "uint64_t timestamp",
-                    "float roll",
-                    "float pitch",
-                    "float yaw",
-                    "float[3] thrust_body",
-                ],
-                [
-                    (t, *(c[1:] * flip), 0.0, 0.0, -u)
-                    for t, c, u in zip(stamps, columns["command"], ahead)
-                ],
-            ),
-        },
-    )
-    (log,) = read(tmp_path / "a.ulg")
-    assert "command" not in log
+    late = Channel(columns["time"] + 0.003, columns.pop("quat_wb"), "1", "world")
+    rates = columns.pop("command")[:, 1:]
+    log = log_of(columns | {"throttle": ahead, "rate_setpoint_b": rates}, quat_wb=late)
     (made,), (mistake,) = commanded([log], plant)
     assert mistake.name == "throttle"
     assert "throttle / 0.37" in mistake.equation

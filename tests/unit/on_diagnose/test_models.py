@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
 from tests.commands import run_command
+from tests.flightlogs import log_at, with_channels
 from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
@@ -75,9 +76,7 @@ def swing_log(
     angle = solve_ivp(
         slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10
     ).y[0]
-    return FlightLog(
-        {"angle": Channel(time, angle + offset + default_rng(1).normal(0, noise, len(time)), "rad")}
-    )
+    return log_at(time, angle=angle + offset + default_rng(1).normal(0, noise, len(time)))
 
 
 def found(model, names) -> dict[str, tuple[float, float]]:
@@ -137,7 +136,7 @@ class TestBall:
 
     def test_nothing_that_falls(self):
         time = np.arange(0, 3, 0.01)
-        still = FlightLog({"payload_pos_w": Channel(time, np.zeros((len(time), 3)), "m", "world")})
+        still = log_at(time, payload_pos_w=np.zeros((len(time), 3)))
         with raises(LogError, match="no stretch"):
             BallModel([still], BALL)
 
@@ -176,14 +175,12 @@ class TestStand:
         current = (volts - np.sqrt(volts**2 - 0.4 * power)) / 0.2
         time = 2.0 * np.arange(12)
         rng = default_rng(seed)
-        values = {
-            "thrust": (thrust * (1 + rng.normal(0, 0.005, 12)), "N"),
-            "rotor_speed": (speed, "rad/s"),
-            "supply_voltage": (np.full(12, volts), "V"),
-            "current": (current, "A"),
-        }
-        return FlightLog(
-            {name: Channel(time, column, unit) for name, (column, unit) in values.items()}
+        return log_at(
+            time,
+            thrust=thrust * (1 + rng.normal(0, 0.005, 12)),
+            rotor_speed=speed,
+            supply_voltage=np.full(12, volts),
+            current=current,
         )
 
     def test_curve_and_zero_are_found(self):
@@ -246,18 +243,14 @@ class TestFlyer:
         )
         height = 5.0 + np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1])) * fine])
         seen, zero = time[::100], np.zeros(len(time[::100]))
-        log = FlightLog(
-            {
-                "pos_w": Channel(seen, np.column_stack([zero, zero, height[::100]]), "m", "world"),
-                "quat_wb": Channel(
-                    seen, np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1)), "1", "world"
-                ),
-                "thrust_command": Channel(sent, told[:, None], "N"),
-            }
+        log = log_at(
+            seen,
+            pos_w=np.column_stack([zero, zero, height[::100]]),
+            quat_wb=np.tile([0.0, 0.0, 0.0, 1.0], (len(seen), 1)),
         )
-        assert (
-            np.abs(np.concatenate(FlyerModel([log], params).residuals({}))).max() < 1e-4
-        )  # motion capture has more noise
+        log = with_channels(log, thrust_command=Channel(sent, told[:, None], "N"))
+        off = np.concatenate(FlyerModel([log], params).residuals({}))
+        assert np.abs(off).max() < 1e-4  # motion capture has more noise
 
     def test_a_cable_is_attached_where_its_setup_says(self):
         mount = (0.01, 0.0, -0.03)
@@ -313,27 +306,15 @@ class TestFlyer:
         """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body
         mechanics says.
         """
-        torque = TorqueParams((2e-5, 2e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
-        params = FlyerParams(**{**vars(FLYER), "torque": torque})
         log = fly(5.0)
         time = log["pos_w"].time
         u = log["motor_command"].values[:, 0]
         lost = 0.1 * (0.06 * u + 0.1 * u * u)  # of the front left motor
-        spin = (
-            np.cumsum(
-                np.column_stack([-0.03 * lost / 2e-5, 0.03 * lost / 2e-5, -0.006 * lost / 3e-5]),
-                axis=0,
-            )
-            * 0.01
-        )
-        rates = Channel(time, 1e-4 * spin, "rad/s", "body")  # small: gyroscopic terms vanish
-        weak = FlyerParams(
-            **{
-                **vars(params),
-                "torque": TorqueParams((0.2, 0.2, 0.3), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0)),
-            }
-        )
-        model = FlyerModel([FlightLog({**log.channels, "rate_b": rates})], weak)
+        torque = np.outer(lost, [-0.03, 0.03, -0.006])
+        spin = 0.01 * np.cumsum(torque / [0.2, 0.2, 0.3], axis=0)
+        rates = Channel(time, spin, "rad/s", "body")  # small: gyroscopic terms vanish
+        weak = replace(FLYER, torque=replace(TORQUE, inertia=(0.2, 0.2, 0.3)))
+        model = FlyerModel([with_channels(log, rate_b=rates)], weak)
         right = [s.channel == 1 for s in model.stretches]
         truth, nothing = model.residuals({"motor_fl": -0.1}), model.residuals({})
         good = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(truth, right)]) ** 2))
@@ -341,18 +322,12 @@ class TestFlyer:
         assert good < 0.1 * bad
 
     def test_missing_channels_are_named(self):
+        log = fly(3.0)
+        del log.channels["quat_wb"]
         with raises(LogError, match="missing everywhere: quat_wb"):
-            FlyerModel(
-                [FlightLog({k: v for k, v in fly(3.0).channels.items() if k != "quat_wb"})], FLYER
-            )
+            FlyerModel([log], FLYER)
         with raises(ConfigError, match="single motors"):
-            FlyerParams(
-                **{
-                    **vars(FLYER),
-                    "input": "thrust_command",
-                    "torque": TorqueParams((1, 1, 1), 1, 1, 1, (1, 1, 1, 1)),
-                }
-            )
+            replace(FLYER, input="thrust_command", torque=TORQUE)
 
 
 TRIM = TrimParams(
@@ -410,12 +385,11 @@ class TestImu:
         t, acc, *columns = np.array(rows).T
         rates, command = np.array(columns[:3]).T, np.array(columns[3:]).T
         force = np.column_stack([0.0 * acc, 0.0 * acc, acc + 0.2])
-        return FlightLog(
-            {
-                "motor_command": Channel(t, command, "1"),
-                "acc_b": Channel(t, force + rng.normal(0, 0.3, force.shape), "m/s^2", "body"),
-                "rate_b": Channel(t, rates + rng.normal(0, 0.02, rates.shape), "rad/s", "body"),
-            }
+        return log_at(
+            t,
+            motor_command=command,
+            acc_b=force + rng.normal(0, 0.3, force.shape),
+            rate_b=rates + rng.normal(0, 0.02, rates.shape),
         )
 
     def test_lag_curve_and_inertia_without_a_position(self):
@@ -459,13 +433,8 @@ def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
     time = np.arange(0, 8, 0.01)
     command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
     pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
-    return FlightLog(
-        {
-            "pos_w": Channel(time, pos, "m", "world"),
-            "vel_w": Channel(time, rng.normal(0, 0.01, (len(time), 3)), "m/s", "world"),
-            "motor_command": Channel(time, command, "1"),
-        }
-    )
+    vel = rng.normal(0, 0.01, (len(time), 3))
+    return log_at(time, pos_w=pos, vel_w=vel, motor_command=command)
 
 
 class TestTrim:
@@ -505,19 +474,15 @@ class TestGimbal:
         turn, gap, _ = seen(time)
         point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
         gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
-        return [
-            FlightLog(
-                {
-                    "pos_w": Channel(time, np.tile([0, 0, 4.0], (len(time), 1)), "m", "world"),
-                    "quat_wb": Channel(time, turn.as_quat(), "1", "world"),
-                    "payload_pos_w": Channel(time, gap + [0, 0, 4], "m", "world"),
-                    "marker_pos_c": Channel(
-                        time, point + rng.normal(0, 0.005, point.shape), "m", "camera"
-                    ),
-                    "gimbal": Channel(time, gimbal, "rad", "body"),
-                }
-            )
-        ]
+        log = log_at(
+            time,
+            pos_w=np.tile([0, 0, 4.0], (len(time), 1)),
+            quat_wb=turn.as_quat(),
+            payload_pos_w=gap + [0, 0, 4],
+            marker_pos_c=point + rng.normal(0, 0.005, point.shape),
+            gimbal=gimbal,
+        )
+        return [log]
 
     def test_tilt_delay_and_focal_length_are_found(self):
         model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)

@@ -5,6 +5,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import approx, raises
 
+from tests.flightlogs import log_at, with_channels
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -23,15 +24,10 @@ def flight(rate: float, noise: float, gap: tuple[float, float] = (9.0, 9.0)) -> 
     values += noise * default_rng(0).standard_normal(values.shape)
     still = np.zeros((len(at), 3)) + 1e-4 * default_rng(1).standard_normal((len(at), 3))
     quat = np.column_stack((1e-4 * default_rng(2).standard_normal((len(at), 3)), np.ones(len(at))))
-    return FlightLog(
-        {
-            "pos_w": Channel(at, still, "m", "world"),
-            "quat_wb": Channel(at, quat, "1", "world"),
-            "command": Channel(
-                at[::4], np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)), "N, rad/s", "body"
-            ),
-            "rate_b": Channel(seen, values, "rad/s", "body"),
-        }
+    commands = log_at(at[::4], command=np.tile([4.0, 0.0, 0.0, 0.0], (len(at[::4]), 1)))
+    gyro = log_at(seen, rate_b=values)
+    return with_channels(
+        log_at(at, pos_w=still, quat_wb=quat), **commands.channels, **gyro.channels
     )
 
 
@@ -61,11 +57,10 @@ def test_no_sample_of_a_gyro_is_made_up_in_a_gap():
 
 def test_a_log_without_commands_is_told_what_makes_them():
     """As PX4's, which holds motor outputs, poses and rates."""
-    time = np.arange(20.0)
-    pos = Channel(time, np.zeros((20, 3)), "m", "world")
-    quat = Channel(time, np.tile([0.0, 0.0, 0.0, 1.0], (20, 1)), "1", "world")
+    quat = np.tile([0.0, 0.0, 0.0, 1.0], (20, 1))
+    log = log_at(np.arange(20.0), pos_w=np.zeros((20, 3)), quat_wb=quat)
     with raises(DiagnoseError, match=r"no command; .*throttle and rate_setpoint_b.*--config"):
-        record_of(FlightLog({"pos_w": pos, "quat_wb": quat}))
+        record_of(log)
 
 
 def test_rounding_counts_as_noise_of_a_twelfth_of_its_steps_square():

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from pytest import approx, importorskip, mark, raises
 
-from tests.unit.on_logs.test_check import flight
+from tests.flightlogs import flight
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.proposal import propose
 from visthrow.logs import read, table_of

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bench import delays
 from tests.commands import run_command
+from tests.flightlogs import DELAY, UNITS, G, flight, log_at, log_of, with_channels
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.search import diagnose, refused_of
@@ -22,78 +23,6 @@ from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, table
 from visthrow.logs.flightlog import Channel, FlightLog
-
-G = 9.81
-DELAY = 0.04
-"""Of the rates behind the commands [s]."""
-
-
-def flight(
-    seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: float = 1.0
-) -> dict[str, np.ndarray]:
-    """Columns of a flight along a smooth path, attitude along the thrust that it takes; noise of a
-    good motion capture.
-    """
-    rng = default_rng(seed)
-    time = np.arange(0.0, seconds, 1.0 / rate)
-    tones = [
-        (axis, a, w, rng.uniform(0, 6))
-        for axis in range(3)
-        for a, w in ((0.6, 1.3 + 0.4 * axis), (0.08, 5.1 + axis))
-    ]
-    pos, vel, acc = (np.zeros((len(time), 3)) for _ in range(3))
-    for axis, a, w, phase in tones:
-        a, w = a * scale, w * rng.uniform(0.75, 1.25)
-        pos[:, axis] += a * np.sin(w * time + phase)
-        vel[:, axis] += a * w * np.cos(w * time + phase)
-        acc[:, axis] -= a * w * w * np.sin(w * time + phase)
-    force = acc + [0, 0, G]
-    up = force / norm(force, axis=1, keepdims=True)
-    yaw = np.sin(rng.uniform(0.5, 0.9) * time + rng.uniform(0, 6))
-    heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
-    side = np.cross(up, heading)
-    side /= norm(side, axis=1, keepdims=True)
-    turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
-    step = 1e-3
-    later = Rotation.from_matrix(turn.as_matrix())
-    rates = np.gradient(np.zeros(len(time)))[:, None] * np.zeros(3)
-    rates[1:-1] = (later[:-2].inv() * later[2:]).as_rotvec() * rate / 2.0
-    rates[0], rates[-1] = rates[1], rates[-2]
-    ahead = np.column_stack([np.interp(time + DELAY, time, column) for column in rates.T])
-    thrust = 0.2 * norm(force, axis=1)
-    quat = (turn * Rotation.from_rotvec(rng.normal(0, step, (len(time), 3)))).as_quat()
-    return {
-        "time": time,
-        "pos_w": pos + [0, 0, 3.0] + rng.normal(0, 3e-4, pos.shape),
-        "vel_w": vel + rng.normal(0, 5e-3, vel.shape),
-        "quat_wb": quat,
-        "rate_b": rates + rng.normal(0, 0.02, rates.shape),
-        "acc_b": turn.inv().apply(force) + rng.normal(0, 0.1, force.shape),
-        "command": np.column_stack([thrust, ahead]) + rng.normal(0, 1e-3, (len(time), 4)),
-    }
-
-
-UNITS = {
-    "pos_w": ("m", "world"),
-    "vel_w": ("m/s", "world"),
-    "quat_wb": ("1", "world"),
-    "rate_b": ("rad/s", "body"),
-    "acc_b": ("m/s^2", "body"),
-    "command": ("N, rad/s", "body"),
-    "payload_pos_w": ("m", "world"),
-    "motor_command": ("1", "none"),
-    "est_pos_w": ("m", "world"),
-}
-
-
-def log_of(columns: dict[str, np.ndarray], **channels: Channel) -> FlightLog:
-    time = columns["time"]
-    made = {
-        name: Channel(time, values, *UNITS[name])
-        for name, values in columns.items()
-        if name != "time"
-    }
-    return FlightLog({**made, **channels})
 
 
 def faults(log: FlightLog, verdict: str = "bad") -> str:
@@ -423,7 +352,7 @@ def test_a_delay_that_noise_hides_is_not_told(width):
 def test_the_least_of_few_samples_is_no_rail(count, clipped, told):
     values = default_rng(0).normal(0.0, 1.0, (count, 3))
     values[:clipped, 0] = np.max(values)
-    log = FlightLog({"rate_b": Channel(0.02 * np.arange(count), values, "rad/s", "body")})
+    log = log_at(0.02 * np.arange(count), rate_b=values)
     assert ("saturated" in " ".join(row.text for row in check([log])[0].rows)) == told
 
 
@@ -510,7 +439,7 @@ def test_clocks_are_compared_where_a_noisy_payload_moves_fast_enough(rate, compa
     logs = []
     for seed, late in ((0, 0.0), (1, 0.02)):
         noise = default_rng(seed).normal(0.0, 1.5e-3, swing.shape)
-        logs.append(FlightLog({"payload_pos_w": Channel(time + late, swing + noise, "m", "world")}))
+        logs.append(log_at(time + late, payload_pos_w=swing + noise))
     delays = [r.figures["delay_s"] for r in check(logs)[1].rows if "rms_m" in r.figures]
     assert delays == ([approx(0.02, abs=3e-3)] if compared else [])
 
@@ -576,9 +505,7 @@ def test_a_flight_that_excites_everything_answers_every_question():
 def test_long_and_constant_logs():
     time = np.arange(0.0, 7200.0, 0.1)
     zero = np.zeros((len(time), 3))
-    log = FlightLog(
-        {"pos_w": Channel(time, zero, "m", "world"), "rate_b": Channel(time, zero, "rad/s", "body")}
-    )
+    log = log_at(time, pos_w=zero, rate_b=zero)
     assert "one value from beginning to end" in faults(log)
     assert "long" in faults(log, "warn")
 
@@ -664,5 +591,5 @@ def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
     upright = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
     log = log_of({"time": time, "quat_wb": upright})
     force = Channel(time[:count], np.tile([0.0, 0.0, 5.0], (count, 1)), *UNITS["acc_b"])
-    rows = physics.look(FlightLog({**log.channels, "acc_b": force}))
+    rows = physics.look(with_channels(log, acc_b=force))
     assert any("mean force" in row.text for row in rows) == judged

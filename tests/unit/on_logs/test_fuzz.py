@@ -18,6 +18,7 @@ from pytest import mark, raises
 
 from tests import logfiles
 from tests.commands import run_command
+from tests.flightlogs import log_at, with_channels
 from tests.places import DATA
 from visthrow.common.errors import LogError, VisthrowError
 from visthrow.diagnose.inputs import setup as setups
@@ -121,13 +122,9 @@ def blackbox(path: Path) -> None:
 def own() -> FlightLog:
     """A log of ours."""
     time, rng = 0.01 * np.arange(SAMPLES), np.random.default_rng(0)
-    return FlightLog(
-        {
-            "pos_w": Channel(time, rng.normal(size=(SAMPLES, 3)), "m", "world"),
-            "command": Channel(time[::2], np.ones((SAMPLES // 2, 4)), "N, rad/s", "body"),
-            "attached": Channel(time, np.arange(SAMPLES) < SAMPLES // 2, "bool"),
-        }
-    )
+    log = log_at(time, pos_w=rng.normal(size=(SAMPLES, 3)), attached=time < time[SAMPLES // 2])
+    command = Channel(time[::2], np.ones((SAMPLES // 2, 4)), "N, rad/s", "body")
+    return with_channels(log, command=command)
 
 
 def lines_of(folder: str, name: str) -> bytes:
@@ -266,19 +263,15 @@ def test_damaged_bytes_are_reported_in_one_row(tmp_path, capfd):
 
 
 @mark.parametrize(
-    ("channel", "words"),
+    ("name", "size", "factor", "words"),
     [
-        (Channel(0.01 * np.arange(SAMPLES), np.full(SAMPLES, 3700.0), "V"), "no such pack"),
-        (
-            Channel(0.01 * np.arange(SAMPLES), np.full((SAMPLES, 4), 40_000.0), "1"),
-            "no shares of the full command",
-        ),
+        ("battery_voltage", np.full(SAMPLES, 3700.0), 1e-3, "no such pack"),
+        ("motor_command", np.full((SAMPLES, 4), 40_000.0), 1e-5, "no shares of the full command"),
     ],
 )
-def test_sizes_that_only_another_unit_gives(channel, words):
-    name = "battery_voltage" if channel.unit == "V" else "motor_command"
-    for factor, bad in ((1.0, True), (1e-3 if channel.unit == "V" else 1e-5, False)):
-        log = FlightLog({name: Channel(channel.time, factor * channel.values, channel.unit)})
+def test_sizes_that_only_another_unit_gives(name, size, factor, words):
+    for values, bad in ((size, True), (factor * size, False)):
+        log = log_at(0.01 * np.arange(SAMPLES), **{name: values})
         assert any(words in row.text for row in check([log])[0].rows) == bad
 
 

@@ -20,7 +20,7 @@ VEHICLE, PAYLOAD, LENGTH = 0.214, 0.058, 0.38
 NOTHING = 1e-6
 DELAY, LAGS = 0.022, np.array([0.033, *[1.0 / 30.0] * 3])
 """Of the command, and of the thrust and the body-rate loop [s]."""
-PERIOD, STEP = 0.02, 0.002
+PERIOD, STEP = 0.02, 0.005
 GOAL = np.array([0.0, 0.0, 2.0])
 
 
@@ -60,19 +60,12 @@ class LaggingPendulum:
         return np.arccos(np.clip(-self.state[:, pm.DIR][:, 2], -1.0, 1.0))
 
 
-def fly(
-    plant: LaggingPendulum,
-    duration: float,
-    yaw: float = 0.0,
-    params: HoverParams | None = None,
-    told_mass=None,
-):
+def fly(plant: LaggingPendulum, duration: float, yaw: float = 0.0, heavier=1.0, **params: float):
     """Fly to GOAL; return times (T,), distances (T, E), swings (T, E), heights (T, E)."""
-    controller = HoverController(params or HoverParams(), PERIOD, len(plant.state))
+    controller = HoverController(HoverParams(**params), PERIOD, len(plant.state))
     rows = []
     for k in range(round(duration / PERIOD)):
-        mass = plant.mass if told_mass is None else told_mass
-        plant.advance(k * PERIOD, controller.step(*plant.seen, GOAL, mass, yaw))
+        plant.advance(k * PERIOD, controller.step(*plant.seen, GOAL, heavier * plant.mass, yaw))
         pos_w = plant.seen[0]
         rows.append((norm(pos_w - GOAL, axis=1), plant.swing, pos_w[:, 2]))
     return (PERIOD * np.arange(1, len(rows) + 1), *map(np.array, zip(*rows)))
@@ -119,15 +112,10 @@ def test_hover_without_the_payload_and_yaw_turns():
 
 
 def test_integral_makes_up_for_a_wrong_mass():
-    _, distances, _, _ = fly(LaggingPendulum(GOAL), 12.0, told_mass=0.95 * (VEHICLE + PAYLOAD))
+    _, distances, _, _ = fly(LaggingPendulum(GOAL), 12.0, heavier=0.95)
     assert distances.max() > 0.05
     assert distances[-1, 0] < 0.01
-    _, without, _, _ = fly(
-        LaggingPendulum(GOAL),
-        12.0,
-        told_mass=0.95 * (VEHICLE + PAYLOAD),
-        params=HoverParams(integral_gain=0.0),
-    )
+    _, without, _, _ = fly(LaggingPendulum(GOAL), 4.0, heavier=0.95, integral_gain=0.0)
     assert without[-1, 0] > 0.05
 
 
@@ -167,19 +155,16 @@ def test_commands_by_hand():
     assert low == approx(GRAVITY - 3.5 * 1.5 * 0.1 - step_of_integral, abs=1e-12)
 
 
-@mark.parametrize("axis", range(3))
-def test_the_integral_is_limited_alike_both_ways(axis):
-    """A vehicle that is held beside its goal for long: mirrored, the same push."""
-    level, still = np.array([[0.0, 0.0, 0.0, 1.0]]), np.zeros((1, 3))
-    pushes = []
-    for side in (-1.0, 1.0):
-        controller = HoverController(HoverParams(), PERIOD)
-        goal = 0.1 * side * np.eye(3)[axis]
-        for _ in range(2000):
-            command = controller.step(still, level, still, goal, 0.27)[0]
-        pushes.append(command - [0.27 * GRAVITY, 0.0, 0.0, 0.0])
-    assert np.abs(pushes[0]).max() > 0.05
-    assert_allclose(pushes[0], -pushes[1], atol=1e-9)
+def test_the_integral_is_limited_alike_both_ways():
+    """Vehicles that are held beside their goals for long: mirrored, the same push."""
+    goals = 0.1 * np.vstack((-np.eye(3), np.eye(3)))
+    level, still = np.tile([0.0, 0.0, 0.0, 1.0], (6, 1)), np.zeros((6, 3))
+    controller = HoverController(HoverParams(), PERIOD, 6)
+    for _ in range(2000):
+        command = controller.step(still, level, still, goals, 0.27)
+    pushes = command - [0.27 * GRAVITY, 0.0, 0.0, 0.0]
+    assert np.abs(pushes).max(axis=1).min() > 0.05
+    assert_allclose(pushes[:3], -pushes[3:], atol=1e-9)
 
 
 def test_limits_hold_for_any_state():

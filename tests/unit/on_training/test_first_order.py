@@ -35,8 +35,8 @@ LEAST_COSINE, MOST_BIAS = 0.97, 0.15
 rates) lets them differ.
 """
 LEARNT = 0.195
-"""Landing error that the small task is brought under [m]: five seeds end at 0.09 to 0.17, with Adam
-in place of Muon at 0.22 to 0.40.
+"""Landing error that the small task is brought under [m]: five seeds ended at 0.09 to 0.17, with
+Adam in place of Muon at 0.22 to 0.40.
 """
 
 ALIKE = 0.006
@@ -334,7 +334,7 @@ def small_task():
     return load_experiment("state", ['algorithm="first_order"', *words])
 
 
-@mark.parametrize("seed", range(5))
+@mark.parametrize("seed", range(3))
 def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
     """Of the last five of 36 iterations nearly all flights release, and land near."""
     trainer = Trainer(small_task(), "cpu", seed)
