@@ -38,7 +38,7 @@ def _response(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     return _placed(time, np.array([np.interp(_fine(), knots, row) for row in np.eye(len(knots))]).T)
 
 
-def catalogue(count: int = 20) -> tuple[Effect, ...]:
+def catalogue(count: int) -> tuple[Effect, ...]:
     """Effects: two thirds are forces, one third are shifts of a measured position."""
     blocks = ("thrust map", "rope", "aero", "payload aero", "release")
     effects = []
@@ -62,11 +62,14 @@ def catalogue(count: int = 20) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
+EFFECTS = catalogue(12)
+
+
 @dataclass
 class SyntheticModel(Model):
     """A synthetic :class:`visthrow.diagnose.models.model_interface.Model`; ``truth`` in floors."""
 
-    effects: tuple[Effect, ...] = field(default_factory=catalogue)
+    effects: tuple[Effect, ...] = EFFECTS
     truth: dict[str, float] = field(default_factory=dict)
     seed: int = 0
     throws: int = 5
@@ -77,12 +80,11 @@ class SyntheticModel(Model):
     same: dict[str, tuple[str, float]] = field(
         default_factory=dict
     )  # effect -> (of which it is a multiple, factor)
-    law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl" or "thrust"
+    law: str = ""  # a hidden force outside the catalogue: "speed" or "swirl"
     law_size: float = 0.0
     channels: tuple[str, ...] = CHANNELS
     rate: int = 40  # of the measurements [Hz]
     fresh: int = 0  # seed of noise and gusts alone
-    calls: int = 0
 
     def __post_init__(self) -> None:
         self._rng = default_rng(self.seed)
@@ -91,9 +93,8 @@ class SyntheticModel(Model):
         self._time = np.arange(0.0, LENGTH, 1.0 / self.rate)
         self._knots = np.linspace(0.0, LENGTH, KNOTS)
         self._placed = _response(self._time, self._knots)
-        self.by_law: list[
-            np.ndarray
-        ] = []  # of each window, what the law adds to the measured positions
+        # of each window, what the law adds to the measured positions
+        self.by_law: list[np.ndarray] = []
         self._windows = [
             w for flight in range(self.free + self.throws) for w in self._flight(flight)
         ]
@@ -105,14 +106,9 @@ class SyntheticModel(Model):
 
     def _smooth(self, size: int, scale: float, at: np.ndarray | None = None) -> np.ndarray:
         at = self._knots if at is None else at
-        phase, speed = (
-            self._rng.uniform(0, 2 * np.pi, (3, size)),
-            self._rng.uniform(2.0, 9.0, (3, size)),
-        )
-        waves = (
-            np.sin(speed[..., None] * at + phase[..., None])
-            * self._rng.normal(size=(3, size))[..., None]
-        )
+        phase = self._rng.uniform(0, 2 * np.pi, (3, size, 1))
+        speed = self._rng.uniform(2.0, 9.0, (3, size, 1))
+        waves = np.sin(speed * at + phase) * self._rng.normal(size=(3, size, 1))
         return scale * waves.sum(0).T / 1.7  # (times, size)
 
     def _motion(self, vigour: float) -> dict[str, np.ndarray]:
@@ -141,9 +137,8 @@ class SyntheticModel(Model):
             on_payload = e.channels == ("payload_pos_w",)
             rows = slice(3 * n, 6 * n) if on_payload else slice(0, 3 * n)
             if e.unit == "m":
-                shape = np.array(
-                    [np.interp(self._time, self._knots, c) for c in self._smooth(3, vigour).T]
-                ).T
+                moved = self._smooth(3, vigour).T
+                shape = np.array([np.interp(self._time, self._knots, c) for c in moved]).T
             else:
                 shape = self._placed @ self._smooth(3, vigour) / MASS[on_payload]
             effects[rows, j] = shape.ravel()
@@ -193,15 +188,10 @@ class SyntheticModel(Model):
     def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
         force = np.zeros((2, 3, len(motion["time"])))
         if self.law == "speed":  # drag of the vehicle that grows with the square of its speed
-            force[0] = (
-                -self.law_size
-                * (np.linalg.norm(motion["vel_w"], axis=1)[:, None] * motion["vel_w"]).T
-            )
-        elif self.law == "swirl":  # a force across the payload's velocity
+            speed = np.linalg.norm(motion["vel_w"], axis=1)
+            force[0] = -self.law_size * speed * motion["vel_w"].T
+        else:  # a force across the payload's velocity
             force[1] = self.law_size * np.cross([0.0, 0.0, 1.0], motion["payload_vel_w"]).T
-        else:  # thrust grows with the square of the speed across its axis
-            across = (motion["vel_w"][:, :2] ** 2).sum(1)
-            force[0, 2] = self.law_size * motion["thrust"] * across
         return force.ravel()
 
     def _floors(self, sizes: dict[str, float]) -> np.ndarray:
@@ -218,7 +208,6 @@ class SyntheticModel(Model):
         return {name: value / self.effects[self._at[name]].floor for name, value in theta.items()}
 
     def windows(self, theta: dict[str, float]) -> list[Window]:
-        self.calls += 1
         slope = 1.0 + 2.0 * self.curvature * np.abs(self._floors(self._sizes(theta))) / 30.0
         left = self.residuals(theta)
         return [

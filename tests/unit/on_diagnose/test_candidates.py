@@ -8,13 +8,12 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select import result, search
 from visthrow.diagnose.select.point import fitted
 from visthrow.diagnose.select.selection import Selector
 
-EFFECTS = catalogue(12)
 NAME, SIZE = "effect_03", 10.0  # in floors
 LUCK, SHOWN = 0.3, 0.2
 """What better initial states explain, in noise; what an effect does there, in what its derivative
@@ -46,7 +45,7 @@ class Whipping(SyntheticModel):
 
 
 def explained(size: float):
-    return search.explain(Whipping(effects=EFFECTS, truth={NAME: size}, seed=5), laws=False)
+    return search.explain(Whipping(truth={NAME: size}, seed=5), laws=False)
 
 
 def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_leads():
@@ -97,7 +96,7 @@ def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(
             self.problem, self._linearised(point.theta, point), active
         ),
     )
-    model = Luckier(effects=EFFECTS, truth={NAME: 1.0}, seed=8)
+    model = Luckier(truth={NAME: 1.0}, seed=8)
     assert not search.explain(model, laws=False).named
 
 
@@ -129,9 +128,7 @@ def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
     off = []
     for seed in range(5):
         truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
-        diagnosis = search.explain(
-            Levered(effects=EFFECTS, truth=truth, seed=seed, throws=8), laws=False
-        )
+        diagnosis = search.explain(Levered(truth=truth, seed=seed, throws=8), laws=False)
         assert diagnosis.named == (NAME,)
         size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
         off.append((own.estimate - size) / own.sd)
@@ -161,5 +158,5 @@ class Sideways(SyntheticModel):
 
 def test_of_causes_of_which_only_one_is_there_that_one_is_named():
     """The simulated set holds a cause near 0; without it the other has hardly been listed."""
-    model = Sideways(truth={"effect_01": 40.0}, throws=6, free=2)
+    model = Sideways(effects=catalogue(20), truth={"effect_01": 40.0}, throws=6, free=2)
     assert search.explain(model, laws=False).named == ("effect_01",)

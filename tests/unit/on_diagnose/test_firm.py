@@ -6,12 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 from pytest import approx, mark
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.reporting.diagnosis_report import instead
 from visthrow.diagnose.select import held_out, result, scatter, search, verdicts
-
-EFFECTS = catalogue(12)
 
 
 def promised(nats, came):
@@ -73,10 +71,8 @@ def judged(monkeypatch, truth, same=(), **changes):
         return replace(plain(*args), **changes)
 
     monkeypatch.setattr(held_out, "measure", measure)
-    return search.explain(
-        SyntheticModel(effects=EFFECTS, truth=truth, same=dict(same), throws=8, free=4, seed=2),
-        laws=False,
-    )
+    model = SyntheticModel(truth=truth, same=dict(same), throws=8, free=4, seed=2)
+    return search.explain(model, laws=False)
 
 
 def test_names_that_held_out_flights_do_not_confirm_are_candidates(monkeypatch):
@@ -112,7 +108,7 @@ def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
 def test_nothing_is_named_over_an_interval_that_holds_zero():
     """Also where the evidence for it is overwhelming."""
     diagnosis = search.explain(
-        SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
+        SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2),
         laws=False,
     )
     findings = [replace(f, low=-f.low) if f.name == "effect_05" else f for f in diagnosis.findings]
@@ -208,6 +204,6 @@ def test_several_forms_at_once_are_another_form(monkeypatch):
     for count in (1, 2):
         found = forms[:count], scatter.Varies()
         monkeypatch.setattr(verdicts, "random_shares_of", lambda selection, found=found: found)
-        model = SyntheticModel(effects=EFFECTS, truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
+        model = SyntheticModel(truth={"effect_05": 40.0}, throws=8, free=4, seed=2)
         overall.append(search.explain(model, laws=False).overall)
     assert overall == [result.KNOWN, result.UNKNOWN]

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 from pytest import mark
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
 from visthrow.diagnose.select import result, search
 from visthrow.diagnose.select.point import Problem, linearise, untracked_windows
 
-EFFECTS = catalogue(12)
 BAD = 10
 """Number of the window that is spoiled."""
 ROUGH = 1.0
@@ -54,14 +53,14 @@ def lost_of(model) -> list[int]:
     [(True, 0.0, []), (True, ROUGH, [BAD]), (False, ROUGH, []), (False, 3.0, [BAD])],
 )
 def test_less_misfit_is_taken_from_a_window_after_slack(shaken, rough, expected):
-    model = Spoiled(effects=EFFECTS, throws=8, seed=4)
+    model = Spoiled(throws=8, seed=4)
     model.shaken, model.rough = shaken, rough
     assert lost_of(model) == expected
 
 
 def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goes_on():
     said = []
-    model = Spoiled(effects=EFFECTS, truth={"effect_00": 15.0}, throws=8, seed=4)
+    model = Spoiled(truth={"effect_00": 15.0}, throws=8, seed=4)
     model.rough, model.beyond = 4.0, 5.0
     diagnosis = search.explain(model, laws=False, progress=said.append)
     assert sum("are left out, which the simulation does not follow" in line for line in said) == 1

@@ -10,7 +10,7 @@ from pytest import approx, fixture, mark, raises
 
 from tests.commands import run_command
 from tests.places import DATA
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
@@ -23,7 +23,6 @@ from visthrow.diagnose.throw.landing import PredictedLandings
 from visthrow.view import page
 
 SWING = str(DATA / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
-EFFECTS = catalogue(12)
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 
 
@@ -52,7 +51,7 @@ class Throwing(SyntheticModel):
 
 @fixture(scope="module")
 def found():
-    model = Throwing(effects=EFFECTS, truth=TRUTH, seed=1)
+    model = Throwing(truth=TRUTH, seed=1)
     return model, search.explain(model, laws=False)
 
 
@@ -111,15 +110,13 @@ def test_completeness_rises_and_noise_is_not_named(hidden):
 @fixture(scope="module")
 def degenerate():
     same = {"effect_07": ("effect_03", 0.5)}
-    model = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, same=same, seed=2)
+    model = SyntheticModel(truth={"effect_03": 12.0}, same=same, seed=2)
     return search.explain(model, laws=False)
 
 
 def test_the_plan_prefers_the_manoeuvre_that_separates(degenerate):
-    apart = SyntheticModel(effects=EFFECTS, truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
-    alike = SyntheticModel(
-        effects=EFFECTS, same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9
-    )
+    apart = SyntheticModel(truth={"effect_03": 12.0}, throws=1, free=0, seed=9)
+    alike = SyntheticModel(same={"effect_07": ("effect_03", 0.5)}, throws=1, free=0, seed=9)
     aim = plan.PlanningGoal(degenerate)
     models = {"hover": alike, "circle": apart}
     told = [
@@ -158,7 +155,7 @@ def test_a_scale_settles_what_no_flight_separates(degenerate, monkeypatch):
     }
     assert not plan.propose(plan.PlanningGoal(degenerate, ("effect_00",)), [])
     model = SyntheticModel(
-        effects=EFFECTS, truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
+        truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2
     )
     model.effects = measures.narrowed(EFFECTS, measures.parsed([f"effect_07={scale.sd}"]))
     assert search.explain(model, laws=False)["effect_03"].verdict == result.FOUND

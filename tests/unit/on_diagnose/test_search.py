@@ -8,7 +8,7 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, mark, raises
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
@@ -19,11 +19,9 @@ from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.point import Problem, linearise
 from visthrow.diagnose.select.selection import Selector
 
-EFFECTS = catalogue(12)
-
 
 def world(**options) -> SyntheticModel:
-    return SyntheticModel(effects=EFFECTS, **options)
+    return SyntheticModel(**options)
 
 
 def sizes(model, diagnosis) -> dict[str, float]:
@@ -42,7 +40,7 @@ class Altered(SyntheticModel):
 
 
 def altered(change, **options) -> SyntheticModel:
-    return type("Altered", (Altered,), {"change": staticmethod(change)})(effects=EFFECTS, **options)
+    return type("Altered", (Altered,), {"change": staticmethod(change)})(**options)
 
 
 def pushed(model, window, size: float):
@@ -394,7 +392,7 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     Where one flight alone can tell, none that was held out can confirm it: that is not asked here.
     """
     monkeypatch.setattr(held_out, "judged", lambda diagnosis: diagnosis)
-    model = SyntheticModel(effects=EFFECTS, throws=1, free=2, law="speed", law_size=0.0, seed=4)
+    model = SyntheticModel(throws=1, free=2, law="speed", law_size=0.0, seed=4)
     model.effects = (EFFECTS[0], replace(EFFECTS[1], floor=1e-3, prior_sd=4e-3), *EFFECTS[2:])
     model.law_size = 1.0
     for w in model._windows:

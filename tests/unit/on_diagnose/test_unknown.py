@@ -11,7 +11,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import approx, mark
 
-from tests.synthetic_diagnosis import SyntheticModel, catalogue
+from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import law_terms as laws
@@ -24,7 +24,6 @@ from visthrow.diagnose.select.point import Problem, candidate, linearise
 from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares
 from visthrow.diagnose.select.selection import Selector, Trial
 
-EFFECTS = catalogue(12)
 IN_THE_BODY = ("vehicle torque", laws.JOINT)
 # of a hidden force after a table learnt from a dozen throws, in a throw that it has not seen: a
 # table is no formula
@@ -147,9 +146,7 @@ def test_units_and_formulas(term, unit, formula):
 
 
 def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
-    model = SyntheticModel(
-        effects=EFFECTS, law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3
-    )
+    model = SyntheticModel(law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3)
     diagnosis = search.explain(model)
     assert diagnosis.overall == result.UNKNOWN
     assert diagnosis.block == "payload force"
@@ -177,7 +174,7 @@ class PassedBy(SyntheticModel):
 
 
 def test_a_law_that_other_flights_do_not_repeat_is_not_told():
-    diagnosis = search.explain(PassedBy(EFFECTS, law="passing", law_size=0.4, seed=3))
+    diagnosis = search.explain(PassedBy(law="passing", law_size=0.4, seed=3))
     assert diagnosis.overall == result.UNKNOWN
     assert "left out do not repeat it" in " ".join(diagnosis.reasons)
     assert not any(" = c " in reason for reason in diagnosis.reasons)
@@ -189,7 +186,7 @@ def with_a_name_for_the_law(most: float) -> SyntheticModel:
     """A hidden drag of 0.02, and an effect of the very same form that is unusual beyond 0.005 and
     cannot exceed ``most``.
     """
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    model = SyntheticModel(law="speed", law_size=0.02, seed=3)
     model.effects = (
         EFFECTS[0],
         replace(EFFECTS[1], floor=1e-3, prior_sd=3e-3, bounds=(-0.1, most)),
@@ -266,7 +263,7 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
     """What acts where the law acts may be a part of its form; a force on the payload is none."""
     truth = {"effect_03": 15.0, "effect_06": 15.0}
     at = beside_a_law(
-        SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, truth=truth, seed=3),
+        SyntheticModel(law="speed", law_size=0.02, truth=truth, seed=3),
         [3, 6],
         DRAG,
     )
@@ -278,7 +275,7 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     """A force on the payload and its twin that pushes the vehicle as well: what tells them apart is
     a force on the vehicle.
     """
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3)
+    model = SyntheticModel(law="speed", law_size=0.02, seed=3)
     for w in model._windows:
         w.effects[:, 8] = w.effects[:, 6] + 0.2 * w.effects[:, 3]
     at = beside_a_law(model, [6, 8], DRAG)
@@ -300,15 +297,13 @@ def test_a_law_of_the_vehicle_may_turn_it_as_well():
 
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
-    model = SyntheticModel(
-        effects=EFFECTS, law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3
-    )
+    model = SyntheticModel(law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
     assert verdicts._law(beside_a_law(model, [3, 6], DRAG))[0] == {3, 6}
 
 
 def test_the_table_takes_up_what_no_name_explains():
     """Weights from some flights predict the hidden drag in a flight that they have not seen."""
-    model = SyntheticModel(effects=EFFECTS, law="speed", law_size=0.02, seed=3, throws=12)
+    model = SyntheticModel(law="speed", law_size=0.02, seed=3, throws=12)
     point = search.explain(model, laws=False).work.before
     table = table_of(point, default_rng(0))
     flights = [w.flight for w in point.windows]
@@ -332,7 +327,7 @@ def test_the_table_takes_up_what_no_name_explains():
 @mark.parametrize("days", [(), (0, 0, 1, 1, 2, 2)])
 def test_terms_are_screened_beside_what_varies(days):
     """Beside each flight's own share: else what flights have of their own is taken for a law."""
-    model = SyntheticModel(EFFECTS, law="swirl", law_size=0.02)
+    model = SyntheticModel(law="swirl", law_size=0.02)
     problem = Problem.of(model, model.windows({}), range(14))
     varies = Varies(days, {(0, FLIGHT): 5.0} | ({(4, DAY): 2.0} if days else {}))
     point = replace(linearise(problem, np.zeros(12)), varies=varies)

@@ -22,6 +22,7 @@ from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import derivative, relate
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import check, contradictions, table
+from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
 
 
@@ -593,3 +594,17 @@ def test_few_samples_of_an_accelerometer_say_nothing_of_gravity(count, judged):
     force = Channel(time[:count], np.tile([0.0, 0.0, 5.0], (count, 1)), *UNITS["acc_b"])
     rows = physics.look(with_channels(log, acc_b=force))
     assert any("mean force" in row.text for row in rows) == judged
+
+
+def test_delays_of_pieces_that_noise_hides_are_no_drift():
+    """A slow motion goes together with itself, but each piece tells its delay to 50 ms at best."""
+    rng, time = default_rng(0), np.arange(0.0, 40.0, 0.01)
+    pos = np.column_stack([np.sin(time), np.cos(time), 0.0 * time])
+    noisy = [pos + rng.normal(0.0, 0.3, pos.shape) * [1.0, 1.0, 0.0] for _ in range(2)]
+    log = log_at(time, pos_w=noisy[0], est_pos_w=noisy[1])
+    assert "the delay runs" not in faults(log, "warn")
+
+
+def test_values_in_steps_are_as_noisy_as_their_rounding():
+    values = np.round(np.linspace(0.0, 1.0, 400)[:, None], 1)
+    assert noise(Channel(0.01 * np.arange(400), values, "m")) == approx([0.1 / np.sqrt(12.0)])

@@ -265,6 +265,19 @@ def test_a_policy_that_is_compared_with_itself_is_numbered(dropper):
     assert unique_names([load_policy(dropper)] * 2) == ["dropper 1", "dropper 2"]
 
 
+def test_compare_throws_under_the_conditions_of_its_options(
+    dropper, tmp_path, refused, monkeypatch
+):
+    def throw(loaded, *conditions):
+        raise ConfigError(f"thrown {len(loaded)} {conditions}")
+
+    monkeypatch.setattr("visthrow.cli.compare.throw_hybrid", throw)
+    options = f"--targets 0.5 1 --throws 7 --seed 3 --device cpu --calibrate --out {tmp_path}"
+    refused(
+        f"compare {dropper} {dropper} {options}", said="thrown 2 ([0.5, 1.0], 7, 'cpu', 3, True)"
+    )
+
+
 def test_protocol_on_the_reference_plant(tmp_path, monkeypatch):
     """A drop from hover lands below the hover point, so far from the target as that is; in parts or
     as a whole.
