@@ -57,7 +57,7 @@ def pictures(name: str) -> list[np.ndarray]:
     """Draw a board in each of the poses, shape (H, W) of its lens."""
     board, lens = BOARDS[name], Fisheye(lens_of(name))
     middle = torch.from_numpy(board.corners_m().mean(0)).float()
-    samples, scale = 3, 60
+    samples, scale = (2 if name == "charuco" else 3), 60
     page = texture(board, scale)
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
     rays, seen = pixel_rays(lens, samples)

@@ -52,7 +52,7 @@ def test_without_noise_nothing_of_the_vehicle_passes_for_the_camera():
     flown = hover_start(quiet("vision_ideal", *errors))
     torch.manual_seed(0)
     with torch.inference_mode():
-        env, found = ThrowEnv(flown, "cpu", 0, 6), []
+        env, found = ThrowEnv(flown, "cpu", 0, 4), []
         env.fix_goal(torch.tensor([2.0, 0.0, 0.0]))
         calibrated_start(flown, found)(env)
         turn, scale = (

@@ -118,19 +118,6 @@ def test_each_audited_parameter_has_a_row(firmware):
     assert [name for name in parameters if not has_row(name)] == []
 
 
-@mark.parametrize("path", CHOICES)
-def test_each_choice_is_still_there(path):
-    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
-    bound = {
-        name
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign)
-        for target in node.targets
-        for name in names(target)
-    }
-    assert set(CHOICES[path].split()) - bound == set()
-
-
 def test_a_constant_without_a_source_is_found():
     assert offences("LEVELS_AFTER = 0.36\n", set()) == ["1: 0.36"]
     assert offences("ASK = 0.36\n", {"ASK"}) == []

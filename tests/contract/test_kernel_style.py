@@ -69,13 +69,6 @@ def test_arguments_of_kernels_are_grouped(path):
     assert not wrong
 
 
-def test_there_are_kernels_to_check():
-    found = [
-        kernel.name for path in (ROOT / "sim").rglob("*.py") for kernel in kernels(path.read_text())
-    ]
-    assert found
-
-
 @pytest.mark.parametrize(
     ("arguments", "count"),
     [

@@ -42,9 +42,3 @@ def test_no_public_module_silences_the_checker():
             encoding="utf-8"
         )
         assert not re.search(r"#\s*mypy:|#\s*type:\s*ignore(?!\[)", text), name
-
-
-def test_every_package_ships_its_types():
-    assert all(
-        (ROOT / package / "py.typed").is_file() for package in ("camera", "sim", "visthrow", "hil")
-    )

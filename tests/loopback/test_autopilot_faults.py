@@ -13,7 +13,7 @@ from pytest import approx, mark
 from hil.control.recording.record import RunRecorder
 from hil.control.state_machine import OperatorInput
 from tests.fakes.fake_px4 import HOLD
-from tests.hil_flight import AT_ONCE, NEVER, simple_policy
+from tests.hil_flight import AT_ONCE, NEVER
 from tests.level import LevelPlant
 from tests.loopback.wire import AUTOPILOTS, QUICK, cut, peers
 
@@ -325,20 +325,4 @@ def test_the_disk_is_full(tmp_path, full_at):
         assert states[-1] == "throw"
     recorder.close(summary)
     assert "No space left on device" in recorder.failed
-    assert fake.witness.releases == 0
-
-
-@mark.slow
-def test_the_fence_ends_a_policy_at_its_limits():
-    from visthrow.throws.wire_plant import make
-
-    fake, _, told = run(
-        "ardupilot",
-        4.0,
-        loaded=simple_policy((1.0, 1.0, -1.0, 1.0, -1.0)),
-        plant=make("state", 0),
-        overrides=("states.quiet=0.02",),
-    )
-    assert reason(told, "abort").startswith("fence: ")
-    assert when(told, "abort") - when(told, "throw") < 0.6
     assert fake.witness.releases == 0

@@ -80,7 +80,7 @@ def test_modes_that_others_have_set_are_set_again():
             assert fake.parameters[name] == value
 
 
-@mark.parametrize("name", ["stabilizer.controller", "flightmode.posSet", "hook.open"])
+@mark.parametrize("name", ["stabilizer.controller", "hook.open"])
 def test_nothing_flies_while_a_setting_is_missing(name):
     tables = []
     one = desk(tell=tables.append)

@@ -89,10 +89,6 @@ def test_a_fault_in_mid_throw(name):
     assert not runner.errors
 
 
-def test_every_fault_is_accounted_for():
-    assert ENDS | FLOWN_THROUGH | {"payload-lost", "rare"} == set(FAULTS)
-
-
 @mark.parametrize("name", ["swap", "order", "jump", "shuffle", "clock-forth"])
 def test_a_fault_as_the_policy_asks_for_the_release(name):
     """It asks from the first tick of the throw on; the fault is there from the start of the check:

@@ -65,15 +65,6 @@ def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulat
     assert reach <= ball.length * (1.0 + 1e-9)
 
 
-def test_a_release_at_a_steady_speed_falls_for_the_time_that_gravity_takes():
-    ball, speed = make_ball("vision", 0), np.array([1.0, 0.5, 0.0])
-    fly(ball, 4.0, lambda t: np.array([0.0, 0.0, 2.0]) + t * speed, release=3.0)
-    height = 2.0 + ball.mount_b[2] - ball.length - ball.ground
-    fall = ball.landing["landing_time"] - ball.landing["separation_time"]
-    assert fall == approx(math.sqrt(2.0 * height / 9.81), abs=0.02)
-    assert not ball.attached
-
-
 def test_a_ball_below_a_vehicle_on_the_ground_lies_there():
     ball = make_ball("vision", 0)
     fly(ball, 0.5, lambda t: np.array([0.0, 0.0, 0.1]))

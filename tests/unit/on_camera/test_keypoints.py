@@ -12,11 +12,10 @@ from camera.keypoints import (
     KeypointCamera,
     ball_extremes_c,
     by_rule,
-    goal_corners_w,
     keypoints,
     payload_keypoints,
 )
-from camera.mount import nominal_rot_cb, points_c_from_w, rotation_from_vector
+from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 
 f64 = partial(torch.tensor, dtype=torch.float64)
@@ -47,18 +46,6 @@ def scene(environments: int, dtype: torch.dtype = torch.float32):
         2.0 * normal(environments, 2),
         pos_w + 0.3 * normal(environments, 3),
     )
-
-
-def test_downward_mount_axes():
-    pos_w, rot_wb = hover(2.0)
-    front, left, below = [1.0, 0.0, 2.0], [0.0, 1.0, 2.0], [0.0, 0.0, 0.0]
-    points_w = f64([[front, left, below]])
-    points_c = points_c_from_w(
-        points_w, pos_w, rot_wb, nominal_rot_cb(MountParams()), torch.zeros(3, dtype=torch.float64)
-    )
-    # Front is up in the image (-y_c), left is left (-x_c), below is ahead of the lens (+z_c).
-    expected = f64([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 2.0]])
-    assert torch.allclose(points_c[0], expected, atol=1e-12)
 
 
 def test_mount_rotation_is_about_body_axes():
@@ -101,16 +88,6 @@ def test_extrinsic_error_moves_and_turns_the_camera():
     # bottom. Camera 0.1 m forward: atan(0.1) in the same direction.
     assert torch.allclose(middle[0], f64([0.0, angle / EDGE]), atol=1e-6)
     assert torch.allclose(middle[1], f64([0.0, math.atan(0.1) / EDGE]), atol=1e-4)
-
-
-def test_goal_corners_order_and_place():
-    corners = goal_corners_w(torch.tensor([[2.0, 1.0, 0.04]]), 0.25)
-    assert torch.equal(
-        corners[0],
-        torch.tensor(
-            [[2.125, 1.125, 0.0], [2.125, 0.875, 0.0], [1.875, 0.875, 0.0], [1.875, 1.125, 0.0]]
-        ),
-    )
 
 
 def test_goal_below_a_level_vehicle_closed_form():

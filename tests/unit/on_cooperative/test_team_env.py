@@ -49,29 +49,6 @@ def test_vehicles_of_a_world_start_around_one_load_with_one_goal(env):
     assert (heights.abs() < 0.1).all()
 
 
-def test_a_latch_trips_only_where_both_asked_a_message_ago(env):
-    one = torch.tensor([1.0, -1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0])
-    timer = env.views.state["release_timer"]
-    env.step(hover(env, one))
-    assert (timer < 0.0).all()  # nobody knows of the other yet
-    env.step(hover(env, -torch.ones(8)))
-    tripped = env._worlds(timer >= 0.0)
-    assert tripped.tolist() == [[False] * 2, [True] * 2, [False] * 2, [False] * 2]
-
-
-def test_a_world_ends_for_both_and_the_landing_is_the_last_ones(env):
-    actions = hover(env, torch.ones(8))
-    for _ in range(9):
-        _, reward, done, _ = env.step(actions)
-        if done.any():
-            break
-    assert torch.equal(done, torch.ones(8))
-    assert env.last["released"].all()
-    assert (env.last["apart"] == 0.0).all()
-    assert torch.equal(reward[::2] != 0.0, torch.ones(4, dtype=torch.bool))
-    assert (env.last["landing_w"][:, :2].norm(dim=-1) < 0.5).all()
-
-
 def test_faults_are_those_of_vehicle_zero():
     parts = members(as_flown(experiment(), "weak"))
     assert parts["vehicles"][0].thrust.gain == (0.9,) * 4

@@ -9,7 +9,7 @@ from hil.errors import RunError
 from hil.links.mavlink_link import Link, attitude_target
 from hil.links.pymav import mav
 from hil.rehearsal.fake import FakeOptions, Witness
-from hil.rehearsal.process import load_fake
+from hil.rehearsal.process import load_fake, load_plant
 from tests.level import LevelPlant
 from tests.loopback.wire import pipe
 from visthrow import config
@@ -101,3 +101,19 @@ def test_options_of_a_fake():
         load_fake("ardupilo")
     with raises(RunError, match="expected module:class"):
         load_fake("my-fakes:Fake")
+
+
+@mark.parametrize(
+    "name",
+    [
+        "nowhere:make",
+        "visthrow.throws.wire_plant:none",
+        "visthrow.throws.wire_plant",
+        "",
+        "os:system",
+        "math:pi",
+    ],
+)
+def test_plants_that_are_none(name):
+    with raises(RunError, match="expected module:function"):
+        load_plant(name, "state", 0)

@@ -190,18 +190,6 @@ def test_a_step_of_the_sources_clock_costs_nothing(step):
     assert body.accepted == 60
 
 
-def test_a_state_is_carried_forward():
-    body = track()
-    for i in range(5):
-        half = 0.01 * i / 2
-        body.update(pose(0.01 * i, 0.02 * i, (0.0, 0.0, math.sin(half), math.cos(half))))
-    state = body.state(0.05, lead=0.02)
-    assert_allclose(state.pos, (0.08 + 0.04, 0.0, 1.0), atol=1e-9)
-    assert_allclose(2 * math.asin(state.quat[2]), 0.06, atol=1e-5)
-    assert state.age == approx(0.01)
-    assert track().state(0.0) is None
-
-
 def test_the_monotonic_clock_keeps_its_speed():
     clock = MonotonicClock(4.0)
     start = clock.now()

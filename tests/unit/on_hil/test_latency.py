@@ -9,7 +9,6 @@ from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
 from hil.control.runner import Runner
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from tests.hil_flight import Spy, params, simple_policy
-from visthrow.view import parts
 
 BIN = 0.011
 """Relative width of a bin and a little: what a percentile may be off."""
@@ -49,9 +48,7 @@ def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
     assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
 
 
-def test_report_and_picture(tmp_path, monkeypatch):
-    figures, png_of = [], parts.png_of
-    monkeypatch.setattr(parts, "png_of", lambda figure: figures.append(figure) or png_of(figure))
+def test_report_and_picture(tmp_path):
     stages, rng, names = Stages(), default_rng(0), ["poll", "observation", "total"]
     for _ in range(500):
         stages.add(dict(zip(names, rng.gamma(4.0, 1e-4, 3).tolist())))
@@ -63,11 +60,6 @@ def test_report_and_picture(tmp_path, monkeypatch):
     assert "clock" not in lines[0]
     draw(tmp_path / "latency.png", stages, "a run")
     assert np.ptp(cv2.imread(str(tmp_path / "latency.png"))) > 200
-    labels = [text.get_text() for text in figures[0].legends[0].texts]
-    assert labels == [f"{name}: {STAGES[name]}" for name in names]
-    times, longer = figures[0].axes[0].lines[2].get_data()
-    median = stages.summary()["total"]["p50_ms"]
-    assert np.interp(-0.5, -longer, times) == approx(median, rel=0.03)
     draw(tmp_path / "empty.png", Stages(), "nothing flown")
 
 

@@ -236,22 +236,6 @@ def test_the_estimate_of_a_ulg_takes_the_attitude_before_it(tmp_path):
         read_ulg(path, (LogBody("vehicle", "vehicle_local_position"),))
 
 
-def test_a_topic_without_an_attitude_says_so(tmp_path):
-    importorskip("pyulog")
-    path = tmp_path / "a.ulg"
-    files.write_ulg(
-        path,
-        {
-            ("vehicle_odometry", 0): (
-                ["uint64_t timestamp", "float[3] position"],
-                [(1, 0.0, 0.0, 0.0)],
-            )
-        },
-    )
-    with raises(SourceError, match="vehicle_odometry gives no attitude"):
-        read_ulg(path, (LogBody("vehicle", "vehicle_odometry"),))
-
-
 def test_a_log_is_recorded_and_replayed(tmp_path, printed):
     """Vehicle and payload from two loggers through `hil record`, in MAVLink's frames, the policy
     looking on.

@@ -109,3 +109,16 @@ def test_no_bytes_make_the_back_end_raise_or_command():
 @mark.parametrize("seed", SEEDS)
 def test_a_million_byte_strings(seed):
     fuzz(EACH, seed)
+
+
+def test_nothing_is_sent_before_the_order_of_the_channels_is_known():
+    here, _ = pipe()
+    backend = Betaflight(here, load_run("fake_betaflight", ["betaflight.audit=false"]).betaflight)
+    modes = msp.Frame(msp.BOXIDS, bytes([0, 1, 27, 50]), msp.ANSWER)
+    order = msp.Frame(msp.RX_MAP, bytes([0, 1, 3, 2, 4, 5, 6, 7]), msp.ANSWER)
+    for time, frames, known in ((0.1, (HELLO, modes), False), (0.2, (order,), True)):
+        here.inbox.extend(map(msp.pack, frames))
+        backend.service(time)
+        backend.ask("follow", time)
+        assert backend.status(time).connected == known
+        assert backend.send((2.668, 0.0, 0.0, 0.0), time) == known

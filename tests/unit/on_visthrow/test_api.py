@@ -5,7 +5,6 @@ from pytest import raises
 import visthrow
 from visthrow.cli import api
 from visthrow.common.errors import VisthrowError
-from visthrow.training import trainer
 
 
 def test_keywords_become_options():
@@ -19,18 +18,6 @@ def test_keywords_become_options():
     ]
     assert api._words("--no-report", True, False) == ["--no-report"]
     assert api._words("--json", None, False) == []
-
-
-def test_a_throw_a_comparison_and_a_training(tmp_path, monkeypatch):
-    monkeypatch.setattr(trainer, "EVALUATED", 4)
-    log = visthrow.fly("state", target=1.5, device="cpu", out=tmp_path / "fly")
-    assert log.meta["goal_w"][0] == 1.5
-    figures = visthrow.compare("state", throws=2, targets=[2.0], device="cpu", out=tmp_path / "c")
-    assert figures
-    policy = visthrow.train(
-        "laptop", iterations=1, set={"ppo.environments": 64}, device="cpu", out=tmp_path / "t"
-    )
-    assert policy.action_dim == 5
 
 
 def test_mistakes_raise():

@@ -68,22 +68,6 @@ def test_coverage_of_a_ratio_and_a_difference():
     assert abs(share - 0.95) < COVERAGE
 
 
-def test_throws_alone_miss_the_scatter_between_runs():
-    """Eight runs whose true means scatter: pooling their throws claims far too much, two levels do
-    not.
-    """
-    rng = default_rng(4)
-    pooled = two = 0
-    for _ in range(150):
-        groups = [rng.normal(m, 0.01, 100) for m in rng.normal(0.03, 0.01, 8)]
-        pooled += 0.03 in st.mean(np.concatenate(groups), draws=400)
-        two += 0.03 in st.mean(groups, draws=400)
-    assert pooled / 150 < 0.6
-    assert (
-        two / 150 > 0.85
-    )  # the percentile interval of eight runs is known to be short: 0.90 expected
-
-
 def test_pairs_remove_what_both_share():
     rng = default_rng(5)
     shared = rng.normal(0.0, 0.1, 200)
