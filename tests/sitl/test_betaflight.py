@@ -9,11 +9,9 @@ it is not set."""
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import sysconfig
-import time
 from pathlib import Path
 
 import numpy as np
@@ -86,9 +84,6 @@ Throws on a quiet machine land 0.02 to 0.15 m off.
 
 ON = 10.0
 """Flown on after a landing [s]: the runner hovers again 3 s and has landed 6 s after it."""
-
-OVER = {"armed": 4.0, "throw": 5.0}
-"""The time of a run that is over in hover and in a throw [s]."""
 
 LONG = 200.0
 """A run on a busy machine [s]."""
@@ -330,8 +325,12 @@ def test_under_msp_override_the_audit_knows_what_silence_does(tmp_path, state):
     assert told["back"] < 0.2, "the pilot's switch gives the sticks back"
 
 
-@mark.parametrize("state", endings.STATES)
-@mark.parametrize("way", [*endings.REASONS, "output raises", "SIGINT twice"])
+WAYS = [("SIGINT", "armed"), ("SIGINT twice", "armed")]
+WAYS += [(way, "throw") for way in ("SIGINT", "SIGINT twice", "source raises", "output raises")]
+"""Signals and the end of the time are one to the autopilot: `tests/loopback/test_endings.py`."""
+
+
+@mark.parametrize(("way", "state"), WAYS)
 def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeypatch):
     """In hover and in a throw: the runner descends, except where it is gone at once, and the
     firmware disarms when it falls silent.
@@ -342,7 +341,6 @@ def test_every_way_to_end_brings_it_down(tmp_path, settings, way, state, monkeyp
     )  # [s]; without poses nothing is sent, and after 1.5 s the firmware would disarm
     overrides = (*endings.QUICK, f"states.abort={abort}", *endings.STATES[state])
     params = load_run("betaflight_sitl", overrides)
-    monkeypatch.setattr(endings, "OVER", OVER[state])
     if way == "SIGINT twice":
         endings.twice(monkeypatch)
     reason = {
@@ -427,27 +425,3 @@ def test_a_whole_throw(tmp_path):
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
 
 
-def test_a_runner_that_is_killed_leaves_the_firmware_to_its_failsafe(tmp_path):
-    """SIGKILL in a throw: the motors stop and it disarms, with nothing of the runner left."""
-    endings.NEVER.save(tmp_path / "never.npz")
-    overrides = (f'policy="{tmp_path / "never.npz"}"', *endings.QUICK)
-    report, run = tmp_path / "report.json", tmp_path / "run"
-    bridge = bridged(tmp_path / "firmware", report)
-    runner = None
-    try:
-        wait_for(bridge, "it flies")
-        runner = running(run, *overrides)
-        wait_for(runner, " s  throw ")
-        time.sleep(0.3 / SPEED)
-        runner.kill()
-        time.sleep(2.0 * DISARM[1] / SPEED)
-        bridge.send_signal(signal.SIGINT)
-        bridge.communicate(timeout=LONG)
-    finally:
-        bridge.kill()
-        if runner is not None:
-            runner.kill()
-    found = json.loads(report.read_text())
-    told = [text for _, text in found["events"]]
-    assert told == ["armed", "disarmed"], found["events"]
-    assert not found["armed"]

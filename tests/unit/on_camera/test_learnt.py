@@ -25,7 +25,6 @@ from visthrow import config
 from visthrow.detector_training.fit_detector import (
     FitParams,
     Labels,
-    _angle_between,
     offsets,
     other_lens,
     platt,
@@ -133,12 +132,6 @@ def test_corners_are_told_in_one_order():
             made.distractor,
         )
         assert offsets("goal", views, found, turned, torch.tensor([0])).abs().max() < 1e-6
-
-
-def test_angles_go_up_to_half_a_turn():
-    ahead = ray(0.0, 0.0)
-    for angle in (1e-6, 1.0, 2.0, math.pi):
-        assert float(_angle_between(ray(angle, 0.3), ahead)) == approx(angle, rel=1e-5)
 
 
 def test_probabilities_are_calibrated():

@@ -34,21 +34,6 @@ def hover(env: TeamEnv, rho: torch.Tensor) -> torch.Tensor:
     return actions
 
 
-def test_vehicles_of_a_world_start_around_one_load_with_one_goal(env):
-    state, load = env.views.state, env._rows(env.load_w)
-    length = env._segment * env.cfg.rope.segments
-    mounts = state["pos_w"] + (state["quat_wb"][:, :3] * 0.0)
-    distance = (mounts - load).norm(dim=-1)
-    assert torch.allclose(distance, length, atol=0.03)
-    goals = env._worlds(env.views.goal_w)
-    assert torch.equal(goals[:, 0], goals[:, 1])
-    assert len(goals[:, 0].unique(dim=0)) == env.worlds
-    separation = env._worlds(state["pos_w"]).diff(dim=1).norm(dim=-1)
-    assert (separation > 0.4).all()
-    heights = state["pos_w"][:, 2] - env.cfg.task.start.spawn_height
-    assert (heights.abs() < 0.1).all()
-
-
 def test_faults_are_those_of_vehicle_zero():
     parts = members(as_flown(experiment(), "weak"))
     assert parts["vehicles"][0].thrust.gain == (0.9,) * 4

@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
-from camera.detectors.following import GATE, LOST
 from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
@@ -184,44 +183,6 @@ def test_pictures_of_another_lens_give_the_keypoints_of_training(folder):
         assert valid.all()
         assert np.abs(points[0] - true_keypoints(i)).max() < WORST
     assert source.poll(99.0) == []
-
-
-def told(looker, picture, stamp, hint, blind=False):
-    """A detection, and what the detector was told for it; a blind one sees nothing."""
-    kept, detect = [], looker.detector.detect
-
-    def listen(image, prior):
-        kept.append(prior)
-        return FrameDetections(None, None) if blind else detect(image, prior)
-
-    looker.detector.detect = listen
-    looker.hint = hint
-    detection = looker.look(picture, stamp)
-    looker.detector.detect = detect
-    return detection, kept[0]
-
-
-def test_a_ball_that_is_missed_is_looked_for_ever_wider_and_reads_as_it_swings_while_that_is_known(
-    folder, pictures
-):
-    looker = Eyes(params(folder), training())
-    pos, vector, _ = pose(0)
-    hint = Hint(tuple(pos.tolist()), quaternion(vector), (0.2, 0.6))
-    for k in range(5):
-        first, _ = told(looker, pictures[0], 0.02 * k, hint)
-    before = 0.0
-    for stamp in (0.1, 0.12, 0.14, 0.4):
-        detection, prior = told(looker, pictures[0], stamp, hint, blind=True)
-        assert prior.ball_within > before
-        before = prior.ball_within
-        assert detection.corners is None, "a goal that is missed is not held"
-        assert (detection.ball is not None) == (prior.ball_within < GATE * LOST) == (stamp < 0.2)
-        if detection.ball is not None:
-            assert_allclose(detection.ball[:3], prior.ball_ray_c, atol=1e-9)
-            assert_allclose(detection.ball, first.ball, atol=0.03)
-    assert told(looker, pictures[0], 0.42, hint)[0].ball == approx(first.ball), (
-        "and it is found again"
-    )
 
 
 def test_only_the_newest_of_several_pictures_is_looked_at(folder):

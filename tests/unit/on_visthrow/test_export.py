@@ -17,44 +17,11 @@ THROWS, STEPS = 100, 10
 TOLERANCE = 1e-5
 """float32 sums in another order; actions are of the size of 1."""
 SHIPPED = ("state", "vision", "any")
+"""The second one has a memory."""
 FLAGS = ["-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-shared", "-fPIC"]
 
 
-def recurrent_policy(seed: int = 5) -> Policy:
-    """Return a small policy with a memory, random weights."""
-    from visthrow.onboard.estimator import Estimator
-
-    draw = torch.Generator().manual_seed(seed)
-
-    def normal(*shape):
-        return torch.randn(*shape, generator=draw) / shape[-1] ** 0.5
-
-    estimator = Estimator(
-        mean=normal(6),
-        std=1.0 + normal(6).abs(),
-        encoder_weight=normal(8, 6),
-        encoder_bias=normal(8),
-        inner=((normal(9, 8), normal(9)), (normal(7, 9), normal(7))),
-        input_weight=normal(15, 7),
-        input_bias=normal(15),
-        memory_weight=normal(15, 5),
-        memory_bias=normal(15),
-        output_weight=normal(4, 5),
-        output_bias=normal(4),
-        kept=torch.tensor([0, 6, 2, 6]),
-    )
-    weights = (normal(7, 4), normal(5, 7))
-    return Policy(weights, (normal(7), normal(5)), "elu", {}, estimator=estimator)
-
-
-def policies() -> dict[str, Policy]:
-    """Return the shipped policies and one with a memory."""
-    return {name: Policy.load(find_policy(name)) for name in SHIPPED} | {
-        "recurrent": recurrent_policy()
-    }
-
-
-POLICIES = policies()
+POLICIES = {name: Policy.load(find_policy(name)) for name in SHIPPED}
 
 
 def rollout(policy: Policy) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +57,7 @@ def test_onnx_gives_the_policys_actions(name, tmp_path):
         assert_allclose(outputs[0], action, rtol=0.0, atol=TOLERANCE)
 
 
-@mark.parametrize("name", ["state", "recurrent"])
+@mark.parametrize("name", ["state", "vision"])
 def test_c_gives_the_policys_actions_without_a_heap(name, tmp_path):
     from visthrow.cli.export.c_source import write_c
 
