@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal
 
 import torch
 
@@ -17,6 +16,7 @@ from camera.mount import rotate
 from camera.params import FisheyeParams
 
 GROUND_LIGHT, GROUND_DARK = 0.62, 0.50
+YELLOW = (0.80, 0.88, 0.20)
 TILE = 0.5
 """Side of the ground's tiles [m]."""
 
@@ -25,13 +25,12 @@ LIGHT_W = (0.35, 0.25, 0.9)
 
 
 @dataclass(frozen=True)
-class Clutter:
-    """Something in the room that is neither goal nor payload."""
+class Mat:
+    """A coloured rectangle on the ground that is no goal."""
 
-    shape: Literal["disc", "rectangle", "ball"]  # the first two lie on the ground
-    centre_w: tuple[float, float, float]  # [m], world frame; height 0 where it lies on the ground
-    size: tuple[float, float]  # half sides of a rectangle; radius, twice, of the others [m]
-    yaw: float  # of a rectangle [rad]
+    centre_w: tuple[float, float]  # [m], world frame
+    size: tuple[float, float]  # half sides [m]
+    yaw: float  # [rad]
     colour: tuple[float, float, float]  # RGB in [0, 1]
 
 
@@ -69,7 +68,8 @@ def render_scene(
     ball_radius: float = 0.033,
     goal_side: float = 0.25,
     supersample: int = 2,
-    clutter: Sequence[Clutter] = (),
+    mats: Sequence[Mat] = (),
+    felt: tuple[float, float, float] = YELLOW,
 ) -> torch.Tensor:
     """Draw ball, goal square and ground as the camera sees them.
 
@@ -82,7 +82,8 @@ def render_scene(
         ball_radius: [m].
         goal_side: Side of the goal square, along the world's axes [m].
         supersample: Samples a pixel along each axis, averaged.
-        clutter: What else there is; what lies on the ground lies below the goal square.
+        mats: What else lies on the ground, below the goal square.
+        felt: Colour of the ball, RGB in [0, 1].
 
     Returns:
         Colours in [0, 1], RGB, float32, shape (H, W, 3); black outside the field of view.
@@ -94,19 +95,10 @@ def render_scene(
     down = rays_w[..., 2] < -1e-9
     depth = -eye_w[2] / torch.where(down, rays_w[..., 2], torch.full_like(rays_w[..., 2], -1.0))
     ground_w = eye_w + rays_w * depth.unsqueeze(-1)
-    ground = _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, clutter)
+    ground = _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, mats)
     colour = torch.where((down & (depth > 0.0)).unsqueeze(-1), ground, colour)
-    balls = [
-        (torch.tensor(c.centre_w, dtype=torch.float64), c.size[0], _rgb(*c.colour))
-        for c in clutter
-        if c.shape == "ball"
-    ]
-    balls.sort(key=lambda found: -float((found[0] - eye_w).norm()))  # the nearest is drawn last
-    for centre_w, radius, felt in balls:
-        hit, normal_w = _sphere(eye_w, rays_w, centre_w, radius)
-        colour = torch.where(hit.unsqueeze(-1), felt * _lit(normal_w), colour)
     hit, normal_w = _sphere(eye_w, rays_w, ball_w.double(), ball_radius)
-    colour = torch.where(hit.unsqueeze(-1), _ball(normal_w), colour)
+    colour = torch.where(hit.unsqueeze(-1), _ball(normal_w, felt), colour)
     colour = colour * seen.unsqueeze(-1)
     return _average(colour, supersample)
 
@@ -127,28 +119,21 @@ def _sky(rays_w: torch.Tensor) -> torch.Tensor:
     return _rgb(0.30, 0.33, 0.38) + height * _rgb(0.35, 0.36, 0.37)
 
 
-def _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, clutter) -> torch.Tensor:
-    """Tiles that fade with the distance (no aliasing near the horizon), clutter, the goal square
+def _ground(ground_w, depth, goal_w, goal_side, ball_w, ball_radius, mats) -> torch.Tensor:
+    """Tiles that fade with the distance (no aliasing near the horizon), mats, the goal square
     with its rim, the ball's shadow.
     """
     tile = (ground_w[..., :2] / TILE).floor().sum(-1) % 2
     fade = (-depth / 6.0).exp()
     shade = GROUND_DARK + (GROUND_LIGHT - GROUND_DARK) * (0.5 + (tile - 0.5) * fade)
     colour = shade.unsqueeze(-1) * _rgb(1.0, 0.98, 0.94)
-    for thing in clutter:
-        if thing.shape == "ball":
-            continue
-        x, y = (ground_w[..., :2] - torch.tensor(thing.centre_w[:2], dtype=torch.float64)).unbind(
-            -1
-        )
-        c, s = math.cos(thing.yaw), math.sin(thing.yaw)
-        across, along = (c * x + s * y) / thing.size[0], (c * y - s * x) / thing.size[1]
-        covered = (
-            across**2 + along**2 < 1.0
-            if thing.shape == "disc"
-            else torch.maximum(across.abs(), along.abs()) < 1.0
-        )
-        colour = torch.where(covered.unsqueeze(-1), _rgb(*thing.colour), colour)
+    for mat in mats:
+        away = ground_w[..., :2] - torch.tensor(mat.centre_w, dtype=torch.float64)
+        x, y = away.unbind(-1)
+        c, s = math.cos(mat.yaw), math.sin(mat.yaw)
+        across, along = (c * x + s * y) / mat.size[0], (c * y - s * x) / mat.size[1]
+        covered = torch.maximum(across.abs(), along.abs()) < 1.0
+        colour = torch.where(covered.unsqueeze(-1), _rgb(*mat.colour), colour)
     reach = (ground_w[..., :2] - goal_w[:2].double()).abs().amax(-1)
     colour = torch.where((reach < goal_side / 2).unsqueeze(-1), _rgb(0.93, 0.93, 0.90), colour)
     colour = torch.where(
@@ -170,12 +155,12 @@ def _sphere(eye_w, rays_w, centre_w, radius) -> tuple[torch.Tensor, torch.Tensor
     return hit, (rays_w * depth.unsqueeze(-1) - to_centre) / radius
 
 
-def _ball(normal_w: torch.Tensor) -> torch.Tensor:
+def _ball(normal_w: torch.Tensor, felt: tuple[float, float, float]) -> torch.Tensor:
     """A tennis ball: felt with a seam, lit by one lamp."""
     turn = torch.atan2(normal_w[..., 1], normal_w[..., 0])
     seam = (normal_w[..., 2] - 0.45 * (2.0 * turn).sin()).abs() < math.sin(0.09)
-    felt = torch.where(seam.unsqueeze(-1), _rgb(0.95, 0.95, 0.92), _rgb(0.80, 0.88, 0.20))
-    return felt * _lit(normal_w)
+    colour = torch.where(seam.unsqueeze(-1), _rgb(0.95, 0.95, 0.92), _rgb(*felt))
+    return colour * _lit(normal_w)
 
 
 def _lit(normal_w: torch.Tensor) -> torch.Tensor:

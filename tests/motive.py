@@ -67,9 +67,9 @@ class Motive:
             elif data[:2] == b"\4\0":
                 self._socket.sendto(models({7: "quad", 8: "ball"}), sender)
 
-    def send(self, data: bytes, to: tuple[str, int] | None = None) -> None:
-        """Send a datagram, to the client where no address is given."""
-        self._socket.sendto(data, to or self.client)
+    def send(self, data: bytes) -> None:
+        """Send a datagram to the client."""
+        self._socket.sendto(data, self.client)
 
     def close(self) -> None:
         """Stop."""

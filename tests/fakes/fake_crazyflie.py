@@ -2,14 +2,14 @@
 bridge beside it.
 
 Written from the source alone, not from the back-end: `hil.links.facts`, crazyflie, has file and
-line of each behaviour. Packets are decoded (crtp_commander_rpyt.c, crtp_commander_generic.c), kept
+line of each behaviour. Packets are decoded (crtp_commander_generic.c), kept
 by priority (commander.c), cut by the supervisor's states (supervisor_state_machine.c), and flown as
-the PID controller takes them (controller_pid.c): roll and pitch as rates or angles, yaw as a rate
-that moves the yaw that is held. What follows the rates is the vehicle of the training. A set-point
+the PID controller takes them (controller_pid.c): roll and pitch as rates, yaw as a rate that moves
+the yaw that is held. What follows the rates is the vehicle of the training. A set-point
 of a place is held by the fakes' own controller.
 
-Left out: the legacy modes althold, poshold and posSet (nothing flies then), trajectories, DSHOT's
-check of the rotors, and the integral of roll and pitch angles."""
+Left out: what the back-end never sends (legacy set-points, angles, trajectories), DSHOT's check of
+the rotors, and the integral of roll and pitch angles."""
 
 import math
 import struct
@@ -26,7 +26,6 @@ from visthrow.onboard.hover import GRAVITY
 
 FACTS = values("crazyflie")
 HOOK = "hook.open"  # parameter of the app that moves the mechanism
-ANGLES = ("flightmode.stabModeRoll", "flightmode.stabModePitch", "flightmode.stabModeYaw")
 DEFAULTS = {"flightmode.stabModeRoll": 1, "flightmode.stabModePitch": 1, "stabilizer.controller": 0}
 """Parameters that the firmware starts with, where these are not what they have to be."""
 
@@ -49,14 +48,13 @@ VARIABLES = (*(f"motor.{letter}" for letter in "abcdefghijk"), *GYRO, "pm.vbat")
 
 @dataclass(frozen=True)
 class SetPoint:
-    """What the commander holds: angles and rates in degrees, as its packets have them."""
+    """What the commander holds: rates in degrees a second, as its packets have them."""
 
     time: float = -math.inf  # when it came [s]
     roll: float = 0.0
     pitch: float = 0.0
     yaw: float = 0.0
     thrust: float = 0.0  # of 65535
-    rates: tuple[bool, bool, bool] = (True, True, True)  # roll, pitch, yaw; else angles
     place_w: tuple[float, ...] | None = None  # [m]; None: none is held
 
 
@@ -89,7 +87,6 @@ class FakeCrazyflie(PortFake):
         self.protocol, self.priority, self.hook_opens = FACTS["protocol_state"], 0, 1
         self.supervisor = PASSED
         self.held = SetPoint()  # by the commander
-        self._locked = FACTS["thrust_locked"]  # thrust of legacy set-points
         self._begun = False  # whether somebody holds it in the hand no longer
         self._turned = -math.inf  # of the supervisor [s]
         self._since = self._thrust_at = 0.0  # of the supervisor's state, of the last thrust [s]
@@ -107,7 +104,6 @@ class FakeCrazyflie(PortFake):
             return
         port, channel = data[0] >> FACTS["header_shift"], data[0] & 3
         places = {
-            (FACTS["port_setpoint"], 0): self._legacy,
             (FACTS["port_generic"], FACTS["channel_set_point"]): self._generic,
             (FACTS["port_localization"], FACTS["channel_pose"]): self._pose,
             (FACTS["port_supervisor"], FACTS["channel_info"]): self._tell_state,
@@ -125,39 +121,16 @@ class FakeCrazyflie(PortFake):
         header = bytes([FACTS[port] << FACTS["header_shift"] | FACTS[channel]])
         self.later(self.options.answer_delay, lambda: self.port.write(header + data))
 
-    def _legacy(self, data: bytes) -> None:
-        """Take a legacy set-point: roll, pitch, yaw, thrust."""
-        roll, pitch, yaw, thrust = struct.unpack_from("<3fH", data)
-        if self.priority == 0:
-            self._locked = True
-        if thrust == 0:
-            self._locked = False
-        none = self._locked or thrust < FACTS["legacy_least"]
-        mode = {name: self.parameters[f"flightmode.{name}"] for name in ("althold", "poshold")}
-        if mode["althold"] or mode["poshold"] or self.parameters["flightmode.posSet"]:
-            self.happened("legacy set-point in another mode")
-            none = True
-        rates = tuple(self.parameters[name] == 0 for name in ANGLES)
-        yaw = FACTS["legacy_yaw_sign"] * yaw if rates[2] else yaw
-        thrust = 0 if none else min(thrust, FACTS["legacy_most"])
-        self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust, rates))
-
     def _generic(self, data: bytes) -> None:
-        """Take a generic set-point; one of an unknown type stops the motors."""
+        """Take a set-point of body rates or of a place."""
         kind, data = data[0], data[1:]
         if kind == FACTS["manual"]:
-            if len(data) != struct.calcsize("<3fHb"):
-                self.happened("assertion failed: restarted")
-                self._go(LOCKED)
-                return
             roll, pitch, yaw, thrust, rate = struct.unpack("<3fHb", data)
-            rates = (rate == FACTS["manual_rate"],) * 2
-            self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust, (*rates, True)))
+            assert rate == FACTS["manual_rate"], "angles are never sent"
+            self._commanded(SetPoint(self.plant.time, roll, pitch, yaw, thrust))
         elif kind == FACTS["position"]:
             *place, yaw = struct.unpack_from("<4f", data)
             self._commanded(SetPoint(self.plant.time, yaw=yaw, place_w=tuple(place)))
-        else:
-            self._commanded(SetPoint(self.plant.time))
 
     def _commanded(self, set_point: SetPoint) -> None:
         """Hand a set-point to the commander, which drops it where another one has priority."""
@@ -367,23 +340,14 @@ class FakeCrazyflie(PortFake):
 
     def _rates(self, target: np.ndarray) -> np.ndarray:
         """Return the body rates that the PID controller asks for [rad/s], forward, left, up."""
-        rates, level = target[1:].copy(), self.supervisor == LEVEL
-        x, y, z, w = map(float, self.plant.state["quat_wb"])
-        angles = (
-            math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
-            math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0)),
-        )
-        for axis in range(2):
-            if level or not self.held.rates[axis]:
-                wanted = 0.0 if level else rates[axis]
-                rates[axis] = FACTS["level_p"] * (wanted - angles[axis])
+        rates = target[1:].copy()
+        if self.supervisor == LEVEL:
+            x, y, z, w = map(float, self.plant.state["quat_wb"])
+            roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+            pitch = math.asin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
+            rates = FACTS["level_p"] * np.array([-roll, -pitch, 0.0])
         dt, turned = self.plant.period, float(self.plant.state["rate_b"][2])
-        if level:
-            rates[2] = 0.0
-        if self.held.rates[2] or level:
-            self._yaw_held += rates[2] * dt
-        else:
-            self._yaw_held = rates[2]
+        self._yaw_held += rates[2] * dt
         error = math.remainder(self._yaw_held - self._heading(), 2.0 * math.pi)
         self._yaw_sum += error * dt
         rates[2] = FACTS["yaw_p"] * error + FACTS["yaw_i"] * self._yaw_sum - FACTS["yaw_d"] * turned

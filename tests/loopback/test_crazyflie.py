@@ -3,7 +3,6 @@
 Throws over CRTP, signs, priorities, silence, versions, and what each refuses.
 """
 
-import math
 import socket
 import struct
 import sys
@@ -18,14 +17,9 @@ from hil.links import crtp
 from hil.links.backends import make_backend
 from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
 from hil.links.backends.crazyflie import MODES, Crazyflie
-from hil.links.device import Device, UdpPort
 from hil.links.facts import values
-from hil.links.mavlink_link import Link
-from hil.rehearsal.fake import VEHICLE_ID
 from tests.configs import load_run
-from tests.fakes.fake_crazyflie import CRASHED, FLYING, LEVEL, LOCKED, FakeCrazyflie
-from tests.fakes.ports import AnsweringPort
-from tests.level import LevelPlant
+from tests.fakes.fake_crazyflie import CRASHED, FLYING, LEVEL, LOCKED
 from tests.loopback.test_backends import HOVER, Desk
 
 FACTS = values("crazyflie")
@@ -186,29 +180,6 @@ def test_packets_and_devices(monkeypatch):
     with raises(LinkError, match="crazyflie"):
         crtp.open_crtp("radio://0/80/2M", False)
     assert Crazyflie.holds is False
-
-
-def test_by_udp():
-    """The software in the loop's datagrams: heard, set, armed."""
-    number, poses = free_port(), free_port()
-    over = [
-        f'crazyflie.device="udpout:127.0.0.1:{number}"',
-        f'link.device="udp:127.0.0.1:{poses}"',
-    ]
-    params = load_run("fake_crazyflie", over)
-    port = AnsweringPort(Device("udp", "127.0.0.1", number))
-    link = Link(UdpPort(Device("udpout", "127.0.0.1", poses)), *VEHICLE_ID)
-    fake, backend = FakeCrazyflie(LevelPlant(), link, port=port), make_backend(params)
-    try:
-        for _ in range(400):
-            backend.ask(FOLLOW, fake.plant.time)
-            backend.service(fake.plant.time)
-            fake.step()
-        assert backend.status(fake.plant.time).mode == FOLLOW
-        assert math.isfinite(fake.plant.time)
-    finally:
-        backend.close()
-        fake.close()
 
 
 def test_nobody_else_speaks_for_a_crazyflie():

@@ -1,14 +1,12 @@
 """The ball below PX4's own vehicle: its laws, and the bridge against a fake of the other side."""
 
 import math
-import threading
 
 import numpy as np
 from numpy.testing import assert_allclose
 from pytest import approx, fixture
 
 from bench.processes import free_port
-from hil.links.clock import MonotonicClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.links.pymav import mav
@@ -16,7 +14,6 @@ from hil.rehearsal.bridges.px4_bridge import ORIGIN, Motion, Place, Px4Sih
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_command import make_ball
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from hil.rehearsal.process import serve
 from tests.configs import load_run
 
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
@@ -63,13 +60,6 @@ def test_a_small_swing_has_the_period_of_a_pendulum_and_halves_as_in_the_simulat
     assert late / early == approx(0.25, abs=0.05)
     reach = np.linalg.norm(track[-1, 1:] - [0.02, 0.0, 2.0 + ball.mount_b[2]])
     assert reach <= ball.length * (1.0 + 1e-9)
-
-
-def test_a_ball_below_a_vehicle_on_the_ground_lies_there():
-    ball = make_ball("vision", 0)
-    fly(ball, 0.5, lambda t: np.array([0.0, 0.0, 0.1]))
-    assert ball.state["payload_pos_w"][2] == approx(ball.ground)
-    assert ball.attached
 
 
 class OtherSide:
@@ -191,22 +181,3 @@ def test_an_output_that_was_open_before_releases_nothing(bridge):
         if n == 150:
             assert bridge.report()["releases"] == 0
     assert bridge.report()["releases"] == 1
-
-
-def test_a_px4_that_is_slower_than_the_wall_keeps_the_time(bridge):
-    """On a clock of its own the bridge would run ahead of the vehicle, and show it where it was."""
-    done = threading.Event()
-
-    def speak():
-        for n in range(10_000):
-            bridge.other.say(7.0 + 0.005 * n, (0.01 * n, 0.0, -1.333), 0.0, 2000)
-            if done.wait(0.01):
-                return
-
-    thread = threading.Thread(target=speak)
-    thread.start()
-    report = serve(bridge, MonotonicClock(), 1.0)
-    done.set()
-    thread.join()
-    assert report["speed"] < 0.8
-    assert abs(bridge.plant.until - bridge.plant.time) < 0.011

@@ -423,5 +423,3 @@ def test_a_whole_throw(tmp_path):
     # lands at once. On time it hovers again, as the throws in lock step say.
     assert "hovering again" in states or "after the throw, fence" in states
     assert list(folder.glob("LOG*")), "the firmware wrote its blackbox"
-
-

@@ -23,11 +23,10 @@ from camera.detectors.contours import (
     detected_keypoints,
     ordered_corners,
 )
-from camera.detectors.edges import cone_fit
 from camera.keypoints import KeypointCamera, goal_square, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
-from tests.drawn import Clutter, render_scene
+from tests.drawn import YELLOW, Mat, render_scene
 
 f64 = partial(torch.tensor, dtype=torch.float64)
 
@@ -43,15 +42,10 @@ POS = f64([[0.1, 0.0, 1.3]])
 ROT = rotation_from_vector(f64([[0.05, 0.3, 0.1]]))
 BALL = f64([[0.12, 0.05, 0.9]])
 GOAL = f64([[0.9, -0.3]])
-GREEN, YELLOW = (0.16, 0.55, 0.26), (0.80, 0.88, 0.20)
-CLUTTER = (
-    Clutter(
-        "rectangle", (0.4, 0.6, 0.0), (0.12, 0.12), 0.3, GREEN
-    ),  # of the goal's colour and size, without a rim
-    Clutter(
-        "rectangle", (-0.5, 0.3, 0.0), (0.15, 0.05), 0.8, YELLOW
-    ),  # of the ball's colour, not round
-    Clutter("ball", (0.0, -0.7, 0.1), (0.1, 0.1), 0.0, (0.2, 0.2, 0.8)),
+GREEN, BLUE = (0.16, 0.55, 0.26), (0.2, 0.2, 0.8)
+MATS = (
+    Mat((0.4, 0.6), (0.12, 0.12), 0.3, GREEN),  # of the goal's colour and size, without a rim
+    Mat((-0.5, 0.3), (0.15, 0.05), 0.8, YELLOW),  # of the ball's colour, not round
 )
 TOLERANCE = 0.8
 """Of any keypoint on a clean frame of 400 pixels [px]; over random frames of 640 the RMS is a third
@@ -59,11 +53,10 @@ of that.
 """
 
 
-def rendered(clutter=(), goal=GOAL, ball=BALL) -> np.ndarray:
+def rendered(goal=GOAL, ball=BALL, **other) -> np.ndarray:
     eye = POS[0] + ROT[0] @ CAMERA.position_b
-    return render_scene(
-        CAMERA.fisheye, eye, ROT[0] @ CAMERA.rot_cb.T, goal[0], ball[0], 0.033, 0.25, 2, clutter
-    ).numpy()
+    attitude = ROT[0] @ CAMERA.rot_cb.T
+    return render_scene(CAMERA.fisheye, eye, attitude, goal[0], ball[0], **other).numpy()
 
 
 @fixture(scope="module")
@@ -73,12 +66,8 @@ def scene():
 
 @fixture(scope="module")
 def cluttered():
-    """Neither goal nor payload in view, only what resembles them."""
-    far = (
-        f64([[60.0, 0.0]]),
-        f64([[60.0, 5.0, 0.5]]),
-    )
-    return rendered(CLUTTER, *far)
+    """Neither goal nor payload in view, only what resembles them: a blue ball, two mats."""
+    return rendered(f64([[60.0, 0.0]]), f64([[0.0, -0.7, 0.1]]), mats=MATS, felt=BLUE)
 
 
 def known() -> Prior:
@@ -193,36 +182,6 @@ def test_wrong_pictures():
     with raises(ValueError, match="float64"):
         DETECTOR.detect(np.zeros((400, 400, 3)))
     assert DETECTOR.detect(np.zeros((400, 400, 3), np.uint8)) == FrameDetections(None, None)
-
-
-def cone(axis, half_angle, n=64):
-    """Unit rays on a circular cone, shape (n, 3)."""
-    axis = np.array(axis) / norm(axis)
-    helper = np.cross(axis, [0.3, 0.5, -0.8])
-    x = helper / norm(helper)
-    angle = 2 * math.pi * np.arange(n) / n
-    across = np.cos(angle)[:, None] * x + np.sin(angle)[:, None] * np.cross(axis, x)
-    return math.cos(half_angle) * axis + math.sin(half_angle) * across, axis
-
-
-@mark.parametrize("axis", [(0, 0, 1), (1, 0.2, 0.1), (0.4, -0.9, -0.5)])
-def test_a_cone_is_found_in_every_direction(axis):
-    rays, axis = cone(axis, 0.08)
-    found, half_angle, misfit, share = cone_fit(rays)
-    assert_allclose(found, axis, atol=1e-12)
-    assert half_angle == approx(0.08, abs=1e-12)
-    assert (misfit, share) == (approx(0.0, abs=1e-9), 1.0)
-
-
-def test_bites_out_of_an_outline_do_not_shrink_it():
-    """A third of the outline lies up to 40 % too far in, as behind a seam or a bar."""
-    rays, axis = cone((0.2, 0.1, 1.0), 0.08)
-    inner, _ = cone((0.2, 0.1, 1.0), 0.055)
-    rays[10:31] = inner[10:31]
-    found, half_angle, _, share = cone_fit(rays)
-    assert half_angle == approx(0.08, rel=1e-6)
-    assert_allclose(found, axis, atol=1e-7)
-    assert share == approx(43 / 64)
 
 
 @mark.parametrize("yaw", np.linspace(-3.1, 3.1, 9))

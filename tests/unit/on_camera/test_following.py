@@ -233,25 +233,6 @@ def test_what_is_known_of_a_balls_place_counts_as_bayes_has_it(learnt):
     assert bayes(learnt, 0.66, math.radians(25.0), within) < 0.5
 
 
-def test_where_a_goal_is_expected_a_faint_square_counts_with_its_own_probability(learnt):
-    corners = 0.05 * np.array(
-        [[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]]
-    )
-    rays = [corners + toward(angle) for angle in (0.0, 0.8)]
-    things = torch.tensor(
-        np.array([one / norm(one, axis=1, keepdims=True) for one in rays]),
-        dtype=torch.float32,
-    )
-    known = Prior(goal_ray_c=toward(0.8), goal_within=math.radians(10.0))
-
-    def scores(known, *p):
-        return [one.score for one in learnt._squares(torch.tensor(p), things, known)]
-
-    assert scores(known, 0.9, 0.6) == approx([0.9, 0.6])
-    assert scores(known, 0.3, 0.2) == approx([0.2])
-    assert scores(Prior(), 0.3, 0.2) == []
-
-
 def test_a_thing_that_is_seen_elsewhere_is_followed_anew():
     rots, rays = throw(8)
     following = BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])

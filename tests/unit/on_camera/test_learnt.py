@@ -25,7 +25,6 @@ from visthrow import config
 from visthrow.detector_training.fit_detector import (
     FitParams,
     Labels,
-    offsets,
     other_lens,
     platt,
     search_loss,
@@ -112,26 +111,6 @@ def test_the_right_grid_has_the_least_loss():
     moved[0, 0, 1] += 0.2
     assert search_loss(moved, made, LENS) > least + 0.15
     assert search_loss(right.roll(3, -1), made, LENS) > least + 10.0
-
-
-def test_corners_are_told_in_one_order():
-    """The order of a square that is turned by up to 40 deg is that of its quadrants, whatever order
-    the labels have.
-    """
-    made = labels()
-    views = views_about(made.rays["goal"], torch.tensor([0.3]), -made.north)
-    exact = views.points(made.corners).flatten(1)
-    found = torch.cat([torch.zeros(1, 2), exact], -1)
-    for shift in range(4):
-        turned = Labels(
-            made.rays,
-            made.sizes,
-            made.seen,
-            made.corners.roll(shift, 1),
-            made.north,
-            made.distractor,
-        )
-        assert offsets("goal", views, found, turned, torch.tensor([0])).abs().max() < 1e-6
 
 
 def test_probabilities_are_calibrated():

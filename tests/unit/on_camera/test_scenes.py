@@ -9,14 +9,13 @@ import numpy as np
 import torch
 from numpy.testing import assert_allclose
 from pytest import fixture, importorskip, raises
-from torch.testing import assert_close
 
 from camera.fisheye import Fisheye
 from camera.mount import nominal_rot_cb, rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 from tests.drawn import render_scene
 from visthrow.detector_training.scenes.renderer import Renderer
-from visthrow.detector_training.scenes.scene import Nuisances, posed_scenes, random_scenes, truth_of
+from visthrow.detector_training.scenes.scene import posed_scenes, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import photographs, pyramid
 
 importorskip("skimage", reason="photographs of visthrow[detector]")
@@ -125,24 +124,6 @@ def test_a_seed_gives_the_same_bits_alone_and_in_a_batch(renderer):
     assert torch.equal(images[1:2], renderer.render(second, 7))
     assert not torch.equal(images, renderer.render(scenes, 8))
     assert not torch.equal(scenes.pose, random_scenes(CAMERA, renderer.textures, 3, 6).pose)
-
-
-def test_nuisances_are_off_and_on(renderer):
-    none = Nuisances(*(0.0,) * 8)
-    plain = random_scenes(CAMERA, renderer.textures, 4, 1, none)
-    assert not plain.shutter.any()
-    assert not plain.things[..., 0].any()
-    assert not plain.rope[:, 3].any()
-    assert_close(plain.sensor[:, :4], torch.tensor([[1.0, 0.0, 0.0, 1.0]]).expand(4, 4))
-    assert_close(
-        plain.pose,
-        random_scenes(CAMERA, renderer.textures, 4, 1).pose,
-        msg="the same moments all the same",
-    )
-    scenes = hovering()
-    blurred = replace(scenes, shutter=torch.tensor([[0.0, 0.0, 1.5]]))
-    sharp, soft = (renderer.render(s)[0, 60:130, 60:130].float() for s in (scenes, blurred))
-    assert soft.diff(dim=1).square().mean() < 0.7 * sharp.diff(dim=1).square().mean()
 
 
 def test_photographs_and_what_is_none(tmp_path):

@@ -66,7 +66,6 @@ class Hall:
         self.command = np.array([self.plant.mass[0] * 9.81, 0.0, 0.0, 0.0])
         self.decisions, self.released = [], False
         runner.backend.release = self.release
-        self.worst_off = 0.0
 
     def detection(self, now: float) -> Detection:
         """What the camera saw when it did."""

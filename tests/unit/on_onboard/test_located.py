@@ -12,7 +12,7 @@ from camera.mount import rotation_from_vector
 from tests.configs import load_experiment
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.onboard.goal_motion import fitted_goal, middle
+from visthrow.onboard.goal_motion import fitted_goal
 
 EXACT = 2e-3
 """Of float32 at 2 m, and of the box's middle, which is not quite the image of the ball's centre
@@ -116,12 +116,3 @@ def test_what_is_not_seen_is_nought():
     assert found[4:, 2:5].abs().max() == 0.0
     assert (found[4:, 5] == 1.0).all()
     assert_close(found[:4, 2:5], ray[:4], rtol=0, atol=EXACT)
-
-
-def test_middle_is_the_median_of_what_is_valid():
-    torch.manual_seed(0)
-    points, valid = torch.randn(200, 4, 2), torch.rand(200, 4) > 0.4
-    expected = (
-        torch.where(valid.unsqueeze(-1), points, torch.nan).nanquantile(0.5, dim=1).nan_to_num(0.0)
-    )
-    assert_close(middle(points, valid), expected)

@@ -6,7 +6,6 @@ import time
 
 from pytest import mark, raises
 
-from bench.processes import side_by_side
 from visthrow.common.errors import VisthrowError
 from visthrow.common.workers import Workers, done, progress
 
@@ -67,22 +66,3 @@ def test_leaving_early_ends_the_processes():
         running = list(workers._running.values())
     assert time.monotonic() - begin < 60.0
     assert not any(process.is_alive() for process in running)
-
-
-def test_threads_hold_one_place_each_and_begin_nothing_after_an_error():
-    busy, begun = set(), []
-
-    def work(item, place):
-        assert place not in busy
-        busy.add(place)
-        begun.append(item)
-        time.sleep(0.01)
-        busy.remove(place)
-        if item == 4:
-            raise VisthrowError("no")
-        return 10 * item
-
-    assert sorted(side_by_side(work, range(4), ["a", "b"])) == [0, 10, 20, 30]
-    with raises(VisthrowError, match="no"):
-        list(side_by_side(work, range(4, 20), ["a", "b"]))
-    assert max(begun) < 8
