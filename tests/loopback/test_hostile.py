@@ -16,19 +16,16 @@ from hil.links.backends.base import FAILED
 from hil.links.pymav import Signed, mav
 from tests.commands import start
 from tests.fuzz import EACH, SEEDS, any_message, mutated, noise
-from tests.hil_flight import AutoOperator, simple_policy
+from tests.hil_flight import AT_ONCE, AutoOperator
 from tests.level import LevelPlant
-from tests.loopback.wire import HERE, cut, peers
-from visthrow.onboard.actions import hover_action
+from tests.loopback.wire import HERE, QUICK, cut, peers
 
 
 def flood(count: int, kind: str, seed: int) -> None:
     """Messages of every kind with any bits in their fields, spoiled poses, and noise, to a runner
     that nobody armed.
     """
-    runner, source, clock, fake = peers(
-        LevelPlant(), kind=kind, write=True, loaded=simple_policy((-0.1269, 0, 0, 0, 1.0))
-    )
+    runner, source, clock, fake = peers(LevelPlant(), kind=kind, write=True, loaded=AT_ONCE)
     rng, inbox, commands = default_rng(seed), source._link.port.inbox, []
     fake.link.listen(
         lambda message, arrival: commands.append(
@@ -66,7 +63,7 @@ STRANGERS = tuple(("127.0.0.1", 2 + i) for i in range(5)) + (("10.0.0.9", 14550)
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 MOST_THROWS = 8
 
-AT_ONCE = 200
+BESIDE = 200
 """Packets beside each look at the link: together with the true ones less than are read in one go.
 """
 
@@ -122,29 +119,12 @@ def flown(seed: int, count: int, kind: str, signed: bool):
     """A throw in lock step beside so many forged packets: what was decided, what the vehicle took,
     what was refused.
     """
-    kwargs = {"key": KEY} if signed else {}
-    hover = hover_action(9.81 * 0.272, 14.0)[0]
-    quick = (
-        "states.check_hold=0.2",
-        "states.armed_least=0.1",
-        "states.quiet=0.1",
-        "states.land=0.5",
-    )
+    key = KEY if signed else None
     runner, source, clock, fake = peers(
-        LevelPlant(),
-        kind=kind,
-        loaded=simple_policy((hover, 0, 0, 0, 1.0)),
-        overrides=quick,
-        **kwargs,
+        LevelPlant(), kind=kind, loaded=AT_ONCE, overrides=QUICK, key=key
     )
-    rng, port, captured = default_rng(seed), source.links[0].port, []
-    make, left, decisions, poll, tick = (
-        forger(rng, signed, captured),
-        [count],
-        [],
-        source.poll,
-        runner.tick,
-    )
+    port, captured, left, decisions = source.links[0].port, [], [count], []
+    make, poll, tick = forger(default_rng(seed), signed, captured), source.poll, runner.tick
 
     def polled(now):
         # Where nothing is signed, the first valid sender is the party: strangers come after it.
@@ -154,10 +134,10 @@ def flown(seed: int, count: int, kind: str, signed: bool):
             data for data in list(port.inbox)[:2] if len(captured) < 100 and isinstance(data, bytes)
         )
         if known and left[0] > 0:
-            left[0] -= AT_ONCE
-            true, forged = list(port.inbox), [make() for _ in range(AT_ONCE)]
+            left[0] -= BESIDE
+            true, forged = list(port.inbox), [make() for _ in range(BESIDE)]
             port.inbox.clear()
-            port.inbox.extend(forged[: AT_ONCE // 2] + true + forged[AT_ONCE // 2 :])
+            port.inbox.extend(forged[: BESIDE // 2] + true + forged[BESIDE // 2 :])
         return poll(now)
 
     def ticked(now, *args):

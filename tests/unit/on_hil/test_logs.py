@@ -27,7 +27,7 @@ YAWED = (QUARTER, 0.0, 0.0, QUARTER)
 """A quarter turn about down, wxyz."""
 
 
-def vision(i, reset=0, quality=100, ignored=0):
+def vision(i, reset=0):
     return (
         "VISP",
         (
@@ -43,8 +43,8 @@ def vision(i, reset=0, quality=100, ignored=0):
             0,
             0,
             reset,
-            ignored,
-            quality,
+            0,
+            100,
         ),
     )
 
@@ -131,13 +131,6 @@ def test_a_place_on_the_globe_becomes_metres_from_the_origin(tmp_path):
     (pose,) = read_bin(path, (LogBody("vehicle", "POS"),))
     assert pose.pos == approx((3.0, 2.0, -1.5), abs=0.02), "1e-7 deg are 11 mm"
     assert pose.quat == approx(YAWED)
-
-
-def test_a_vision_pose_of_negative_quality_or_that_was_ignored_is_none(tmp_path):
-    path = tmp_path / "a.BIN"
-    rows = [vision(0, quality=-1), vision(1, quality=0), vision(2, ignored=1)]
-    files.write_bin(path, {"VISP": files.VISP}, rows)
-    assert [pose.valid for pose in read_bin(path, VEHICLE)] == [False, True, False]
 
 
 def test_loggers_of_two_bodies_are_joined_by_a_stated_offset(tmp_path):
