@@ -5,8 +5,8 @@ A history is newest first. Its functions neither index by masks nor branch on da
 inside a CUDA graph. On reset it is filled with the first value: so it never mixes two episodes and
 never holds zeros that were no measurement.
 
-On one row NumPy takes a fraction of torch's time. Both give the same bits: sums, products and
-quotients round alike, and roots and angles are torch's own."""
+On one row NumPy takes a fraction of torch's time. Both give the same bits: sums, products,
+quotients and roots round alike, and angles are torch's own."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -43,7 +43,7 @@ class ArrayFunctions:
     atan = _by_torch(torch.atan)
     cos = _by_torch(torch.cos)
     sin = _by_torch(torch.sin)
-    sqrt = _by_torch(torch.sqrt)
+    sqrt = np.sqrt
     linalg = SimpleNamespace(cross=_by_torch(torch.linalg.cross))
 
 

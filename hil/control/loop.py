@@ -27,6 +27,8 @@ two alone; earlier by a share of the second number that goes round from tick to 
 link is looked at, and peers are asked for their time, at any point of their periods.
 """
 
+MARGIN = 2e-4  # left between the rehearsal's end and the tick [s]
+
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
 SAY_AGAIN = 3.0  # between two words on why it does not go on that differ in their numbers alone [s]
@@ -77,6 +79,7 @@ class Loop:
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
     _ended: float = -math.inf
+    _rehearsal: float = 0.0  # duration of the last one [s]
     _state: str = ""
     _waits: str = ""
     # reasons to wait, without their numbers, and when they were said [s]
@@ -119,14 +122,14 @@ class Loop:
         ticker = self.ticker
         backend = self.runner.backend
         source.hold(runner.in_flight)
-        _wait(
-            clock,
-            ticker.due() - LEAD - LEAD_SPREAD * (self.count * GOLDEN % 1.0),
-            backend,
-            source,
-        )
+        lead = LEAD + LEAD_SPREAD * (self.count * GOLDEN % 1.0) + self._rehearsal
+        _wait(clock, ticker.due() - lead, backend, source)
         early = source.poll(clock.now())
         runner.take_poses(early)
+        _wait(clock, ticker.due() - self._rehearsal - MARGIN, backend, source)
+        start = perf_counter()
+        runner.rehearse()
+        self._rehearsal = perf_counter() - start
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed

@@ -7,7 +7,7 @@ and flights of a real vehicle, so that whatever reads one reads them all."""
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,6 +38,13 @@ def _standard_channels() -> dict[str, ChannelSpec]:
 
 STANDARD_CHANNELS = _standard_channels()
 """Channels of these names hold this, in this unit and frame; other names are free."""
+
+
+class Samples(NamedTuple):
+    """Samples of one quantity."""
+
+    time: np.ndarray  # [s], shape (N,)
+    values: np.ndarray  # shape (N, components)
 
 
 @dataclass(frozen=True)
@@ -101,13 +108,12 @@ class Channel:
             self.values.shape[1:]
         )
 
-    def samples(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return times [s] and values of the valid samples, float64, shapes (N,) and (N,
-        components).
-        """
-        values = self.values[np.asarray(self.valid)].astype(float)
-        return self.time[np.asarray(self.valid)], values.reshape(
-            len(values), int(np.prod(values.shape[1:]))
+    def samples(self) -> Samples:
+        """Return the valid samples, float64."""
+        rows = np.asarray(self.valid)
+        values = self.values[rows].astype(float)
+        return Samples(
+            self.time[rows], values.reshape(len(values), np.prod(values.shape[1:], dtype=int))
         )
 
     def hold(self, time: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ from scipy.signal import correlate, correlation_lags
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
 from visthrow.logs.check import relations
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog, Samples
 
 RATE = 50.0  # rate of the grid on which logs are first laid over one another [Hz]
 # correlation of what was measured twice, below which two logs are not taken for one flight
@@ -23,9 +23,6 @@ _FINE = 0.1  # around the coarse answer [s]
 _SPAN = 0.1  # of turns: rates of attitudes with 0.2 deg of noise are good to 0.05 rad/s then [s]
 _STEP = 0.001  # of lags there, through whose best three a parabola is laid [s]
 _FINE_RATE = 200.0  # of samples compared there [Hz]
-
-Signal = tuple[np.ndarray, np.ndarray]
-"""Times [s], shape (T,), and values, shape (T, 1 or 3)."""
 
 
 def join(logs: Sequence[FlightLog]) -> FlightLog:
@@ -88,25 +85,26 @@ def offset_of(first: FlightLog, second: FlightLog) -> tuple[float, float, str]:
     return offset, correlation, method
 
 
-def _turning(log: FlightLog) -> Signal | None:
+def _turning(log: FlightLog) -> Samples | None:
     """Body rates over ``_SPAN``: by gyro, else by attitude."""
     if "rate_b" not in log:
         return relations.rates_of(*log["quat_wb"].samples(), _SPAN) if "quat_wb" in log else None
     time, rate = log["rate_b"].samples()
-    if len(time):
-        overlap = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
-    else:
-        overlap = time
-    return (overlap, relations.mean_over(time, rate, overlap, _SPAN)) if len(overlap) else None
+    if not len(time):
+        return None
+    overlap = time[(time > time[0] + 0.5 * _SPAN) & (time < time[-1] - 0.5 * _SPAN)]
+    if not len(overlap):
+        return None
+    return Samples(overlap, relations.mean_over(time, rate, overlap, _SPAN))
 
 
-def _velocity(log: FlightLog) -> Signal | None:
+def _velocity(log: FlightLog) -> Samples | None:
     if "vel_w" in log:
         return log["vel_w"].samples()
     return relations.derivative(*log["pos_w"].samples()) if "pos_w" in log else None
 
 
-def _force(log: FlightLog) -> Signal | None:
+def _force(log: FlightLog) -> Samples | None:
     """Size of the specific force: the accelerometer's axes turn in the world."""
     if "acc_b" in log:
         return _sized(*log["acc_b"].samples())
@@ -116,11 +114,11 @@ def _force(log: FlightLog) -> Signal | None:
     return _sized(time, acc + [0.0, 0.0, GRAVITY])
 
 
-def _sized(time: np.ndarray, values: np.ndarray) -> Signal:
-    return time, np.linalg.norm(values, axis=1, keepdims=True)
+def _sized(time: np.ndarray, values: np.ndarray) -> Samples:
+    return Samples(time, np.linalg.norm(values, axis=1, keepdims=True))
 
 
-def _lag(a: Signal, b: Signal) -> tuple[float, float]:
+def _lag(a: Samples, b: Samples) -> tuple[float, float]:
     """Offset of the second [s] and the correlation of sizes, which no axes change.
 
     All lags at once by Fourier transform of the sizes; about the best one by one, the components in
@@ -141,7 +139,7 @@ def _lag(a: Signal, b: Signal) -> tuple[float, float]:
     return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
 
 
-def _on_common_grid(a: Signal, b: Signal, offset: float) -> tuple[np.ndarray, np.ndarray]:
+def _on_common_grid(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, np.ndarray]:
     """Values of both on a grid of the first's clock, the same for any offset, where
     there are both.
     """

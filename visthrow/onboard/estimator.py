@@ -121,7 +121,3 @@ class Estimator:
         )
         correction = F.linear(memory, self.output_weight, self.output_bias)
         return F.pad(obs, (0, 1))[:, self.kept] + correction, memory
-
-    def to(self, device: str | torch.device) -> "Estimator":
-        """Return the estimator with its tensors on another device."""
-        return Estimator.of_parts({name: part.to(device) for name, part in self.parts().items()})

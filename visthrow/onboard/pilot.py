@@ -168,6 +168,7 @@ class Pilot:
         self._answers = self._zeros(count, 1 + layout.response, ob.RESPONSE)
         self._goal_fit = self._zeros(count, goal_motion.SUMS)
         self._memory = self.policy.begin(count)
+        self._shown: tuple[Any, ...] = ()  # to the last call
         self._fresh = self._zeros(count) == 0.0
         self._steps = 0
         # of the rows of history and response, newest first; rows beyond copy the oldest [s]
@@ -214,6 +215,7 @@ class Pilot:
         detected = None
         if keypoints is not None:  # copies: a detector may reuse its arrays
             detected = tuple(self._native(np.array(array)) for array in keypoints)
+        self._shown = views, detected
         seen = self._see(views, detected)
         if now is not None and self._bridged(now, seen):
             seen = self._see(views, detected)
@@ -236,6 +238,15 @@ class Pilot:
             None if seen.points is None else np.asarray(seen.points),
             None if seen.points is None else np.asarray(seen.valid),
         )
+
+    @torch.inference_mode()
+    def rehearse(self) -> None:
+        """Work out the last call once more and forget it, so that the next one finds weights and
+        code in the processor's caches.
+        """
+        if self._shown:
+            observation = self._see(*self._shown).observation
+            self._decide(torch.as_tensor(observation), self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of
@@ -340,21 +351,22 @@ class Pilot:
         observation, history = ob.observe(layout, frame, filled, *carried, *further)
         return Seen(observation, history, answers, goal_fit, points, valid)
 
-    def _decision(
-        self, observation: Tensor, memory: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Clipped action, command, whether a release is asked for, and the policy's memory."""
-        raw, memory = self.policy.step(observation, memory)
-        action = act.clip_action(raw)
-        command = act.command_from_action(action, self._max_thrust, self._max_rate)
-        return action, command, act.release_asked(raw, self._threshold), memory
-
     def _traced(self) -> Any:
-        """Return :meth:`_decision` as a program that runs without its Python code."""
-        examples = torch.zeros(self.count, self.policy.obs_dim), self.policy.begin(self.count)
+        """Return a program that runs without Python code: from observation and memory to the
+        clipped action, command, whether a release is asked for, and the new memory.
+        """
+        policy = self.policy.for_one_row() if self.count == 1 else self.policy
+        examples = torch.zeros(self.count, policy.obs_dim), policy.begin(self.count)
+
+        def decision(observation: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
+            raw, memory = policy.step(observation, memory)
+            action = act.clip_action(raw)
+            command = act.command_from_action(action, self._max_thrust, self._max_rate)
+            return action, command, act.release_asked(raw, self._threshold), memory
+
         with warnings.catch_warnings(), torch.no_grad():
             warnings.simplefilter("ignore")  # of branches that depend on shapes alone
-            return torch.jit.trace(self._decision, examples, check_trace=False)
+            return torch.jit.trace(decision, examples, check_trace=False)
 
     @torch.inference_mode()
     def see(

@@ -175,14 +175,25 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-        moved: dict[str, Any] = {}
-        for name in ("weights", "biases"):
-            moved[name] = tuple(tensor.to(device) for tensor in getattr(self, name))
-        parts = {name: getattr(self, name) for name in ("mean", "std", "estimator")}
-        for name, part in parts.items():
-            if part is not None:
-                moved[name] = part.to(device)
-        return replace(self, **moved)
+        return self._with_tensors(lambda tensor: tensor.to(device))
+
+    def for_one_row(self) -> "Policy":
+        """Return the policy with its weights column by column in memory: on a single row, where
+        reading them is what takes the time, they are then read once and in order.
+        """
+        return self._with_tensors(lambda tensor: tensor.t().contiguous().t())
+
+    def _with_tensors(self, change: Callable[[Tensor], Tensor]) -> "Policy":
+        changed: dict[str, Any] = {
+            "weights": tuple(map(change, self.weights)),
+            "biases": tuple(map(change, self.biases)),
+        }
+        if self.mean is not None and self.std is not None:
+            changed |= {"mean": change(self.mean), "std": change(self.std)}
+        if self.estimator is not None:
+            parts = self.estimator.parts()
+            changed["estimator"] = Estimator.of_parts({n: change(p) for n, p in parts.items()})
+        return replace(self, **changed)
 
     def require(
         self,

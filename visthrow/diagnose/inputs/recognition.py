@@ -20,7 +20,7 @@ from visthrow.diagnose.inputs.unit_evidence import (
     turn_to,
 )
 from visthrow.logs.check import physics, relations
-from visthrow.logs.flightlog import Channel
+from visthrow.logs.flightlog import Channel, Samples
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
 from visthrow.logs.unit_names import UNITS
@@ -346,7 +346,7 @@ class Recognition:
         grid = np.arange(np.nanmin(self.time), np.nanmax(self.time), _COARSE)
         if not groups or len(grid) < 25:
             return groups
-        laid = {g.columns: _on_grid(self.time, g.values, grid) for g in groups + paths}
+        laid = {g.columns: _on_grid(self._samples(g), grid) for g in groups + paths}
         slopes = [_normalised(np.gradient(laid[path.columns], axis=0)) for path in paths]
         values = [_normalised(laid[group.columns]) for group in groups]
         firm = np.array(slopes) @ np.array(values).T > _FIRMLY
@@ -357,18 +357,21 @@ class Recognition:
             or not any(hit and path is not group for hit, path in zip(column, paths))
         ]
 
+    def _samples(self, group: Group) -> Samples:
+        return rising(self.time, group.values)
+
     def _best(
-        self, stamps: np.ndarray, derived: np.ndarray, groups: list[Group]
+        self, derived: Samples, groups: list[Group]
     ) -> tuple[relations.Relation, Group] | None:
         """Return the group that goes best with what was derived of others, and how; None where none
         does.
         """
         best = None
         for group in groups:
-            time, values = rising(self.time, group.values)
-            if min(len(stamps), len(time)) < 100:
+            values = self._samples(group)
+            if min(len(derived.time), len(values.time)) < 100:
                 continue
-            relation = relations.relate(stamps, derived, time, values, reach=_REACH)
+            relation = relations.relate(derived, values, reach=_REACH)
             if relation is None or abs(relation.delay) > _LATEST:
                 continue
             if relation.correlation > (best[0].correlation if best else _BELONGS):
@@ -380,13 +383,11 @@ class Recognition:
             if name not in self._made:
                 continue
             entry, channel = self._made[name]
-            slope = relations.derivative(*rising(self.time, self._group(name).values), _SPAN)
-            best = self._best(*slope, [g for g in self._open(3) if g.unit not in LENGTHS])
-            if name == "pos_w" and self._body_velocity(
-                channel, best[0].correlation if best else 0.0
-            ):
-                continue
-            if best is None:
+            slope = relations.derivative(*self._samples(self._group(name)), _SPAN)
+            best = self._best(slope, [g for g in self._open(3) if g.unit not in LENGTHS])
+            in_world = best[0].correlation if best else 0.0
+            turned = name == "pos_w" and self._body_velocity(channel, in_world)
+            if turned or best is None:
                 continue
             relation, group = best
             size = UNITS[entry.unit][1] / relation.scale
@@ -402,16 +403,16 @@ class Recognition:
         """
         if "quat_wb" not in self._made:
             return False
-        stamps, slope = relations.derivative(*path.samples(), _SPAN)
+        time, slope = relations.derivative(*path.samples(), _SPAN)
         attitude = self._made["quat_wb"][1].samples()
-        if min(len(stamps), len(attitude[0])) < 100:
+        if min(len(time), len(attitude.time)) < 100:
             return False
-        turned = rotate_back(relations.attitude_at(*attitude, stamps), slope)
-        best = self._best(stamps, turned, [g for g in self._open(3) if g.hints_at("velocity")])
+        turned = Samples(time, rotate_back(relations.attitude_at(*attitude, time), slope))
+        best = self._best(turned, [g for g in self._open(3) if g.hints_at("velocity")])
         if best is None:
             return False
         relation, group = best
-        independent = 0.5 * float(np.ptp(stamps)) / _REACH
+        independent = 0.5 * float(np.ptp(time)) / _REACH
         unlike = max(1.0 - relation.correlation**2, 1e-6)
         nats = independent * np.log((1.0 - in_world**2) / unlike)
         if nats < SURE or relation.correlation < _FIRMLY:
@@ -421,15 +422,15 @@ class Recognition:
         return self._take("vel_b", group, unit, why, frame="body")
 
     def _rates(self) -> None:
-        derived = np.empty(0), np.empty((0, 3))
+        derived = Samples(np.empty(0), np.empty((0, 3)))
         if "quat_wb" in self._made:
             derived = relations.rates_of(*self._made["quat_wb"][1].samples())
         ranked = []
         for group in [g for g in self._open(3) if g.hints_at("rate_b")]:
-            time, values = rising(self.time, group.values)
-            relation = relations.relate(*derived, time, values, reach=_REACH)
+            values = self._samples(group)
+            relation = relations.relate(derived, values, reach=_REACH)
             score = relation.axes_correlation if relation is not None else 0.0
-            ranked.append((score, group, float(np.sqrt(np.mean(np.var(values, axis=0))))))
+            ranked.append((score, group, _size(values)))
         if not ranked:
             return
         score, group, size = max(ranked, key=lambda candidate: candidate[0])
@@ -438,7 +439,7 @@ class Recognition:
         unit = NAMES["usual_units"].get(group.columns[0], "deg/s" if largest > 30.0 else "rad/s")
         unit = group.unit if group.unit.endswith("/s") else unit
         if score > _BELONGS:
-            times = size / max(float(np.sqrt(np.mean(np.var(derived[1], axis=0)))), 1e-6)
+            times = size / max(_size(derived), 1e-6)
             unit = "deg/s" if times > 7.0 else "rad/s"
             why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
         elif not group.unit:
@@ -555,7 +556,13 @@ def _normalised(values: np.ndarray) -> np.ndarray:
     return centred / max(float(np.linalg.norm(centred)), 1e-300)
 
 
-def _on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
+def _on_grid(samples: Samples, grid: np.ndarray) -> np.ndarray:
     """Return a group's values at times of a grid, zeros where too few are known."""
-    time, values = rising(time, values)
-    return relations.on_grid(time, values, grid) if len(time) >= 100 else np.zeros((len(grid), 3))
+    if len(samples.time) < 100:
+        return np.zeros((len(grid), 3))
+    return relations.on_grid(*samples, grid)
+
+
+def _size(samples: Samples) -> float:
+    """Root mean square about the means of the columns."""
+    return float(np.sqrt(np.mean(np.var(samples.values, axis=0))))

@@ -13,7 +13,7 @@ from visthrow.common.rotations import matrix_of_quat
 from visthrow.logs.axes import OURS, turn_of
 from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import MASS_BAD
-from visthrow.logs.flightlog import Channel
+from visthrow.logs.flightlog import Channel, Samples
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.unit_names import UNITS
 
@@ -197,9 +197,9 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
     return best if off[best] < MASS_BAD else ""
 
 
-def rising(time: np.ndarray, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def rising(time: np.ndarray, path: np.ndarray) -> Samples:
     """Rows that are numbers, later than those before."""
     good = np.isfinite(time) & np.all(np.isfinite(path), axis=1)
     time = time[good]
     later = np.diff(np.maximum.accumulate(time), prepend=-np.inf) > 0.0
-    return time[later], path[good][later]
+    return Samples(time[later], path[good][later])

@@ -26,16 +26,12 @@ REACHES = (0.03, 0.1, 0.3, 1.0, 3.0)
 
 def _inputs(window: Window) -> np.ndarray:
     """Body velocity, body rates and thrust at the knots, as far as they are known, shape (k, I)."""
-    knots = window.knots
-    parts = [np.zeros((len(knots.get("time", ())), 0))]
-    if "vel_w" in knots:
-        parts.append(
-            rotate_back(knots["quat_wb"], knots["vel_w"]) if "quat_wb" in knots else knots["vel_w"]
-        )
-    parts += [
-        knots[name].reshape(len(knots[name]), -1) for name in ("rate_b", "thrust") if name in knots
-    ]
-    return np.hstack(parts)
+    knots = dict(window.knots)
+    count = len(knots.get("time", ()))
+    if "vel_w" in knots and "quat_wb" in knots:
+        knots["vel_w"] = rotate_back(knots["quat_wb"], knots["vel_w"])
+    known = [knots[name] for name in ("vel_w", "rate_b", "thrust") if name in knots]
+    return np.hstack([np.zeros((count, 0)), *(values.reshape(count, -1) for values in known)])
 
 
 @dataclass(frozen=True)
@@ -59,18 +55,12 @@ class ForceTable:
         parts = []
         values = laws.KnotValues(window.knots)
         for block in self.blocks:
-            turned = block != "vehicle torque" and "quat_wb" in values
-            axes = np.stack(
-                [
-                    values[f"axis_{i}"] if turned else np.tile(row, (len(basis), 1))
-                    for i, row in zip("xyz", np.eye(3))
-                ],
-                -1,
-            )
+            axes = np.broadcast_to(np.eye(3), (len(basis), 3, 3))
+            if block != "vehicle torque" and "quat_wb" in values:
+                axes = np.stack([values[f"axis_{i}"] for i in "xyz"], -1)
             latents = grammar.through_latents(window, values, block)
-            parts.append(
-                latents @ (axes[..., None] * basis[:, None, None]).reshape(latents.shape[1], -1)
-            )
+            columns = axes[..., None] * basis[:, None, None]
+            parts.append(latents @ columns.reshape(latents.shape[1], -1))
         return np.hstack(parts)
 
 
@@ -131,22 +121,17 @@ def train(
     size = table.columns(point.windows[0]).shape[1]
     information = np.zeros((len(names), size, size))
     score = np.zeros((len(names), size))
-    for window, part, group in zip(
-        point.windows, statistics(point.grams, point.noise, point.device), groups
-    ):
+    parts = statistics(point.grams, point.noise, point.device)
+    for window, part, group in zip(point.windows, parts, groups):
         columns = table.columns(window)
         f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
         score[f] += columns.T @ (part.latent_score + part.latent_effects @ shift)
-    reach = np.concatenate(
-        [
-            np.full(
-                size // len(table.blocks),
-                max(v for (b, _), v in point.noise.latent_sd.items() if LATENT_BLOCKS[b] == name),
-            )
-            for name in table.blocks
-        ]
-    )
+    strongest = dict.fromkeys(table.blocks, 0.0)
+    for (block, _), sd in point.noise.latent_sd.items():
+        name = LATENT_BLOCKS[block]
+        strongest[name] = max(strongest[name], sd)
+    reach = np.repeat([*strongest.values()], size // len(table.blocks))
     return Trained(names, information, score, reach)
 
 
@@ -158,9 +143,8 @@ def unexplained(point: Point, seed: int) -> dict | None:
     table = table_of(point, np.random.default_rng(seed))
     if table is None:
         return None
-    weights = train(point, table, [0] * len(point.windows), point.statistics.theta).weights(
-        np.ones(1, dtype=bool)
-    )
+    trained = train(point, table, [0] * len(point.windows), point.statistics.theta)
+    weights = trained.weights(np.ones(1, dtype=bool))
     by_block = weights.reshape(len(table.blocks), 3, -1)
     return {
         "label": "unexplained",

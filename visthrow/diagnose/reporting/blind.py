@@ -51,17 +51,22 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
 
     ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out
     first; ``draws``: worlds for each effect, size and sign."""
-    work, rng = diagnosis.work, np.random.default_rng(seed)
-    point, priors, effects = work.after, work.problem.priors, work.problem.model.effects
-    information, score_of = point.information, point.statistics.score
+    work = diagnosis.work
+    rng = np.random.default_rng(seed)
+    priors = work.problem.priors
+    effects = work.problem.model.effects
+    information = work.after.information
+    score_of = work.after.statistics.score
     parametric = len(score_of) < FEWEST_FLIGHTS
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
 
+    shape = draws, len(effects)
+
     def worlds() -> np.ndarray:
-        small = rng.uniform(-1.0, 1.0, (draws, len(effects))) @ information
+        small = rng.uniform(-1.0, 1.0, shape) @ information
         if parametric:
-            return small + rng.standard_normal((draws, len(effects))) @ root.T
+            return small + rng.standard_normal(shape) @ root.T
         return small + rng.choice((-1.0, 1.0), (draws, len(score_of))) @ score_of
 
     def named(score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -79,24 +84,12 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
             gain, named_effect = named(score)
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
-            rows.append(
-                (
-                    size,
-                    np.mean(named_effect & best),
-                    np.mean(named_effect & close),
-                    np.mean(named_effect & ~close),
-                )
-            )
+            hits = [np.mean(named_effect & answer) for answer in (best, close, ~close)]
+            rows.append((size, *hits))
         size, exact, similar, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
         limit = _limit(size, similar) * effect.floor if rows else float("nan")
-        curves.append(
-            Completeness(
-                effect.name,
-                effect.unit,
-                *map(tuple, (size * effect.floor, exact, similar, wrong)),
-                limit,
-            )
-        )
+        shares = map(tuple, (size * effect.floor, exact, similar, wrong))
+        curves.append(Completeness(effect.name, effect.unit, *shares, limit))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
     source = (
         "drawn from its fitted level"

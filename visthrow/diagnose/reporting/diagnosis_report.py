@@ -3,6 +3,7 @@ next; and the same as JSON.
 """
 
 import dataclasses
+from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -31,10 +32,9 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
     """Return the text that the command line prints."""
     lines = [sentence_of(diagnosis), *(f"  {reason}" for reason in diagnosis.reasons), ""]
     lines += [f"{word:6} {text}" for word, text in _statements(diagnosis, gain)]
-    counted = {v: sum(f.verdict == v for f in diagnosis.findings) for v in result.VERDICTS}
-    lines.append(
-        ", ".join(f"{count} {verdict.lower()}" for verdict, count in counted.items() if count)
-    )
+    counted = Counter(f.verdict for f in diagnosis.findings)
+    counts = [f"{counted[v]} {v.lower()}" for v in result.VERDICTS if v in counted]
+    lines.append(", ".join(counts))
     compared = gain or diagnosis.held_out
     if compared is not None and (diagnosis.theta or gain is None):
         lines += [_gain_line(c) for c in compared.channels]
@@ -49,25 +49,25 @@ def summary(diagnosis: Diagnosis, gain: Gain | None = None) -> str:
 def _statements(diagnosis: Diagnosis, gain: Gain | None) -> list[tuple[str, str]]:
     """Return the findings, each with its verdict."""
     moved = gain.landing.moved if gain is not None and gain.landing is not None else {}
-    moves = {name: f" It moves landings by {1e3 * size:.0f} mm." for name, size in moved.items()}
-    named = [f for f in diagnosis.findings if f.verdict in result.NAMED]
     measured = {m.effect: f"{m.name} (--measured {m.effect}={m.sd:g})" for m in MEASUREMENTS}
-    separations = {}
-    for f in named:
+    statements = []
+    for f in diagnosis.findings:
+        if f.verdict not in result.NAMED:
+            continue
+        text = f.sentence
+        if f.name in moved:
+            text += f" It moves landings by {1e3 * moved[f.name]:.0f} mm."
         ways = [*f.manoeuvres, *(measured[n] for n in (f.name, *f.partners) if n in measured)]
         if f.partners and ways:
-            separations[f.name] = f" To tell them apart: {'; '.join(ways)}."
-    named_findings = [
-        (f.verdict, f.sentence + moves.get(f.name, "") + separations.get(f.name, "")) for f in named
-    ]
-    named_findings += [("OR", line) for line in instead(diagnosis)]
-    named_findings += [("FOUND", m.sentence) for m in diagnosis.mistakes]
-    named_findings += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
-    named_findings += [("EVENT", _event(diagnosis, flight)) for flight in diagnosis.events]
-    return named_findings + [
-        ("COPY", f"flight {flight} repeats flight {original} and was left out")
-        for flight, original in diagnosis.duplicates.items()
-    ]
+            text += f" To tell them apart: {'; '.join(ways)}."
+        statements.append((f.verdict, text))
+    statements += [("OR", line) for line in instead(diagnosis)]
+    statements += [("FOUND", m.sentence) for m in diagnosis.mistakes]
+    statements += [("VARIES", s.sentence) for s in diagnosis.scatter if s.found]
+    statements += [("EVENT", _event(diagnosis, flight)) for flight in diagnosis.events]
+    for flight, original in diagnosis.duplicates.items():
+        statements.append(("COPY", f"flight {flight} repeats flight {original} and was left out"))
+    return statements
 
 
 def _gain_line(c: ChannelGain) -> str:
@@ -130,11 +130,12 @@ def instead(diagnosis: Diagnosis) -> list[str]:
     """A line for each set of causes that says the same with several others; single ones that do are
     told as a class.
     """
-    lines = []
+    lines: list[str] = []
     named = set(diagnosis.theta)
-    withdrawn = not diagnosis.sets or set(diagnosis.sets[0][0]) != named  # for a law
-    for names, nats in () if withdrawn else diagnosis.sets:
-        removed = sorted(named - set(names))
+    if not diagnosis.sets or set(diagnosis.sets[0][0]) != named:  # withdrawn for a law
+        return lines
+    for names, nats in diagnosis.sets:
+        removed = sorted(named.difference(names))
         new = sorted(set(names) - named)
         if max(len(removed), len(new)) > 1:
             lines.append(

@@ -75,12 +75,10 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
     after = test_flights.model
     before = after.plain()
     if diagnosis.explanations:
-        after = after.with_laws(
-            [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
-        )
-    tested = on_others(
-        before, after, diagnosis.expected, diagnosis, refused_of(checked, test_flights.known)
-    )
+        laws = [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
+        after = after.with_laws(laws)
+    refused = refused_of(checked, test_flights.known)
+    tested = on_others(before, after, diagnosis.expected, diagnosis, refused)
     print(
         f"tested on {tested.windows} windows of {tested.flights} of {len(test_flights.logs)} "
         f"flights;"
@@ -89,11 +87,9 @@ def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[flo
     for channel, channel_errors in tested.errors.items():
         factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
         before, after, floor = (factor * x for x in channel_errors)
-        won = (
-            f", {(before - after) / (before - floor):.0%} of what is above it"
-            if before > floor
-            else ""
-        )
+        won = ""
+        if before > floor:
+            won = f", {(before - after) / (before - floor):.0%} of what is above it"
         print(
             f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone"
             f" {floor:.3g}{won}"
@@ -123,23 +119,15 @@ def write_report(
     from visthrow.view import page
 
     measured = gain.measure(diagnosis, seed=seed)
-    measured = (
-        measured if measured.channels else None
-    )  # windows of one sample have nothing ahead that could be predicted
+    if not measured.channels:  # windows of one sample have nothing ahead that could be predicted
+        measured = None
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error()
     origin = provenance.collect()
-    source = {
-        "logs": len(logs),
-        "command": origin["command"],
-        "commit": origin["commit"],
-        "time": origin["time"],
-    }
-    table = (
-        blackbox.unexplained(diagnosis.work.after, seed)
-        if diagnosis.overall == result.UNKNOWN
-        else None
-    )
+    source = {"logs": len(logs)} | {key: origin[key] for key in ("command", "commit", "time")}
+    table = None
+    if diagnosis.overall == result.UNKNOWN:
+        table = blackbox.unexplained(diagnosis.work.after, seed)
     extra = {**(made_with or {}), "step_error_sigma": steps, "provenance": origin, "table": table}
     whole = report.to_json(diagnosis, measured, hidden, extra=extra)
     write_json(folder / DIAGNOSIS, whole)  # before pictures, which a full disk may refuse

@@ -32,25 +32,17 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     style.use()
     import matplotlib.pyplot as plt
 
-    names = [name for name in _FIRST if name in log] + [
-        name for name in log.channels if name not in _FIRST
-    ]
-    names = [name for name in names if len(log[name].time) > 1][:CHANNELS_DRAWN]
-    figure, axes = plt.subplots(
-        max(len(names), 1),
-        1,
-        figsize=(9, 1.1 + 1.25 * max(len(names), 1)),
-        sharex=True,
-        squeeze=False,
-    )
+    ordered = dict.fromkeys((*_FIRST, *log.channels))
+    names = [name for name in ordered if name in log and len(log[name].time) > 1][:CHANNELS_DRAWN]
+    rows = max(len(names), 1)
+    size = (9, 1.1 + 1.25 * rows)
+    figure, axes = plt.subplots(rows, 1, figsize=size, sharex=True, squeeze=False)
     for axis, name in zip(axes[:, 0], names):
         _channel(axis, log, name)
-        verdict = worst(
-            [row for row in checked.rows if name in row.channel.replace(",", " ").split()]
-        )
-        axis.set_ylabel(
-            f"{name}\n[{log[name].unit}]", rotation=0, ha="right", va="center", fontsize=8
-        )
+        concern = [row for row in checked.rows if name in row.channel.replace(",", " ").split()]
+        verdict = worst(concern)
+        label = f"{name}\n[{log[name].unit}]"
+        axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
         axis.spines["left"].set_color(_SHADE[verdict])
         axis.spines["left"].set_linewidth(4)
     axes[-1, 0].set_xlabel("time [s]")

@@ -31,12 +31,6 @@ SHOWN_EFFECTS = 14  # rows and columns of the confusion picture
 SHOWN_HORIZONS = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # ticks [s]
 STEPS_ACROSS = 3
 NAMES_ACROSS = 26  # letters in a line of a set's names
-MOST_TICKS = 16  # over the whole width
-STEPS_OF_TICKS = (
-    (1, 2, 5),
-    (1, 3),
-    (1,),
-)  # within a decade of a logarithmic axis; the finest that leaves room is taken
 
 
 def _figure(rows: int, columns: int, height: float, **options):
@@ -49,32 +43,26 @@ def _figure(rows: int, columns: int, height: float, **options):
 
 
 def _with_legend(figure) -> bytes:
-    """Return the PNG of a figure, the labels of its first axes above it."""
-    labelled = figure.axes[0].get_legend_handles_labels()
-    figure.legend(*labelled, loc="outside upper center", ncol=4, markerscale=2)
+    """Return the PNG of a figure, the labels of its first axes above it, each once."""
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    by_label = dict(zip(labels, handles))
+    figure.legend(by_label.values(), by_label, loc="outside upper center", ncol=4, markerscale=2)
     return png_of(figure)
 
 
-def plain_ticks(low: float, high: float, count: int) -> list[float]:
-    """Ticks of a logarithmic axis, or one that is linear about 0, within its limits; none where no
-    choice of them fits.
+def _plain(axis, digits: Sequence[int] = (1,)) -> None:
+    """Label one axis of a picture with plain numbers, those of each decade that begin with these
+    digits, instead of powers of ten.
     """
-    for digits in STEPS_OF_TICKS:
-        sizes = np.outer(10.0 ** np.arange(-4, 7), digits).ravel()
-        if low <= 0.0 <= high:
-            sizes = sizes[sizes >= 1.0]
-            sizes = np.concatenate((-sizes[::-1], [0.0], sizes))
-        ticks = sizes[(sizes >= low) & (sizes <= high)].tolist()
-        if 2 <= len(ticks) <= count:
-            return ticks
-    return []
+    axis.get_major_locator().set_params(subs=digits)
+    axis.set_major_formatter("{x:g}")
+    axis.set_ticks([], minor=True)
 
 
-def _plain(axis, count: int) -> None:
-    """Ticks of one axis of a picture as plain numbers instead of powers of ten."""
-    if ticks := plain_ticks(*axis.get_view_interval(), count):
-        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-        axis.set_ticks([], minor=True)
+def _name_rows(axis, names: Sequence[str], size: float) -> None:
+    """Write a name in letters of some size [pt] beside each row of a picture."""
+    axis.set_yticks(range(len(names)), names, fontsize=size)
+    axis.set_ylim(-1, len(names))
 
 
 def left_over(window: Window, noise: Noise) -> np.ndarray:
@@ -168,7 +156,7 @@ def ladder(diagnosis: Diagnosis) -> bytes:
             title=f"step {number}: {several if ', ' in step.named else step.named}",
         )
         axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
-        _plain(axis.xaxis, MOST_TICKS // columns)
+        _plain(axis.xaxis)
         axis.tick_params(axis="y", labelsize=8)
     return png_of(figure)
 
@@ -185,26 +173,19 @@ def verdicts(diagnosis: Diagnosis) -> bytes:
     findings = [f for f in diagnosis.findings if f.verdict in colours][::-1]
     figure, axes = _figure(1, 1, 0.8 + 0.19 * len(findings))
     axis = axes[0, 0]
-    labelled = set()
     axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
     for y, f in enumerate(findings):
         colour = colours[f.verdict]
-        label = None if f.verdict in labelled else f.verdict
-        labelled.add(f.verdict)
         middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
         ends = np.array([f.low, f.high]) / f.floor
         axis.plot(ends, [y, y], color=colour, lw=2.4, solid_capstyle="butt")
         marker = "o" if f.estimate else "|"
-        axis.plot(middle / f.floor, y, marker, color=colour, ms=6, label=label)
+        axis.plot(middle / f.floor, y, marker, color=colour, ms=6, label=f.verdict)
     axis.axvline(0.0, color=style.QUIET, lw=0.8)
-    axis.set(
-        xlabel="size in floors (grey: within the floor)",
-        yticks=range(len(findings)),
-        ylim=(-1, len(findings)),
-    )
-    axis.set_yticklabels([f.name for f in findings], fontsize=8)
+    axis.set_xlabel("size in floors (grey: within the floor)")
+    _name_rows(axis, [f.name for f in findings], 8)
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
-    _plain(axis.xaxis, MOST_TICKS)
+    _plain(axis.xaxis)
     axis.tick_params(axis="x", top=True, labeltop=True)
     return _with_legend(figure)
 
@@ -220,7 +201,7 @@ def horizons(gain: Gain) -> bytes:
         axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
         axis.set_xticks(SHOWN_HORIZONS, [f"{x:g}" for x in SHOWN_HORIZONS])
         axis.minorticks_off()
-        _plain(axis.yaxis, MOST_TICKS // 2)
+        _plain(axis.yaxis, (1, 2, 5))
     axes[0, 0].set_ylabel("error [sigma of the sensor]")
     return _with_legend(figure)
 
@@ -275,34 +256,23 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     open to the right if never.
     """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
-    last = {c.name: c.limit / f if np.isfinite(c.limit) else np.inf for c, f in pairs}
-    pairs = sorted(pairs, key=lambda p: last[p[0].name])
+    pairs.sort(key=lambda pair: np.nan_to_num(pair[0].limit / pair[1], nan=np.inf), reverse=True)
     figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
     axis = axes[0, 0]
-    for y, (curve, floor) in enumerate(pairs[::-1]):
+    for y, (curve, floor) in enumerate(pairs):
         sizes = np.array(curve.sizes) / floor
         share = np.maximum.accumulate(curve.up_to_class)
-        half, top = (
-            float(np.interp(q, share, sizes)) if share[-1] >= q else sizes[-1] for q in (0.5, 0.9)
-        )
+        half, top = np.interp((0.5, 0.9), share, sizes)
+        marker, colour = ("o", AFTER) if share[-1] >= 0.9 else (">", BEFORE)
         axis.plot((half, top), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
-        axis.plot(
-            top,
-            y,
-            "o" if share[-1] >= 0.9 else ">",
-            color=AFTER if share[-1] >= 0.9 else BEFORE,
-            ms=5,
-        )
+        axis.plot(top, y, marker, color=colour, ms=5)
     axis.set(
         xscale="log",
         xlabel=(
             "hidden size [floors] named in 50 % and (mark) 90 % of worlds; >: never within what was"
             " tried"
         ),
-        yticks=range(len(pairs)),
-        ylim=(-1, len(pairs)),
     )
-    axis.set_yticklabels([curve.name for curve, _ in pairs[::-1]], fontsize=7)
-    axis.set_xticks((1, 2, 5, 10, 20, 50), ("1", "2", "5", "10", "20", "50"))
-    axis.minorticks_off()
+    _name_rows(axis, [curve.name for curve, _ in pairs], 7)
+    _plain(axis.xaxis, (1, 2, 5))
     return png_of(figure)

@@ -18,7 +18,7 @@ from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded_flight import measured
 from visthrow.logs.axes import EXCHANGES, matrix_of
 from visthrow.logs.check import relations, thrust_checks
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog, Samples
 
 # correlation of commanded and measured rates, with whichever axes, from which a log tells of its
 # commands
@@ -163,12 +163,11 @@ def _followed(log: FlightLog) -> relations.Relation | None:
     attitude = measured(log, "quat_wb")
     if attitude is None or "command" not in log or np.count_nonzero(attitude.valid) < 50:
         return None
-    time, rate = relations.rates_of(*attitude.samples())
-    stamps, commanded = log["command"].samples()
-    commanded = commanded[:, 1:]
-    if len(time) < 50 or len(commanded) < 20 or np.max(np.std(rate, axis=0)) < MOVES:
+    rates = relations.rates_of(*attitude.samples())
+    time, command = log["command"].samples()
+    if len(rates.time) < 50 or len(time) < 20 or np.max(np.std(rates.values, axis=0)) < MOVES:
         return None
-    relation = relations.relate(stamps, commanded, time, rate)
+    relation = relations.relate(Samples(time, command[:, 1:]), rates)
     return relation if relation is not None and relation.axes_correlation > FOLLOWS else None
 
 

@@ -12,7 +12,7 @@ from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import relations
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog, Samples
 
 # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
 # to be compared
@@ -72,8 +72,9 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> list[Row]:
     return rows
 
 
-def usable(time: np.ndarray, values: np.ndarray, threshold: float) -> bool:
-    return len(time) > 50 and bool(np.max(np.std(values, axis=0)) > threshold)
+def usable(samples: Samples, threshold: float) -> bool:
+    moves = len(samples.time) > 50 and np.max(np.std(samples.values, axis=0)) > threshold
+    return bool(moves)
 
 
 def median_tilt(attitude: Channel) -> float:
@@ -146,14 +147,14 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
-    (time_p, p) = log[pos].samples()
-    (time_v, v) = log[vel].samples()
-    if not (usable(time_p, p, 0.02) and usable(time_v, v, 0.0)):
+    place = log[pos].samples()
+    velocity = log[vel].samples()
+    if not (usable(place, 0.02) and usable(velocity, 0.0)):
         return []
-    relation = relations.relate(*relations.derivative(time_p, p), time_v, v)
-    notes = [log.meta.get("ingest", {}).get(name, {}) for name in (pos, vel)]
-    message, second = (note.get("message") for note in notes)
-    return _compared(relation, f"d({pos})/dt", vel, message is not None and message == second)
+    notes = log.meta.get("ingest", {})
+    messages = {notes.get(name, {}).get("message") for name in (pos, vel)}
+    one_clock = len(messages) == 1 and None not in messages
+    return _compared(relations.derivative(*place), velocity, f"d({pos})/dt, {vel}", one_clock)
 
 
 def _rates(log: FlightLog, quat: str) -> list[Row]:
@@ -161,22 +162,17 @@ def _rates(log: FlightLog, quat: str) -> list[Row]:
         return []
     measured = log["rate_b"].samples()
     derived = relations.rates_of(*log[quat].samples())
-    if not (
-        usable(*derived, 0.0)
-        and usable(*measured, 0.0)
-        and (usable(*derived, MOVES) or usable(*measured, MOVES))
-    ):
+    both = derived, measured
+    if not all(usable(rates, 0.0) for rates in both) or not any(usable(r, MOVES) for r in both):
         return []
-    return _compared(relations.relate(*derived, *measured), f"rate of {quat}", "rate_b")
+    return _compared(*both, f"rate of {quat}, rate_b")
 
 
-def _compared(
-    relation: relations.Relation | None, first: str, second: str, one_clock: bool = False
-) -> list[Row]:
+def _compared(first: Samples, second: Samples, channels: str, one_clock: bool = False) -> list[Row]:
     """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
+    relation = relations.relate(first, second)
     if relation is None:
         return []
-    channels = f"{first}, {second}"
     figures = _figures(relation)
     if _disagrees(relation):
         text = (
@@ -185,15 +181,7 @@ def _compared(
         )
         return [Row("frames", channels, "bad", text, figures)]
     if _turned(relation):
-        return [
-            Row(
-                "frames",
-                channels,
-                "bad",
-                f"go together as {_better(relation)}",
-                figures | {"axes": relation.axes, "nats": relation.nats},
-            )
-        ]
+        return [_in_other_axes(relation, channels, "go together")]
     together = f"go together as they are, correlation {relation.correlation:.2f}"
     rows = [Row("frames", channels, "ok", together, figures)]
     if not 0.67 < relation.scale < 1.5:
@@ -220,14 +208,17 @@ def _turned(relation: relations.Relation) -> bool:
     return relation.nats > _NATS and relation.axes_correlation > relation.correlation + CLEARLY
 
 
+def _in_other_axes(relation: relations.Relation, channels: str, words: str) -> Row:
+    """Report a pair that goes together in other axes."""
+    figures = _figures(relation) | {"axes": relation.axes, "nats": relation.nats}
+    return Row("frames", channels, "bad", f"{words} as {_better(relation)}", figures)
+
+
 def _better(relation: relations.Relation, whose: str = "") -> str:
     """Words about an exchange of axes that beats those as they are."""
-    text = f"({relation.axes}){whose}, {relation.nats:.0f} nats better: {_kind(relation.axes)} "
+    kind = "a mirror image" if is_mirror(relation.axes) else "axes exchanged or turned"
+    text = f"({relation.axes}){whose}, {relation.nats:.0f} nats better: {kind} "
     return text + f"(correlation {relation.axes_correlation:.2f}, not {relation.correlation:.2f})"
-
-
-def _kind(axes: str) -> str:
-    return "a mirror image" if is_mirror(axes) else "axes exchanged or turned"
 
 
 def _late(relation: relations.Relation, channels: str, figures: dict, one_clock: bool) -> Row:
@@ -269,8 +260,8 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
     """Check that the mean force on the body, turned to the world, carries the vehicle."""
     if "acc_b" not in log:
         return []
-    (time_q, q) = log[quat].samples()
-    (time_a, acc) = log["acc_b"].samples()
+    time_q, q = log[quat].samples()
+    time_a, acc = log["acc_b"].samples()
     if len(time_q) < 50 or len(time_a) < 50:
         return []
     nearest = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
@@ -296,15 +287,8 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
         return [Row("frames", channels, "bad", text, figures)]
     verdict = "warn" if tilt > 3.0 or abs(size / GRAVITY - 1.0) > 0.03 else "ok"
-    return [
-        Row(
-            "frames",
-            channels,
-            verdict,
-            f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up",
-            figures,
-        )
-    ]
+    text = f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up"
+    return [Row("frames", channels, verdict, text, figures)]
 
 
 def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
@@ -316,36 +300,35 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     sensed = "acc_b" in log
     if path not in log:
         return []
-    time_p, p = log[path].samples()
-    time_q, q = log[quat].samples()
-    if min(len(time_p), len(time_q)) < 50:
+    motion = log[path].samples()
+    attitude = log[quat].samples()
+    if min(len(motion.time), len(attitude.time)) < 50:
         return []
-    time, acc = accelerations(time_p, p, log[path].unit)
+    time, acc = accelerations(*motion, log[path].unit)
     if len(time) < 50 or float(np.sqrt(np.sum(np.var(acc, axis=0)))) < _PUSHED:
         return []
-    turn = relations.attitude_at(time_q, q, time)
+    turn = relations.attitude_at(*attitude, time)
     if not sensed:
-        carried = _carried(log, quat, time, acc)
-        hangs = carried[0]
+        hangs, relative = _carried(log, quat, time, acc)
         if np.sum(hangs) < 50:
             return []
         turn = turn[hangs]
-        acc = _together(acc[hangs], carried[1][hangs], turn)
+        acc = _together(acc[hangs], relative[hangs], turn)
         return _leaning(time[hangs], acc, turn, f"d({path})/dt, {quat} thrust along z")
-    time_a, force_b = log["acc_b"].samples()
-    if len(time_a) < 50 or sparse(time_a) or sparse(time_p):
+    force_b = log["acc_b"].samples()
+    if len(force_b.time) < 50 or sparse(force_b.time) or sparse(motion.time):
         return []
     gravity = np.array([0.0, 0.0, GRAVITY])
-    pushed = rotate(relations.attitude_at(time_q, q, time_a), force_b) - gravity
-    pushed = relations.mean_over(time_a, pushed, time, _SPAN)
-    relation = relations.relate(time, acc, time, pushed)
+    pushed = rotate(relations.attitude_at(*attitude, force_b.time), force_b.values) - gravity
+    pushed = relations.mean_over(force_b.time, pushed, time, _SPAN)
+    relation = relations.relate(Samples(time, acc), Samples(time, pushed))
     if relation is None:
         return []
     channels = f"d({path})/dt, {quat} acc_b"
     wrong = _exchanged(relation, channels)
     if wrong is None:
-        expected_b = rotate_back(turn, acc + gravity)
-        wrong = _exchanged_body(time, expected_b, time_a, force_b, channels)
+        expected_b = Samples(time, rotate_back(turn, acc + gravity))
+        wrong = _exchanged_body(expected_b, force_b, channels)
     return [wrong] if wrong is not None else _pushed(relation, acc, pushed, channels, True)
 
 
@@ -358,10 +341,10 @@ def _carried(
     pos = quat.replace("quat_wb", "pos_w")
     if "payload_pos_w" not in log or np.sum(log["payload_pos_w"].valid) < 50 or pos not in log:
         return np.ones(len(time), bool), np.zeros_like(acc)
-    time_p, p = log["payload_pos_w"].samples()
-    gap = relations.on_grid(time_p, p, time) - relations.on_grid(*log[pos].samples(), time)
+    payload = log["payload_pos_w"].samples()
+    gap = relations.on_grid(*payload, time) - relations.on_grid(*log[pos].samples(), time)
     length = np.linalg.norm(gap, axis=1)
-    stamps, acc_p = accelerations(time_p, p, "m")
+    stamps, acc_p = accelerations(*payload, "m")
     if not len(stamps):
         return np.zeros(len(time), bool), np.zeros_like(acc)
     hangs = np.abs(length - np.median(length)) < _TAUT * np.median(length)
@@ -387,7 +370,7 @@ def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str)
     level = np.array([1.0, 1.0, 0.0])
     up = matrix_of_quat(turn)[:, :, 2]
     pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * level
-    relation = relations.relate(time, acc * level, time, pushed)
+    relation = relations.relate(Samples(time, acc * level), Samples(time, pushed))
     if relation is None:
         return []
     wrong = _exchanged(relation, channels)
@@ -401,35 +384,27 @@ def sparse(time: np.ndarray) -> bool:
     return len(time) > 1 and float(np.median(np.diff(time))) > relations.INDEPENDENT
 
 
-def _exchanged_body(
-    time: np.ndarray, expected_b: np.ndarray, time_a: np.ndarray, force_b: np.ndarray, channels: str
-) -> Row | None:
+def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row | None:
     """Which exchange of axes level with the rotors an accelerometer has: it feels the little that
     drag and cable leave there.
     """
-    grid = time[(time > time_a[0] + _SPAN) & (time < time_a[-1] - _SPAN)]
+    time = expected_b.time
+    known = (time > force_b.time[0] + _SPAN) & (time < force_b.time[-1] - _SPAN)
+    grid = time[known]
     if len(grid) < 50:
         return None
-    felt = relations.mean_over(time_a, force_b, grid, 2.0 * _SPAN)
-    relation = relations.relate(
-        grid, relations.on_grid(time, expected_b, grid), grid, felt, reach=_DELAY_BAD
-    )
+    measured = Samples(grid, relations.mean_over(*force_b, grid, 2.0 * _SPAN))
+    expected = Samples(grid, expected_b.values[known])
+    relation = relations.relate(expected, measured, reach=_DELAY_BAD)
     if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
         return None
-    return Row(
-        "frames",
-        channels,
-        "bad",
-        f"acc_b fits as {_better(relation)}",
-        {"axes": relation.axes, "of": "acc_b", "nats": relation.nats},
-    )
+    figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
+    return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)
 
 
-def accelerations(
-    time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return times [s] and accelerations [m/s^2], shape (N, 3), of positions (unit m) or
-    velocities, over about ``span`` seconds each.
+def accelerations(time: np.ndarray, path: np.ndarray, unit: str, span: float = _SPAN) -> Samples:
+    """Return accelerations [m/s^2] of positions (unit m) or velocities, over about ``span`` seconds
+    each.
     """
     if unit == "m":
         time, path = relations.derivative(time, path, span)
@@ -499,15 +474,8 @@ def _still_gravity(log: FlightLog) -> list[Row]:
     figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(acc, axis=0).tolist()}
     if not 0.7 < size / GRAVITY < 1.4:
         hint = relations.unit_hint(size / GRAVITY) or "gravity is missing or the unit is wrong"
-        return [
-            Row(
-                "units",
-                "acc_b",
-                "bad",
-                f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}",
-                figures,
-            )
-        ]
+        text = f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}"
+        return [Row("units", "acc_b", "bad", text, figures)]
     return [Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)]
 
 
@@ -522,35 +490,33 @@ def _commands(log: FlightLog) -> list[Row]:
     else:
         return []
     rows: list[Row] = []
-    for name in (
-        name for name in ("command", "rate_setpoint_b") if name in log and usable(*rates, MOVES)
-    ):
-        time, set_points = log[name].samples()
-        set_points = set_points[:, -3:]  # a command's first is thrust
-        if (
-            usable(time, set_points, MOVES)
-            and (relation := relations.relate(time, set_points, *rates)) is not None
-        ):
+    if not usable(rates, MOVES):
+        return rows
+    spread = float(np.max(np.std(rates.values, axis=0)))
+    for name in ("command", "rate_setpoint_b"):
+        if name not in log:
+            continue
+        time, values = log[name].samples()
+        set_points = Samples(time, values[:, -3:])  # a command's first is thrust
+        relation = relations.relate(set_points, rates) if usable(set_points, MOVES) else None
+        if relation is not None:
             channels = f"{name}, {turning}"
-            spread = float(np.max(np.std(rates[1], axis=0)))
-            early = _early(relation, time, set_points, rates, channels)
+            early = _early(relation, set_points, rates, channels)
             rows += early or _followed(relation, channels, spread)
     return rows
 
 
 def _early(
-    relation: relations.Relation,
-    time: np.ndarray,
-    set_points: np.ndarray,
-    rates: tuple[np.ndarray, np.ndarray],
-    channels: str,
+    relation: relations.Relation, set_points: Samples, rates: Samples, channels: str
 ) -> list[Row]:
     """Report rates that go before their commands: if no delay that a controller has fits them as
     well, the clock of the commands is late. A swing that a controller opposes fits both.
     """
     if relation.axes_delay > -_DELAY_BAD or relation.axes_correlation < FIRMLY:
         return []
-    later = relations.relate(time + _RESPONSE, set_points, *rates, reach=_RESPONSE)
+    time = set_points.time
+    moved = set_points._replace(time=time + _RESPONSE)
+    later = relations.relate(moved, rates, reach=_RESPONSE)
     if later is None:
         return []
     before = min(relation.axes_correlation, 0.999)
@@ -575,16 +541,7 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
         )
         return [Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)]
     if _turned(relation):
-        text = f"the rates follow the commands as {_better(relation)}"
-        return [
-            Row(
-                "frames",
-                channels,
-                "bad",
-                text,
-                figures | {"axes": relation.axes, "nats": relation.nats},
-            )
-        ]
+        return [_in_other_axes(relation, channels, "the rates follow the commands")]
     is_measured = relation.delay_sd < _UNTOLD
     late = is_measured and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
@@ -598,66 +555,47 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
         f"the rates follow {when}, correlation {relation.correlation:.2f}, gain"
         f" {relation.scale:.2f}"
     )
-    text += (
-        ": before they were commanded"
-        if late
-        else f": {hint}"
-        if hint
-        else ": weakly"
-        if weak
-        else ""
-    )
+    if late:
+        text += ": before they were commanded"
+    elif hint:
+        text += f": {hint}"
+    elif weak:
+        text += ": weakly"
     return [Row("delay", channels, verdict, text, figures)]
 
 
 def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     if "pos_w" not in log or "payload_pos_w" not in log:
         return []
-    (time_q, q) = log["pos_w"].samples()
-    (time_p, p) = log["payload_pos_w"].samples()
-    if len(time_q) < 20 or len(time_p) < 20:
+    place = log["pos_w"].samples()
+    time, pos = log["payload_pos_w"].samples()
+    if len(place.time) < 20 or len(time) < 20:
         return []
-    overlap = (time_p > time_q[0]) & (time_p < time_q[-1])
+    overlap = (time > place.time[0]) & (time < place.time[-1])
     if "attached" in log:
-        overlap &= log["attached"].hold(time_p).astype(bool)
-    time_p = time_p[overlap]
-    p = p[overlap]
-    gap = p - relations.on_grid(time_q, q, time_p)
+        overlap &= log["attached"].hold(time).astype(bool)
+    payload = Samples(time[overlap], pos[overlap])
+    gap = payload.values - relations.on_grid(*place, payload.time)
     length = np.linalg.norm(gap, axis=1)
     channels = "pos_w, payload_pos_w"
     if len(length) < 20:
-        return [
-            Row("frames", channels, "bad", "vehicle and payload were never measured at one time")
-        ]
+        text = "vehicle and payload were never measured at one time"
+        return [Row("frames", channels, "bad", text)]
     middle = float(np.median(length))
     spread = float(np.percentile(length, 90) - np.percentile(length, 10))
     above = float(np.mean(gap[:, 2] > 0.5 * middle))
     figures = {"median_m": middle, "p10_to_p90_m": spread, "payload_above_share": above}
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
     if above > 0.5:
-        return [
-            Row(
-                "frames",
-                channels,
-                "bad",
-                text + ", the payload above: bodies exchanged, or z down",
-                figures,
-            )
-        ]
+        text += ", the payload above: bodies exchanged, or z down"
+        return [Row("frames", channels, "bad", text, figures)]
     if not 0.02 < middle < 20.0:
-        return [
-            Row(
-                "units",
-                channels,
-                "bad",
-                text + ": no cable; millimetres taken for metres, or metres for millimetres?",
-                figures,
-            )
-        ]
+        text += ": no cable; millimetres taken for metres, or metres for millimetres?"
+        return [Row("units", channels, "bad", text, figures)]
     rows = [Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)]
     rows += _length(middle, vehicle.cable_length, channels) if vehicle.cable_length else []
-    rows += _left_early(log, time_p, gap)
-    return rows + _payload_late(time_q, q, time_p, p, channels)
+    rows += _left_early(log, payload.time, gap)
+    return rows + _payload_late(place, payload, channels)
 
 
 def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> list[Row]:
@@ -693,49 +631,33 @@ def _length(middle: float, expected: float, channels: str) -> list[Row]:
     figures = {"median_m": middle, "model_m": expected}
     text = f"apart by {100 * off:+.1f} % of the model's cable of {expected:g} m"
     verdict = "bad" if abs(off) > _OTHER_CABLE else "warn" if abs(off) > _LONGER else "ok"
-    return [
-        Row(
-            "cable",
-            channels,
-            verdict,
-            text + (": another cable, or another body" if verdict == "bad" else ""),
-            figures,
-        )
-    ]
+    text += ": another cable, or another body" if verdict == "bad" else ""
+    return [Row("cable", channels, verdict, text, figures)]
 
 
-def _payload_late(
-    time_q: np.ndarray, q: np.ndarray, time_p: np.ndarray, p: np.ndarray, channels: str
-) -> list[Row]:
+def _payload_late(place: Samples, payload: Samples, channels: str) -> list[Row]:
     """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
-    overlap = (time_p > time_q[0] + 0.2) & (time_p < time_q[-1] - 0.2)
+    overlap = (payload.time > place.time[0] + 0.2) & (payload.time < place.time[-1] - 0.2)
     if np.sum(overlap) < 50:
         return []
-    lengths = np.array(
-        [
-            np.linalg.norm(p[overlap] - relations.on_grid(time_q, q, time_p[overlap] - d), axis=1)
-            for d in delays
-        ]
-    )
-    spread = np.std(lengths, axis=1)
+    time, pos = (array[overlap] for array in payload)
+    gaps = pos - relations.on_grid(*place, time - delays[:, None])
+    spread = np.std(np.linalg.norm(gaps, axis=2), axis=1)
     best = int(np.argmin(spread))
-    independent = max(float(np.ptp(time_p[overlap])) / relations.INDEPENDENT, 10.0)
+    delay = float(delays[best])
+    independent = max(float(np.ptp(time)) / relations.INDEPENDENT, 10.0)
     floor = 1e-9  # of a cable's length without any noise [m]
-    nats = independent * float(
-        np.log(max(spread[len(delays) // 2], floor) / max(spread[best], floor))
-    )
-    if nats < _NATS or best in (0, len(delays) - 1) or abs(delays[best]) < _DELAY_WARN:
+    plain, least = np.maximum(spread[[len(delays) // 2, best]], floor)
+    nats = independent * float(np.log(plain / least))
+    if nats < _NATS or best in (0, len(delays) - 1) or abs(delay) < _DELAY_WARN:
         return []
     text = (
-        f"the payload is {1e3 * delays[best]:+.0f} ms behind the vehicle: the cable's length then"
-        " varies by "
+        f"the payload is {1e3 * delay:+.0f} ms behind the vehicle: the cable's length then"
+        f" varies by {1e3 * least:.1f} mm, not {1e3 * plain:.1f} ({nats:.0f} nats)"
     )
-    text += (
-        f"{1e3 * spread[best]:.1f} mm, not {1e3 * spread[len(delays) // 2]:.1f} ({nats:.0f} nats)"
-    )
-    verdict = "bad" if abs(delays[best]) > _DELAY_BAD else "warn"
-    return [Row("delay", channels, verdict, text, {"delay_s": float(delays[best]), "nats": nats})]
+    verdict = "bad" if abs(delay) > _DELAY_BAD else "warn"
+    return [Row("delay", channels, verdict, text, {"delay_s": delay, "nats": nats})]
 
 
 def _same(log: FlightLog) -> list[Row]:
@@ -746,28 +668,31 @@ def _same(log: FlightLog) -> list[Row]:
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         if first not in log or second not in log:
             continue
-        (time_a, a) = log[first].samples()
-        (time_b, b) = log[second].samples()
-        if not (usable(time_a, a, MOVES) and usable(time_b, b, MOVES)):
+        a = log[first].samples()
+        b = log[second].samples()
+        if not (usable(a, MOVES) and usable(b, MOVES)):
             continue
-        rows += _compared(relations.relate(time_a, a, time_b, b), first, second)
+        rows += _compared(a, b, f"{first}, {second}")
         if "bad" not in {row.verdict for row in rows}:
-            rows += _drift(time_a, a, time_b, b, f"{first}, {second}")
+            rows += _drift(a, b, f"{first}, {second}")
     return rows
 
 
-def _drift(
-    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, channels: str
-) -> list[Row]:
+def _within(samples: Samples, start: float, end: float) -> Samples:
+    rows = (samples.time >= start) & (samples.time < end)
+    return Samples(samples.time[rows], samples.values[rows])
+
+
+def _drift(first: Samples, second: Samples, channels: str) -> list[Row]:
     """Whether the delay is the same from piece to piece of 5 s."""
     delays = []
     piece = 5.0
-    for start in np.arange(time_a[0], time_a[-1] - piece, piece):
-        near_a = (time_a >= start) & (time_a < start + piece)
-        near_b = (time_b >= start - 1.0) & (time_b < start + piece + 1.0)
-        if np.sum(near_a) < 50 or np.sum(near_b) < 50 or np.max(np.std(a[near_a], axis=0)) < MOVES:
+    for start in np.arange(first.time[0], first.time[-1] - piece, piece):
+        a = _within(first, start, start + piece)
+        b = _within(second, start - 1.0, start + piece + 1.0)
+        if min(len(a.time), len(b.time)) < 50 or np.max(np.std(a.values, axis=0)) < MOVES:
             continue
-        relation = relations.relate(time_a[near_a], a[near_a], time_b[near_b], b[near_b])
+        relation = relations.relate(a, b)
         if relation is not None and relation.correlation > 0.8 and relation.delay_sd < DELAY_KNOWN:
             delays.append((start, relation.delay))
     if len(delays) < 3:

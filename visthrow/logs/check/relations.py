@@ -6,6 +6,7 @@ import numpy as np
 
 from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
+from visthrow.logs.flightlog import Samples
 
 REACH = 0.4  # largest delay looked for [s]
 # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
@@ -28,15 +29,11 @@ INDEPENDENT = 0.1
 
 UNITS = {
     180 / np.pi: "one is in degrees",
-    np.pi / 180: "one is in degrees",
     1000.0: "one is in thousandths",
-    1e-3: "one is in thousandths",
     9.80665: "one is in g",
-    1 / 9.80665: "one is in g",
     100.0: "one is in hundredths",
-    0.01: "one is in hundredths",
 }
-"""Ratio -> what it gives away."""
+"""Ratio of the larger to the smaller -> what it gives away."""
 
 
 @dataclass(frozen=True)
@@ -60,67 +57,52 @@ def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarra
     return np.stack([np.interp(grid, time, column) for column in values.T], -1)
 
 
-def relate(
-    time_a: np.ndarray, a: np.ndarray, time_b: np.ndarray, b: np.ndarray, reach: float = REACH
-) -> Relation | None:
-    """Relate two signals of one or three components.
+def relate(first: Samples, second: Samples, reach: float = REACH) -> Relation | None:
+    """Relate two signals of one or three components; ``reach``: largest delay [s].
 
-    Args:
-        time_a: Stamps of the first [s].
-        a: The first, shape (N, 1 or 3).
-        time_b: Stamps of the second [s].
-        b: The second, shape (M, 1 or 3).
-        reach: Largest delay [s].
-
-    Returns:
-        None where they overlap too little or do not move.
+    Returns None where they overlap too little or do not move.
     """
-    if min(len(time_a), len(time_b)) < 2:
+    clocks = first.time, second.time
+    if min(map(len, clocks)) < 2:
         return None
-    start = max(time_a[0], time_b[0]) + reach
-    end = min(time_a[-1], time_b[-1]) - reach
-    period = max(np.median(np.diff(time_a)), np.median(np.diff(time_b)))
+    start = max(time[0] for time in clocks) + reach
+    end = min(time[-1] for time in clocks) - reach
+    period = max(np.median(np.diff(time)) for time in clocks)
     period = max(period, (end - start) / _LONGEST_GRID)
     count = int((end - start) / period)
     if count < 50:
         return None
     grid = start + period * np.arange(count)
     steps = int(reach / period)
-    relation, follows = _related(time_a, a, time_b, b, grid, period, steps)
+    relation, follows = _related(first, second, grid, period, steps)
     if relation is not None and not np.all(follows):
-        relation, _ = _related(time_a, a, time_b, b, grid[follows], period, steps)
+        relation, _ = _related(first, second, grid[follows], period, steps)
     return relation
 
 
 def _related(
-    time_a: np.ndarray,
-    a: np.ndarray,
-    time_b: np.ndarray,
-    b: np.ndarray,
-    grid: np.ndarray,
-    period: float,
-    steps: int,
+    first: Samples, second: Samples, grid: np.ndarray, period: float, steps: int
 ) -> tuple[Relation | None, np.ndarray]:
     """Relation at the times of a grid [s], and which of them go with the rest."""
-    values = on_grid(time_a, a, grid)
+    values = on_grid(*first, grid)
     count = len(grid)
-    first = _centred(values)
-    usual_a = np.median(values, axis=0)
-    usual_b = np.median(on_grid(time_b, b, grid), axis=0)
-    values = values - usual_a
+    centred = values - np.mean(values, axis=0)
+    values = values - np.median(values, axis=0)
+    usual = np.median(on_grid(*second, grid), axis=0)
     edges = np.linspace(0, count, BLOCKS, endpoint=False).astype(int)
-    sums = np.zeros((2, 2 * steps + 1, BLOCKS))
-    cross = np.zeros((a.shape[1], b.shape[1], 2 * steps + 1))
-    norms = np.zeros(2 * steps + 1)
-    power = float(np.sum(first**2))
-    for lag in range(-steps, steps + 1):
-        moved = on_grid(time_b, b, grid + lag * period)
-        second = _centred(moved)
-        cross[:, :, lag + steps] = first.T @ second
-        norms[lag + steps] = np.sum(second**2)
-        moved = moved - usual_b
+    lags = 2 * steps + 1
+    sums = np.zeros((2, lags, BLOCKS))
+    cross = np.zeros((values.shape[1], len(usual), lags))
+    norms = np.zeros(lags)
+    power = float(np.sum(centred**2))
+    for lag in range(lags):
+        moved = on_grid(*second, grid + (lag - steps) * period)
+        moved_centred = moved - np.mean(moved, axis=0)
+        cross[:, :, lag] = centred.T @ moved_centred
+        norms[lag] = np.sum(moved_centred**2)
+        moved = moved - usual
         products = np.sum(values * moved, axis=1), np.sum(moved**2, axis=1)
-        sums[:, lag + steps] = np.add.reduceat(products, edges, axis=1)
+        sums[:, lag] = np.add.reduceat(products, edges, axis=1)
     if power <= 0.0 or np.min(norms) <= 0.0:
         return None, np.ones(count, bool)
     powers = np.add.reduceat(np.sum(values**2, axis=1), edges)
@@ -269,10 +251,6 @@ def _vertex(
     return vertex, _STUDENT * float(np.sqrt(variance) / -bend)
 
 
-def _centred(values: np.ndarray) -> np.ndarray:
-    return values - np.mean(values, axis=0)
-
-
 def peak(score: np.ndarray, index: int) -> tuple[float, float]:
     """Vertex of the parabola through the peak and its neighbours, and its curvature [1/step^2]."""
     if not 0 < index < len(score) - 1:
@@ -285,34 +263,27 @@ def peak(score: np.ndarray, index: int) -> tuple[float, float]:
 def unit_hint(ratio: float) -> str:
     """Name the unit that a ratio of two measurements suggests, or return nothing."""
     for factor, words in UNITS.items():
-        if ratio and abs(np.log(abs(ratio) / factor)) < _UNIT:
+        if ratio and abs(abs(np.log(abs(ratio))) - np.log(factor)) < _UNIT:
             return words
     return ""
 
 
-def derivative(
-    time: np.ndarray, values: np.ndarray, span: float = 0.06
-) -> tuple[np.ndarray, np.ndarray]:
+def derivative(time: np.ndarray, values: np.ndarray, span: float = 0.06) -> Samples:
     """Return the derivative over about ``span`` seconds, or two periods where these are longer;
     gaps are left out.
-
-    Returns times [s] and derivatives.
     """
     first, last, middle, width = _pairs(time, span)
-    return middle, (values[last] - values[first]) / width[:, None]
+    return Samples(middle, (values[last] - values[first]) / width[:, None])
 
 
-def rates_of(
-    time: np.ndarray, quat: np.ndarray, span: float = 0.06
-) -> tuple[np.ndarray, np.ndarray]:
-    """Body rates from attitudes xyzw, over about ``span`` seconds as in :func:`derivative`.
-
-    Returns times [s] and rates [rad/s], shape (N, 3).
+def rates_of(time: np.ndarray, quat: np.ndarray, span: float = 0.06) -> Samples:
+    """Return body rates [rad/s] from attitudes xyzw, over about ``span`` seconds as in
+    :func:`derivative`.
     """
     first, last, middle, width = _pairs(time, span)
     if not len(middle):
-        return middle, np.empty((0, 3))
-    return middle, vectors_between(quat[first], quat[last]) / width[:, None]
+        return Samples(middle, np.empty((0, 3)))
+    return Samples(middle, vectors_between(quat[first], quat[last]) / width[:, None])
 
 
 def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

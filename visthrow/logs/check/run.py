@@ -228,17 +228,16 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
         if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100
     ]
     for first, second in combinations(named[:_MOST_PAIRED], 2):
-        (time_a, a), (time_b, b) = (logs[i]["payload_pos_w"].samples() for i in (first, second))
-        if max(np.max(np.std(a, axis=0)), np.max(np.std(b, axis=0))) < physics.MOVES:
+        a, b = (logs[i]["payload_pos_w"].samples() for i in (first, second))
+        if max(np.max(np.std(path.values, axis=0)) for path in (a, b)) < physics.MOVES:
             continue
         # on a straight path an offset of positions looks like a delay; velocities have none
-        relation = relations.relate(
-            *relations.derivative(time_a, a), *relations.derivative(time_b, b)
-        )
+        relation = relations.relate(relations.derivative(*a), relations.derivative(*b))
         if relation is None or relation.delay_sd > physics.DELAY_KNOWN:
             continue
-        common = (time_a > time_b[0] - relation.delay) & (time_a < time_b[-1] - relation.delay)
-        difference = a[common] - relations.on_grid(time_b, b, time_a[common] + relation.delay)
+        late_time = a.time + relation.delay
+        common = (late_time > b.time[0]) & (late_time < b.time[-1])
+        difference = a.values[common] - relations.on_grid(*b, late_time[common])
         off = float(np.sqrt(np.mean(difference**2))) if np.any(common) else np.inf
         if off < _ONE_PAYLOAD:
             late = 1e3 * relation.delay

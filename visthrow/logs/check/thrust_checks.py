@@ -9,7 +9,7 @@ from visthrow.common.rotations import rotate_back
 from visthrow.logs.check import relations
 from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog, Samples
 
 INPUTS = (
     "command",
@@ -290,18 +290,10 @@ def _rotors(log: FlightLog) -> list[Row]:
             if ratio < 0.02:
                 text += "its sensor is dead, or the rotor stands"
             else:
-                twin = next(
-                    (
-                        w
-                        for f, w in ((0.5, "half"), (2.0, "twice"))
-                        if abs(np.log(ratio / f)) < 0.15
-                    ),
-                    "",
-                )
-                text += (
-                    f"{twin + ': ' if twin else ''}no trim explains it; a sensor (pole pairs, a"
-                    " lost wire), or the rotor"
-                )
+                for factor, word in ((0.5, "half"), (2.0, "twice")):
+                    if abs(np.log(ratio / factor)) < 0.15:
+                        text += f"{word}: "
+                text += "no trim explains it; a sensor (pole pairs, a lost wire), or the rotor"
             rows.append(Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio}))
     return rows
 
@@ -311,11 +303,11 @@ def _turning(log: FlightLog) -> list[Row]:
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), None)
     if name is None or "rate_b" not in log or log[name].values.shape[1:] != (4,):
         return []
-    (time_m, motors) = log[name].samples()
-    (time_w, rate) = log["rate_b"].samples()
-    if not usable(time_w, rate, MOVES) or len(time_m) < 50:
+    time_m, motors = log[name].samples()
+    rate = log["rate_b"].samples()
+    if not usable(rate, MOVES) or len(time_m) < 50:
         return []
-    time_d, turning = relations.derivative(time_w, rate, 0.03)
+    time_d, turning = relations.derivative(*rate, 0.03)
     front_left, front_right, rear_left, rear_right = motors.T
     roll = front_left + rear_left - front_right - rear_right
     pitch = rear_left + rear_right - front_left - front_right
@@ -323,9 +315,8 @@ def _turning(log: FlightLog) -> list[Row]:
         return []
     rows = []
     for axis, (word, torque) in enumerate((("roll", roll), ("pitch", pitch))):
-        relation = relations.relate(
-            time_m, torque[:, None], time_d, turning[:, axis : axis + 1], 0.2
-        )
+        driven = Samples(time_m, torque[:, None])
+        relation = relations.relate(driven, Samples(time_d, turning[:, axis : axis + 1]), 0.2)
         if relation is not None and relation.axes_correlation >= 0.2:
             rows.append(_turned_by(word, relation, f"{name}, rate_b"))
     return rows

@@ -25,7 +25,7 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
     read_common,
 )
 from visthrow.logs.check.relations import Relation, derivative, relate
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog, Samples
 
 CHANNELS = ("acc_b", "rate_b")
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
@@ -116,7 +116,7 @@ def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
         return None
     time, inputs = log[params.input].samples()
     sent = params.torque.of(params.thrust(inputs)) / np.array(params.torque.inertia)
-    return relate(time, sent, *derivative(*log["rate_b"].samples(), SMOOTHING))
+    return relate(Samples(time, sent), derivative(*log["rate_b"].samples(), SMOOTHING))
 
 
 def _why_not(turned: Sequence[Relation], source: str) -> str:
