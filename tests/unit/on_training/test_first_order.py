@@ -34,9 +34,9 @@ LEAST_COSINE, MOST_BIAS = 0.97, 0.15
 """Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
 rates) lets them differ.
 """
-LEARNT = 0.195
-"""Landing error that the small task is brought under [m]: five seeds ended at 0.09 to 0.17, with
-Adam in place of Muon at 0.22 to 0.40.
+LEARNT = 0.3
+"""Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
+twelve with Adam in place of Muon eleven at 0.32 to 1.24 and one at 0.28.
 """
 
 ALIKE = 0.006
@@ -322,7 +322,7 @@ def small_task():
         for word in (
             "horizon=40",
             "iterations=100",
-            "learning_rate=3e-2",
+            "learning_rate=5e-2",
             "initial_release=-0.5",
             "final_width=0.1",
             "first_release=20",
@@ -334,7 +334,7 @@ def small_task():
     return load_experiment("state", ['algorithm="first_order"', *words])
 
 
-@mark.parametrize("seed", range(3))
+@mark.parametrize("seed", range(5))
 def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
     """Of the last five of 36 iterations nearly all flights release, and land near."""
     trainer = Trainer(small_task(), "cpu", seed)
