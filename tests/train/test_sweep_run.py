@@ -8,7 +8,7 @@ import signal
 import subprocess
 
 import numpy as np
-from pytest import fixture, importorskip, mark
+from pytest import fixture, mark
 
 from tests.commands import start
 from tests.waiting import eventually
@@ -119,26 +119,3 @@ def test_killed_at_any_moment_it_loses_nothing_and_repeats_nothing(path, tmp_pat
     training, throws = collect(work, broken, tmp_path / "records")
     assert len(results.load(throws)) == 2
     assert training.is_file()
-
-
-@mark.slow
-def test_jobs_through_submitit_in_pieces(path, tmp_path, monkeypatch):
-    """The same tasks as jobs of submitit's local executor, in pieces that end before the training
-    does.
-    """
-    importorskip("submitit")
-    from visthrow.paper.sweep import pool
-    from visthrow.paper.sweep.cluster import Cluster
-
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    monkeypatch.setattr(pool, "BUSY_PAUSE", 0.1)
-    changes = ("runs.tiny.seeds=[1]", 'runs.tiny.changes=["ppo.iterations=16"]')
-    work, out, said = load_list(path, changes), tmp_path / "jobs", []
-    cluster = Cluster(path, out, "local", 1, 1, minutes=0.001, changes=changes)
-    outcome = pool.ProcessPool(work, out, cluster, said.append).run()
-    assert outcome == pool.Outcome()
-    assert status(work, out)[1]
-    pieces = list((work.sources[0].folder(out) / "pieces").iterdir())
-    assert len(pieces) > 1
-    assert rows(work.sources[0], out) == 16
-    assert sum("begins" in line for line in said) >= len(pieces)

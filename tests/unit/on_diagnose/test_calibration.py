@@ -13,7 +13,7 @@ from visthrow.diagnose.select import result, search
 pytestmark = mark.slow
 
 EFFECTS = catalogue(20)
-NULLS, SINGLES, PAIRS = 100, 30, 20
+NULLS, WORLDS = 100, 30
 SURE = 0.01
 """Probability below which a count speaks against the rate that is promised."""
 
@@ -43,33 +43,25 @@ def worlds(count: int, hidden: int, floors: float, seed: int):
 
 def test_null_worlds_raise_no_false_alarm():
     """At most as many as a rate of one per cent allows."""
-    alarms = [
-        d
-        for _, model in worlds(NULLS, 0, 0.0, 1)
-        if (d := search.explain(model)).overall != result.NO_EFFECT
-    ]
-    assert binom.sf(len(alarms) - 1, NULLS, 0.01) > SURE, [a.reasons for a in alarms]
+    found = [search.explain(model).overall for _, model in worlds(NULLS, 0, 0.0, 1)]
+    alarms = sum(overall != result.NO_EFFECT for overall in found)
+    assert binom.sf(alarms - 1, NULLS, 0.01) > SURE
 
 
-@mark.parametrize(("floors", "found"), [(6.0, 0.75), (10.0, 0.92), (15.0, 0.97)])
-def test_single_effects_are_found_and_named_rightly(floors, found):
-    right = wrong = 0
-    for truth, model in worlds(SINGLES, 1, floors, int(floors)):
-        named = set(search.explain(model, laws=False).named)
+@mark.parametrize(
+    ("hidden", "floors", "found"),
+    [(1, 6.0, 0.75), (1, 10.0, 0.92), (1, 15.0, 0.97), (2, 12.0, 0.9)],
+)
+def test_effects_are_named_rightly_and_intervals_cover(hidden, floors, found):
+    right, wrong, inside = 0, 0, []
+    for truth, model in worlds(WORLDS, hidden, floors, int(floors)):
+        diagnosis = search.explain(model, laws=False)
+        named = set(diagnosis.named)
         right += named == set(truth)
         wrong += bool(named - set(truth))
-    assert binom.cdf(right, SINGLES, found) > SURE
-    assert binom.sf(wrong - 1, SINGLES, 0.02) > SURE
-
-
-def test_pairs_are_found_and_intervals_cover():
-    right, inside = 0, []
-    for truth, model in worlds(PAIRS, 2, 12.0, 3):
-        diagnosis = search.explain(model, laws=False)
-        right += set(diagnosis.named) == set(truth)
-        for name, size in truth.items():
-            f = diagnosis[name]
-            if f.verdict == result.FOUND:
-                inside.append(f.low <= size * f.floor <= f.high)
-    assert binom.cdf(right, PAIRS, 0.9) > SURE
+        for name in named & set(truth):
+            finding = diagnosis[name]
+            inside.append(finding.low <= truth[name] * finding.floor <= finding.high)
+    assert binom.cdf(right, WORLDS, found) > SURE
+    assert binom.sf(wrong - 1, WORLDS, 0.02) > SURE
     assert binom.cdf(sum(inside), len(inside), 0.95) > SURE

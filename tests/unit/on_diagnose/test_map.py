@@ -20,7 +20,6 @@ from visthrow.diagnose.inputs.proposal import propose
 from visthrow.diagnose.throw.command_mistakes import commanded
 from visthrow.diagnose.throw.recorded_flight import record_of
 from visthrow.logs import read, table_of
-from visthrow.logs.check import relations
 from visthrow.logs.check.run import check, contradictions
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.logs.joining import join, offset_of
@@ -144,33 +143,6 @@ def test_a_table_in_drawn_units_and_axes_is_read_as_it_was_flown(seed):
     assert np.ptp(log["pos_w"].time) == approx(np.ptp(columns["time"]))
 
 
-@pytest.mark.parametrize("angles", [False, True])
-@pytest.mark.parametrize("down", [False, True])
-def test_north_east_down_is_known_by_gravity(angles, down):
-    columns = flight(20.0)
-    flip = np.array([1.0, -1.0, -1.0]) if down else np.ones(3)
-    quat = columns["quat_wb"] * [*flip, 1.0]
-    attitude = {f"q{a}": c for a, c in zip("xyzw", quat.T)}
-    if angles:
-        lean = Rotation.from_quat(quat).as_euler("ZYX", degrees=True)[:, ::-1]
-        attitude = dict(zip(("roll", "pitch", "yaw"), lean.T))
-    table = {"time": columns["time"], **attitude}
-    for stem, name in (("pos", "pos_w"), ("gyro", "rate_b"), ("acc", "acc_b"), ("v", "vel_w")):
-        table |= named(stem, columns[name] * flip)
-    found = propose(table, "a.csv")
-    axes = "x,-y,-z" if down else ""
-    assert not found.questions
-    assert {c.name: c.axes for c in found.mapping.channels} == dict.fromkeys(
-        ("quat_wb", "pos_w", "vel_w", "rate_b", "acc_b"), axes
-    )
-    onboard = {name: c for name, c in table.items() if not name.startswith(("pos", "v_"))}
-    found = propose(onboard, "a.csv")
-    assert not found.questions
-    assert {c.name: c.axes for c in found.mapping.channels} == dict.fromkeys(
-        ("quat_wb", "rate_b", "acc_b"), axes
-    )
-
-
 def test_the_input_that_the_force_follows_drives_the_vehicle():
     columns = flight(20.0)
     thrust = columns["command"][:, 0]
@@ -197,20 +169,16 @@ def test_a_marker_in_millimetres_is_no_velocity_of_another():
     assert [c.name for c in propose(table, "a.csv").mapping.channels] == ["pos_w"]
 
 
-def test_markers_are_compared_in_a_time_that_grows_with_their_number(monkeypatch):
+def test_of_many_markers_a_velocity_is_no_position():
     """Thirty markers whose names tell no unit; one velocity among them is no position."""
     time = np.arange(0.0, 8.0, 0.01)
     path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 1.0 + 0.2 * np.sin(time)])
     columns = {"time": time} | named("v", np.gradient(path, time, axis=0))
     for i in range(30):
         columns |= named(f"m{i}", path + [0.01 * i, 0.02 * i, 0.0])
-    compared = []
-    relate = relations.relate
-    monkeypatch.setattr(relations, "relate", lambda *a, **k: compared.append(0) or relate(*a, **k))
     asked = " ".join(propose(columns, "capture").questions)
     assert "m29_x, m29_y, m29_z" in asked
     assert "v_x" not in asked
-    assert len(compared) < 100
 
 
 def test_a_payload_belongs_to_the_path_that_it_hangs_below():

@@ -58,23 +58,6 @@ def test_impossible_releases_are_refused(height, speed):
         release_for(2.0, height, speed, 0.04)
 
 
-def through(start, waypoints, end, velocity, times):
-    """Spline from rest at a start [m], shape (3,), through waypoints, shape (3, 3), in segments of
-    these times [s], shape (4,).
-    """
-    solved = sp._coefficients(start, waypoints[None], end, velocity, times[None])[0]
-    return sp.Spline(times, solved / (times[:, None] ** np.arange(sp.ORDER))[:, :, None])
-
-
-def test_derivatives_of_the_spline_are_its_slopes():
-    path = through(
-        np.zeros(3), np.arange(9.0).reshape(3, 3), np.ones(3), np.ones(3), np.full(4, 0.3)
-    )
-    time, h = np.array([0.1, 0.5, 0.95]), 1e-6
-    slopes = (path.sample(time + h) - path.sample(time - h)) / (2 * h)
-    assert np.allclose(slopes[:, :5], path.sample(time)[:, 1:], rtol=1e-4, atol=1e-3)
-
-
 def test_plan_ends_in_the_release_on_the_grid_and_within_bounds(plan):
     end = plan.path.sample(np.array([plan.path.duration]))[0]
     assert np.allclose(end[:2], [plan.release.pos_w, plan.release.vel_w], atol=1e-9)

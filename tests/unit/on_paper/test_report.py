@@ -10,7 +10,7 @@ from pytest import approx, fixture
 from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.paper.commands import report_command as command
-from visthrow.paper.report import ablations, beyond, gap, result_set, throws, trade
+from visthrow.paper.report import ablations, gap, result_set, throws
 from visthrow.throws import results
 from visthrow.throws.results import Result
 from visthrow.view import page
@@ -42,15 +42,6 @@ def texts(section, kind: str) -> str:
 
 def only(*found) -> result_set.ResultSet:
     return result_set.ResultSet(tuple(found))
-
-
-def test_changes_of_one_name_in_two_tables_are_both_shown():
-    changes = {"rope.length": 0.3, "task.start.length": 0.2}
-    one = made_up.policy(default_rng(0), "far", "state", "hybrid", 2.0, departures=changes)
-    section = beyond.section(
-        only(Result({**one.unit, "variant": "far"}, one.columns, made_up.MADE))
-    )
-    assert "length 0.3, length 0.2" in grids(section)[0].rows[0]
 
 
 def test_records_and_folders_are_read_and_batches_joined(tmp_path, full):
@@ -161,22 +152,6 @@ def test_ablation_ratio_bias_and_the_verdict():
     said = texts(section, "finding")
     assert re.search(r"no aerodynamics\*\*.*no effect shows; the paper: 3\.26", said)
     assert re.search(r"no motor lag\*\*.*the component matters; the paper: 2\.42", said)
-
-
-def test_front_tells_honestly_who_beats_whom(full):
-    rng = default_rng(3)
-    policy = made_up.policy(rng, "state", "state", "hybrid", 2.0, 0.02, duration=1.05)
-
-    def told(**setting) -> str:
-        found = made_up.baseline(rng, "hybrid", "both", 2.0, speed=2.2, **setting)
-        return texts(trade.front_section(only(policy, found)), "finding")
-
-    assert (
-        "no setting is both as accurate and as fast; the policy is faster than every setting"
-        in told(error=0.03, duration=1.5)
-    )
-    assert "1 of 1 setting as accurate and as fast at once" in told(error=0.004, duration=1.0)
-    assert "none of 1 setting landed all its throws" in told(error=0.004, duration=1.0, lost=1)
 
 
 def test_the_page_stands_alone(written):
