@@ -361,35 +361,6 @@ def test_shipped_lists_name_what_exists():
     ), "hours of one H200"
 
 
-def test_a_job_that_vanishes_is_submitted_again_but_not_for_ever():
-    utils = importorskip("submitit.core.utils")
-    from collections import Counter
-
-    from visthrow.paper.sweep import cluster
-
-    class Ended:
-        def __init__(self, outcome):
-            self.outcome = outcome
-
-        def done(self):
-            return self.outcome is not None
-
-        def result(self):
-            if isinstance(self.outcome, Exception):
-                raise self.outcome
-            return self.outcome
-
-    lost = Counter()
-    assert cluster.ClusterJob(Ended(None), "a", lost).poll() is None
-    assert cluster.ClusterJob(Ended(0), "a", lost).poll() == 0
-    assert cluster.ClusterJob(Ended(utils.FailedJobError("raised")), "a", lost).poll() == 1
-    gone = [
-        cluster.ClusterJob(Ended(utils.UncompletedJobError("preempted")), "a", lost).poll()
-        for _ in range(4)
-    ]
-    assert gone == [pool.EXIT_STOPPED] * cluster.LOST_AT_MOST + [1]
-
-
 def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused):
     """A stand-in for sbatch keeps the script that it is given; where there is no Slurm, that is
     said.

@@ -27,7 +27,7 @@ from visthrow.throws.flight import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant
-from visthrow.throws.recorded import fly
+from visthrow.throws.recorded import _Full, fly
 from visthrow.view.tables import csv_text, markdown
 
 LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
@@ -189,6 +189,21 @@ def test_a_flight_goes_from_hover_to_hover(flown):
     of_others = {"flying", "neighbour_pos_w"}  # an autopilot says it, or another vehicle's log
     assert set(STANDARD_CHANNELS) - of_others <= set(flown.channels)
     assert "measured_pos_w" in flown
+
+
+def test_a_rope_keeps_its_speed_when_the_ball_lands():
+    """A rope that stands on the ball and tips over goes on tipping for 10 ms."""
+    recording, height = _Full(None, {}), np.linspace(0.5, 0.1, 5)
+    upright, leaning = (
+        np.column_stack((lean * height, 0.0 * height, height)) for lean in (0, 0.02)
+    )
+    ball = np.array([[0.0, 0.0, 0.04]])
+    recording._before = SimpleNamespace(time=1.0, cable_points_w=upright[None])
+    now = SimpleNamespace(time=1.03, cable_points_w=leaning[None], payload_pos_w=ball)
+    landing = SimpleNamespace(landed=[True], time=[1.02])
+    plant = SimpleNamespace(landing=landing, period=0.02)
+    moved = recording._rope(SimpleNamespace(now=now, plant=plant)) - leaning
+    assert_allclose(moved[:-1, 0], 0.01 * height[:-1], rtol=0.15)
 
 
 def test_a_flights_modes_and_commands(flown):
