@@ -2,9 +2,6 @@
 flight joined, throttles as commands.
 """
 
-import gzip
-from pathlib import Path
-
 import numpy as np
 import pytest
 from pytest import approx, raises
@@ -61,64 +58,6 @@ def test_a_proposal_names_the_columns_that_the_shipped_mapping_names(path, tmp_p
     assert (mine.time.column, mine.time.unit) == (shipped.time.column, shipped.time.unit)
     log = read(file, mine)[0]
     assert not contradictions(check([log], setup.known(tmp_path / "mine.toml")))
-
-
-def written(
-    path: Path, columns: dict[str, np.ndarray], mark: str = ",", comma: bool = False
-) -> Path:
-    rows = "\n".join(mark.join(f"{x:.9g}" for x in row) for row in zip(*columns.values()))
-    text = f"{mark.join(columns)}\n{rows.replace('.', ',') if comma else rows}\n"
-    path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
-    return path
-
-
-def table(**more: np.ndarray) -> dict[str, np.ndarray]:
-    """A flight as another tool might write it: milliseconds, millimetres, degrees, rates in another
-    body frame.
-    """
-    columns = flight(20.0)
-    angles = np.degrees(Rotation.from_quat(columns["quat_wb"]).as_euler("ZYX")[:, ::-1])
-    names = {"millis": 1e3 * columns["time"]}
-    names |= {f"uav{a}": 1e3 * c for a, c in zip("XYZ", columns["pos_w"].T)}
-    names |= dict(zip(("roll", "pitch", "yaw"), angles.T))
-    flipped = np.degrees(columns["rate_b"]) * [1.0, -1.0, -1.0]
-    names |= {f"gyro.{a}": c for a, c in zip("xyz", flipped.T)}
-    return names | {f"acc_{a}": c / 9.80665 for a, c in zip("xyz", columns["acc_b"].T)} | more
-
-
-def test_units_and_axes_are_found_by_physics(tmp_path):
-    path = written(
-        tmp_path / "a.csv",
-        {**table(), "vbat_mV": np.linspace(3900.0, 3700.0, 2000)},
-        mark=";",
-        comma=True,
-    )
-    found = propose(table_of(path), "a.csv")
-    by = {c.name: c for c in found.mapping.channels}
-    assert (found.mapping.time.column, found.mapping.time.unit) == ("millis", "ms")
-    assert {name: c.unit for name, c in by.items()} == {
-        "quat_wb": "deg",
-        "rate_b": "deg/s",
-        "acc_b": "g",
-        "battery_voltage": "mV",
-        "pos_w": "mm",
-    }
-    assert by["rate_b"].axes == "x,-y,-z"
-    assert "axes by physics" in found.why["rate_b"]
-
-
-def test_brackets_say_units_and_the_lean_says_the_order_of_a_quaternion():
-    columns = flight(20.0)
-    table = {"t[s]": columns["time"]}
-    for stem, name, unit in (("", "pos_w", "m"), ("v", "vel_w", "m/s"), ("w", "rate_b", "rad/s")):
-        table |= {f"{stem}{a}[{unit}]": c for a, c in zip("xyz", columns[name].T)}
-    scalar_first = columns["quat_wb"][:, [3, 0, 1, 2]]
-    found = propose(table | {f"q{i}": c for i, c in enumerate(scalar_first.T, 1)}, "a.csv")
-    by = {c.name: c for c in found.mapping.channels}
-    units = {name: by[name].unit for name in ("pos_w", "vel_w", "rate_b")}
-    assert units == {"pos_w": "m", "vel_w": "m/s", "rate_b": "rad/s"}
-    assert by["quat_wb"].order == "wxyz"
-    assert "by gravity" in found.why["quat_wb"]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -266,8 +205,8 @@ def test_rows_that_share_a_stamp_have_a_clock():
 
 
 def test_what_is_not_known_is_asked(tmp_path):
-    columns = {name: values for name, values in table().items() if name != "millis"}
-    found = propose(table_of(written(tmp_path / "a.csv", columns)), "a.csv")
+    columns = flight(20.0)
+    found = propose(named("pos", columns["pos_w"]) | named("acc", columns["acc_b"]), "a.csv")
     assert any("how far are the rows apart" in question for question in found.questions)
     with raises(LogError, match="none of its 2 columns holds numbers that change"):
         propose({"a": np.zeros(9), "b": np.array(["x"] * 9)}, "b.csv")

@@ -165,19 +165,6 @@ def test_initial_states_follow_the_effects(planted):
         assert_allclose(again.residual, w.residual, atol=1e-9)
 
 
-def test_a_search_goes_no_further_than_effects_can_go_together(planted):
-    """Each of two effects that share a coefficient may take all of it, but not both."""
-    model = ThrowModel(planted[0], paper_plant(), only=["rotor_drag", "rotor_drag_z"])
-    windows = model.windows({})
-    problem = Problem(model, tuple(range(len(windows))))
-    nominal = linearise(problem, np.zeros(2), windows=windows)
-    priors = problem.priors
-    both = moved(problem, nominal, priors.low)
-    assert_allclose(both.theta, [priors.low[0], 0.0], atol=1e-9)
-    one = moved(problem, nominal, np.array([priors.low[0], 0.0]))
-    assert_allclose(both.windows[0].residual, one.windows[0].residual, atol=1e-12)
-
-
 def test_a_plant_without_aerodynamics_gets_coefficients_of_nought():
     setting = setting_with({})
     vehicle = setting.plant.vehicle
@@ -375,20 +362,3 @@ def test_a_path_comes_down_between_two_points():
     path = np.array([[0.0, 0.0, 0.2], [1.0, 0.0, 0.6], [2.0, 0.5, 0.2], [3.0, 0.5, 0.1]])
     assert_allclose(landing._crossing(path, 0.5), [1.25, 0.125, 0.5])
     assert np.isnan(landing._crossing(path, 0.7)).all()
-
-
-def test_residuals_and_lost_commands_are_those_of_states_of_the_setting_s_own_rope():
-    rigid = paper_plant()
-    rigid = replace(rigid, rope=replace(rigid.rope, segments=1))
-    logs = fly(setting_with({}), free=1, throws=0, seconds=1.0)
-    model = ThrowModel(logs, rigid, only=["rope_flexible", "mass_payload"])
-    unasked = model.residuals({"rope_flexible": 1.0})
-    for residual, expected in zip(unasked, model._flown(*model.begun({"rope_flexible": 1.0}))):
-        assert_allclose(residual, expected)
-    windows = model.windows({"rope_flexible": 1.0})
-    model.windows({})
-    elsewhere = {"rope_flexible": 1.0, "mass_payload": 1e-6}  # where no states were fitted
-    columns = model.without_commands(elsewhere, range(len(windows)))
-    at_fit = model.without_commands({"rope_flexible": 1.0}, range(len(windows)))
-    for near, exact in zip(columns, at_fit):
-        assert_allclose(near, exact, atol=1e-3 * np.abs(exact).max())

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs.proposal import propose
-from visthrow.logs import read, table_of
+from visthrow.logs import table_of
 from visthrow.logs.readers.table import logs_of
 
 TIME = 0.01 * np.arange(400)
@@ -96,8 +96,10 @@ def qualisys(bodies=("quad",)):
 
 
 QUATS = TURN.as_quat()
-TUM = [[f"{1e9 + t:.4f}", *p.round(6), *q.round(7)] for t, p, q in zip(TIME, POS, QUATS)]
-WXYZ = np.column_stack([POS, QUATS[:, [3, 0, 1, 2]]]).round(7)
+XYZW = np.column_stack([TIME, POS.round(6), QUATS.round(7)]).tolist()
+MM = np.column_stack([TIME, (1e3 * POS).round(3), QUATS]).tolist()
+WXYZ = np.column_stack([TIME, POS, QUATS[:, [3, 0, 1, 2]]]).round(7).tolist()
+TUM = lines([[f"{1e9 + t:.4f}", *row] for t, *row in XYZW], " ")
 EXPORTS = {
     "motive 1.23.csv": motive(),
     "motive 3.csv": motive("3.0", scale=1e3, units="Millimeters"),
@@ -105,25 +107,19 @@ EXPORTS = {
     "vicon nexus.csv": vicon(),
     "vicon tracker.csv": vicon("Objects", "deg", twice=True),
     "qualisys.tsv": qualisys(),
-    "tum with a hash.txt": "# timestamp tx ty tz qx qy qz qw\n" + lines(TUM, " "),
-    "tum with two hashes.txt": "# ground truth\n# timestamp tx ty tz qx qy qz qw\n"
-    + lines(TUM, " "),
-    "tum without a head.tum": lines(TUM, " "),
-    "tum below a sentence.txt": "# TF Coordinate Frame: /optical(data: /optical)\n"
-    + lines(TUM, " "),
+    "tum with a hash.txt": "# timestamp tx ty tz qx qy qz qw\n" + TUM,
+    "tum with two hashes.txt": "# ground truth\n# timestamp tx ty tz qx qy qz qw\n" + TUM,
+    "tum without a head.tum": TUM,
+    "tum below a sentence.txt": "# TF Coordinate Frame: /optical(data: /optical)\n" + TUM,
     "euroc.csv": "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],"
-    "q_RS_y [],q_RS_z []\n" + lines([[int(1e18 + 1e9 * t), *r] for t, r in zip(TIME, WXYZ)]),
-    "q1 to q4.csv": "time,x,y,z,q1,q2,q3,q4\n" + lines([[t, *r] for t, r in zip(TIME, WXYZ)]),
-    "q0 to q3, vector first.csv": "time,x,y,z,q0,q1,q2,q3\n"
-    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))]),
+    "q_RS_y [],q_RS_z []\n" + lines([[int(1e18 + 1e9 * t), *row] for t, *row in WXYZ]),
+    "q1 to q4.csv": "time,x,y,z,q1,q2,q3,q4\n" + lines(WXYZ),
+    "q0 to q3, vector first.csv": "time,x,y,z,q0,q1,q2,q3\n" + lines(XYZW),
     "names that say nothing.csv": "time,log.x,log.y,log.z,log.qx,log.qy,log.qz,log.qw\n"
-    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))]),
-    "units in a second line.csv": "time,x,y,z,qx,qy,qz,qw\ns,mm,mm,mm,,,,\n"
-    + lines([[t, *(1e3 * p).round(3), *q] for t, p, q in zip(TIME, POS, QUATS)]),
-    "units in brackets.csv": "t[s],x[mm],y[mm],z[mm],qx,qy,qz,qw\n"
-    + lines([[t, *(1e3 * p).round(3), *q] for t, p, q in zip(TIME, POS, QUATS)]),
-    "semicolons and commas.csv": "time;x;y;z;qx;qy;qz;qw\n"
-    + lines([[t, *p, *q] for t, p, q in zip(TIME, POS.round(6), QUATS.round(7))], ";", comma=True),
+    + lines(XYZW),
+    "units in a second line.csv": "time,x,y,z,qx,qy,qz,qw\ns,mm,mm,mm,,,,\n" + lines(MM),
+    "units in brackets.csv": "t[s],x[mm],y[mm],z[mm],qx,qy,qz,qw\n" + lines(MM),
+    "semicolons and commas.csv": "time;x;y;z;qx;qy;qz;qw\n" + lines(XYZW, ";", comma=True),
     "motive without labels.csv": motive().replace(",Type,", ",,").replace(",Name,", ",,"),
     "vicon with devices.csv": "Devices\n1000\n,,Force,,\nFrame,Sub Frame,Fx,Fy,Fz\n,,N,N,N\n"
     + "".join(f"{i},{j},1.0,2.0,{i % 7}\n" for i in range(9) for j in range(10))
@@ -214,7 +210,7 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, proposed):
     pos, quat = POS.copy(), QUATS.copy()
     pos[200:260] = pos[199] if mode == "held" else 0.0
     quat[200:260] = {"all zero": [0, 0, 0, 0], "position zero": [0, 0, 0, 1]}.get(mode, quat[199])
-    rows = [[t, *p, *q, *(b - [0, 0, 0.5])] for t, p, q, b in zip(TIME, pos, quat, POS)]
+    rows = np.column_stack([TIME, pos, quat, POS - [0.0, 0.0, 0.5]]).tolist()
     _, found, (log, *_) = proposed("time,x,y,z,qx,qy,qz,qw,px,py,pz\n" + lines(rows))
     assert "pos_w" in log
     if mode != "held":
@@ -227,7 +223,7 @@ def test_a_body_that_the_capture_lost_is_a_gap(mode, proposed):
 def test_markers_of_qualisys_without_names_of_columns(extra, proposed):
     """Places alone below the settings: the markers' names and the rate stand among these."""
     head = "NO_OF_FRAMES\t400\nNO_OF_MARKERS\t2\nFREQUENCY\t100\nDATA_INCLUDED\t3D\n"
-    rows = [[*(1e3 * p).round(3), *(1e3 * (p - [0, 0, 0.5])).round(3)] for p in POS]
+    rows = (1e3 * np.column_stack([POS, POS - [0.0, 0.0, 0.5]])).round(3).tolist()
     text = f"{head}{extra}MARKER_NAMES\tquad\tball\n{lines(rows, chr(9))}"
     _, _, (log,) = proposed(text, "a.tsv")
     assert_allclose(log["pos_w"].values, POS, atol=1e-6)
@@ -248,7 +244,7 @@ def test_angles_in_degrees_are_no_position(proposed):
     """Euler angles of an order that no name tells are left out and listed."""
     angles = TURN.as_euler("XYZ", degrees=True)
     names = [f"quad.{kind}.{axis} [{unit}]" for kind, unit in KINDS.items() for axis in "XYZ"]
-    rows = [[t, *a, *p] for t, a, p in zip(TIME, angles, POS)]
+    rows = np.column_stack([TIME, angles, POS]).tolist()
     _, found, _ = proposed(lines([["time", *names], *rows]))
     (entry,) = (entry for entry in found.mapping.channels if entry.name == "pos_w")
     assert entry.columns[0] == "quad.Position.X [m]"
@@ -268,19 +264,18 @@ def test_what_nothing_checks_is_asked(head, proposed):
     rng = np.random.default_rng(0)
     rates = 0.5 * np.column_stack([np.sin(3 * TIME), np.cos(2 * TIME), np.sin(TIME)])
     acc = [0.0, 0.0, 1.0] + rng.normal(0.0, 0.01, (len(TIME), 3))
-    rows = [[t, *r, *a] for t, r, a in zip(TIME, rates, acc)]
+    rows = np.column_stack([TIME, rates, acc]).tolist()
     _, found, _ = proposed(f"time,{head}\n" + lines(rows))
     assert any(ASKED[head] in question for question in found.questions)
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
 def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, proposed):
-    turn = (
-        Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
-    )  # it turns about itself all the while
+    # it turns about itself all the while
+    turn = Rotation.from_euler("z", 0.8 * TIME[:, None]) * TURN
     vel = np.gradient(POS, TIME, axis=0)
     vel = vel if frame == "world" else turn.inv().apply(vel)
-    rows = [[t, *p, *q, *v] for t, p, q, v in zip(TIME, POS, turn.as_quat(), vel)]
+    rows = np.column_stack([TIME, POS, turn.as_quat(), vel]).tolist()
     _, found, _ = proposed("time,x,y,z,qx,qy,qz,qw,vx,vy,vz\n" + lines(rows))
     names = {entry.name for entry in found.mapping.channels}
     assert ("vel_b" in names, "vel_w" in names) == (frame == "body", frame == "world")
@@ -288,11 +283,9 @@ def test_velocities_of_the_world_and_of_the_body_are_told_apart(frame, proposed)
 
 def test_rotor_speeds_are_proposed_as_speeds(proposed):
     speeds = 6000.0 + 100.0 * np.sin(np.outer(TIME, [1.0, 1.1, 1.2, 1.3]))
-    for head, unit in (
-        ("rpm1,rpm2,rpm3,rpm4", "rpm"),
-        ("m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]", "rad/s"),
-    ):
-        rows = [[t, *p, *s] for t, p, s in zip(TIME, POS, speeds)]
+    rows = np.column_stack([TIME, POS, speeds]).tolist()
+    heads = {"rpm1,rpm2,rpm3,rpm4": "rpm", "m1[rad/s],m2[rad/s],m3[rad/s],m4[rad/s]": "rad/s"}
+    for head, unit in heads.items():
         _, found, _ = proposed(f"time,x,y,z,{head}\n" + lines(rows))
         (entry,) = [e for e in found.mapping.channels if e.name == "motor_speed"]
         assert entry.unit == unit
@@ -335,12 +328,3 @@ def test_topics_that_cannot_be_decoded_are_named_and_the_rest_is_read(others, tm
     assert table["json:values[1]"].tolist() == [2.0 * i for i in range(60)]
     assert len(table.left_out) == len(others)
     assert all(any(other in part for part in table.left_out) for other in others)
-
-
-def test_a_mapping_reads_a_table_as_map_proposed_it(tmp_path):
-    """One reader feeds map, the runner's recorded poses and check."""
-    path = tmp_path / "a.tsv"
-    path.write_text(qualisys())
-    mapping = propose(table_of(path), "a.tsv").mapping
-    (log,) = read(path, mapping)
-    assert log["pos_w"].values == approx(POS, abs=1e-6)
