@@ -11,14 +11,8 @@ from pytest import approx
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select import result, search
-from visthrow.diagnose.select.point import fitted
-from visthrow.diagnose.select.selection import Selector
 
 NAME, SIZE = "effect_03", 10.0  # in floors
-LUCK, SHOWN = 0.3, 0.2
-"""What better initial states explain, in noise; what an effect does there, in what its derivative
-says.
-"""
 BUMP = 0.3
 """Misfit a floor's distance from where initial states were fitted, in noise."""
 
@@ -53,51 +47,6 @@ def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_lead
     assert diagnosis.named == (NAME,)
     assert diagnosis[NAME].estimate == approx(SIZE * EFFECTS[3].floor, rel=0.1)
     assert diagnosis.overall == result.KNOWN
-
-
-class Luckier(SyntheticModel):
-    """Initial states fitted anew explain more than the first at any size, and derivatives there
-    tell of more than the size does.
-    """
-
-    def __post_init__(self):
-        super().__post_init__()
-        self.fits = 0
-
-    def windows(self, theta):
-        self.fits += 1
-        found = super().windows(theta)
-        return [
-            replace(w, residual=r)
-            for w, r in zip(found, self._fitted(theta, [w.residual for w in found]))
-        ]
-
-    def residuals(self, theta, about=None):
-        return self._fitted(theta, super().residuals(theta))
-
-    def _fitted(self, theta, residuals):
-        rough, taken_back = default_rng(3), (1.0 - SHOWN) * theta.get(NAME, 0.0)
-        if self.fits > 1:
-            return [r + taken_back * w.effects[:, 3] for r, w in zip(residuals, self._windows)]
-        return [
-            r + LUCK * w.sigma * rough.choice((-1.0, 1.0), len(r))
-            for r, w in zip(residuals, self._windows)
-        ]
-
-
-def test_initial_states_that_were_fitted_anew_are_no_evidence_for_the_candidate(monkeypatch):
-    """Without it they explain the flights as well, which the simulation shows and derivatives do
-    not.
-    """
-    monkeypatch.setattr(
-        Selector,
-        "_settled",
-        lambda self, point, active: fitted(
-            self.problem, self._linearised(point.theta, point), active
-        ),
-    )
-    model = Luckier(truth={NAME: 1.0}, seed=8)
-    assert not search.explain(model, laws=False).named
 
 
 class Levered(SyntheticModel):

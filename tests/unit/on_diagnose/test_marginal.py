@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import Priors, estimate
 from visthrow.diagnose.likelihood.stack import Stack, statistics
-from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Window
+from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 EFFECTS = catalogue(6)
 
@@ -174,27 +174,6 @@ def test_broken_windows_are_named(fitted, spoil):
     _, windows, floors, _, _ = fitted
     with raises(DiagnoseError, match="window of flight 0"):
         marginal.gram_of(spoil(windows[0]), floors, 2)
-
-
-def test_a_model_without_latent_forces_works():
-    rng = default_rng(0)
-    n = 50
-    s, x = rng.normal(size=(n, 2)), np.ones((n, 1))
-    window = Window(
-        0,
-        "swing",
-        np.arange(n) / 50.0,
-        np.zeros(n, dtype=int),
-        s @ [0.3, 0.0] + rng.normal(size=n) * 0.1,
-        np.full(n, 0.1),
-        s,
-        x,
-        np.ones(1),
-        latent=np.zeros((n, 0)),
-    )
-    levels, grams = noise.fit([window], [marginal.gram_of(window, np.ones(2), 1)])
-    part = alone(grams[0], levels, 0)
-    assert np.linalg.solve(part.information, part.score) == approx([0.3, 0.0], abs=0.05)
 
 
 def test_estimates_stay_within_their_bounds_to_the_last_digit():

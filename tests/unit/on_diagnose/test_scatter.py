@@ -7,14 +7,25 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
+from pytest import mark
 
-from visthrow.config.effects import catalogue
+from tests.synthetic_diagnosis import EFFECTS as MADE_UP
+from tests.synthetic_diagnosis import SyntheticModel
+from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.extend import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
+from visthrow.diagnose.select import result, search, verdicts
 from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, freed, own_shares
+from visthrow.diagnose.select.scatter import (
+    DAY,
+    FLIGHT,
+    Varies,
+    freed,
+    own_shares,
+    relinearised_per_flight,
+)
 
 NAMES = ("release_lag", "payload_drag", "wind_x", "wind_y", "wind_z")
 EFFECTS = tuple(catalogue()[name] for name in NAMES)
@@ -120,3 +131,178 @@ def test_training_draws_what_varies():
     theta, covariance = patch.with_scatter({"release_lag": 0.02}, [[1e-6]], report)
     assert theta == {"release_lag": 0.02}
     assert_allclose(covariance, [[1.01e-4]])
+
+
+DELAYED = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(MADE_UP))
+FLOOR = DELAYED[4].floor
+
+
+class Drawn(SyntheticModel):
+    """Flights each of which has its own size of one effect, in floors."""
+
+    sizes = ()
+
+    def __post_init__(self):
+        super().__post_init__()
+        self._windows = [
+            replace(
+                w,
+                residual=w.residual + self._answer(w.effects, {"cmd_delay": self.sizes[w.flight]}),
+            )
+            for w in self._windows
+        ]
+
+
+def drawn(sizes, **options) -> SyntheticModel:
+    return type("Own", (Drawn,), {"sizes": tuple(sizes)})(
+        effects=DELAYED, throws=len(sizes) - 1, free=1, **options
+    )
+
+
+def deviation_of(mean: float, deviation: float, seed: int) -> float:
+    """Return the deviation that is found of a release that is late by so much in all flights and by
+    so much more or less in each [s]; 0 where it does not vary.
+    """
+    found = flights(default_rng(seed), release_lag=deviation)
+    common = np.zeros(len(NAMES))
+    common[0] = mean / PRIORS.floor[0]
+    moved = found.score + found.information @ common
+    return chosen_of(replace(found, score=moved))[1].get("lag_jitter", 0.0)
+
+
+def delay_jitter(diagnosis):
+    return next(s for s in diagnosis.scatter if s.name == "cmd_jitter")
+
+
+def test_a_deviation_is_about_the_mean():
+    found = np.array([deviation_of(0.080, 0.012, seed) for seed in range(12)])
+    assert np.mean(found > 0.0) > 0.9
+    assert abs(np.median(found) / 0.012 - 1.0) < 0.3
+
+
+def test_what_flights_have_of_their_own_is_integrated_out():
+    found, K, j, size = flights(default_rng(3), count=1), len(NAMES), 2, 1.7
+    left, own, score = (
+        freed(found, Varies((), {(j, FLIGHT): size})),
+        found.information[0],
+        found.score[0],
+    )
+    theta = default_rng(4).normal(size=K)
+
+    def misfit(x):
+        there = theta + np.eye(K)[j] * x[:, None]
+        return -2.0 * there @ score + np.einsum("xi,ij,xj->x", there, own, there)
+
+    x = np.linspace(-12.0 * size, 12.0 * size, 20001)
+    density = (
+        np.exp(-0.5 * (misfit(x) - misfit(np.zeros(1))) - 0.5 * (x / size) ** 2)
+        / np.sqrt(2.0 * np.pi)
+        / size
+    )
+    whole = found.square[0] + misfit(np.zeros(1))[0] - 2.0 * np.log(density.sum() * (x[1] - x[0]))
+    told = left.square[0] - 2.0 * theta @ left.score[0] + theta @ left.information[0] @ theta
+    assert_allclose(told, whole, rtol=1e-9)
+
+
+# Less than what flights may differ by, and more.
+@mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
+def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
+    sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
+    diagnosis = search.explain(drawn(sizes, seed=seed), laws=False)
+    assert diagnosis.overall == result.KNOWN
+    assert diagnosis.named == ("cmd_delay",)
+    found, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
+    assert found.low < 14.0 * FLOOR < found.high
+    assert (
+        found.sd > deviation * FLOOR / np.sqrt(16) * 0.8
+    )  # no mean is known better than its flights scatter
+    assert varies.found
+    assert varies.low < deviation * FLOOR < varies.high
+
+
+def test_an_effect_that_varies_about_nothing_is_not_named():
+    sizes = 6.0 * default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
+    diagnosis = search.explain(drawn(sizes, seed=5), laws=False)
+    assert not diagnosis.theta
+    assert delay_jitter(diagnosis).found
+    mean = delay_jitter(diagnosis).mean["cmd_delay"]
+    assert abs(mean - sizes.mean() * FLOOR) < 3.0 * 6.0 * FLOOR / np.sqrt(12)
+    assert mean != 0.0
+    assert diagnosis.expected == {"cmd_delay": mean}
+
+
+BENT = 0.1
+"""A release early by a floor tells so much more of itself than its derivative says, and twice as
+much by two.
+"""
+TRUTH = 0.012
+"""Deviation of the release's lag [s]: 6 floors."""
+INFORMATION = 30.0
+
+
+def answer(lag):
+    """What is seen of a release late by so many floors, per its derivative."""
+    return lag + BENT * lag * np.maximum(-lag, 0.0)
+
+
+def world(seed: int, count: int = 12):
+    """Statistics of flights about no lag, and the same flights simulated with another."""
+    rng, K = np.random.default_rng(seed), len(NAMES)
+    lags = rng.normal(size=count) * TRUTH / PRIORS.floor[0]
+    seen = answer(lags) + rng.normal(size=count) / np.sqrt(INFORMATION)
+    information = np.tile(np.eye(K), (count, 1, 1))
+    information[:, 0, 0] = INFORMATION
+    score = np.zeros((count, K))
+    score[:, 0] = INFORMATION * seen
+    found = Statistics(
+        np.arange(count),
+        information,
+        score,
+        INFORMATION * seen**2,
+        np.full(count, 500),
+        np.zeros(K),
+    )
+
+    def again(theta):
+        left = seen - answer(theta[0])
+        there = replace(
+            found,
+            square=INFORMATION * left**2,
+            score=INFORMATION * left[:, None] * np.eye(1, K),
+            theta=theta,
+        )
+        return there if abs(theta[0]) < 40.0 else None
+
+    return found, again
+
+
+EFFECT = next(v for v in random_effects() if v.name == "lag_jitter")
+
+
+def jitter(found, again):
+    if again is not None:
+        found = relinearised_per_flight(found, np.zeros(len(NAMES)), PRIORS, 0, again)
+    offered = shared(EFFECTS) + random_shares(EFFECTS, PRIORS, found, ())
+    share = next(c for c in offered if c.name == "lag_jitter")
+    linear = Linear(found, PRIORS, offered, lambda _: 0.0)
+    return verdicts.share_verdict(linear, share, frozenset(offered[:1]), {}, EFFECT, LEAST)
+
+
+def test_flights_far_apart_are_told_by_simulations_where_they_lie():
+    with_it = [jitter(*world(seed)) for seed in range(40)]
+    without = [jitter(world(seed)[0], None) for seed in range(40)]
+    assert all(s.found for s in with_it)
+    inside, outside = (
+        np.mean([s.low <= TRUTH <= s.high for s in told]) for told in (with_it, without)
+    )
+    assert inside > 0.85, inside  # 95 %, less three deviations of 40 draws
+    assert outside < 0.7, (
+        outside
+    )  # the derivatives alone take early releases for still earlier ones
+    assert abs(np.median([s.size for s in with_it]) / TRUTH - 1.0) < 0.15
+    assert np.median([s.size for s in without]) > 1.15 * TRUTH
+
+
+def test_a_simulation_that_fails_everywhere_leaves_the_derivatives():
+    found, _ = world(0)
+    assert jitter(found, lambda theta: None) == jitter(found, None)

@@ -10,6 +10,7 @@ from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from pytest import approx, mark
+from scipy.spatial.transform import Rotation
 
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
@@ -21,7 +22,6 @@ from visthrow.diagnose.select import result, search, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
-from visthrow.diagnose.select.scatter import DAY, FLIGHT, Varies, own_shares
 from visthrow.diagnose.select.selection import Selector, Trial
 
 IN_THE_BODY = ("vehicle torque", laws.JOINT)
@@ -47,18 +47,11 @@ def table(terms_: list, knots: dict) -> np.ndarray:
     return np.stack([term.read(laws.KnotValues(knots)) for term in terms_], axis=-1)
 
 
-def turned(knots: dict, angle: float) -> dict:
-    """The same flight in a world turned about the vertical."""
-    c, s = np.cos(angle), np.sin(angle)
-    turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    half = np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])
-    out = dict(knots)
-    for name in ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "cable_dir_w"):
-        out[name] = knots[name] @ turn.T
-    x, y, z, w = knots["quat_wb"].T
-    a, b = half[2], half[3]
-    out["quat_wb"] = np.column_stack((b * x - a * y, b * y + a * x, b * z + a * w, b * w - a * z))
-    return out
+def turned(knots: dict, turn: Rotation) -> dict:
+    """The same flight in a turned world."""
+    vectors = ("pos_w", "vel_w", "payload_pos_w", "payload_vel_w", "cable_dir_w")
+    quats = (turn * Rotation.from_quat(knots["quat_wb"])).as_quat()
+    return knots | {name: turn.apply(knots[name]) for name in vectors} | {"quat_wb": quats}
 
 
 def random_knots(seed: int = 0) -> dict:
@@ -85,19 +78,14 @@ def test_terms_turn_with_the_world(block):
     """Frame-covariant: forces turn with the world about the vertical, torques in the body do not
     notice.
     """
-    knots, angle = random_knots(), 0.7
-    c, s = np.cos(angle), np.sin(angle)
-    turn = (
-        np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-        if block not in IN_THE_BODY
-        else np.eye(3)
-    )
+    knots, about = random_knots(), Rotation.from_euler("z", 0.7)
+    turn = np.eye(3) if block in IN_THE_BODY else about.as_matrix()
     every = laws.terms_of(block, KNOTS)
     assert len(every) > 300
     values = table(every, knots)
     together = laws.table(every, laws.KnotValues(knots))
     assert_allclose(together, values, atol=1e-12 * np.abs(values).max())
-    again = table(every, turned(knots, angle))
+    again = table(every, turned(knots, about))
     assert_allclose(again, np.einsum("ij,kjt->kit", turn, values), atol=1e-9 * np.abs(values).max())
 
 
@@ -322,34 +310,6 @@ def test_the_table_takes_up_what_no_name_explains():
     speeds = np.column_stack((velocity, window.knots["rate_b"], window.knots["thrust"]))
     drag = again.radial(speeds) @ np.array(data["weights"]["vehicle force"]).T
     assert norm(drag - truth) < LEFT * norm(truth)
-
-
-def test_terms_are_screened_beside_what_varies():
-    """Beside each flight's own share: else what flights have of their own is taken for a law."""
-    model = SyntheticModel(law="swirl", law_size=0.02)
-    problem = Problem.of(model, model.windows({}), range(14))
-    varies = Varies((0, 0, 1, 1, 2, 2), {(0, FLIGHT): 5.0, (4, DAY): 2.0})
-    point = replace(linearise(problem, np.zeros(12)), varies=varies)
-    calm, parts = terms.with_capped_gusts(point)
-    shares = own_shares(point.plain, point.theta, varies)
-    assert np.abs(shares[:, 0]).max() > 1.0
-    moves = dict(zip(point.plain.flights.tolist(), shares * problem.priors.floor))
-    calm = replace(
-        calm,
-        windows=[
-            replace(w, residual=w.residual - w.effects @ moves[w.flight]) for w in calm.windows
-        ],
-    )
-    screen = terms.screen(
-        calm, parts, "payload force", [laws.KnotValues(w.knots) for w in calm.windows]
-    )
-    for i in (0, 1, 40):
-        own = terms.as_effect(screen.terms[i], 0.1, 0.0)
-        _, (wide,) = terms.extended(problem, [calm], [own])
-        assert_allclose(screen.information[i], wide.information[-1, -1] / own.floor**2, rtol=1e-6)
-        assert_allclose(screen.score[i], wide.score[-1] / own.floor, rtol=1e-6)
-        cross = wide.information[-1, :-1] / own.floor
-        assert_allclose(screen.cross[i], cross, rtol=1e-6, atol=1e-6 * abs(cross).max())
 
 
 def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
