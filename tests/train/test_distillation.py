@@ -61,11 +61,10 @@ def whole(tmp_path_factory):
     return folder
 
 
-def trained(iterations, sign=1.0, *extra, seed=1):
-    """Trainer after so many iterations of a short schedule; ``sign`` turns every gradient."""
+def trained(iterations, *extra):
+    """Trainer after so many iterations of a short schedule."""
     sets = (
         *SMALL[:2],
-        "distillation.iterations=14",
         "distillation.horizon=60",
         "distillation.hidden=128",
         "distillation.memory=64",
@@ -73,12 +72,10 @@ def trained(iterations, sign=1.0, *extra, seed=1):
         "distillation.learning_rate=0.005",
         *extra,
     )
-    experiment = load_experiment("vision_ideal", sets)
-    trainer = Trainer(experiment, "cpu", seed)
-    for parameter in trainer.algorithm.network.parameters():
-        parameter.register_hook(lambda gradient: sign * gradient)
-    losses = [trainer.step()["value"] for _ in range(iterations)]
-    return trainer, losses
+    trainer = Trainer(load_experiment("vision_ideal", sets), "cpu", 1)
+    for _ in range(iterations):
+        trainer.step()
+    return trainer
 
 
 @mark.parametrize("seed", range(3))
@@ -99,23 +96,10 @@ def test_every_seed_learns_at_a_rate_that_needs_muon(seed):
     assert [trainer.step()["value"] for _ in range(4)][-1] < 7.5
 
 
-@mark.slow
-def test_it_learns_to_throw():
-    """A dozen rollouts of 48 throws teach it."""
-    summary = trained(14)[0].throw(2.0, 64).summary()
-    assert summary["success"] > 0.9
-    assert summary["error_mean"] < 0.5  # untrained it drops the payload at once, 2.0 m off
-
-
-def test_turned_gradients_teach_nothing():
-    _, losses = trained(4, sign=-1.0)
-    assert losses[-1] > losses[0]
-
-
 def test_the_teachers_action_is_learnt_where_it_has_a_weight():
     networks = []
     for weight in (0.0, 10.0):
-        trainer, _ = trained(1, 1.0, f"distillation.action_weight={weight}")
+        trainer = trained(1, f"distillation.action_weight={weight}")
         networks.append(
             torch.cat([p.detach().flatten() for p in trainer.algorithm.network.parameters()])
         )
@@ -130,14 +114,14 @@ def test_the_targets_are_as_old_as_the_poses_that_the_teacher_learnt_from(monkey
         return exact(env, age)
 
     monkeypatch.setattr(ThrowEnv, "exact_frame", noted)
-    trainer, _ = trained(1)
+    trainer = trained(1)
     latency = trainer.algorithm.teacher.contract["observation"]["latency"]
     assert sorted(ages) == approx([np.mean(latency)])
     assert max(latency) > 0.0
 
 
 def test_a_throw_that_ended_teaches_no_more():
-    trainer, _ = trained(0, 1.0, "distillation.horizon=30", "task.bounds.time_limit=0.4")
+    trainer = trained(0, "distillation.horizon=30", "task.bounds.time_limit=0.4")
     trainer.algorithm.collect(0.0)
     alive = trainer.algorithm._alive
     assert alive[0].all()

@@ -1,14 +1,11 @@
 """The flight log: round trips, what it refuses, and what the exported tables hold."""
 
-import csv
-import json
-
 import numpy as np
 from numpy.testing import assert_array_equal
 from pytest import fixture, mark, raises
 
 from visthrow.common.errors import LogError
-from visthrow.logs.export import columns, export
+from visthrow.logs.export import columns
 from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
 
 
@@ -133,22 +130,3 @@ def test_table_is_the_union_of_all_time_stamps(log):
     assert table["pos_w[1] [m, world]"].compressed().tolist() == [0.0, 2.0, 4.0, 6.0, 8.0]
     assert table["battery_voltage [V]"].compressed().tolist() == [16.0, 15.0, 13.0, 12.0]
     assert table["landing[0] [m, world]"].count() == 1
-
-
-def test_csv_and_parquet_hold_the_same_table(log, tmp_path):
-    import pyarrow.parquet as pq
-
-    export(log, tmp_path / "f.csv")
-    export(log, tmp_path / "f.parquet")
-    with open(tmp_path / "f.csv", newline="") as file:
-        rows = list(csv.DictReader(file))
-    table = pq.read_table(tmp_path / "f.parquet")
-    assert json.loads(table.schema.metadata[b"visthrow"]) == log.meta
-    assert table.column_names == list(rows[0])
-    for name in table.column_names:
-        from_csv = [row[name] for row in rows]
-        assert from_csv == [
-            "" if value is None else str(value) for value in table[name].to_pylist()
-        ]
-    with raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
-        export(log, tmp_path / "f.xlsx")

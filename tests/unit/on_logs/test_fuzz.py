@@ -3,7 +3,6 @@ what; nothing else, and soon.
 """
 
 import gzip
-import itertools
 import lzma
 import math
 import random
@@ -280,17 +279,3 @@ def test_sizes_that_only_another_unit_gives(name, size, factor, words):
 def test_many_damaged_files(name, tmp_path):
     said = all_of(name, tmp_path, MANY)
     assert not all(said)
-
-
-@mark.slow
-@mark.parametrize("name", ["a.ulg", "a.BIN", "a.tlog", "a.bbl"])
-def test_cut_at_many_places(name, tmp_path):
-    path = tmp_path / name
-    FORMATS[name](path)
-    whole = path.read_bytes()
-    said = []
-    for end in itertools.chain(range(0, 2000, 37), range(2000, len(whole), 211)):
-        path.write_bytes(whole[:end])
-        said.append(looked_at(path))
-    first = said.index(True)
-    assert all(said[first:])  # what was readable when less was there stays so

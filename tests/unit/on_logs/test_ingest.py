@@ -14,13 +14,14 @@ from pytest import approx, mark, raises
 from scipy.spatial.transform import Rotation
 
 from tests import logfiles
+from tests.flightlogs import log_at, with_channels
 from tests.places import DATA
 from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.logs import read
 from visthrow.logs.export import export
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel
 from visthrow.logs.mapping import ChannelMap, Split, TableMap, TimeColumn
 from visthrow.logs.readers.blackbox import codec as blackbox_codec
 from visthrow.logs.readers.blackbox import decoder as blackbox
@@ -344,14 +345,11 @@ class TestTables:
 
     def test_export_comes_back(self, tmp_path):
         time = np.arange(30) * 0.01
-        log = FlightLog(
-            {
-                "pos_w": Channel(time, np.random.default_rng(0).normal(size=(30, 3)), "m", "world"),
-                "command": Channel(time[::3], np.ones((10, 4)), "N, rad/s", "body"),
-                "attached": Channel(time[::2], np.arange(15) < 9, "bool"),
-            },
-            {"who": "me"},
-        )
+        log = log_at(time, pos_w=np.random.default_rng(0).normal(size=(30, 3)))
+        command = Channel(time[::3], np.ones((10, 4)), "N, rad/s", "body")
+        attached = Channel(time[::2], np.arange(15) < 9, "bool")
+        log = with_channels(log, command=command, attached=attached)
+        log.meta["who"] = "me"
         for ending in ("csv", "parquet"):
             export(log, tmp_path / f"a.{ending}")
             (back,) = read(tmp_path / f"a.{ending}")
@@ -359,6 +357,8 @@ class TestTables:
                 assert back[name].values == approx(log[name].values.astype(float))
                 assert back[name].time == approx(log[name].time)
         assert back.meta["who"] == "me"
+        with raises(LogError, match=r"'\.xlsx'; expected one of \.csv, \.parquet"):
+            export(log, tmp_path / "f.xlsx")
 
     @mark.parametrize(
         ("rows", "message"),

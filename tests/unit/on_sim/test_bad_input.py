@@ -37,35 +37,81 @@ def test_bad_plants_are_refused(path, value, message):
         HybridSim(plant_with(path, value), 1)
 
 
-def test_an_unknown_integrator_of_the_quadrotor():
-    with raises(ValueError, match=r"'rk5'; expected one of \('euler', 'rk4'\)"):
-        bare_quadrotor(paper_plant().vehicle, integrator="rk5")
+PLANT = paper_plant()
+EXCHANGED = plant_with("sim.solver", "exchanged_chain")
+AERO_LESS = [PLANT.vehicle, plant_with("vehicle.aero.kind", "none").vehicle]
+SHORT = replace(PLANT.rope, segments=3)
+THREE = np.zeros((3, 3))
+REFUSED = {
+    "integrator": (
+        lambda: bare_quadrotor(PLANT.vehicle, integrator="rk5"),
+        r"'rk5'; expected one of \('euler', 'rk4'\)",
+    ),
+    "push": (lambda: HybridSim(PLANT, 1).set_wrench(THREE[:1], THREE[:1]), "extension 'push'"),
+    "engine": (
+        lambda: HybridSim(EXCHANGED, 1, without_rope="rk4"),
+        r"without a rope in sim\.solver 'exchanged_chain'",
+    ),
+    "count": (lambda: HybridSim(PLANT, 0), "0 environments; expected 1 or more"),
+    "blocks": (
+        lambda: HybridSim(PLANT, 2, vehicles=AERO_LESS),
+        r"'none'.*expected the same blocks",
+    ),
+    "blocks without a rope": (
+        lambda: bare_quadrotor(PLANT.vehicle, 2, vehicles=AERO_LESS),
+        r"'none'.*expected the same blocks",
+    ),
+    "segments": (
+        lambda: HybridSim(PLANT, 2, ropes=[PLANT.rope, SHORT]),
+        r"\[3, 15\] segments in one batch of 15",
+    ),
+    "cable": (
+        lambda: HybridSim(PLANT, 3).place(THREE, cable_dir_w=np.zeros((3, 14, 3))),
+        r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)",
+    ),
+    "release": (
+        lambda: HybridSim(PLANT, 3).set_command(np.zeros((3, 4)), np.zeros(2)),
+        r"release of shape \(2,\); expected \(3,\)",
+    ),
+    "wrench": (
+        lambda: bare_quadrotor(PLANT.vehicle, 3).set_wrench(np.zeros(3), THREE),
+        r"force_w of shape \(3,\); expected \(3, 3\)",
+    ),
+    "precision": (lambda: types("double"), "expected 'float32' or 'float64'"),
+}
+"""What a call is told."""
 
 
-def test_wrenches_and_engines_that_do_not_fit():
-    plant = paper_plant()
-    with raises(ValueError, match="extension 'push'"):
-        HybridSim(plant, 1).set_wrench(np.zeros((1, 3)), np.zeros((1, 3)))
-    exchanged = plant_with("sim.solver", "exchanged_chain")
-    with raises(ValueError, match=r"without a rope in sim\.solver 'exchanged_chain'"):
-        HybridSim(exchanged, 1, without_rope="rk4")
+@mark.parametrize("name", REFUSED)
+def test_what_does_not_fit_is_refused(name):
+    call, message = REFUSED[name]
+    with raises(ValueError, match=message):
+        call()
 
 
-def test_a_batch_of_no_environments():
-    with raises(ValueError, match="0 environments; expected 1 or more"):
-        HybridSim(paper_plant(), 0)
+def test_no_tethers():
+    z = config.load(TaskParams, config.find("task", "state")).start
+    with raises(ValueError, match="tether_variants 0"):
+        tether_lengths(paper_plant().rope, replace(z, tether_variants=0))
 
 
-def test_other_kinds_of_blocks_in_one_batch():
-    """A kernel is built for one choice of blocks; a vehicle of another would silently fly with the
-    wrong ones.
-    """
-    other = plant_with("vehicle.aero.kind", "none").vehicle
-    plant = paper_plant()
-    with raises(ValueError, match=r"'none'.*expected the same blocks"):
-        HybridSim(plant, 2, vehicles=[plant.vehicle, other])
-    with raises(ValueError, match=r"'none'.*expected the same blocks"):
-        bare_quadrotor(plant.vehicle, 2, vehicles=[plant.vehicle, other])
+@mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda sim: sim.place(np.zeros((2, 3))), r"pos_w of shape \(2, 3\); expected \(3, 3\)"),
+        (lambda sim: sim.place(THREE, THREE), r"quat_wb of shape \(3, 3\); expected \(3, 4\)"),
+        (lambda sim: sim.place(THREE, rate_b=np.zeros(3)), r"rate_b of shape \(3,\)"),
+        (
+            lambda sim: sim.set_command(np.zeros((4, 3))),  # twelve numbers, but not of three
+            r"command of shape \(4, 3\); expected \(3, 4\)",
+        ),
+        (lambda sim: sim.get("position"), r"no array 'position'; there are .*pos_w"),
+    ],
+)
+def test_shapes_and_names_are_told_with_a_rope_and_without(call, message):
+    for sim in (HybridSim(PLANT, 3), bare_quadrotor(PLANT.vehicle, 3)):
+        with raises(ValueError, match=message):
+            call(sim)
 
 
 def test_every_optional_number_reaches_the_kernel():
@@ -83,61 +129,6 @@ def test_every_optional_number_reaches_the_kernel():
     plant = plant_with("rope.gripper_mass", 0.01)
     with raises(ValueError, match="gripper_mass"):
         HybridSim(plant, 1)
-
-
-def test_ropes_of_different_segments_in_one_batch():
-    plant = paper_plant()
-    short = replace(plant.rope, segments=3)
-    with raises(ValueError, match=r"\[3, 15\] segments in one batch of 15"):
-        HybridSim(plant, 2, ropes=[plant.rope, short])
-
-
-def test_no_tethers():
-    z = config.load(TaskParams, config.find("task", "state")).start
-    with raises(ValueError, match="tether_variants 0"):
-        tether_lengths(paper_plant().rope, replace(z, tether_variants=0))
-
-
-@mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"pos_w": np.zeros((2, 3))}, r"pos_w of shape \(2, 3\); expected \(3, 3\)"),
-        (
-            {"pos_w": np.zeros((3, 3)), "quat_wb": np.zeros((3, 3))},
-            r"quat_wb of shape \(3, 3\); expected \(3, 4\)",
-        ),
-        ({"pos_w": np.zeros((3, 3)), "rate_b": np.zeros(3)}, r"rate_b of shape \(3,\)"),
-    ],
-)
-def test_shapes_of_poses(arguments, message):
-    for sim in (HybridSim(paper_plant(), 3), bare_quadrotor(paper_plant().vehicle, 3)):
-        with raises(ValueError, match=message):
-            sim.place(**arguments)
-
-
-def test_shape_of_the_cable():
-    with raises(ValueError, match=r"cable_dir_w of shape \(3, 14, 3\); expected \(3, 15, 3\)"):
-        HybridSim(paper_plant(), 3).place(np.zeros((3, 3)), cable_dir_w=np.zeros((3, 14, 3)))
-
-
-def test_shapes_of_commands():
-    """Twelve numbers are no command of three environments just because they fit."""
-    sim, quad = HybridSim(paper_plant(), 3), bare_quadrotor(paper_plant().vehicle, 3)
-    for target in (sim, quad):
-        with raises(ValueError, match=r"command of shape \(4, 3\); expected \(3, 4\)"):
-            target.set_command(np.zeros((4, 3)))
-    with raises(ValueError, match=r"release of shape \(2,\); expected \(3,\)"):
-        sim.set_command(np.zeros((3, 4)), np.zeros(2))
-    with raises(ValueError, match=r"force_w of shape \(3,\); expected \(3, 3\)"):
-        quad.set_wrench(np.zeros(3), np.zeros((3, 3)))
-
-
-def test_unknown_names():
-    for sim in (HybridSim(paper_plant(), 1), bare_quadrotor(paper_plant().vehicle, 1)):
-        with raises(ValueError, match=r"no array 'position'; there are .*pos_w"):
-            sim.get("position")
-    with raises(ValueError, match="expected 'float32' or 'float64'"):
-        types("double")
 
 
 def test_get_is_a_copy():
