@@ -83,16 +83,6 @@ def test_loose_rope_keeps_its_links_and_its_energy():
     assert norm(ends[0] - (points[0] - ball)) > 0.1, "it must have turned"
 
 
-def test_a_loose_rope_comes_to_rest_on_the_ground():
-    points = np.column_stack((np.zeros(9), np.zeros(9), np.linspace(0.3, 0.07, 9)))
-    ball = np.array([0.0, 0.0, 0.04])
-    rope = LooseRope(points, np.tile([0.3, 0.0, -4.0], (9, 1)), ball, np.zeros(3))
-    rope.sink(2.0, 0.003 - 0.04)
-    height = rope.points_w(ball)[:-1, 2]
-    assert 0.0 < height.min() <= height[0] < 0.02
-    assert norm(rope.velocity_w, axis=1).max() < 0.2
-
-
 def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
     experiment = load_experiment("state")
     plant = HybridPlant(experiment, 2)
