@@ -182,19 +182,6 @@ def test_the_queue_holds_hover_after_a_reset():
     assert_allclose(queue[..., 0], np.tile(weight[:, None], (1, queue.shape[1])), rtol=1e-6)
 
 
-@mark.parametrize("seed", [0, 11])
-def test_one_seed_one_flight(seed):
-    first, second, other = (HybridSim(paper_plant(), COUNT, seed=s) for s in (seed, seed, seed + 1))
-    commands = random_commands(7, STEPS, COUNT)
-    for sim in (first, second, other):
-        sim.randomize(start_spreads())
-        drive(sim, commands)
-        sim.randomize(start_spreads())
-        drive(sim, commands)
-    assert_same(everything(first), everything(second))
-    assert np.all(first.get("pos_w") != other.get("pos_w"))
-
-
 def test_draws_do_not_depend_on_the_batch():
     large, small = HybridSim(paper_plant(), COUNT, seed=3), HybridSim(paper_plant(), 2, seed=3)
     for sim in (large, small):

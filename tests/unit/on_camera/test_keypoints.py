@@ -5,7 +5,7 @@ from dataclasses import replace
 from functools import partial
 
 import torch
-from pytest import approx, mark, raises
+from pytest import approx, mark
 
 from camera.fisheye import Fisheye
 from camera.keypoints import (
@@ -173,23 +173,6 @@ def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
     assert not valid[0, 4:].any()
     # 102 deg of 110 towards the image's top; the square's corners lie about it.
     assert points[0, :4, 1].mean() == approx(-102.0 / 110.0, abs=5e-3)
-
-
-@mark.parametrize("reads", ["edge", "zero"])
-def test_what_invalid_points_read(reads):
-    camera = KeypointCamera(
-        replace(PARAMS, noise=KeypointNoiseParams(invalid_reads=reads)), dtype=torch.float64
-    )
-    points, valid = keypoints(camera, *scene(2000, torch.float64))
-    corners = points[:, :4][~valid[:, :4]]
-    expected = 1.0 if reads == "edge" else 0.0
-    assert len(corners) > 50
-    assert torch.allclose(
-        corners.norm(dim=-1), torch.full((len(corners),), expected, dtype=torch.float64)
-    )
-    assert points.abs().max() <= 1.0 + 1e-12
-    with raises(ValueError, match="expected one of 'edge', 'zero'"):
-        KeypointNoiseParams(invalid_reads="nought")
 
 
 def test_out_of_view_tells_nothing_but_that():

@@ -11,7 +11,6 @@ from torch.testing import assert_close
 
 from camera.detectors.learnt import (
     CELL,
-    KINDS,
     PATCH,
     LearntDetector,
     Networks,
@@ -24,10 +23,8 @@ from camera.params import FisheyeParams
 from visthrow import config
 from visthrow.detector_training.fit_detector import (
     FitParams,
-    Labels,
     other_lens,
     platt,
-    search_loss,
 )
 
 LENS = Fisheye(FisheyeParams(320, 320, 80.0, 80.0, 159.5, 159.5, k1=0.01, fov_deg=200.0))
@@ -77,40 +74,6 @@ def test_places_are_where_the_grid_says():
     pixel, _ = LENS.project(rays[:1])
     np.testing.assert_allclose(pixel[0].numpy(), [12.75 * CELL - 0.5, 7.0 * CELL - 0.5], atol=1e-3)
     assert sizes[0] == approx(0.5 * CELL / LENS.params.fx)
-
-
-def labels() -> Labels:
-    corners = torch.tensor(
-        [[[-0.1, -0.1, 1.0], [0.1, -0.1, 1.0], [0.1, 0.1, 1.0], [-0.1, 0.1, 1.0]]]
-    )
-    corners = torch.nn.functional.normalize(corners, dim=-1)
-    rays = {"ball": ray(0.5, 0.0), "goal": ray(0.0, 0.0)}
-    seen = {kind: torch.tensor([True]) for kind in KINDS}
-    return Labels(
-        rays,
-        {"ball": torch.tensor([0.08]), "goal": torch.tensor([0.14])},
-        seen,
-        corners,
-        -NORTH,
-        ray(1.0, 1.0),
-    )
-
-
-def test_the_right_grid_has_the_least_loss():
-    made, right = labels(), torch.full((1, 2, 4, 20, 20), -8.0)
-    right[:, :, 1:] = 0.0
-    for k, kind in enumerate(KINDS):
-        pixel, _ = LENS.project(made.rays[kind])
-        at = (pixel[0] + 0.5) / CELL
-        i, j = at.floor().long().tolist()
-        size = math.log(float(made.sizes[kind]) * LENS.params.fx / CELL)
-        right[0, k, :, j, i] = torch.tensor([8.0, at[0] - i - 0.5, at[1] - j - 0.5, size])
-    least = search_loss(right, made, LENS)
-    assert least < 0.05
-    moved = right.clone()
-    moved[0, 0, 1] += 0.2
-    assert search_loss(moved, made, LENS) > least + 0.15
-    assert search_loss(right.roll(3, -1), made, LENS) > least + 10.0
 
 
 def test_probabilities_are_calibrated():

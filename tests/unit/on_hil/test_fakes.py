@@ -46,26 +46,6 @@ def test_the_witness_catches_commands(command, text):
     assert text in witness.breaches[0]
 
 
-@mark.parametrize(
-    ("armed", "payload_w", "answered", "text"),
-    [
-        (False, INSIDE, False, "disarmed"),
-        (True, np.array([3.5, 0.0, 1.0]), False, "outside of its fence"),
-        (True, INSIDE, True, "again after the answer"),
-    ],
-)
-def test_the_witness_catches_releases(armed, payload_w, answered, text):
-    witness = Witness(LIMITS)
-    witness.release(1.0, True, INSIDE)
-    witness.release(1.04, True, INSIDE)
-    assert witness.breaches == [], "a repetition before the answer is one release"
-    if answered:
-        witness.answered()
-    witness.release(1.08, armed, payload_w)
-    assert [text in breach for breach in witness.breaches] == [True]
-    assert witness.releases == 3
-
-
 def test_a_fake_reports_what_its_witness_saw():
     """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
     here, there = pipe()

@@ -3,7 +3,6 @@ channels.
 """
 
 import socket
-import threading
 
 from pytest import fixture, raises
 
@@ -29,53 +28,6 @@ def test_samples_are_forward_right_down_and_the_force_turned_round():
     assert values[4:7] == (-1.0, -2.0, -9.8)
     assert values[7:11] == (0.9, 0.0, 0.1, 0.2)
     assert len(values) == 18
-
-
-class Answers:
-    """A command line that keeps what it is told, but for what it is to forget; one connection."""
-
-    def __init__(self, port, forgets=()):
-        self._server = socket.create_server(("127.0.0.1", port))
-        self.kept, self.forgets = {}, forgets
-        threading.Thread(target=self._serve, daemon=True).start()
-
-    def _serve(self):
-        peer, _ = self._server.accept()
-        peer.recv(1)
-        peer.sendall(b"\r\nEntering CLI Mode, type 'exit' to reboot, or 'help'\r\n\r\n# ")
-        for line in peer.makefile("r"):
-            peer.sendall(self._said(line.strip()).encode() + b"\r\n# ")
-
-    def _said(self, line):
-        words = line.split()
-        if words[0] == "set":
-            self.kept |= {} if words[1] in self.forgets else {words[1]: words[3]}
-            return f"{words[1]} set to {words[3]}"
-        if words[0] == "get":
-            return f"{words[1]} = {self.kept.get(words[1], '25')}\r\nAllowed range: 0 - 180"
-        return "###ERROR IN input: UNKNOWN COMMAND, TRY 'HELP'###"
-
-    def close(self):
-        self._server.close()
-
-
-@fixture
-def answers(monkeypatch):
-    port = free_port(socket.SOCK_STREAM)
-    monkeypatch.setattr(firmware, "PORTS", (port, port + 1))
-    server = Answers(port, forgets=("min_check",))
-    yield server
-    server.close()
-
-
-def test_command_line_writes_reads_back_and_says_what_is_refused(answers):
-    with firmware.CommandLine() as line:
-        line.ask(firmware.line_of("small_angle", "180"))
-        line.ask(firmware.line_of("min_check", "1050"))
-        assert line.read("small_angle") == "180"
-        assert line.read("min_check") == "25"
-        with raises(RunError, match=r"refuses 'serial UART2 1'.*UNKNOWN COMMAND"):
-            line.ask(firmware.line_of("serial UART2", "1"))
 
 
 def test_a_program_that_is_not_there_is_named(tmp_path):
