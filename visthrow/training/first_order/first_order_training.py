@@ -68,7 +68,7 @@ class FirstOrder(Algorithm):
         _require_supported(experiment)
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag = int(lag + 1e-6)
-        remainder = max(lag - int(lag + 1e-6), 0.0)
+        remainder = max(lag - self.lag, 0.0)
         if self.p.horizon < self.lag + NODES[-1]:
             raise ConfigError(
                 f"first_order.horizon is {self.p.horizon} steps; expected at least {self.lag + 2}"

@@ -116,12 +116,17 @@ class FlightBatch:
         """
         env = self.env
         x = self.x
-        state = self.env.views.state
-        out = self.env.views.out
-        loads = {"load_pos": out["payload_pos_w"], "load_vel": out["payload_vel_w"]}
-        sources = {"pos": state["pos_w"], "vel": state["vel_w"], "quat": state["quat_wb"]} | loads
+        state = env.views.state
+        out = env.views.out
+        sources = {
+            "pos": state["pos_w"],
+            "vel": state["vel_w"],
+            "quat": state["quat_wb"],
+            "load_pos": out["payload_pos_w"],
+            "load_vel": out["payload_vel_w"],
+        }
         observation = env.reset()["actor"]
-        torch.add(self._body * state["mass_scale"], self._rope, out=self.mass)
+        self.mass.copy_(self._body * state["mass_scale"] + self._rope)
         self.flying[:] = 1
         self.steps[:] = 0
         for k in range(len(self.obs) + 1):
@@ -129,9 +134,7 @@ class FlightBatch:
                 env.sim.foresee()
             for name, source in sources.items():
                 x[name][k] = source
-            torch.mul(
-                self._thrust, state["motor_speed"].square().sum(-1), out=x["response"][k, :, 0]
-            )
+            x["response"][k, :, 0] = self._thrust * state["motor_speed"].square().sum(-1)
             x["response"][k, :, 1:] = state["rate_b"]
             self.status[k] = state["status"]
             self.landing[k] = env.views.foreseen["landing_w"][:, :2]
@@ -145,13 +148,10 @@ class FlightBatch:
             self.steps.add_(self.flying)
             observation = env.carry(action, self._mask)["actor"]
             x["command"][k] = env.views.command
-        flown = (
-            x["pos"][1:],
-            ob.rotation_from_quat(x["quat"][1:]),
-            x["load_pos"][1:],
-            self.status[1:],
-        )
-        pos, rot, load_pos, status = (value.flatten(0, 1) for value in flown)
+        pos = x["pos"][1:].flatten(0, 1)
+        rot = ob.rotation_from_quat(x["quat"][1:].flatten(0, 1))
+        load_pos = x["load_pos"][1:].flatten(0, 1)
+        status = self.status[1:].flatten()
         latched = torch.zeros_like(status, dtype=torch.bool)
         time = torch.zeros_like(pos[:, 0])
         height = env.cfg.release.landing_height
@@ -189,8 +189,8 @@ def fit(flights: FlightBatch) -> dict[str, Tensor]:
     tension = _solve(
         torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"]
     )
-    samples = (("response", torch.stack(response, -1)), ("force", force), ("tension", tension))
-    return {name: value.float().contiguous() for name, value in samples}
+    found = {"response": torch.stack(response, -1), "force": force, "tension": tension}
+    return {name: value.float().contiguous() for name, value in found.items()}
 
 
 def _solve(features: Tensor, target: Tensor) -> Tensor:
