@@ -65,17 +65,13 @@ class EstimatorNetwork(nn.Module):
 
     def frozen(self) -> Estimator:
         """Return the estimator that flies; it shares the parameters."""
-        mask = self.learnt
         gru = self.gru
         normaliser = self.normalizer
-        parts = [
-            normaliser.mean,
-            normaliser.std + normaliser.eps,
-            self.encoder.weight,
-            self.encoder.bias,
-        ]
+        parts = [normaliser.mean, normaliser.std + normaliser.eps]
+        parts += [self.encoder.weight, self.encoder.bias]
         parts += [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0]
-        parts += [self.output.weight * mask[:, None], self.output.bias * mask, self.kept]
+        parts.append(self.output.weight * self.learnt[:, None])
+        parts += [self.output.bias * self.learnt, self.kept]
         inner = tuple((layer.weight.detach(), layer.bias.detach()) for layer in self.inner)
         return Estimator(*(part.detach() for part in parts), inner)
 
@@ -105,56 +101,49 @@ class Distillation(Algorithm):
 
     def __init__(self, experiment: Experiment, device: str, seed: int, ranks: Ranks):
         self.experiment = experiment
-        self.p = experiment.distillation
-        observation = experiment.task.observation
-        if experiment.task.target.moves or observation.layout != "vision":
+        self.p = p = experiment.distillation
+        if experiment.task.target.moves or experiment.task.observation.layout != "vision":
             raise ConfigError(
                 'algorithm = "distillation" takes goals that stand still and observation.layout ='
                 ' "vision"'
             )
         self._ranks = ranks
-        self.teacher = Policy.load(find_policy(self.p.teacher), device)
+        self.teacher = Policy.load(find_policy(p.teacher), device)
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
-        self._layout = ob.layout_of(SimpleNamespace(**contract))
-        if self._layout.name != "state":
+        self._layout = layout = ob.layout_of(SimpleNamespace(**contract))
+        if layout.name != "state":
             raise ConfigError(
-                f"distillation.teacher {self.p.teacher!r} has the layout {self._layout.name!r};"
+                f"distillation.teacher {p.teacher!r} has the layout {layout.name!r};"
                 " expected 'state'"
             )
-        if self._layout.motion or self._layout.located or self._layout.response:
+        if layout.motion or layout.located or layout.response:
             raise ConfigError(
-                f"distillation.teacher {self.p.teacher!r} is given more than the paper's state"
+                f"distillation.teacher {p.teacher!r} is given more than the paper's state"
                 " policy; expected one without goal_velocity, located and response"
             )
         self.env = env = ThrowEnv(experiment, device, seed)
-        self.iterations = self.p.iterations
+        self.iterations = p.iterations
         E = env.num_envs
-        T = self.p.horizon
+        T = p.horizon
         self.samples = E * T * ranks.world
         self._age = sum(contract["latency"]) / 2.0
-        passed, learnt = _passed(env.layout, self._layout)
-        self.network = EstimatorNetwork(passed, learnt, env.layout.dimension, self.p).to(device)
+        passed, learnt = _passed(env.layout, layout)
+        self.network = EstimatorNetwork(passed, learnt, env.layout.dimension, p).to(device)
         ranks.share(self.network)
-        widths = (3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + self._layout.history), 1)
-        scales = (*SCALES[:4], 1.0, *SCALES[4:], 1.0)
-        make = {"device": device, "dtype": torch.float32}
-        self._scales = torch.cat(
-            [torch.full((width,), scale, **make) for width, scale in zip(widths, scales)]
-        )
-        self._obs, self._truth = (
-            torch.zeros(T, E, env.layout.dimension, **make),
-            torch.zeros(T, E, self._layout.dimension, **make),
-        )
-        self._alive = torch.zeros(T, E, **make)
-        self._history = torch.zeros(E, 1 + self._layout.history, self._layout.payload, **make)
+        widths = [3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + layout.history), 1]
+        scales = torch.tensor([*SCALES[:4], 1.0, *SCALES[4:], 1.0])
+        self._scales = scales.repeat_interleave(torch.tensor(widths)).to(device)
+        self._obs = torch.zeros(T, E, env.layout.dimension, device=device)
+        self._truth = torch.zeros(T, E, layout.dimension, device=device)
+        self._alive = torch.zeros(T, E, device=device)
+        self._history = torch.zeros(E, 1 + layout.history, layout.payload, device=device)
         self._flying = self.network.frozen()
         self.average = averaged(self.network, AVERAGED)
         on_gpu = device.startswith("cuda")
         weights = self.network.parameters()
-        self.optimizer = MuonAdam(
-            weights, self.network.matrices, lr=self.p.learning_rate, fused=on_gpu
-        )
+        matrices = self.network.matrices
+        self.optimizer = MuonAdam(weights, matrices, lr=p.learning_rate, fused=on_gpu)
         self.rollout = ReplayedGraph(self._fly) if on_gpu else self._fly
 
     @torch.no_grad()
@@ -200,33 +189,34 @@ class Distillation(Algorithm):
 
     def _descend(self) -> dict[str, float]:
         """Fit the last rollout, each throw once an epoch."""
-        total = torch.zeros((), device=self.env.device)
-        for _ in range(self.p.epochs):
-            for rows in torch.randperm(self.env.num_envs, device=self.env.device).chunk(
-                self.p.minibatches
-            ):
-                obs = self._obs[:, rows]
-                truth = self._truth[:, rows]
-                alive = self._alive[:, rows]
-                estimate = self.network(obs)
-                off = F.smooth_l1_loss(
-                    estimate / self._scales, truth / self._scales, reduction="none"
-                ).mean(-1)
-                target = act.clip_action(self.teacher.decide(truth))
-                action = self.teacher.decide(estimate)
-                wrong = (
-                    act.clip_action(action) - target
-                ).detach()  # beyond the limits only the way back counts
-                acted = (wrong * action).sum(-1) if self.p.action_weight else 0.0
-                loss = (alive * (off + self.p.action_weight * acted)).sum() / alive.sum()
-                self.network.zero_grad()
-                loss.backward()
-                self._ranks.average(self.network.parameters())
-                nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-                self.optimizer.step()
-                self.average.update_parameters(self.network)
-                total += (alive * off).sum().detach() / alive.sum()
-        return {"value": float(total) / (self.p.epochs * self.p.minibatches)}
+        p = self.p
+        losses = []
+        for _ in range(p.epochs):
+            order = torch.randperm(self.env.num_envs, device=self.env.device)
+            losses += [self._step(rows) for rows in order.chunk(p.minibatches)]
+        return {"value": float(sum(losses)) / len(losses)}
+
+    def _step(self, rows: Tensor) -> Tensor:
+        """Take one gradient step on these throws; return their mean error in :data:`SCALES`."""
+        truth = self._truth[:, rows]
+        alive = self._alive[:, rows]
+        estimate = self.network(self._obs[:, rows])
+        scaled = estimate / self._scales
+        off = F.smooth_l1_loss(scaled, truth / self._scales, reduction="none").mean(-1)
+        target = act.clip_action(self.teacher.decide(truth))
+        action = self.teacher.decide(estimate)
+        # beyond the limits only the way back counts
+        wrong = (act.clip_action(action) - target).detach()
+        acted = (wrong * action).sum(-1)
+        count = alive.sum()
+        loss = (alive * (off + self.p.action_weight * acted)).sum() / count
+        self.network.zero_grad()
+        loss.backward()
+        self._ranks.average(self.network.parameters())
+        nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self.optimizer.step()
+        self.average.update_parameters(self.network)
+        return (alive * off).sum().detach() / count
 
     def _refresh(self) -> None:
         """Take the network's state into what flies, in place: a captured rollout reads these
@@ -247,15 +237,13 @@ class Distillation(Algorithm):
     def take_up(self, policy: Policy) -> None:
         e = policy.estimator
         n = self.network
-        fits = e is not None and {k: v.shape for k, v in e.parts().items()} == {
-            k: v.shape for k, v in n.frozen().parts().items()
-        }
-        if not fits:
+        parts = e.parts()
+        taken = n.frozen().parts()  # the network's own memory, but for the masked output's
+        if {k: v.shape for k, v in parts.items()} != {k: v.shape for k, v in taken.items()}:
             raise ConfigError(
                 "--from: the policy has no estimator of this configuration's shape to start from"
             )
-        taken = n.frozen().parts()  # the network's own memory, but for the masked output's
-        for name, value in e.parts().items():
+        for name, value in parts.items():
             taken[name].copy_(value)
         n.output.load_state_dict({"weight": e.output_weight, "bias": e.output_bias})
         n.normalizer.load_state_dict(normalizer_state(e.mean, e.std - n.normalizer.eps))
@@ -266,14 +254,15 @@ def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
     """Which entry of a vision observation each entry of a state observation corrects, and which of
     these are learnt.
     """
-    none = vision.dimension
-    vehicle = list(range(ob.VEHICLE + 5))
+    known = ob.VEHICLE + 5
     places = vision.dimension - vision.motion - vision.located
-    goal = [places, places + 1] if vision.located else [none, none]
-    between = state.dimension - len(vehicle) - len(goal) - 1
-    columns = torch.tensor([*vehicle, *goal, *[none] * between, places - vision.validity - 1])
+    columns = torch.full((state.dimension,), vision.dimension)
+    columns[:known] = torch.arange(known)
+    if vision.located:
+        columns[known : known + 2] = torch.tensor([places, places + 1])
+    columns[-1] = places - vision.validity - 1
     learnt = torch.ones(state.dimension, dtype=torch.bool)
     # the action before and the latch are known
-    learnt[ob.VEHICLE : ob.VEHICLE + 5] = False
+    learnt[ob.VEHICLE : known] = False
     learnt[-1] = False
     return columns, learnt

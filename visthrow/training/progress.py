@@ -1,7 +1,7 @@
 """Progress of a training run: printed lines, and a CSV row an iteration."""
 
 import csv
-import io
+import math
 import time
 from datetime import timedelta
 from pathlib import Path
@@ -51,13 +51,12 @@ class TrainLog:
         self.last = last
         self.done = done
         self.minutes = minutes
-        rows = _rows(path, done) if done and path.exists() else []
-        text = io.StringIO()
-        writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        atomic_write(path, text.getvalue())
-        self._before = float(rows[-1]["wall_s"]) if rows else 0.0
+        lines = _lines(path, done) if done and path.exists() else []
+        header = ",".join(COLUMNS) + "\n"
+        atomic_write(path, header + "".join(lines))
+        self._before = 0.0
+        if lines:
+            self._before = float(lines[-1].split(",")[COLUMNS.index("wall_s")])
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(
@@ -81,11 +80,9 @@ class TrainLog:
         where the disk is full.
         """
         elapsed = time.perf_counter() - self._start
-        figures = (
-            figures
-            | {"wall_s": self._before + elapsed}
-            | (evaluated(throws) if throws is not None else {})
-        )
+        figures = figures | {"wall_s": self._before + elapsed}
+        if throws is not None:
+            figures |= evaluated(throws)
         self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
@@ -96,7 +93,12 @@ class TrainLog:
             f" {timedelta(seconds=round(self._remaining(figures['iteration'], elapsed)))} left"
         )
         if throws is not None:
-            print(f"{text}  at 2.0 m: {figures_text(figures)}", flush=True)
+            landed = 100 * figures["landed_2m"]
+            print(
+                f"{text}  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s,"
+                f" landed {landed:.1f} %",
+                flush=True,
+            )
         elif figures["iteration"] % SAID_EVERY == 0:
             print(text, flush=True)
 
@@ -111,28 +113,16 @@ class TrainLog:
 def evaluated(throws: Throws) -> dict[str, float]:
     """Columns of an evaluation; no error where none landed."""
     row = throws.summary()
-    nan = float("nan")
     return {
-        "error_2m": row.get("error_mean", nan),
-        "duration_2m": row.get("duration_mean", nan),
+        "error_2m": row.get("error_mean", math.nan),
+        "duration_2m": row.get("duration_mean", math.nan),
         "landed_2m": row["success"],
     }
 
 
-def figures_text(figures: dict) -> str:
-    """Return an evaluation in words."""
-    return (
-        f"{figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s, landed"
-        f" {100 * figures['landed_2m']:.1f} %"
-    )
-
-
-def _rows(path: Path, done: int) -> list[dict]:
+def _lines(path: Path, done: int) -> list[str]:
     """Whole rows of a log up to an iteration."""
     with path.open(newline="", encoding="utf-8") as file:
-        whole = [
-            row
-            for row in csv.DictReader(file)
-            if (row.get("iteration") or "").isdigit() and row[COLUMNS[-1]] is not None
-        ]
-    return [row for row in whole if int(row["iteration"]) <= done]
+        _, *rows = file
+    whole = [row for row in rows if row.endswith("\n")]
+    return [row for row in whole if int(row.split(",")[0]) <= done]

@@ -12,19 +12,18 @@ from visthrow.task import RewardParams
 
 def kinetic(p: RewardParams, vel_w: Tensor, rate_b: Tensor, payload_vel_w: Tensor) -> Tensor:
     """r_kin: alpha_v |v_q|^2 + alpha_omega |omega_q|^2 + alpha_p |v_p - v_q|^2, shape (E,)."""
-    relative = payload_vel_w - vel_w
-    return (
-        p.velocity * vel_w.square().sum(-1)
-        + p.angular_velocity * rate_b.square().sum(-1)
-        + p.relative_velocity * relative.square().sum(-1)
-    )
+    flight = p.velocity * vel_w.square().sum(-1)
+    turn = p.angular_velocity * rate_b.square().sum(-1)
+    swing = p.relative_velocity * (payload_vel_w - vel_w).square().sum(-1)
+    return flight + turn + swing
 
 
 def command(p: RewardParams, action: Tensor, weights: Tensor) -> Tensor:
     """r_cmd: -beta sum_i c^omega_i u_i^2 over the three rate commands, shape (E,). weights:
     c^omega, shape (3,).
     """
-    return -p.smoothness * (weights * action[:, 1:4].square()).sum(-1)
+    squares = action[:, 1:4].square()
+    return -p.smoothness * (weights * squares).sum(-1)
 
 
 def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -> Tensor:
@@ -32,7 +31,8 @@ def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -
     jerks of the four, shape (E,). weights: shape (4,).
     """
     delta = action[:, :4] - previous[:, :4]
-    return -p.smoothness * (weights * (p.l1_mix * delta.abs() + delta.square())).sum(-1)
+    jerk = p.l1_mix * delta.abs() + delta.square()
+    return -p.smoothness * (weights * jerk).sum(-1)
 
 
 def carry_time(p: RewardParams, period: float) -> float:

@@ -135,12 +135,8 @@ def _begun(args: Options) -> tuple:
     if args.start is None:
         return config.load(Experiment, path, args.overrides), None, folder, seed
     policy = Policy.load(find_policy(args.start))
-    return (
-        fitted(config.load(Experiment, path, [ADAPTATION, *args.overrides]), policy),
-        policy,
-        folder,
-        seed,
-    )
+    experiment = config.load(Experiment, path, [ADAPTATION, *args.overrides])
+    return fitted(experiment, policy), policy, folder, seed
 
 
 def _resumed(args: Options) -> tuple:
@@ -152,10 +148,7 @@ def _resumed(args: Options) -> tuple:
     if not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")
     experiment = config.load(Experiment, folder / "config.toml")
-    if (
-        args.overrides
-        and config.load(Experiment, folder / "config.toml", args.overrides) != experiment
-    ):
+    if config.load(Experiment, folder / "config.toml", args.overrides) != experiment:
         raise CheckpointError(
             f"{folder}: a run of another configuration than --set says; resume without it, or begin"
             " a new run"
@@ -223,20 +216,16 @@ def _loop(args: Options, trainer, folder: Path, last: int) -> str:
     saved = trainer.iteration
     why = DONE
     ranks = trainer.ranks
-    evaluations = Regularly(
-        args.evaluate_every,
-        EVALUATION_SHARE if args.until or sys.stdout.isatty() else 0.0,
-    )
+    share = EVALUATION_SHARE if args.until or sys.stdout.isatty() else 0.0
+    evaluations = Regularly(args.evaluate_every, share)
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
     log = None
     if ranks.lead:
         samples = trainer.algorithm.samples
         log = TrainLog(folder / "progress.csv", samples, last, saved, args.minutes)
     try:
-        with (
-            log or contextlib.nullcontext(),
-            StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING) as stop,
-        ):
+        stop = StopRequest((signal.SIGINT, signal.SIGTERM), STOPPING)
+        with log or contextlib.nullcontext(), stop:
             while trainer.iteration < last and why == DONE:
                 figures = trainer.step()
                 throws = None

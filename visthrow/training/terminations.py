@@ -23,13 +23,11 @@ def out_of_bounds(p: BoundsParams, pos_w: Array) -> dict[str, Array]:
     """Vehicle outside the altitude or the horizontal bounds. pos_w: [m], shape (E, 3)."""
     height = pos_w[:, 2]
     low, high = p.altitude
+    outside = (height < low) | (height > high)
+    far = (pos_w[:, :2] ** 2).sum(-1) > p.horizontal**2
     return {
-        f"the vehicle left its altitude bounds of {low:g} to {high:g} m": (
-            (height < low) | (height > high)
-        ),
-        f"the vehicle went further than {p.horizontal:g} m": (
-            (pos_w[:, :2] ** 2).sum(-1) > p.horizontal**2
-        ),
+        f"the vehicle left its altitude bounds of {low:g} to {high:g} m": outside,
+        f"the vehicle went further than {p.horizontal:g} m": far,
     }
 
 
@@ -50,8 +48,9 @@ def while_carrying(
             (E,).
         time: since the start [s], shape (E,) or one for all.
     """
+    steepest = math.cos(math.radians(p.tilt_deg))
     return {
-        "the vehicle tilted too far": upright < math.cos(math.radians(p.tilt_deg)),
+        "the vehicle tilted too far": upright < steepest,
         "the payload rose above the vehicle": payload_w[:, 2] > pos_w[:, 2],
         "the payload touched the ground before the release": payload_w[:, 2] < landing_height,
         f"no release within {p.time_limit:g} s": time > p.time_limit - 1e-6,
@@ -77,6 +76,8 @@ def negative(
             3, 3).
         status: bits of :mod:`sim.kernels.state`, shape (E,). latched: shape (E,), bool.
     """
-    always = (*out_of_bounds(p, pos_w).values(), (status & (COLLISION | NONFINITE)) != 0)
+    failed = (status & (COLLISION | NONFINITE)) != 0
+    always = reduce(or_, out_of_bounds(p, pos_w).values()) | failed
     carrying = while_carrying(p, pos_w, rot_wb[:, 2, 2], payload_w, time, landing_height)
-    return reduce(or_, always) | (reduce(or_, carrying.values()) & ~latched)
+    early = reduce(or_, carrying.values()) & ~latched
+    return always | early

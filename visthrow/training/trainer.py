@@ -19,7 +19,10 @@ from visthrow.task import Experiment, contract_of
 from visthrow.task.measurement import TARGETS, Throws
 from visthrow.training import protocol
 from visthrow.training.compute_device import rounded_products
+from visthrow.training.distillation import Distillation
+from visthrow.training.first_order.first_order_training import FirstOrder
 from visthrow.training.ppo.algorithm import Algorithm
+from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 
 CHECKPOINT = "checkpoint.pt"
@@ -52,25 +55,17 @@ def coarsen(experiment: Experiment) -> Experiment:
         return experiment
     p = experiment.first_order if experiment.algorithm == "first_order" else experiment.ppo
     rope = experiment.rope
-    rope = dataclasses.replace(rope, segments=min(p.segments or rope.segments, rope.segments))
     sim = experiment.sim
+    segments = min(p.segments or rope.segments, rope.segments)
+    rope = dataclasses.replace(rope, segments=segments)
     sim = dataclasses.replace(sim, substep=max(p.substep, sim.substep))
     return dataclasses.replace(experiment, rope=rope, sim=sim)
 
 
 def build(experiment: Experiment, device: str, seed: int, ranks: Ranks) -> Algorithm:
-    """Algorithm that the experiment names; imported only when chosen."""
-    if experiment.algorithm == "first_order":
-        from visthrow.training.first_order.first_order_training import FirstOrder
-
-        return FirstOrder(experiment, device, seed, ranks)
-    if experiment.algorithm == "distillation":
-        from visthrow.training.distillation import Distillation
-
-        return Distillation(experiment, device, seed, ranks)
-    from visthrow.training.ppo.ppo_training import PPOTraining
-
-    return PPOTraining(experiment, device, seed, ranks)
+    """Algorithm that the experiment names."""
+    algorithms = {"ppo": PPOTraining, "first_order": FirstOrder, "distillation": Distillation}
+    return algorithms[experiment.algorithm](experiment, device, seed, ranks)
 
 
 def fitted(experiment: Experiment, policy: Policy) -> Experiment:
@@ -123,6 +118,10 @@ class Trainer:
         self.iteration = 0
         self.seconds = {"rollout": 0.0, "learning": 0.0}
 
+    @property
+    def _on_gpu(self) -> bool:
+        return self.device.startswith("cuda")
+
     @rounded_products(True)
     def step(self) -> dict[str, float]:
         """One iteration; returns losses, the finished episodes' means, ``rollout_s`` and
@@ -131,20 +130,18 @@ class Trainer:
         start = time.perf_counter()
         done = min(self.iteration / self.algorithm.iterations, 1.0)
         self.algorithm.collect(done)
-        if self.device.startswith("cuda"):
+        if self._on_gpu:
             torch.cuda.synchronize()
         middle = time.perf_counter()
         figures = self.algorithm.learn(done)
         self._check_losses(figures)
-        times = {"rollout": middle - start, "learning": time.perf_counter() - middle}
+        rollout = middle - start
+        learning = time.perf_counter() - middle
+        self.seconds["rollout"] += rollout
+        self.seconds["learning"] += learning
         self.iteration += 1
-        for part, spent in times.items():
-            self.seconds[part] += spent
-        return (
-            figures
-            | {f"{part}_s": spent for part, spent in times.items()}
-            | {"iteration": self.iteration}
-        )
+        times = {"rollout_s": rollout, "learning_s": learning}
+        return figures | times | {"iteration": self.iteration}
 
     def _check_losses(self, figures: dict[str, float]) -> None:
         """Raise TrainError where a loss or spread is not finite, in any process."""
@@ -164,7 +161,7 @@ class Trainer:
     def throw(
         self,
         target: float,
-        count: int | None = None,
+        count: int = EVALUATED,
         seed: int = 12345,
         experiment: Experiment | None = None,
     ) -> Throws:
@@ -172,11 +169,10 @@ class Trainer:
 
         Args:
             target: distance along x [m].
-            count: of throws (default: :data:`EVALUATED`).
+            count: of throws.
             seed: of starts and noise.
             experiment: conditions of the throws (default: those of the training).
         """
-        count = count or EVALUATED
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
         conditions = experiment or self.experiment
         return protocol.throw(conditions, policy.actor(count), target, count, self.device, seed)
@@ -202,9 +198,7 @@ class Trainer:
         state = {
             "algorithm": self.algorithm.state_dict(),
             "rng": torch.get_rng_state(),
-            "cuda_rng": (
-                torch.cuda.get_rng_state(self.device) if self.device.startswith("cuda") else None
-            ),
+            "cuda_rng": torch.cuda.get_rng_state(self.device) if self._on_gpu else None,
         }
         ranks = self.ranks.gather(state)
         if not self.ranks.lead:
@@ -227,10 +221,6 @@ class Trainer:
         """
         try:
             saved = torch.load(path, map_location=self.device, weights_only=True)
-        except FileNotFoundError:
-            raise CheckpointError(
-                f"{path}: no checkpoint there; expected a file that `visthrow train` wrote"
-            ) from None
         except Exception as error:
             raise CheckpointError(f"{path}: not a readable checkpoint ({error})") from error
         there = saved["config"] + f"seed = {saved['seed']}\n"
@@ -243,15 +233,14 @@ class Trainer:
             )
         self.iteration = saved["iteration"]
         rank = self.ranks.rank
-        parts = saved["ranks"]
-        has_state = rank < len(parts)
-        state = parts[rank if has_state else 0]
+        has_state = rank < len(saved["ranks"])
+        state = saved["ranks"][rank if has_state else 0]
         self.algorithm.load_state_dict(state["algorithm"], own_throws=has_state)
         if not has_state:  # with another's episodes it would collect the same data
             torch.manual_seed((self.seed * 1000 + rank) * 100_003 + self.iteration)
             return
         torch.set_rng_state(state["rng"].cpu())
-        if state["cuda_rng"] is not None and self.device.startswith("cuda"):
+        if state["cuda_rng"] is not None and self._on_gpu:
             torch.cuda.set_rng_state(state["cuda_rng"].cpu(), self.device)
 
 

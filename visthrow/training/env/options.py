@@ -72,9 +72,10 @@ class PoseDelay:
     def begin(self, fresh: Tensor) -> None:
         """Draw the latency of the episodes that begin."""
         low, high = self._params.latency
-        if high > 0.0:
-            sample = low + (high - low) * torch.rand_like(self.age)
-            torch.where(fresh, sample / self._unit, self.age, out=self.age)
+        if high == 0.0:
+            return
+        sample = low + (high - low) * torch.rand_like(self.age)
+        torch.where(fresh, sample / self._unit, self.age, out=self.age)
 
     def push(self, pose: Tensor, fresh: Tensor) -> Tensor:
         """Take the current pose sample; return the delayed one, linear between control steps."""
@@ -84,17 +85,18 @@ class PoseDelay:
         age = self.age
         jitter = self._params.latency_jitter
         if jitter > 0.0:
-            age = age + jitter * (2.0 * torch.rand_like(age) - 1.0) / self._unit
+            sample = 2.0 * torch.rand_like(age) - 1.0
+            age = age + jitter * sample / self._unit
         age = age / self._period
         whole = age.floor().clamp(max=self.poses.shape[1] - 2.0)
         row = whole.long()[:, None, None].expand(-1, 1, POSE)
-        newer, older = (self.poses.gather(1, row + k)[:, 0] for k in (0, 1))
+        newer = self.poses.gather(1, row)[:, 0]
+        older = self.poses.gather(1, row + 1)[:, 0]
         return newer + (older - newer) * (age - whole)[:, None]
 
     def exact(self, age: float) -> Tensor:
         """Pose sample of so long ago [s], at most a control period, shape (E, POSE)."""
-        newer, older = self.poses[:, :2].unbind(1)
-        return torch.lerp(newer, older, age / self._period)
+        return torch.lerp(self.poses[:, 0], self.poses[:, 1], age / self._period)
 
 
 class MovingGoals:
@@ -111,8 +113,9 @@ class MovingGoals:
         sample = torch.rand_like(self.velocity[:, :2])
         speed = self._slowest + (self._fastest - self._slowest) * sample[:, 0]
         heading = 2.0 * math.pi * sample[:, 1]
-        components = [speed * heading.cos(), speed * heading.sin(), torch.zeros_like(speed)]
-        new = torch.stack(components, dim=-1)
+        x = speed * heading.cos()
+        y = speed * heading.sin()
+        new = torch.stack([x, y, torch.zeros_like(x)], dim=-1)
         self.velocity.copy_(torch.where(fresh[:, None], new, self.velocity))
 
 

@@ -85,7 +85,6 @@ class ThrowEnv(VecEnv):
             length = experiment.rope.length
             scales = [[r.payload_mass / mass, r.length / length] for r in ropes]
             self._cargo = like.new_tensor(scales)[row]
-        self.last: dict[str, Tensor] = {}
         self._goal: Tensor | None = None
         self.reset()
 
@@ -128,6 +127,7 @@ class ThrowEnv(VecEnv):
         self.rate_weights = like.new_tensor(task.reward.rate_command)
         self.change_weights = like.new_tensor(task.reward.command_change)
         self.episode_length_buf = like.new_zeros(E, dtype=torch.long)
+        self._everywhere = like.new_ones(E, dtype=torch.bool)
         self.buffers = {
             "previous": like.new_zeros(E, act.ACTIONS),
             "history": like.new_zeros(E, 1 + self.layout.history, self.layout.payload),
@@ -166,24 +166,13 @@ class ThrowEnv(VecEnv):
         Keypoints are corrected from now on for the cameras' turns [rad], shape (E, 3), and errors
         of focal length [-], shape (E,)."""
         self.view.correction = correction
-        fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
         self.episode_length_buf.zero_()
-        self.buffers["previous"].copy_(self.start_action.expand_as(self.buffers["previous"]))
-        return self._look(fresh)
+        self.previous_action.copy_(self.start_action.expand_as(self.previous_action))
+        return self._look(self._everywhere)
 
-    def fix_goal(self, goal_w: Tensor | None) -> None:
-        """Use one goal [m], shape (3,), for all episodes from the next reset on, or drawn ones
-        again (None).
-        """
+    def fix_goal(self, goal_w: Tensor) -> None:
+        """Use one goal [m], shape (3,), for all episodes from the next reset on."""
         self._goal = goal_w
-
-    def _start(self, fresh: Tensor) -> None:
-        """Start episodes where ``fresh``, bool, shape (E,)."""
-        self._fresh = fresh.to(torch.int32)
-        with on_torch_stream(self.device):
-            self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
-        if self._goal is not None:
-            self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
 
     def clear_totals(self) -> None:
         """Start the sums again."""
@@ -202,10 +191,8 @@ class ThrowEnv(VecEnv):
 
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
-        fresh = torch.ones(self.num_envs, device=self.device, dtype=torch.bool)
-        self._start(fresh)
-        self._begin(fresh)
-        return self._look(fresh)
+        self._begin(self._everywhere)
+        return self._look(self._everywhere)
 
     def _look(self, fresh: Tensor) -> TensorDict:
         """Observe, and keep what is observed."""
@@ -222,7 +209,7 @@ class ThrowEnv(VecEnv):
 
         ``mask``: plants that move on, shape (E,), int32; default all.
         """
-        self.buffers["previous"].copy_(self._apply(actions, True, mask))
+        self.previous_action.copy_(self._apply(actions, True, mask))
         return self._look(self.buffers["continued"])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
@@ -233,31 +220,22 @@ class ThrowEnv(VecEnv):
         negative end and must not be bootstrapped, so there are no ``time_outs``."""
         action = self._apply(actions)
         reward, done = self._judge(action)
-        hit = self.last["released"].to(torch.float32)
-        rows = torch.stack(
-            [
-                done.to(torch.float32),
-                hit,
-                self.last["landing_error"] * hit,
-                self.last["duration"] * hit,
-            ]
-        )
+        hit = self.last["released"].float()
+        error = self.last["landing_error"] * hit
+        duration = self.last["duration"] * hit
+        rows = torch.stack([done.float(), hit, error, duration])
         self.buffers["totals"] += rows.sum(-1, dtype=torch.float64)
-        self._start(done)
-        self.buffers["previous"].copy_(action)
+        self.previous_action.copy_(action)
         self._begin(done)
-        return self._look(done), reward, done.to(torch.float32), {}
+        return self._look(done), reward, done.float(), {}
 
     def _apply(self, actions: Tensor, hold: bool = False, mask: wp.array | None = None) -> Tensor:
         """Fly one control period; returns the clipped actions."""
         task = self.cfg.task
         buffers = self.buffers
         action = act.clip_action(actions)
-        noisy = (
-            action[:, : act.COMMANDS]
-            + torch.randn_like(buffers["command_bias"]) * task.noise.command_step
-        )
-        noisy = noisy + buffers["command_bias"]
+        noise = torch.randn_like(buffers["command_bias"]) * task.noise.command_step
+        noisy = action[:, : act.COMMANDS] + noise + buffers["command_bias"]
         self.views.command.copy_(act.command_from_action(noisy, self._max_thrust, self.max_rate))
         self.views.release.copy_(
             act.release_asked(actions, self.cfg.release.threshold) & (not hold)
@@ -291,30 +269,24 @@ class ThrowEnv(VecEnv):
         )
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
-        attached = (
-            rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
-            + rewards.command(p, action, self.rate_weights)
-            + rewards.change(p, action, self.buffers["previous"], self.change_weights)
-        )
-        at_release = (
-            rewards.landing(p, error)
-            + rewards.time_of_flight(p, out["time_to_impact"])
-            + rewards.proximity(p, out["clearance"], self.cfg.release.clearance_margin)
-        )
-        reward = (
-            torch.where(released, at_release, attached)
-            + rewards.carry_time(p, period)
-            - p.termination * negative
-        )
-        duration = time - period + out["separation_time"] + out["time_to_impact"]
-        copied = {name: out[name].clone() for name in ("landing_w", "clearance")}
+        kinetic = rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
+        command = rewards.command(p, action, self.rate_weights)
+        change = rewards.change(p, action, self.previous_action, self.change_weights)
+        attached = kinetic + command + change
+        landing = rewards.landing(p, error) + rewards.time_of_flight(p, out["time_to_impact"])
+        margin = self.cfg.release.clearance_margin
+        at_release = landing + rewards.proximity(p, out["clearance"], margin)
+        reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period)
+        reward = reward - p.termination * negative
         self.last = {
             "released": released,
             "negative": negative,
             "landing_error": error,
-            "duration": duration,
+            "duration": time - period + out["separation_time"] + out["time_to_impact"],
             "action": action,
-        } | copied
+            "landing_w": out["landing_w"].clone(),
+            "clearance": out["clearance"].clone(),
+        }
         if self.goals is not None:
             self.last["goal_w"] = goal
         return p.scale * reward, released | negative
@@ -326,50 +298,49 @@ class ThrowEnv(VecEnv):
         return self.views.goal_w + self.goals.velocity * time[:, None]
 
     def _begin(self, fresh: Tensor) -> None:
-        """Draw what stays fixed over an episode where one begins."""
-        buffers = self.buffers
+        """Start episodes where ``fresh``, bool, shape (E,), and draw what stays fixed in them."""
         noise = self.cfg.task.noise
+        self._fresh = fresh.to(torch.int32)  # until the launches have read it
+        with on_torch_stream(self.device):
+            self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
+        if self._goal is not None:
+            self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
         self.episode_length_buf.masked_fill_(fresh, 0)
-        previous = buffers["previous"]
+        previous = self.previous_action
         torch.where(fresh[:, None], self.start_action, previous, out=previous)
         spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
-        redraw(buffers, spreads, fresh)
+        redraw(self.buffers, spreads, fresh)
         for part in self._parts():
             part.begin(fresh)
 
     def _parts(self) -> list[DetectorView | PoseDelay | MovingGoals]:
         """Return the parts that draw at the start of an episode, in the order of their draws."""
-        parts: list = [self.view, self.delay]
-        return [*parts, self.goals] if self.goals is not None else parts
+        parts = [self.view, self.delay, self.goals]
+        return [part for part in parts if part is not None]
 
     @rounded_products(False)
     def _observe(self, fresh: Tensor) -> TensorDict:
         """Actor's and critic's view of the current state."""
         state = self.views.state
         buffers = self.buffers
-        noise = self.cfg.task.noise
         payload = self.views.out["payload_pos_w"]
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
-        attached = state["attached"].to(torch.float32)
+        attached = state["attached"].float()
         pose = self.delay.push(torch.cat([vehicle, payload], dim=-1), fresh)
         late_goal = self._goal_in(-self.delay.age)
         true_frame = self._state_frame(pose, late_goal)
-        measured = (
-            true_frame
-            + torch.randn_like(true_frame) * noise.observation_step
-            + buffers["frame_bias"]
-        )
+        noise = torch.randn_like(true_frame) * self.cfg.task.noise.observation_step
+        measured = true_frame + noise + buffers["frame_bias"]
         valid = None
         if self.layout.name == "vision":
             if self.cfg.task.observation.oldest > 0.0:
                 rot_wb = ob.rotation_in(pose)
-            points, valid = self.view.look(
-                pose[:, :3], rot_wb, late_goal, pose[:, ob.VEHICLE :], fresh
-            )
+            payload_w = pose[:, ob.VEHICLE :]
+            points, valid = self.view.look(pose[:, :3], rot_wb, late_goal, payload_w, fresh)
             measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
         self.measured = measured, valid
-        time = self.episode_length_buf.to(torch.float32) * self.cfg.sim.control_period
+        time = self.episode_length_buf.float() * self.cfg.sim.control_period
         goal_vel = places = answers = None
         if self.layout.fits:
             fitted = goal_motion.fitted_goal(
@@ -378,15 +349,14 @@ class ThrowEnv(VecEnv):
             buffers["goal_fit"].copy_(fitted.sums)
             _, goal_vel, places, measured, valid = fitted
         if self.layout.response:
-            buffers["answers"].copy_(
-                arrays.push(buffers["answers"], ob.answer(measured, buffers["previous"]), fresh)
-            )
+            answer = ob.answer(measured, self.previous_action)
+            buffers["answers"].copy_(arrays.push(buffers["answers"], answer, fresh))
             answers = buffers["answers"][:, 1:]
         actor, history = ob.observe(
             self.layout,
             measured,
             valid,
-            buffers["previous"],
+            self.previous_action,
             attached,
             buffers["history"],
             fresh,
@@ -396,10 +366,8 @@ class ThrowEnv(VecEnv):
             self._fleet.observed if self._fleet else None,
         )
         buffers["history"].copy_(history)
-        observed = {
-            "actor": actor,
-            "critic": self._privileged(actor, vehicle, payload, time, fresh),
-        }
+        critic = self._privileged(actor, vehicle, payload, time, fresh)
+        observed = {"actor": actor, "critic": critic}
         return TensorDict(observed, batch_size=[self.num_envs], device=self.device)
 
     def _privileged(
@@ -414,14 +382,14 @@ class ThrowEnv(VecEnv):
             offset = ob.state_part(state["pos_w"], self.views.goal_w, payload)
             true_history = arrays.push(buffers["true_history"], offset[:, 2:], fresh)
             buffers["true_history"].copy_(true_history)
-            parts = [vehicle, buffers["previous"], offset[:, :2], true_history.flatten(1)]
+            parts = [vehicle, self.previous_action, offset[:, :2], true_history.flatten(1)]
         quantities = (
             ("payload_velocity", self.views.out["payload_vel_w"]),
             ("release_timer", state["release_timer"][:, None]),
             ("time", time[:, None]),
             ("mass", state["mass_scale"][:, None]),
             ("voltage", state["voltage"][:, None]),
-            ("exact", state["attached"].to(torch.float32)[:, None]),
+            ("exact", state["attached"].float()[:, None]),
             ("goal_velocity", self.goals.velocity[:, :2] if self.goals is not None else None),
             ("cargo", self._cargo),
             ("mount", self.view.buffers["extrinsic_rotation"]),
@@ -430,29 +398,27 @@ class ThrowEnv(VecEnv):
             ("vehicle", self._fleet.exact if self._fleet else None),
         )
         parts += [value for name, value in quantities if name in named and value is not None]
-        return torch.cat(parts, dim=-1) if len(parts) > 1 else actor
+        return torch.cat(parts, dim=-1)
 
     def _tensors(self) -> dict[str, Tensor]:
         """All that the next step depends on, besides torch's generators."""
         memory = self.buffers.copy()
         for part in self._parts():
             memory |= part.buffers
+        tensors = {
+            "episode": wp.to_torch(self.sim.episode),
+            "goal_w": self.views.goal_w,
+            "length": self.episode_length_buf,
+        }
         groups = {
             "sim": self.views.state,
             "out": self.views.out,
             "memory": memory,
             "obs": self._observations,
         }
-        tensors = {
-            f"{group}.{name}": tensor
-            for group, named in groups.items()
-            for name, tensor in named.items()
-        }
-        return tensors | {
-            "episode": wp.to_torch(self.sim.episode),
-            "goal_w": self.views.goal_w,
-            "length": self.episode_length_buf,
-        }
+        for group, named in groups.items():
+            tensors |= {f"{group}.{name}": tensor for name, tensor in named.items()}
+        return tensors
 
     def state_dict(self) -> dict[str, Tensor]:
         """Copy of all that the next step depends on, besides torch's generators."""
