@@ -28,7 +28,7 @@ SAME = {"rtol": 2e-4, "atol": 2e-6}
 gradient's own size.
 """
 
-REACHED = 0.075
+REACHED = 0.06
 """Distance that the small task is brought under; untrained actors are 0.85 off."""
 
 
@@ -212,7 +212,7 @@ class Reach:
         return self.draw(), reward, torch.ones(self.num_envs), {}
 
 
-def reached(seed: int, *changes: str) -> tuple[list[float], list[float]]:
+def reached(seed: int, iterations: int, *changes: str) -> tuple[list[float], list[float]]:
     """Mean distances of the trained actor's actions and of the exported ones from what is seen, and
     each update's target of the divergence.
     """
@@ -221,9 +221,9 @@ def reached(seed: int, *changes: str) -> tuple[list[float], list[float]]:
     experiment = load_experiment("state", [f"ppo.{change}" for change in changes])
     training = PPOTraining(experiment, "cpu", seed, Ranks("cpu"), build=Reach)
     targets = []
-    for i in range(24):
-        training.collect(i / 24)
-        training.learn(i / 24)
+    for i in range(iterations):
+        training.collect(i / iterations)
+        training.learn(i / iterations)
         targets.append(float(training.alg.target_kl))
     seen = training.env.draw()
     with torch.inference_mode():
@@ -233,7 +233,7 @@ def reached(seed: int, *changes: str) -> tuple[list[float], list[float]]:
 
 
 def test_steps_become_ever_smaller():
-    (distance, _), targets = reached(0, "settled=0.5")
+    (distance, _), targets = reached(0, 24, "settled=0.5")
     assert distance < 0.25
     assert targets[0] == approx(0.015)
     assert targets[:12] == sorted(set(targets[:12]), reverse=True)
@@ -242,8 +242,9 @@ def test_steps_become_ever_smaller():
 
 @mark.parametrize("seed", range(3))
 def test_the_mean_of_the_last_weights_learns_from_every_seed(seed):
-    """At this rate the last weights themselves are 0.08 to 0.17 off."""
-    (_, distance), _ = reached(seed, 'schedule="fixed"', "learning_rate=0.01")
+    """At this rate the mean is 0.038 to 0.047 off, the last weights 0.074 to 0.137 (20 seeds)."""
+    changes = ('schedule="fixed"', "learning_rate=0.01", "epochs=2")
+    (_, distance), _ = reached(seed, 60, *changes)
     assert distance < REACHED
 
 

@@ -26,10 +26,10 @@ def hover_start(experiment: Experiment) -> Experiment:
         "payload_spread",
         "drag_spread",
     )
-    start = dataclasses.replace(
-        pilots_hover(), **{name: getattr(experiment.task.start, name) for name in fields}
-    )
-    return dataclasses.replace(experiment, task=dataclasses.replace(experiment.task, start=start))
+    drawn = {name: getattr(experiment.task.start, name) for name in fields}
+    start = dataclasses.replace(pilots_hover(), **drawn)
+    task = dataclasses.replace(experiment.task, start=start)
+    return dataclasses.replace(experiment, task=task)
 
 
 def as_flown(experiment: Experiment) -> Experiment:
@@ -38,7 +38,7 @@ def as_flown(experiment: Experiment) -> Experiment:
         return experiment
     text = config.dumps(experiment)
     name = "the configuration of the training"
-    return config.loads(Experiment, text, list(experiment.flown), name=name)
+    return config.loads(Experiment, text, experiment.flown, name=name)
 
 
 def throw(
@@ -80,9 +80,10 @@ def _fly(
     change, steps = torch.zeros(2, count, device=env.device)
     for _ in range(env.max_episode_length + 1):
         observations, _, done, _ = env.step(policy(observations["actor"]))
-        change += open_ * (env.last["action"] - previous)[:, :4].square().mean(-1)
+        action = env.last["action"]
+        change += open_ * (action - previous)[:, :4].square().mean(-1)
         steps += open_
-        previous = env.last["action"]
+        previous = action
         ended = open_ & (done > 0)
         for name, value in env.last.items():
             mask = ended.view(-1, *(1,) * (value.dim() - 1))
@@ -93,11 +94,17 @@ def _fly(
     results["smoothness"] = (change / steps.clamp(min=1)).sqrt()
     success = (results["released"] & ~open_).cpu().numpy()
 
-    def measured(name: str) -> np.ndarray:
-        values = results[name].double().cpu().numpy()
-        values[~success] = np.nan
-        return values
-
-    numbers = map(measured, ("landing_error", "duration", "clearance", "smoothness"))
-    goal_w = measured("goal_w")[:, :2] if "goal_w" in results else None
-    return Throws(target, success, measured("landing_w")[:, :2], *numbers, goal_w)
+    measured = {}
+    for name, tensor in results.items():
+        measured[name] = tensor.double().cpu().numpy()
+        measured[name][~success] = np.nan
+    return Throws(
+        target,
+        success,
+        measured["landing_w"][:, :2],
+        measured["landing_error"],
+        measured["duration"],
+        measured["clearance"],
+        measured["smoothness"],
+        measured["goal_w"][:, :2] if "goal_w" in measured else None,
+    )

@@ -91,13 +91,11 @@ def run(args: Options) -> int:
     if why in (DONE, REACHED):
         return 0
     if ranks.lead:
-        words = [
-            "visthrow train --resume",
-            f"--out {folder}",
-            *([f"--iterations {args.iterations}"] if args.iterations else []),
-        ]
+        command = f"visthrow train --resume --out {folder}"
+        if args.iterations:
+            command += f" --iterations {args.iterations}"
         print(
-            f"\n{why} after iteration {iteration} of {last}; go on with: {' '.join(words)}",
+            f"\n{why} after iteration {iteration} of {last}; go on with: {command}",
             file=sys.stderr,
         )
     return 0 if why == OUT_OF_TIME else EXIT_INTERRUPTED
@@ -185,26 +183,25 @@ class Regularly:
 
     def __init__(self, period: int | None, share: float):
         """Begin; ``period``: iterations, None leaves it to the clock; ``share``: of the wall time
-        then, 0 for never.
+        then.
         """
         self._every = period
         self._share = share
-        self._after = time.perf_counter()
-        self._wait = FIRST
+        self._next = time.perf_counter() + FIRST
 
     def due(self, iteration: int) -> bool:
         """Whether to do it after this iteration."""
         if self._every:
             return iteration % self._every == 0
-        return self._share > 0.0 and time.perf_counter() - self._after > self._wait
+        return time.perf_counter() > self._next
 
     @contextlib.contextmanager
     def timed(self) -> Iterator[None]:
         """Measure what one costs."""
         begin = time.perf_counter()
         yield
-        self._after = time.perf_counter()
-        self._wait = (self._after - begin) / self._share if self._share else FIRST
+        end = time.perf_counter()
+        self._next = end + (end - begin) / self._share
 
 
 def _loop(args: Options, trainer, folder: Path, last: int) -> str:
@@ -216,8 +213,8 @@ def _loop(args: Options, trainer, folder: Path, last: int) -> str:
     saved = trainer.iteration
     why = DONE
     ranks = trainer.ranks
-    share = EVALUATION_SHARE if args.until or sys.stdout.isatty() else 0.0
-    evaluations = Regularly(args.evaluate_every, share)
+    evaluates = ranks.lead and (args.evaluate_every or args.until or sys.stdout.isatty())
+    evaluations = Regularly(args.evaluate_every, EVALUATION_SHARE)
     checkpoints = Regularly(args.checkpoint_every, CHECKPOINT_SHARE)
     log = None
     if ranks.lead:
@@ -229,7 +226,7 @@ def _loop(args: Options, trainer, folder: Path, last: int) -> str:
             while trainer.iteration < last and why == DONE:
                 figures = trainer.step()
                 throws = None
-                if ranks.lead and evaluations.due(trainer.iteration):
+                if evaluates and evaluations.due(trainer.iteration):
                     with evaluations.timed():
                         throws = trainer.throw(EVALUATION_TARGET)
                 if log:
@@ -238,9 +235,12 @@ def _loop(args: Options, trainer, folder: Path, last: int) -> str:
                     with checkpoints.timed():
                         trainer.save(folder / CHECKPOINT)
                     saved = trainer.iteration
-                reached = bool(args.until and throws is not None and throws.within(args.until))
-                if reached or trainer.iteration < last:
-                    why = _end(reached, stop.asked, time.perf_counter() > deadline)
+                if args.until and throws is not None and throws.within(args.until):
+                    why = REACHED
+                elif trainer.iteration < last and stop.asked:
+                    why = STOPPED
+                elif trainer.iteration < last and time.perf_counter() > deadline:
+                    why = OUT_OF_TIME
                 why = ENDS[ranks.agree(ENDS.index(why))]
             trainer.save(folder / CHECKPOINT)
     except (OSError, StorageError) as error:
@@ -251,15 +251,6 @@ def _loop(args: Options, trainer, folder: Path, last: int) -> str:
             f"{folder}: cannot write ({error}) in iteration {trainer.iteration}; {state}"
         ) from error
     return why
-
-
-def _end(reached: bool, stopped: bool, late: bool) -> str:
-    """Return why a loop ends before its last iteration; :data:`DONE` where it does not."""
-    if reached:
-        return REACHED
-    if stopped:
-        return STOPPED
-    return OUT_OF_TIME if late else DONE
 
 
 def _line(throws: Throws) -> str:
@@ -294,13 +285,13 @@ def _report(args: Options, trainer, folder: Path, wall: float, finished: bool) -
     throws = trainer.final_throws()
     rows = [one.summary() for one in throws["flown"]]
     steps = trainer.iteration * trainer.algorithm.samples
-    spent = {
+    figures = {
+        "throws": rows,
         "wall_s": wall,
         "iterations": trainer.iteration,
         "env_steps": steps,
-        "seconds": dict(trainer.seconds),
+        "seconds": trainer.seconds,
     }
-    figures = {"throws": rows, **spent}
     if "trained" in throws:
         figures["throws_under_faults"] = [one.summary() for one in throws["trained"]]
     finish(trainer, folder, figures, finished)

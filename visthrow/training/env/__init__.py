@@ -1,4 +1,3 @@
 """The throwing task as a vectorised environment, with its options as parts."""
 
-from visthrow.training.env.throw_env import RESULTS as RESULTS
 from visthrow.training.env.throw_env import ThrowEnv as ThrowEnv

@@ -29,10 +29,6 @@ from visthrow.training.env.options import (
     redraw,
 )
 
-RESULTS = ("episodes", "released", "landing_error", "duration")
-"""Sums over finished episodes; landing error [m] and duration [s] over the released ones."""
-
-
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
@@ -134,7 +130,9 @@ class ThrowEnv(VecEnv):
             "true_history": like.new_zeros(E, 1 + self.layout.history, 3),
             "frame_bias": like.new_zeros(E, ob.VEHICLE + 5),
             "command_bias": like.new_zeros(E, act.COMMANDS),
-            "totals": like.new_zeros(len(RESULTS), dtype=torch.float64),
+            # over finished episodes: their number, those released, and of these landing errors [m]
+            # and durations [s]
+            "totals": like.new_zeros(4, dtype=torch.float64),
             "continued": like.new_zeros(E, dtype=torch.bool),
         }
         if self.layout.response:
@@ -183,11 +181,13 @@ class ThrowEnv(VecEnv):
 
         ``released`` is a share of the episodes; ``landing_error`` [m] and ``duration`` [s] are
         means over the released."""
-        totals = dict(zip(RESULTS, self.buffers["totals"].tolist(), strict=True))
-        released = max(totals["released"], 1.0)
-        episodes = max(totals["episodes"], 1.0)
-        means = {name: totals[name] / released for name in ("landing_error", "duration")}
-        return {"released": totals["released"] / episodes, **means, "episodes": totals["episodes"]}
+        episodes, released, error, duration = self.buffers["totals"].tolist()
+        return {
+            "released": released / max(episodes, 1.0),
+            "landing_error": error / max(released, 1.0),
+            "duration": duration / max(released, 1.0),
+            "episodes": episodes,
+        }
 
     def reset(self) -> TensorDict:
         """Start a new episode everywhere."""
@@ -425,13 +425,6 @@ class ThrowEnv(VecEnv):
         return {k: v.clone() for k, v in self._tensors().items()}
 
     def load_state_dict(self, saved: dict[str, Tensor]) -> None:
-        """Take up a state of :meth:`state_dict`; ValueError where it is of an environment of
-        another experiment or size.
-        """
+        """Take up a state of :meth:`state_dict` of an environment of the same experiment."""
         for name, target in self._tensors().items():
-            if name not in saved or saved[name].shape != target.shape:
-                have = tuple(saved[name].shape) if name in saved else "nothing"
-                raise ValueError(
-                    f"environment state {name!r}; expected shape {tuple(target.shape)}, got {have}"
-                )
             target.copy_(saved[name])

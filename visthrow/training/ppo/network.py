@@ -76,7 +76,7 @@ class Network(MLPModel):
         """Start from a policy of the same layers: its weights, and its normaliser, which hardly
         moves from there.
         """
-        layers = [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)]
+        layers = [*self.mlp][::2]  # activations lie between
         for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
             layer.weight.copy_(weight)
             layer.bias.copy_(bias)
@@ -88,17 +88,15 @@ class Network(MLPModel):
     @property
     def matrices(self) -> list[Tensor]:
         """Weights of the hidden layers."""
-        *hidden, _ = (layer.weight for layer in self.mlp if isinstance(layer, torch.nn.Linear))
-        return hidden
+        return [layer.weight for layer in [*self.mlp][:-1:2]]
 
     def output(self, latent: Tensor) -> Tensor:
         """Output of the layers for normalised observations, shape (N, D)."""
         *layers, last = self.mlp
-        x = latent
         with torch.autocast(latent.device.type, torch.bfloat16, enabled=self.bfloat16):
             for layer in layers:
-                x = layer(x)
-        return last(x.float())
+                latent = layer(latent)
+        return last(latent.float())
 
 
 class MuonAdam(torch.optim.Adam):
