@@ -29,6 +29,7 @@ from visthrow.training.env.options import (
     redraw,
 )
 
+
 class ThrowEnv(VecEnv):
     """Batch of throws. Observation groups: ``actor`` and ``critic``.
 
