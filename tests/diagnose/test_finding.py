@@ -59,18 +59,6 @@ def test_a_spoilt_tool_is_caught(name, suite, real):
 
 
 @mark.slow
-@mark.parametrize("seed", [1, 2, 3])
-def test_what_is_hidden_is_found_in_more_worlds(seed):
-    """Further suites, and a plant of MuJoCo, whose flights take longer."""
-    chain = [
-        finding.Kind((), "chain"),
-        finding.Kind(("com_x",), "chain"),
-        finding.Kind(("cmd_delay",), "chain"),
-    ]
-    finding.require(finding.explain, [*finding.kinds(default_rng(seed)), *chain], 1_000_000 * seed)
-
-
-@mark.slow
 def test_effects_exchanged_in_the_catalogue_are_noticed(monkeypatch):
     """Worlds of another hand notice; worlds of the simulator's own equations would not."""
     known = catalogue()

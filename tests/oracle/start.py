@@ -2,6 +2,7 @@
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sim.params import BodyParams, RopeParams
 from tests.scenes import Scene
@@ -18,56 +19,39 @@ def vehicle_and_rope(scene: Scene) -> tuple[BodyParams, RopeParams]:
     return plant.vehicle.body, plant.rope
 
 
-def matrix_from_quat(quat: np.ndarray) -> np.ndarray:
-    """Return the rotation matrix of a unit quaternion xyzw, shape (3, 3)."""
-    matrix = np.empty(9)
-    mujoco.mju_quat2Mat(matrix, np.roll(np.asarray(quat, dtype=np.float64), 1))
-    return matrix.reshape(3, 3)
-
-
-def hinges_from_directions(
-    rot_wb: np.ndarray, rate_w: np.ndarray, cable_dir_w: np.ndarray, cable_vel_w: np.ndarray
+def upper_hinges(
+    rot_wb: np.ndarray, rate_w: np.ndarray, direction: np.ndarray, velocity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return angles [rad] and rates [rad/s] of the universal joints, shape (2 L,) each, order y0,
-    x0, y1, x1, ..
+    """Return angles [rad] and rates [rad/s] of the universal joint at the mount, shape (2,) each,
+    order y, x.
 
-    With ``n = Ry(a) Rx(b) (0, 0, -1) = (-cos b sin a, sin b, -cos b cos a)`` in the parent's frame.
+    With ``n = Ry(a) Rx(b) (0, 0, -1) = (-cos b sin a, sin b, -cos b cos a)`` in the vehicle's
+    frame.
 
     Args:
         rot_wb: attitude of the quadrotor, shape (3, 3).
         rate_w: its angular velocity, world frame [rad/s], shape (3,).
-        cable_dir_w: unit directions, shape (L, 3).
-        cable_vel_w: their time derivatives [1/s], shape (L, 3).
+        direction: unit direction of the rope, shape (3,).
+        velocity: its time derivative [1/s], shape (3,).
     """
-    angles, rates = [], []
-    frame, omega = np.array(rot_wb), np.array(rate_w)
-    for direction, velocity in zip(cable_dir_w, cable_vel_w):
-        n = frame.T @ direction
-        b, a = np.arcsin(np.clip(n[1], -1.0, 1.0)), np.arctan2(-n[0], -n[2])
-        first = frame[:, 1]
-        turned = frame @ np.array(
-            [[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]]
-        )
-        second = turned[:, 0]
-        columns = np.stack((np.cross(first, direction), np.cross(second, direction)), -1)
-        rate = np.linalg.lstsq(columns, velocity - np.cross(omega, direction), rcond=None)[0]
-        angles += [a, b]
-        rates += list(rate)
-        frame = turned @ np.array(
-            [[1, 0, 0], [0, np.cos(b), -np.sin(b)], [0, np.sin(b), np.cos(b)]]
-        )
-        omega = omega + rate[0] * first + rate[1] * second
-    return np.array(angles), np.array(rates)
+    n = rot_wb.T @ direction
+    a, b = np.arctan2(-n[0], -n[2]), np.arcsin(np.clip(n[1], -1.0, 1.0))
+    first = rot_wb[:, 1]
+    second = rot_wb @ np.array([np.cos(a), 0.0, -np.sin(a)])
+    columns = np.stack((np.cross(first, direction), np.cross(second, direction)), -1)
+    rates = np.linalg.lstsq(columns, velocity - np.cross(rate_w, direction), rcond=None)[0]
+    return np.array([a, b]), rates
 
 
 def initial_data(model: "mujoco.MjModel", scene: Scene) -> "mujoco.MjData":
-    """Return MuJoCo data of a universal-joint model at the start of a scene."""
+    """Return MuJoCo data of a universal-joint model at the start of a scene, whose rope is straight
+    and turns as one.
+    """
     data = mujoco.MjData(model)
-    rot_wb = matrix_from_quat(scene.quat_wb)
-    angles, rates = hinges_from_directions(
-        rot_wb, rot_wb @ np.array(scene.rate_b), scene.cable_dir_w(), scene.cable_vel_w()
+    rot_wb = Rotation.from_quat(scene.quat_wb).as_matrix()
+    angles, rates = upper_hinges(
+        rot_wb, rot_wb @ np.array(scene.rate_b), scene.cable_dir_w()[0], scene.cable_vel_w()[0]
     )
-    data.qpos[:3], data.qpos[3:7] = scene.pos_w, np.roll(scene.quat_wb, 1)
-    data.qpos[7:] = angles
-    data.qvel[:3], data.qvel[3:6], data.qvel[6:] = scene.vel_w, scene.rate_b, rates
+    data.qpos[:3], data.qpos[3:7], data.qpos[7:9] = scene.pos_w, np.roll(scene.quat_wb, 1), angles
+    data.qvel[:3], data.qvel[3:6], data.qvel[6:8] = scene.vel_w, scene.rate_b, rates
     return data

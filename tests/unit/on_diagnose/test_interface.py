@@ -110,7 +110,7 @@ def test_the_simulation_decides_what_is_put_right(monkeypatch, change, names):
     """A mistake that is there stays put right; one that is suspected without reason is dropped
     again.
     """
-    flights = fly(setting_with({}), free=2, throws=0, seconds=1.0, seed=3)
+    flights = fly(setting_with({}), free=1, throws=0, seconds=1.0, seed=3)
     both = (lambda u: WRONG["rate_unit"](WRONG[change](u))) if change else (lambda u: u)
     wrong = [changed(log, both) for log in flights]
     if not change:  # as a relation by chance would have it

@@ -1,12 +1,7 @@
-"""Results that nobody flew, for tests of the report: every kind of set of throws, with
-known means.
-"""
+"""Results that nobody flew, with known means, for tests of the report."""
 
 import numpy as np
 
-from visthrow.paper.baseline import front, thrower
-from visthrow.paper.report.ablations import FURTHER, PAPER_FOUR
-from visthrow.paper.report.gap import SWEEPS, TRAINED
 from visthrow.paper.report.result_set import SHIPPED, ResultSet
 from visthrow.task.measurement import TARGETS
 from visthrow.throws import results
@@ -60,172 +55,13 @@ def policy(
     return Result(unit, columns(rng, target, count, spread, offset, duration), MADE)
 
 
-def baseline(
-    rng,
-    plant: str,
-    compensation: str,
-    target: float,
-    error: float,
-    duration: float,
-    lost: int = 0,
-    **how,
-) -> Result:
-    """Throws of the baseline; their error follows the velocity error."""
-    (unit,) = thrower.units(plant, compensation, target, 10, **how)
-    made = columns(rng, target, 10, error, duration=duration, lost=lost)
-    made["velocity_error"] = 0.4 * made["error"]
-    made |= dict.fromkeys(("position_error", "tracking"), 0.02 + 0.0 * made["error"])
-    return Result(unit, made, MADE, {"planned": duration})
-
-
-def _ablations(rng):
-    for plant in PLANTS[1:]:
-        for layout in SHIPPED:
-            for seed in (1, 2, 3):
-                yield policy(rng, f"{layout}-{seed}", layout, plant, 2.0, train_seed=seed)
-            for i, variant in enumerate((*PAPER_FOUR, *FURTHER)):
-                for seed in (1, 2, 3) if i < 4 and layout == "state" else (1,):
-                    yield policy(
-                        rng,
-                        f"{layout}_{variant}-{seed}",
-                        layout,
-                        plant,
-                        2.0,
-                        0.02,
-                        (-0.02 * i, 0.0),
-                        run=f"{layout}_{variant}",
-                        variant=variant,
-                        train_seed=seed,
-                        departures={"vehicle.changed": variant},
-                    )
-
-
-def _baselines(rng):
-    for target in TARGETS:
-        yield baseline(rng, thrower.IDEAL, "none", target, 0.002, 1.6)
-        for compensation, lost in (("none", 10), ("delay", 0), ("both", 0)):
-            yield baseline(rng, "hybrid", compensation, target, 0.05, 1.6, lost)
-    for i, speed in enumerate(front.SPEEDS):
-        for j, (w_t, rho) in enumerate(front.WEIGHTS):
-            how = {"speed": speed, "w_t": w_t, "rho": rho}
-            for bounds, faster in zip(thrower.BOUNDS, (0.0, 0.4)):
-                fast = 1.3 + 0.1 * i + 0.2 * j - faster
-                yield baseline(
-                    rng, thrower.IDEAL, "none", 2.0, 0.03 / fast**3, fast, bounds=bounds, **how
-                )
-                yield baseline(
-                    rng,
-                    "hybrid",
-                    "both",
-                    2.0,
-                    0.2 / fast**3,
-                    fast,
-                    lost=5 if faster else 0,
-                    bounds=bounds,
-                    **how,
-                )
-
-
-def _gap(rng):
-    for sweep in SWEEPS:
-        for name in sweep.policies:
-            for k in range(5):
-                value = (
-                    [0.005 * k, 0.005 * k]
-                    if sweep.key == "task.observation.latency"
-                    else round(0.02 * (k + 1), 4)
-                )
-                yield policy(
-                    rng,
-                    name,
-                    name.partition("_")[0],
-                    "hybrid",
-                    2.0,
-                    0.02 * (1 + 0.3 * k),
-                    departures={sweep.key: value},
-                )
-    for plant in PLANTS[::2]:
-        for variant in TRAINED:
-            if variant != "full":
-                yield policy(
-                    rng,
-                    f"vision_{variant}-1",
-                    "vision",
-                    plant,
-                    2.0,
-                    0.03,
-                    variant=variant,
-                    train_seed=1,
-                )
-        for seed in (1, 2, 3):
-            yield policy(rng, f"vision-{seed}", "vision", plant, 2.0, train_seed=seed)
-
-
-def _beyond(rng):
-    for layout in SHIPPED:
-        for speed in (0.0, 0.25, 0.5, 0.75, 1.0):
-            departures = {"task.target.speed": [speed, speed]}
-            yield policy(
-                rng,
-                f"{layout}_moving-1",
-                layout,
-                "hybrid",
-                2.0,
-                0.03 + 0.05 * speed,
-                variant="moving",
-                departures=departures,
-            )
-        yield policy(
-            rng, layout, layout, "hybrid", 2.0, 0.3, departures={"task.target.speed": [0.5, 0.5]}
-        )
-        yield policy(
-            rng, f"{layout}_payload-1", layout, "hybrid", 2.0, 0.04, variant="payload", train_seed=1
-        )
-        yield policy(
-            rng, layout, layout, "hybrid", 2.0, 0.09, departures={"task.start.payload_spread": 0.2}
-        )
-        yield policy(
-            rng, f"{layout}_far-1", layout, "hybrid", 3.0, 0.05, variant="far", train_seed=1
-        )
-
-
-def runs() -> tuple[dict, ...]:
-    """Training runs with learning curves."""
-    curve = [[2e6 * k, 0.9 * k, 0.5 / (1 + k)] for k in range(1, 60)]
-    base = {
-        "layout": "state",
-        "steps": 2e8,
-        "iterations": 600,
-        "environments": 16384,
-        "seconds": 80.0,
-        "wall_s": 90.0,
-        "pieces": 1,
-        "device": "H200",
-        "commit": "0" * 40,
-        "final": {"error_mean": 0.025, "duration_mean": 1.05},
-        "curve": curve,
-    }
-    names = ("state", "vision", *(f"state_{v}" for v in PAPER_FOUR))
-    return tuple(
-        {"name": f"{n}-{s}", "run": n, "variant": "full", "train_seed": s, **base}
-        for n in names
-        for s in (1, 2)
-    )
-
-
-def everything(seed: int = 0) -> ResultSet:
-    """A book with a result for every question of the report."""
+def shipped(seed: int = 0) -> ResultSet:
+    """A book with throws of the shipped policies, and with what somebody wrote beside them."""
     rng = np.random.default_rng(seed)
-    names = SHIPPED
-    shipped = [
+    thrown = [
         policy(rng, name, name.partition("_")[0], plant, target, 0.02 if name == "state" else 0.024)
-        for name in names
+        for name in SHIPPED
         for plant in PLANTS
         for target in TARGETS
     ]
-    made = [*shipped, *_ablations(rng), *_baselines(rng), *_gap(rng), *_beyond(rng)]
-    return ResultSet(
-        tuple({r.key: r for r in made}.values()),
-        runs(),
-        {"ablations": "Because **this** was so.\n\nAnd `that`."},
-    )
+    return ResultSet(tuple(thrown), (), {"throws": "Because **this** was so.\n\nAnd `that`."})
