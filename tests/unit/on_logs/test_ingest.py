@@ -188,6 +188,10 @@ def written(tmp_path: Path, rows: list[str], name: str = "a.csv") -> Path:
     return path
 
 
+def read_rows(tmp_path: Path, rows: list[str], *channels: ChannelMap, **more) -> list:
+    return read(written(tmp_path, rows), mapping(*channels, **more))
+
+
 class TestTables:
     """CSV and parquet by a mapping."""
 
@@ -236,7 +240,7 @@ class TestTables:
 
     def test_what_a_clock_does_wrong_is_counted_and_left_out(self, tmp_path):
         rows = ["t,v", "0,1", "10,2", "10,3", "20,4", "5,5", "30,", ",7", "40,8"]
-        (log,) = read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
+        (log,) = read_rows(tmp_path, rows, ChannelMap("x", ("v",), "m"))
         notes = log.meta["ingest"]["x"]
         assert log["x"].time == approx([0, 0.01, 0.02, 0.04])
         assert (notes["repeated"], notes["backwards"], notes["unstamped"], notes["blank"]) == (
@@ -261,7 +265,7 @@ class TestTables:
     )
     def test_one_column(self, tmp_path, rows, entry, values):
         entry = {"name": "x", "columns": ("v",), "unit": "m"} | entry
-        (log,) = read(written(tmp_path, [rows]), mapping(ChannelMap(**entry)))
+        (log,) = read_rows(tmp_path, [rows], ChannelMap(**entry))
         period = 0.02 if entry.get("held") else 0.01
         assert log["x"].time == approx([0, period, 2 * period])
         assert log["x"].values.ravel() == approx(values)
@@ -274,10 +278,8 @@ class TestTables:
             "t,v,a,b",
             *(f"{10 * i},{i // 6 if i % 2 else ''},{i if i % 3 else ''},{i}" for i in range(13)),
         ]
-        (log,) = read(
-            written(tmp_path, rows),
-            mapping(ChannelMap("x", ("v",), "m", held=True), ChannelMap("y", ("a", "b"), "m")),
-        )
+        held = ChannelMap("x", ("v",), "m", held=True)
+        (log,) = read_rows(tmp_path, rows, held, ChannelMap("y", ("a", "b"), "m"))
         assert log["x"].time == approx([0.01, 0.07])
         assert np.all(log["x"].valid)
         assert len(log["y"].time) == 13
@@ -372,7 +374,7 @@ class TestTables:
     )
     def test_bad_tables(self, tmp_path, rows, message):
         with raises(LogError, match=message):
-            read(written(tmp_path, rows), mapping(ChannelMap("x", ("v",), "m")))
+            read_rows(tmp_path, rows, ChannelMap("x", ("v",), "m"))
 
     def test_damaged_files(self, tmp_path):
         path = written(tmp_path, ["t,v", *(f"{i},{i}" for i in range(999))], "a.csv.gz")
