@@ -128,11 +128,8 @@ class Spoiled(SyntheticModel):
     def _spoilt(self, theta, residuals):
         if abs(theta.get("effect_00", 0.0)) / EFFECTS[0].floor <= self.beyond:
             return residuals
-        noise = (
-            np.random.default_rng(1).standard_normal(len(residuals[BAD]))
-            * self.rough
-            * self._windows[BAD].sigma
-        )
+        noise = np.random.default_rng(1).standard_normal(len(residuals[BAD]))
+        noise *= self.rough * self._windows[BAD].sigma
         return [r + noise if i == BAD else r for i, r in enumerate(residuals)]
 
     def windows(self, theta):

@@ -26,22 +26,12 @@ class Promising(SyntheticModel):
     simulated.
     """
 
-    def _there(self, theta, residuals):
+    def residuals(self, theta, about=None):
         off = np.random.default_rng(5)
         on = theta.get("effect_03", 0.0) != 0.0
         return [
             r + on * 2.0 * w.sigma * off.normal(size=len(r))
-            for r, w in zip(residuals, self._windows)
-        ]
-
-    def residuals(self, theta, about=None):
-        return self._there(theta, super().residuals(theta))
-
-    def windows(self, theta):
-        found = super().windows(theta)
-        return [
-            replace(w, residual=r)
-            for w, r in zip(found, self._there(theta, [w.residual for w in found]))
+            for r, w in zip(super().residuals(theta), self._windows)
         ]
 
 

@@ -61,12 +61,3 @@ def test_a_resumed_log_goes_on_in_time_and_drops_what_is_made_again(tmp_path, cl
     before, after = capsys.readouterr().out.splitlines()
     assert "0:50 left" in before  # the minute ends before the seven iterations
     assert ", 0:00:00 left" in after
-
-
-def test_what_no_throw_reaches_is_no_error():
-    nothing = Throws(
-        2.0,
-        np.zeros(3, dtype=bool),
-        *(np.full((3, 2), np.nan), *(np.full(3, np.nan) for _ in range(4))),
-    )
-    assert np.isnan(progress.evaluated(nothing)["error_2m"])
