@@ -2,10 +2,12 @@
 throws, 200 Hz.
 """
 
+from collections import defaultdict
 from dataclasses import replace
 
 import numpy as np
 from numpy.random import default_rng
+from scipy.spatial.transform import Rotation
 
 from bench.worlds.pilot import FreeFlight, Throw, Tracker
 from sim.effects.effect import apply
@@ -65,9 +67,7 @@ def fly(
         references, known.vehicle.body.mass, known.rope.payload_mass + known.rope.rope_mass, rng
     )
     sim.place(np.array([r.at(0.0)[0] for r in references]), battery_used=used)
-    tracks: dict[str, list] = {
-        name: [] for name in ("pos_w", "quat_wb", "payload_pos_w", "command", "voltage")
-    }
+    tracks: dict[str, list] = defaultdict(list)
     separated = np.full(len(references), np.inf)
     left, link, arrived = [None] * len(references), default_rng([seed, 1]), None
     ticks = round(max(seconds, 2.6) / TICK)
@@ -91,31 +91,20 @@ def fly(
         for e in np.flatnonzero(np.isfinite(separated)):
             gone = np.array([t + TICK - separated[e]])
             ball[e] = flown(plant.rope, plant.air, *(x[None] for x in left[e]), gone)[0][0]
-        for name, value in (
-            ("pos_w", sim.get("pos_w")),
-            ("quat_wb", sim.get("quat_wb")),
-            ("payload_pos_w", ball),
-        ):
-            tracks[name].append(value.copy())
+        tracks["payload_pos_w"].append(ball)
+        for name in ("pos_w", "quat_wb"):
+            tracks[name].append(sim.get(name))
     times = TICK * np.arange(1, ticks + 1)
-    return [
-        _log(
-            setting,
-            references[e],
-            {n: np.array(v)[:, e] for n, v in tracks.items()},
-            times,
-            noise,
-            rng,
-        )
-        for e in range(len(references))
-    ]
+    logs = []
+    for e, reference in enumerate(references):
+        track = {name: np.array(values)[:, e] for name, values in tracks.items()}
+        logs.append(_log(setting, reference, track, times, noise, rng))
+    return logs
 
 
 def _log(
     setting: Setting, reference, track: dict, times: np.ndarray, noise: float, rng
 ) -> FlightLog:
-    from scipy.spatial.transform import Rotation
-
     x, com = setting.sensing, np.array(setting.plant.vehicle.body.com)
     turned = Rotation.from_quat(track["quat_wb"])
     frame, marker = Rotation.from_rotvec(x.frame_tilt), Rotation.from_rotvec(x.marker_rotation)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sim.hybrid import HybridSim
 from sim.params import (
@@ -134,54 +135,44 @@ def fly(
     return Flight(pos, ball, vel, status)
 
 
-def rotate(quat: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Rotate vectors, shape (E, 3), by quaternions xyzw, shape (E, 4)."""
-    w, q = quat[:, 3:], quat[:, :3]
-    return v + 2.0 * np.cross(q, np.cross(q, v) + w * v)
-
-
 def rods(sim: HybridSim) -> tuple[np.ndarray, ...]:
     """Masses, transverse inertias about the centre, centres and their velocities of every body of
     the rope.
 
-    The ball counts as a body of its own: shapes (L+1,), (L+1,), (E, L+1, 3), (E, L+1, 3), and the
-    directions' rates (E, L+1, 3). Computed from the parameters of the rope, not from what the
-    simulator packs."""
+    The ball counts as a body of its own: shapes (L+1,), (L+1,), (E, L+1, 3), (E, L+1, 3); also the
+    rates of the rods' directions, with the ball's, shape (E, L+1, 3).
+    """
     rope = sim.params.rope
-    get = {
-        k: sim.get(k).astype(float)
-        for k in ("pos_w", "quat_wb", "vel_w", "rate_b", "cable_dir_w", "cable_vel_w")
-    }
-    mount = np.tile(rope.mount, (sim.count, 1))
-    top = get["pos_w"] + rotate(get["quat_wb"], mount)
-    top_vel = get["vel_w"] + rotate(get["quat_wb"], np.cross(get["rate_b"], mount))
-    length, mass, count = rope.length / rope.segments, rope.rope_mass / rope.segments, rope.segments
-    n, u = get["cable_dir_w"], get["cable_vel_w"]
-    ends = top[:, None] + length * np.cumsum(n, axis=1)
-    end_vel = top_vel[:, None] + length * np.cumsum(u, axis=1)
-    centres, vels = ends - 0.5 * length * n, end_vel - 0.5 * length * u
-    ball, ball_vel = (
-        ends[:, -1:] + rope.payload_offset * n[:, -1:],
-        end_vel[:, -1:] + rope.payload_offset * u[:, -1:],
+    length, mass = rope.segment_length, rope.segment_mass
+    turn, n, u = (
+        Rotation.from_quat(sim.get("quat_wb")),
+        sim.get("cable_dir_w"),
+        sim.get("cable_vel_w"),
     )
-    masses = np.append(np.full(count, mass), rope.payload_mass)
-    inertias = np.append(np.full(count, mass * length**2 / 12.0), rope.payload_inertia)
-    join = lambda a, b: np.concatenate((a, b), axis=1)  # noqa: E731
-    return masses, inertias, join(centres, ball), join(vels, ball_vel), join(u, u[:, -1:])
+    n, u = n.astype(float), u.astype(float)
+    turning = np.cross(sim.get("rate_b").astype(float), rope.mount)
+    top = sim.get("pos_w") + turn.apply(np.tile(rope.mount, (sim.count, 1)))
+    top_vel = sim.get("vel_w") + turn.apply(turning)
+
+    def centres(upper: np.ndarray, along: np.ndarray) -> np.ndarray:
+        ends = upper[:, None] + length * np.cumsum(along, axis=1)
+        ball = ends[:, -1:] + rope.payload_offset * along[:, -1:]
+        return np.concatenate((ends - 0.5 * length * along, ball), axis=1)
+
+    masses = np.append(np.full(rope.segments, mass), rope.payload_mass)
+    inertias = np.append(np.full(rope.segments, mass * length**2 / 12.0), rope.payload_inertia)
+    rates = np.concatenate((u, u[:, -1:]), axis=1)
+    return masses, inertias, centres(top, n), centres(top_vel, u), rates
 
 
 def energy(sim: HybridSim) -> np.ndarray:
     """Kinetic and potential energy [J] of vehicle, rope and ball, shape (E,)."""
     masses, inertias, pos, vel, u = rods(sim)
     body = sim.params.vehicle.body
-    v, w, z = (
-        sim.get("vel_w").astype(float),
-        sim.get("rate_b").astype(float),
-        sim.get("pos_w")[:, 2].astype(float),
-    )
+    v, w, pos_w = (sim.get(name).astype(float) for name in ("vel_w", "rate_b", "pos_w"))
     kinetic = 0.5 * body.mass * (v**2).sum(-1) + 0.5 * (np.array(body.inertia) * w**2).sum(-1)
     kinetic += 0.5 * ((vel**2).sum(-1) @ masses + (u**2).sum(-1) @ inertias)
-    return kinetic + sim.gravity * (body.mass * z + pos[..., 2] @ masses)
+    return kinetic + sim.gravity * (body.mass * pos_w[:, 2] + pos[..., 2] @ masses)
 
 
 def momentum(sim: HybridSim) -> np.ndarray:

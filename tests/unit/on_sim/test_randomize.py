@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.testing import assert_allclose
 from pytest import mark
+from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
 from sim.hybrid import HybridSim, tether_lengths
 from tests.plants import paper_plant
-from tests.simulators import rotate
 from visthrow import config
 from visthrow.task import TaskParams
 
@@ -84,12 +84,9 @@ def cable_angles(**changes: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, 
     [1/s] beyond the body's turn there.
     """
     sim = started(**changes)
-    quat = sim.get("quat_wb").astype(float)
-    back = quat * [-1.0, -1.0, -1.0, 1.0]
-    down = rotate(back, sim.get("cable_dir_w")[:, 0].astype(float))
-    swing = rotate(back, sim.get("cable_vel_w")[:, 0].astype(float)) - np.cross(
-        sim.get("rate_b"), down
-    )
+    back = Rotation.from_quat(sim.get("quat_wb")).inv()
+    down = back.apply(sim.get("cable_dir_w")[:, 0])
+    swing = back.apply(sim.get("cable_vel_w")[:, 0]) - np.cross(sim.get("rate_b"), down)
     azimuth = np.arctan2(-down[:, 0], down[:, 1])
     azimuth = np.where(np.cos(azimuth) < 0.0, azimuth + np.pi, azimuth)
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
