@@ -2,11 +2,10 @@
 field is right.
 """
 
-import dataclasses
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
-from pytest import approx, mark, raises
+from pytest import mark, raises
 
 from sim.hybrid import HybridSim
 from sim.params import PlantParams
@@ -90,25 +89,6 @@ def test_a_plant_in_other_units_flies_the_same_flight(kind):
     usual, other = flown(p, Units(1.0, 1.0)), flown(in_units(p, UNITS), UNITS)
     for name, value in usual.items():
         np.testing.assert_allclose(other[name], value, rtol=ROUNDING, atol=ROUNDING, err_msg=name)
-
-
-def test_units_lead_back():
-    there = in_units(plant(), UNITS)
-    for got, expected in zip(numbers(in_units(there, UNITS.inverse)), numbers(plant())):
-        assert got == approx(expected, rel=1e-12)
-
-
-def numbers(value: object) -> list[float]:
-    """All numbers of nested dataclasses."""
-    if dataclasses.is_dataclass(value):
-        return [x for f in fields(value) for x in numbers(getattr(value, f.name))]
-    return (
-        [x for item in value for x in numbers(item)]
-        if isinstance(value, tuple)
-        else [value]
-        if isinstance(value, float)
-        else []
-    )
 
 
 def test_every_field_of_plant_and_task_has_a_dimension():
