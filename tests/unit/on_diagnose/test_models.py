@@ -502,40 +502,6 @@ class TestGimbal:
         )
 
 
-ROUNDING = 1e-8  # relative; of another CPU's sums
-CABLED = replace(FLYER, command_delay=LATE, cable=CableParams(0.5, 0.008, (0.01, 0.0, -0.03)))
-STATISTICS = {
-    "ball": (
-        lambda: BallModel([ball_log(drag=0.04, seed=i, heading=2.1 * i) for i in range(2)], BALL),
-        [42721855665.89668, 3634096442.462917, 2908171307.0876303],
-        [66557501.060087696, 17821536.107680555, 964107.4675978693],
-    ),
-    "pendulum": (
-        lambda: PendulumModel([swing_log(0.21, 0.05, 0.1, 0.02, 0.01)], SWING),
-        [3408114548545.9414, 4182408055.458863, 222633652.2296511],
-        [6907780970.630128, 156847603.93530697, 34875846.19299512],
-    ),
-    "cable": (
-        lambda: FlyerModel([fly(4.0, cable=0.5, mount=CABLED.cable.mount, noise=1e-4)], CABLED),
-        [190160747294.6631, 6830731150.131376, 3071064115.3727813],
-        [34270.61905901086, -5097.118659377244, -26219.916243561824],
-    ),
-}
-"""Model, and what the first three effects' columns gave with themselves and with the
-residuals when it was measured first.
-"""
-
-
-@mark.parametrize("name", STATISTICS)
-def test_a_rewrite_leaves_the_statistics(name):
-    build, information, score = STATISTICS[name]
-    windows = build().windows({})
-    columns = [w.effects[:, :3] / w.sigma[:, None] for w in windows]
-    residuals = [w.residual / w.sigma for w in windows]
-    assert sum(np.sum(c**2, axis=0) for c in columns) == approx(information, rel=ROUNDING)
-    assert sum(c.T @ r for c, r in zip(columns, residuals)) == approx(score, rel=ROUNDING)
-
-
 class TestSetups:
     def test_one_model_a_setup(self):
         with raises(ConfigError, match="ball and stand: a setup has only one model"):
