@@ -108,18 +108,6 @@ def test_a_marker_in_millimetres_is_no_velocity_of_another():
     assert [c.name for c in propose(table, "a.csv").mapping.channels] == ["pos_w"]
 
 
-def test_of_many_markers_a_velocity_is_no_position():
-    """Thirty markers whose names tell no unit; one velocity among them is no position."""
-    time = np.arange(0.0, 8.0, 0.01)
-    path = np.column_stack([np.sin(0.9 * time), np.cos(1.7 * time), 1.0 + 0.2 * np.sin(time)])
-    columns = {"time": time} | named("v", np.gradient(path, time, axis=0))
-    for i in range(30):
-        columns |= named(f"m{i}", path + [0.01 * i, 0.02 * i, 0.0])
-    asked = " ".join(propose(columns, "capture").questions)
-    assert "m29_x, m29_y, m29_z" in asked
-    assert "v_x" not in asked
-
-
 def test_a_payload_belongs_to_the_path_that_it_hangs_below():
     """The first of three paths is another vehicle's."""
     time = np.arange(0.0, 20.0, 0.01)
@@ -187,13 +175,12 @@ def test_an_angle_is_in_the_unit_of_its_reach(reach, unit):
     assert "deg or rad?" in found.questions[0]
 
 
-def test_the_imu_of_euroc_is_proposed(tmp_path):
-    time = 0.005 * np.arange(400)
-    rates = np.column_stack([np.sin(3.0 * time), np.cos(2.0 * time), 0.1 * time])
-    acc = np.column_stack([0.3 * np.sin(time), 0.3 * np.cos(time), 9.81 + 0.2 * np.sin(5.0 * time)])
-    table = {"timestamp [ns]": 1e9 * time}
-    table |= {f"w_RS_S_{axis} [rad s^-1]": c for axis, c in zip("xyz", rates.T)}
-    table |= {f"a_RS_S_{axis} [m s^-2]": c for axis, c in zip("xyz", acc.T)}
+def test_the_imu_of_euroc_is_proposed():
+    columns = flight(2.0)
+    table = {"timestamp [ns]": 1e9 * columns["time"]}
+    for stem, unit, name in (("w", "rad s^-1", "rate_b"), ("a", "m s^-2", "acc_b")):
+        axes = zip("xyz", columns[name].T)
+        table |= {f"{stem}_RS_S_{axis} [{unit}]": column for axis, column in axes}
     found = propose(table, "data.csv").mapping
     assert {"rate_b", "acc_b"} <= {channel.name for channel in found.channels}
 

@@ -252,22 +252,6 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
-def test_an_event_is_left_out_or_weighs_little(found):
-    """A flight that was left out has no windows any more; one whose window is far rougher than
-    others has.
-    """
-    _, diagnosis = found
-    flights = {w.flight for w in diagnosis.work.after.windows}
-    told = replace(diagnosis, events=(min(flights), max(flights) + 1))
-    little, out = (line for line in report.summary(told).splitlines() if line.startswith("EVENT"))
-    assert f"flight {min(flights)} " in little
-    assert little.endswith("weighs little")
-    assert f"flight {max(flights) + 1} " in out
-    assert out.endswith("left out")
-    parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
-    assert sum(text.startswith("**EVENT.**") for text in parts) == 2
-
-
 def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):
     def full(*_):
         raise OSError("no space left")
