@@ -20,7 +20,7 @@ from visthrow.diagnose.inputs.unit_evidence import (
     turn_to,
 )
 from visthrow.logs.check import physics, relations
-from visthrow.logs.flightlog import Channel, Samples
+from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, Samples
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
 from visthrow.logs.unit_names import UNITS
@@ -44,6 +44,8 @@ _TURN = 7.0  # above a full turn in radians: degrees
 _UNUSUAL = 1.0  # nats against an order or axes that are not the usual ones
 _TILTED = 10.0  # nats against an attitude that leans over for half of the time
 _PACK = (2.5, 60.0)  # of any vehicle's battery [V]
+_FRAMES = {"w": "world", "wb": "world", "b": "body", "c": "camera"}
+"""Frame of a channel by the end of its name."""
 _MOTIONS = {"quat_wb", "rate_b", "acc_b", "motor_command", "vel_w"}
 
 
@@ -113,6 +115,10 @@ class Recognition:
             and (targets or not group.matches("target"))
         ]
 
+    def _hinting(self, kind: str) -> list[Group]:
+        """Groups of three columns that no channel has and whose names hint at a kind."""
+        return [group for group in self._open(3) if group.hints_at(kind)]
+
     def _group(self, name: str) -> Group:
         """Group that a channel was made of."""
         return next(g for g in self._groups if g.columns == self._made[name][0].columns)
@@ -125,7 +131,8 @@ class Recognition:
             return False
         values = group.values
         held = bool(np.mean(np.all(values[1:] == values[:-1], axis=1)) > 0.5)
-        entry = ChannelMap(name, group.columns, unit, held=held, **options)
+        frame = "" if name in STANDARD_CHANNELS else _FRAMES.get(name.rpartition("_")[2], "")
+        entry = ChannelMap(name, group.columns, unit, frame=frame, held=held, **options)
         try:
             channel, _ = make_channel(self.time, values, entry, "table")
         except (ConfigError, LogError):
@@ -140,17 +147,15 @@ class Recognition:
             length = np.nanmedian(np.linalg.norm(group.values, axis=1))
             if group.stem == "motor" or not 0.95 < length < 1.05:
                 continue
-            name, frame = "quat_wb", ""
+            name = "quat_wb"
             if group.matches("not_vehicle"):
-                name, frame = "payload_quat_wb", "world"
-            if frame and group.matches("camera"):
-                name, frame = "marker_quat_c", "camera"
-            if name == "quat_wb" and name in self._made and group.matches("estimate"):
-                name, frame = "est_quat_wb", "world"
-            largest = int(np.argmax(np.nanmean(np.abs(group.values), axis=0)))
+                name = "marker_quat_c" if group.matches("camera") else "payload_quat_wb"
+            elif name in self._made and group.matches("estimate"):
+                name = "est_quat_wb"
+            largest = np.argmax(np.nanmean(np.abs(group.values), axis=0))
             order = "xyzw" if _lettered(group) or largest == 3 else "wxyz"
-            options = {"kind": "quaternion", "order": order, "frame": frame}
-            self._take(name, group, "1", "four columns of length 1", **options)
+            why = "four columns of length 1"
+            self._take(name, group, "1", why, kind="quaternion", order=order)
 
     def _other_attitudes(self) -> None:
         """Attitudes as rotation matrices, rotation vectors or angles."""
@@ -202,7 +207,7 @@ class Recognition:
         """Return 1 where an accelerometer says that its z points down in flight, -1 where up, else
         0.
         """
-        for group in [g for g in self._open(3) if g.hints_at("acc_b")]:
+        for group in self._hinting("acc_b"):
             middle = np.nanmedian(group.values, axis=0)
             if abs(middle[2]) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
                 return -float(np.sign(middle[2]))
@@ -221,7 +226,7 @@ class Recognition:
         for group in [g for g in groups if g.matches("camera")]:
             unit = readings(self.time, group.values, _lengths(group), [None])[0].unit
             why = "three columns that move smoothly; their name speaks of a camera"
-            self._take("marker_pos_c", group, unit, why, frame="camera")
+            self._take("marker_pos_c", group, unit, why)
         paths = self._paths([g for g in groups if not g.matches("camera")])
         pay = self._payload(paths, unnamed)
         if pay is not None:
@@ -236,10 +241,9 @@ class Recognition:
             usual = "est_pos_w" if group.matches("estimate") else usual
             wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
             smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd){path.why}"
-            for name in ["pos_w"] * (usual == "pos_w" or path is paths[0]) + [usual]:
-                frame = "" if name == "pos_w" else "world"
-                if self._take(name, group, path.unit, smoothly, frame=frame, axes=self._up()):
-                    break
+            first = path is paths[0]
+            if not first or not self._take("pos_w", group, path.unit, smoothly, axes=self._up()):
+                self._take(usual, group, path.unit, smoothly, axes=self._up())
         if len(paths) > 1:
             listed = "; ".join(path.group.listed for path in paths)
             self.questions.append(
@@ -335,9 +339,9 @@ class Recognition:
         values = group.values[np.all(np.isfinite(group.values), axis=1)]
         if len(values) < 50:
             return False
-        moves_by = np.std(values, axis=0)
-        steps = np.std(np.diff(values, axis=0), axis=0)
-        return bool(np.max(moves_by) > 0.0 and np.max(steps) < 0.3 * np.max(moves_by))
+        width = np.max(np.std(values, axis=0))
+        step = np.max(np.std(np.diff(values, axis=0), axis=0))
+        return bool(width > 0.0 and step < 0.3 * width)
 
     def _without_derivatives(self, groups: list[Group], paths: list[Group]) -> list[Group]:
         """Return the groups that are no derivative of another path; of captures with many markers
@@ -394,8 +398,7 @@ class Recognition:
             unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
             why = f"the derivative of {name}, correlation {relation.correlation:.2f},"
             why += f" {relation.scale:.3g} of its unit a second"
-            frame = "world" if name == "est_pos_w" else ""
-            self._take(name.replace("pos", "vel"), group, unit, why, frame=frame, axes=self._up())
+            self._take(name.replace("pos", "vel"), group, unit, why, axes=self._up())
 
     def _body_velocity(self, path: Channel, in_world: float) -> bool:
         """Take a velocity that is the path's in the body's axes rather than in the world's, where
@@ -408,7 +411,7 @@ class Recognition:
         if min(len(time), len(attitude.time)) < 100:
             return False
         turned = Samples(time, rotate_back(relations.attitude_at(*attitude, time), slope))
-        best = self._best(turned, [g for g in self._open(3) if g.hints_at("velocity")])
+        best = self._best(turned, self._hinting("velocity"))
         if best is None:
             return False
         relation, group = best
@@ -419,14 +422,14 @@ class Recognition:
             return False
         unit = group.unit if group.unit.endswith("/s") else "m/s"
         why = f"the derivative of pos_w in the body's axes, {nats:.0f} nats over the world's"
-        return self._take("vel_b", group, unit, why, frame="body")
+        return self._take("vel_b", group, unit, why)
 
     def _rates(self) -> None:
         derived = Samples(np.empty(0), np.empty((0, 3)))
         if "quat_wb" in self._made:
             derived = relations.rates_of(*self._made["quat_wb"][1].samples())
         ranked = []
-        for group in [g for g in self._open(3) if g.hints_at("rate_b")]:
+        for group in self._hinting("rate_b"):
             values = self._samples(group)
             relation = relations.relate(derived, values, reach=_REACH)
             score = relation.axes_correlation if relation is not None else 0.0
@@ -450,12 +453,12 @@ class Recognition:
         self._take("rate_b", group, unit, why, axes=self._body())
 
     def _forces(self) -> None:
-        for group in [g for g in self._open(3) if g.hints_at("acc_b")]:
+        for group in self._hinting("acc_b"):
             size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
             for unit in ("m/s^2", "g", "mg"):
                 if 0.8 < size * UNITS[unit][1] / physics.GRAVITY < 1.25:
                     why = f"a middle size of {size:.3g}: gravity in {unit}"
-                    self._take("acc_b", group, unit, why, frame="body", axes=self._body())
+                    self._take("acc_b", group, unit, why, axes=self._body())
 
     def _motors(self) -> None:
         for group in [g for g in self._open(4) if g.stem == "motor"]:

@@ -100,24 +100,16 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
     """
     count = len(channel.time)
     span = float(np.ptp(channel.time)) if count else 0.0
+    figures = {"samples": count, "seconds": span}
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:
-        return [
-            Row(
-                "clock",
-                name,
-                "ok",
-                f"{count} settled values over {span:.0f} s",
-                {"samples": count, "seconds": span},
-            )
-        ]
+        text = f"{count} settled values over {span:.0f} s"
+        return [Row("clock", name, "ok", text, figures)]
     if count < FEW_SAMPLES or span < SHORT:
         text = (
             f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
         )
         event = name in _SWITCHES + ("separation", "landing", "goal_w")
-        return [
-            Row("clock", name, "ok" if event else "bad", text, {"samples": count, "seconds": span})
-        ]
+        return [Row("clock", name, "ok" if event else "bad", text, figures)]
     return [
         _clock(name, channel, notes),
         *_gaps(name, channel),
@@ -184,14 +176,10 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
     else:
         verdict = "ok"
     text = (
-        f"{int(np.sum(wide))} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
-        " time, "
+        f"{figures['gaps']} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
+        f" time, {100 * invalid:.1f} % of the samples not valid"
     )
-    return [
-        Row(
-            "gaps", name, verdict, text + f"{100 * invalid:.1f} % of the samples not valid", figures
-        )
-    ]
+    return [Row("gaps", name, verdict, text, figures)]
 
 
 def _values(name: str, channel: Channel) -> list[Row]:

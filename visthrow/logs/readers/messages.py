@@ -25,6 +25,7 @@ import numpy as np
 
 from visthrow.common.errors import LogError
 from visthrow.common.extras import load_extra
+from visthrow.logs.readers.recordings import add_numbers
 
 Fields = dict[str, np.ndarray]
 """Field -> values, shape (T,); ``time`` is when it was measured and ``arrival`` when it was
@@ -258,15 +259,7 @@ class _Columns:
 
     def add(self, key: tuple[str, int], row: dict[str, Any]) -> None:
         numbers: dict[str, float] = {}
-        for name, value in row.items():
-            if isinstance(value, (int, float)):
-                numbers[name] = float(value)
-            elif isinstance(value, (list, tuple)):
-                numbers |= {
-                    f"{name}[{i}]": float(x)
-                    for i, x in enumerate(value)
-                    if isinstance(x, (int, float))
-                }
+        add_numbers(numbers, row)
         rows = self.rows.setdefault(key, {name: [] for name in numbers})
         if rows.keys() <= numbers.keys():
             for name, values in rows.items():

@@ -286,7 +286,7 @@ class Topics:
             return
         try:
             row: dict[str, float] = {}
-            _add_numbers(row, decode(raw), "")
+            add_numbers(row, decode(raw))
         except Exception as error:  # readers of others raise what comes
             self._left_out[topic] = f"{label}: cannot be decoded: {error!r}"[:200]
             return
@@ -334,7 +334,7 @@ def _members(kind: type, name: str) -> tuple[tuple[str, str], ...]:
     return tuple((member, f"{name}.{member}" if name else member) for member in members)
 
 
-def _add_numbers(row: dict[str, float], value: Any, name: str) -> None:
+def add_numbers(row: dict[str, float], value: Any, name: str = "") -> None:
     """Add each number in a message to a row, by its name."""
     if isinstance(value, (bool, int, float, np.integer, np.floating)):
         row[name] = float(value)
@@ -343,13 +343,13 @@ def _add_numbers(row: dict[str, float], value: Any, name: str) -> None:
             row.update(zip(_places(name, value.size), map(float, value.ravel().tolist())))
     elif isinstance(value, dict):
         for key, item in value.items():
-            _add_numbers(row, item, f"{name}.{key}" if name else key)
+            add_numbers(row, item, f"{name}.{key}" if name else key)
     elif isinstance(value, (list, tuple, np.ndarray)) and len(value) <= WIDEST:
         for place, item in zip(_places(name, len(value)), value):
-            _add_numbers(row, item, place)
+            add_numbers(row, item, place)
     else:
         for member, place in _members(type(value), name):
-            _add_numbers(row, getattr(value, member), place)
+            add_numbers(row, getattr(value, member), place)
 
 
 def _c3d(path: Path) -> Table:
