@@ -5,16 +5,10 @@ been named.
 import argparse
 from pathlib import Path
 
-from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError
+from visthrow.diagnose.inputs import model_arguments as opening
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
-
-    add_shared(parser)
-    declared(__file__)(parser)
+add_arguments = opening.declared_with_logs(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -22,7 +16,6 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place, write_json
-    from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.reporting import blind, pictures
 
     check_place(Path(args.out) / "blind.json")

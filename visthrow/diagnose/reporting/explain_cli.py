@@ -3,13 +3,10 @@
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from visthrow.common.arguments import declared
+from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
-
-if TYPE_CHECKING:
-    from visthrow.diagnose.inputs.model_arguments import Opened
 
 # exit status where no cause can be named: the data contradict themselves, or the simulation does
 # not follow them
@@ -18,18 +15,12 @@ REFUSED = 1
 DIAGNOSIS = "diagnosis.json"  # in the report's folder; `diagnose apply` reads it
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
-
-    add_shared(parser)
-    declared(__file__)(parser)
+add_arguments = opening.declared_with_logs(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import check_place, write_json
-    from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.reporting import diagnosis_report as report
 
     folder = Path(args.out)
@@ -59,7 +50,9 @@ def run(args: argparse.Namespace) -> int:
     return REFUSED if diagnosis.overall in (INCONSISTENT, OUT_OF_DOMAIN) else 0
 
 
-def _tested(test_flights: "Opened", diagnosis: Diagnosis) -> dict[str, tuple[float, float, float]]:
+def _tested(
+    test_flights: opening.Opened, diagnosis: Diagnosis
+) -> dict[str, tuple[float, float, float]]:
     """Return prediction errors of other flights by the model as its setup has it without
     extensions, by that with all that was found, and of noise alone; print them.
     """

@@ -7,16 +7,10 @@ import math
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError, expect_known
+from visthrow.diagnose.inputs import model_arguments as opening
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of the action."""
-    from visthrow.diagnose.inputs.model_arguments import add_arguments as add_shared
-
-    add_shared(parser)
-    declared(__file__)(parser)
+add_arguments = opening.declared_with_logs(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -24,7 +18,6 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
 
     from visthrow.common.storage import atomic_write, check_place
-    from visthrow.diagnose.inputs import model_arguments as opening
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.planning import design, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
