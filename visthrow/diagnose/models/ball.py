@@ -7,6 +7,7 @@ The log holds no mass: forces are per kilogram, which is what a path can tell.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from visthrow.common.rotations import cross
 from visthrow.config.bounds import Bounded, NotNegative, Positive
@@ -15,7 +16,6 @@ from visthrow.diagnose.models.numeric import (
     NumericModel,
     Stretch,
     halves,
-    hermite,
     integrate,
     sigma_of,
 )
@@ -106,12 +106,14 @@ class BallModel(NumericModel):
         """See the base class."""
         tilt_x, tilt_y, clock, scale = lanes.theta.T[6:]
         time = stretch.data["time"]
-        step = np.ptp(time) / STEPS
+        grid = np.linspace(time[0], time[-1], STEPS + 1)
         rate = path[..., 3:] * (1.0 + clock[:, None, None])
-        pos = hermite(time, time[0], step, path[..., :3], rate)
+        pos = CubicHermiteSpline(grid, path[..., :3], rate, axis=1)(time)
         first = pos[:, :1]
-        turned = pos + cross(np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)[:, None], pos - first)
-        return (first + (turned - first) * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
+        gone = pos - first
+        tilt = np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)
+        gone = gone + cross(tilt[:, None], gone)
+        return (first + gone * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
 
 
 def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:

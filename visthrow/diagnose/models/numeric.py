@@ -472,32 +472,6 @@ def integrate(
     return path
 
 
-def hermite(
-    time: np.ndarray, start: float, step: float, value: np.ndarray, rate: np.ndarray
-) -> np.ndarray:
-    """Values at stamps from values and rates on an even grid, cubic.
-
-    Returns shape (L, N, C).
-
-    Args:
-        time: [s], shape (N,), or one set of stamps a lane, (L, N).
-        start: Of the grid [s].
-        step: Of the grid [s].
-        value: Shape (L, T, C).
-        rate: Their derivatives, shape (L, T, C).
-    """
-    position = np.broadcast_to((np.asarray(time) - start) / step, (len(value), np.shape(time)[-1]))
-    index = np.clip(position.astype(int), 0, value.shape[1] - 2)
-    s = (position - index)[..., None]
-    lane = np.arange(len(value))[:, None]
-    a = value[lane, index]
-    b = value[lane, index + 1]
-    da = rate[lane, index]
-    db = rate[lane, index + 1]
-    out = (1 + 2 * s) * (1 - s) ** 2 * a + s**2 * (3 - 2 * s) * b
-    return out + step * (s * (1 - s) ** 2 * da + s**2 * (s - 1) * db)
-
-
 def triangles(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
     """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
     return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])

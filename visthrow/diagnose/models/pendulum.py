@@ -5,6 +5,7 @@ the encoder.
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicHermiteSpline
 
 from visthrow.common.errors import LogError
 from visthrow.config.bounds import Bounded, NotNegative, Positive
@@ -13,7 +14,6 @@ from visthrow.diagnose.models.numeric import (
     NumericModel,
     Stretch,
     halves,
-    hermite,
     integrate,
     sigma_of,
     take_samples,
@@ -144,7 +144,7 @@ class PendulumModel(NumericModel):
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
         offset, scale, clock = lanes.theta.T[4:7]
-        rate = path[..., 1:] * (1.0 + clock[:, None, None])
-        step = self.params.window / self._steps
-        angle = hermite(stretch.time, stretch.data["start"], step, path[..., :1], rate)[..., 0]
+        rate = path[..., 1] * (1.0 + clock)[:, None]
+        grid = stretch.data["start"] + np.linspace(0.0, self.params.window, path.shape[1])
+        angle = CubicHermiteSpline(grid, path[..., 0], rate, axis=1)(stretch.time)
         return angle * (1.0 + scale)[:, None] + offset[:, None] + self.params.hanging

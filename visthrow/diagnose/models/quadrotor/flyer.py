@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.integrate import cumulative_trapezoid
+from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 
 from visthrow.common.rotations import cross
@@ -22,7 +23,6 @@ from visthrow.diagnose.models.numeric import (
     NumericModel,
     Stretch,
     halves,
-    hermite,
     integrate,
     triangles,
 )
@@ -218,22 +218,23 @@ class FlyerModel(NumericModel):
         """
         start = stretch.data["start"]
         step = self.params.step
+        grid = start + step * np.arange(path.shape[1])
         if name in self.columns:
             states = path[..., self.columns[name]]
-            grid = start + step * np.arange(path.shape[1])
             time = time[:: states.shape[2]]
             return np.array([on_grid(grid, lane, time) for lane in states])
         time = time[::3]
         value = path[..., 0:3]
         rate = path[..., 3:6]
         if name == "payload_pos_w":
-            late = time - self.size_of(lanes, "payload_delay")[:, None]
-            return hermite(late, start, step, value + path[..., 6:9], rate + path[..., 9:12])
-        late = time - self.size_of(lanes, "pose_delay")[:, None]
-        pos = hermite(late, start, step, value, rate)
+            value = value + path[..., 6:9]
+            rate = rate + path[..., 9:12]
+            return _late(time, self.size_of(lanes, "payload_delay"), grid, value, rate)
+        pos = _late(time, self.size_of(lanes, "pose_delay"), grid, value, rate)
         lever = self.stack(lanes, "marker_x", "marker_y", "marker_z")
-        half = np.clip(((time - start) / (0.5 * step)).round().astype(int), 0, 2 * self.steps)
-        return pos + np.einsum("nij,bj->bni", stretch.data["rot"][half + self._spare], lever)
+        half = ((time - start) / (0.5 * step)).round().astype(int)
+        rot = stretch.data["rot"][np.clip(half, 0, 2 * self.steps) + self._spare]
+        return pos + np.einsum("nij,bj->bni", rot, lever)
 
     def without_commands(
         self, theta: Mapping[str, float], windows: Sequence[int]
@@ -459,6 +460,21 @@ class FlyerModel(NumericModel):
 def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
     """Return the names that all logs hold."""
     return [name for name in names if all(name in log for log in logs)]
+
+
+def _late(
+    time: np.ndarray, delays: np.ndarray, grid: np.ndarray, value: np.ndarray, rate: np.ndarray
+) -> np.ndarray:
+    """Return what stamps show of lanes that are late, shape (L, N, 3).
+
+    ``time``: shape (N,); ``delays``: of the lanes [s], shape (L,); ``value, rate``: of the lanes on
+    a grid and its derivative, shape (L, T, 3)."""
+    out = np.empty((len(value), len(time), 3))
+    for delay in np.unique(delays):
+        members = delays == delay
+        path = CubicHermiteSpline(grid, value[members], rate[members], axis=1)
+        out[members] = path(time - delay)
+    return out
 
 
 def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
