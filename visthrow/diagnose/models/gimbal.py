@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, take_samples
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
@@ -59,29 +59,26 @@ class GimbalModel(NumericModel):
         """
         params = self.params
         marker = log[CHANNEL]
-        table_time, tables = _tables(log, params)
+        tables = _tables(log, params)
         stretches = []
         rejected = 0
         frames = 0
         last = marker.time[-1] - MARGIN - params.window
         for start in np.arange(marker.time[0] + MARGIN, last, params.window):
             end = start + params.window
-            rows = np.flatnonzero(marker.valid & (marker.time >= start) & (marker.time < end))
-            rows = rows[:: params.every]
-            in_table = (table_time > start - MARGIN) & (table_time < end + MARGIN)
-            if len(rows) < 10 or np.sum(in_table) < 20:
+            stamps, point = take_samples(marker, params, start)
+            near = (tables["time"] > start - MARGIN) & (tables["time"] < end + MARGIN)
+            if len(stamps) < 10 or np.sum(near) < 20:
                 continue
-            poses = {name: values[in_table] for name, values in tables.items()}
-            point = marker.values[rows].astype(float)
-            distance = np.median(np.linalg.norm(poses["gap"], axis=1))
+            data = {name: values[near] for name, values in tables.items()}
+            distance = np.median(np.linalg.norm(data["gap_b"], axis=1))
             fits = np.abs(np.linalg.norm(point, axis=1) - distance) < params.largest
             rejected += int(np.sum(~fits))
             frames += len(fits)
             if np.sum(fits) < 10:
                 continue
             sigma = np.array([params.sigma_across, params.sigma_across, params.sigma_along])
-            measured = marker.time[rows][fits], point[fits], sigma
-            data = {"table_time": table_time[in_table], "table": poses}
+            measured = stamps[fits], point[fits], sigma
             stretches.append(self.lay_out(number, "view", [measured], (start, end), data))
         if rejected > MOST_APART * frames:
             raise LogError(
@@ -96,18 +93,13 @@ class GimbalModel(NumericModel):
             self.stack(lanes, *(f"{what}_{axis}" for axis in "xyz"))
             for what in ("camera_tilt", "camera_lever", "marker_rot")
         )
-        time = stretch.time.reshape(-1, 3)[:, 0]
-        table = stretch.data["table"]
-        late = time[None] - self.size_of(lanes, "camera_delay")[:, None]
-        gap, axes, level = (
-            on_grid(stretch.data["table_time"], table[name], late)
-            for name in ("gap", "rot", "gimbal")
+        time = stretch.time[::3]
+        late = time - self.size_of(lanes, "camera_delay")[:, None]
+        gap, level = (
+            on_grid(stretch.data["time"], stretch.data[name], late) for name in ("gap_b", "level")
         )
-        body = np.einsum("bnji,bnj->bni", axes.reshape(*late.shape, 3, 3), gap)
-        body = body + cross(turn[:, None], body)
-        points = np.einsum(
-            "bnji,bnj->bni", level.reshape(*late.shape, 3, 3), body - np.array(self.params.base_b)
-        )
+        gap = gap + cross(turn[:, None], gap) - np.array(self.params.base_b)
+        points = np.einsum("bnji,bnj->bni", level.reshape(*late.shape, 3, 3), gap)
         points = points - np.array([self.params.camera_offset, 0.0, 0.0])
         axes = Rotation.from_euler("xyz", self.params.camera_axes_deg, degrees=True)
         point = points @ axes.as_matrix()
@@ -116,27 +108,21 @@ class GimbalModel(NumericModel):
         shares = (time - stretch.latent_time[0]) / self.params.window
         point = point + self.pushes_at(lanes, shares).swapaxes(0, 1)
         scale = 1.0 + self.stack(lanes, "focal_scale", "focal_scale", "range_scale")
-        return (point * scale[:, None]).reshape(len(lanes.owner), -1)
+        return (point * scale[:, None]).reshape(len(late), -1)
 
 
-def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Poses at the vehicle's stamps: payload's marker from the vehicle, attitude, gimbal to body,
-    matrices as rows of 9.
+def _tables(log: FlightLog, params: GimbalParams) -> dict[str, np.ndarray]:
+    """Return stamps of the vehicle's poses, and at them the payload's marker from the vehicle, body
+    frame, and the rotation from gimbal to body as rows of 9.
     """
     vehicle = log["pos_w"]
     attitude = log["quat_wb"]
     payload = log["payload_pos_w"]
-    good = (
-        vehicle.valid & attitude.valid & payload.valid
-        if len(vehicle.time) == len(payload.time)
-        else vehicle.valid
-    )
+    good = vehicle.valid
+    if len(vehicle.time) == len(payload.time):
+        good = vehicle.valid & attitude.valid & payload.valid
     time = vehicle.time[good]
-    gap = (
-        on_grid(*payload.samples(), time)
-        + np.array([0.0, 0.0, params.marker_z])
-        - vehicle.values[good]
-    )
+    marker = on_grid(*payload.samples(), time) + [0.0, 0.0, params.marker_z]
     rot = matrix_of_quat(attitude.values[good])
     angles = log["gimbal"].values[good] if "gimbal" in log else np.zeros((len(time), 2))
     gimbal = Rotation.from_euler("XY", angles).as_matrix()
@@ -144,4 +130,5 @@ def _tables(log: FlightLog, params: GimbalParams) -> tuple[np.ndarray, dict[str,
         yaw = np.arctan2(rot[:, 1, 0], rot[:, 0, 0])
         level = Rotation.from_euler("z", yaw[:, None]).as_matrix()
         gimbal = np.swapaxes(rot, 1, 2) @ level @ gimbal
-    return time, {"gap": gap, "rot": rot.reshape(-1, 9), "gimbal": gimbal.reshape(-1, 9)}
+    gap_b = np.einsum("nji,nj->ni", rot, marker - vehicle.values[good])
+    return {"time": time, "gap_b": gap_b, "level": gimbal.reshape(-1, 9)}
