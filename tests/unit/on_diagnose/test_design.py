@@ -12,6 +12,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import setup
 from visthrow.diagnose.models.ball import BallModel
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.imu import ImuModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
 from visthrow.diagnose.select import search
@@ -113,10 +114,14 @@ def test_the_simulated_flight_of_a_setup_is_one_that_its_own_model_explains(name
         assert np.sqrt(np.mean(off**2)) < 3e-4, flight.manoeuvre.name
 
 
-def test_a_ball_flies_no_manoeuvre():
+def test_neither_a_ball_nor_a_vehicle_without_position_flies_a_manoeuvre():
     model = BallModel.__new__(BallModel)
     with raises(DiagnoseError, match="flown by a vehicle"):
         fly_manoeuvres.simulator_of(model, None)
+    unlocated = ImuModel.__new__(ImuModel)
+    unlocated.params = setup.load("nanobench_imu").imu
+    with raises(DiagnoseError, match="flown by a vehicle"):
+        fly_manoeuvres.simulator_of(unlocated, None)
 
 
 @mark.parametrize("limits", [{"speed": 0.0}, {"half": (1.0, -1.0)}, {"highest": 0.5}])

@@ -3,8 +3,9 @@ them in one batch.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, fields, replace
-from functools import partial, singledispatch
+from functools import partial
 
 import numpy as np
 
@@ -81,7 +82,20 @@ def simulator_of(
     ``diagnosis``: for the sizes of what was found and the sensors' noise; ``build``: gives a
     setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
     """
-    plant, model_of, adapted = vehicle_in(model, diagnosis, build)
+    if isinstance(model, ThrowModel):
+        plant = apply(model.entries, model.setting, diagnosis.theta).plant
+        model_of = partial(_throw_model, model)
+        adapted = copy
+    elif isinstance(model, FlyerModel) and isinstance(model.params, FlyerParams):
+        known = plant_of(config.load(Experiment, config.find("train", "state")))
+        plant = vehicle_of(model.params, known)
+        model_of = partial(_setup_model, model, build)
+        adapted = partial(carried, params=model.params)
+    else:
+        raise DiagnoseError(
+            "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
+            " with or without payload"
+        )
     noise = _sensor_noise(diagnosis)
 
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
@@ -91,54 +105,36 @@ def simulator_of(
     return simulate, adapted
 
 
-@singledispatch
-def vehicle_in(model: Model, diagnosis: Diagnosis, build: Callable | None) -> tuple:
-    """Return the plant that flies in a model, a function that gives the model of a simulated
-    flight by the sensors' noise, and one that adapts a manoeuvre to it, or gives None.
-
-    Raises DiagnoseError: no vehicle flies in the model.
-    """
-    raise DiagnoseError(
-        "manoeuvres are flown by a vehicle; a plan needs the throw's model, or a quadrotor's"
-        " with or without payload"
-    )
+def _setup_model(
+    model: FlyerModel,
+    build: Callable[[Sequence[FlightLog]], Model],
+    noise: Mapping[str, float],
+    flight: "SimulatedFlight",
+) -> Model:
+    """Return a setup's model of a simulated flight; ``build``: gives it by the flight's log."""
+    return build([flight.setup_log(model.params, noise, model.has_voltage)])
 
 
-@vehicle_in.register
-def _(model: ThrowModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
+def _throw_model(
+    model: ThrowModel, noise: Mapping[str, float], flight: "SimulatedFlight"
+) -> ThrowModel:
+    """Return the throw's model of a simulated flight, with the effects of another flight's."""
+    log = flight.log(noise, model.has_voltage)
+    carries = flight.manoeuvre.payload
+    setting = model.setting
+    releases = np.isfinite(flight.manoeuvre.release)
+    effects = effects_for(setting, set(log.channels), carries, releases)
     requested = {e.name for e in model.effects}
-
-    def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
-        log = flight.log(noise, model.has_voltage)
-        manoeuvre = flight.manoeuvre
-        carries = manoeuvre.payload
-        setting = model.setting
-        releases = np.isfinite(manoeuvre.release)
-        effects = effects_for(setting, set(log.channels), carries, releases)
-        return ThrowModel(
-            [log],
-            setting.plant,
-            sensing=setting.sensing,
-            camera=setting.camera,
-            device=model.device,
-            substep=COARSE * model.substep,
-            only=[name for name in effects if name in requested],
-            carries=carries,
-        )
-
-    plant = apply(model.entries, model.setting, diagnosis.theta).plant
-    return plant, model_of, lambda manoeuvre: manoeuvre
-
-
-@vehicle_in.register
-def _(model: FlyerModel, diagnosis: Diagnosis, build: Callable | None) -> tuple:
-    def model_of(noise: Mapping[str, float], flight: "SimulatedFlight") -> Model:
-        extra = ("battery_voltage",) * model.has_voltage
-        return build([flight.setup_log(model.params, noise, extra)])
-
-    vehicle = plant_of(config.load(Experiment, config.find("train", "state")))
-    plant = vehicle_of(model.params, vehicle)
-    return plant, model_of, partial(carried, params=model.params)
+    return ThrowModel(
+        [log],
+        setting.plant,
+        sensing=setting.sensing,
+        camera=setting.camera,
+        device=model.device,
+        substep=COARSE * model.substep,
+        only=[name for name in effects if name in requested],
+        carries=carries,
+    )
 
 
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
@@ -254,7 +250,7 @@ class SimulatedFlight:
         return self._log(channels)
 
     def setup_log(
-        self, params: FlyerParams, noise: Mapping[str, float], extra: Sequence[str] = ()
+        self, params: FlyerParams, noise: Mapping[str, float], voltage: bool = False
     ) -> FlightLog:
         """Return a flight log like those of a setup: its channel names, inputs through its map of
         thrust, and what an IMU on board measures.
@@ -263,7 +259,6 @@ class SimulatedFlight:
         turns = matrix_of_quat(truth["quat_wb"])
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
         battery = self.plant.vehicle.battery.reference_voltage
-        volts = params.reference_voltage * truth["voltage"] / battery
         measured = {
             params.position: (truth["pos_w"], "m", "world"),
             "payload_pos_w": (truth["payload_pos_w"], "m", "world"),
@@ -279,7 +274,8 @@ class SimulatedFlight:
             params.input: self._input(params),
             "acc_b": Channel(self.time, force_b, "m/s^2", "body"),
         }
-        if "battery_voltage" in extra:
+        if voltage:
+            volts = params.reference_voltage * truth["voltage"] / battery
             channels["battery_voltage"] = Channel(self.time, volts, "V")
         return self._log(channels)
 
