@@ -1,8 +1,8 @@
 """Derivatives of windows' samples by effects, initial states and latent forces: which lanes are
 flown, and what comes of them.
 
-A derivative is a difference of two lanes of the same steps. Steps of twice the length, with a
-nominal lane of their own, tell most of them as well; residuals always come from the nominal steps.
+A derivative is a difference of two lanes of the same steps. Longer steps, with a nominal lane of
+their own, tell most of them as well; residuals always come from the nominal steps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,6 @@ from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.initial_states import MOVED, Direction, States, deviations
 from visthrow.diagnose.throw.recorded_flight import NEVER
 from visthrow.diagnose.throw.replay import (
-    FINENESS,
     KNOT_SPACING,
     Lane,
     ReplayedFlights,
@@ -38,8 +37,7 @@ as much its second order was left, alike for all axes.
 """
 EXACT = ("plant.vehicle.controller.gyro_time_constant", "plant.rope.payload_inertia", "step_square")
 """Numbers by which derivatives take the nominal steps: with twice as long ones they differ by more
-than a fifth. In throws, where a rope whips, those by all effects and states do; latent forces there
-differ by 2 %.
+than a fifth. Where a rope has just come taut, those by all effects and states do.
 """
 
 CALM_SPEED = 0.1
@@ -79,17 +77,20 @@ def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[
 
 @dataclass(frozen=True)
 class Plan:
-    """The lanes of one window in a run: nominal, those that ride along, those of nominal steps;
-    rough nominal, the others.
+    """The lanes of one window in a run.
+
+    Its columns are those of effects, of directions of the initial state, and of latent forces.
     """
 
     window: int
-    first: int  # lane
+    lanes: list[Lane]
+    first: int  # number of its first lane in the run
     first_knot: int  # first row of the knots
-    fine: int  # lanes of nominal steps
-    order: np.ndarray  # of effects, states and latent forces, the lane behind the first one
-    nuisances: list[int]  # directions of the initial state
-    latents: list[tuple[int, int]]  # axis and knot
+    place: np.ndarray  # lane of each column, behind the first one
+    nominal: np.ndarray  # lane of the same steps that it differs from, likewise
+    steps: np.ndarray  # of each column's derivative
+    states: np.ndarray  # directions of the initial state
+    latents: np.ndarray  # axis and knot, shape (L, 2)
 
 
 class Linearisation:
@@ -116,7 +117,7 @@ class Linearisation:
         self._simulation = simulation
         self._setting, *perturbed = simulation.settings
         self._steps = steps
-        self._directions = directions
+        self._state_steps = np.array([direction.step for direction in directions])
         self._deviations = deviations(directions, flights.cuts)
         self._states = states
         self._exact = np.array([exact(e) for e in effects], dtype=bool)
@@ -133,78 +134,85 @@ class Linearisation:
         lanes: list[Lane] = []
         first_knot = 0
         for w in batch:
-            plan, flown_by = self._plan(w, len(lanes), first_knot)
-            plans.append(plan)
-            lanes += flown_by
+            plans.append(self._plan(w, len(lanes), first_knot))
+            lanes += plans[-1].lanes
             first_knot += 2 * int(self._flights.knots[w])
         flown = self._flights.fly(self._simulation, self._states, lanes)
         in_order = map if flown.seen.is_cuda else parallel_map
-        slopes = list(in_order(partial(self._slopes, flown.seen), plans))
+        slopes = all_to_host(list(in_order(partial(self._slopes, flown.seen), plans)))
         nominal = to_host(flown.seen[:, [plan.first for plan in plans]])
-        parts = all_to_host([part for of_window in slopes for part in of_window])
 
         def window(i: int) -> Window:
             residual = self._flights.residual(nominal, plans[i].window, i)
-            of_window = parts[3 * i : 3 * i + 3]
-            return self._window(plans[i], channels[i], residual, of_window, flown.knots)
+            return self._window(plans[i], channels[i], residual, slopes[i], flown.knots)
 
         return parallel_map(window, range(len(plans)))
 
-    def _plan(self, w: int, first: int, first_knot: int) -> tuple[Plan, list[Lane]]:
-        """Return the lanes of one window.
+    def _plan(self, w: int, first: int, first_knot: int) -> Plan:
+        """Plan the lanes of one window: nominal, those that ride along, those of nominal steps;
+        rough nominal, the others.
 
         ``first``: number of the first; ``first_knot``: first row of the knots; twice as many as the
         window's are taken."""
         c = self._flights.cuts[w]
         knots = int(self._flights.knots[w])
         alike = self._alike[self._flights.kind(w)]
-        whips = c.phase in FINENESS or c.after_slack
-        fine = alike | self._exact | whips
-        nuisances = np.flatnonzero(self._deviations[w]).tolist()
-        axes = range(6 if c.payload == NO_PAYLOAD else 9)
-        latents = [(axis, knot) for axis in axes for knot in range(knots)]
-        # where the rough nominal lane stands, which latent lanes leave
-        parent = first + 1 + np.count_nonzero(fine) + len(nuisances) * whips
-        count = len(self._flights.cuts)
-        lanes = [Lane(w, 1 + k, w, rough=not fine[k]) for k in range(len(fine))]
-        lanes += [Lane(w, 0, (1 + d) * count + w, rough=not whips) for d in nuisances]
-        for axis, knot in latents:
+        fine = alike | self._exact | c.after_slack
+        states = np.flatnonzero(self._deviations[w])
+        axes = 6 if c.payload == NO_PAYLOAD else 9
+        latents = np.stack(np.mgrid[:axes, :knots], axis=-1).reshape(-1, 2)
+        # 0: rides along, 1: of nominal steps, 2: of longer ones
+        group = np.concatenate(
+            (
+                np.where(alike, 0, np.where(fine, 1, 2)),
+                np.full(len(states), 1 if c.after_slack else 2),
+                np.full(len(latents), 2),
+            )
+        )
+        rough_first = 1 + np.count_nonzero(group < 2)
+        order = np.argsort(group, kind="stable")
+        windows = len(self._flights.cuts)
+        columns = [Lane(w, 1 + k, w, rough=not fine[k]) for k in range(len(fine))]
+        columns += [
+            Lane(w, 0, (1 + d) * windows + w, rough=not c.after_slack) for d in states.tolist()
+        ]
+        for axis, knot in latents.tolist():
             resume = first_knot + knots + max(knot - 1, 0)
             force = axis, knot, LATENT_SIZES[axis]
-            lanes.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
-        nominal = Lane(w, 0, w, keep=first_knot, shared=int(alike.sum()))
-        rough = Lane(w, 0, w, keep=first_knot + knots, rough=True)
-        flown, split, places = _in_order(lanes, alike, nominal, rough)
-        return Plan(w, first, first_knot, split, places, nuisances, latents), flown
+            parent = first + rough_first
+            columns.append(Lane(w, 0, w, *force, resume=resume, parent=parent, rough=True))
+        lanes = [Lane(w, 0, w, keep=first_knot, shared=int(alike.sum()))]
+        lanes += [columns[i] for i in order]
+        lanes.insert(rough_first, Lane(w, 0, w, keep=first_knot + knots, rough=True))
+        rough = group == 2
+        place = np.argsort(order) + 1 + rough
+        sizes = (
+            self._steps,
+            self._state_steps[states],
+            np.array(LATENT_SIZES)[latents[:, 0]],
+        )
+        steps = np.concatenate(sizes)
+        nominal = rough_first * rough
+        return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
-    def _slopes(self, measured: torch.Tensor, plan: Plan) -> list[torch.Tensor]:
-        """Derivatives of a window's samples by effects, states and latent forces, shape (3 rows,
-        columns) each.
+    def _slopes(self, seen: torch.Tensor, plan: Plan) -> torch.Tensor:
+        """Derivatives of a window's samples by its columns, shape (N, columns).
 
-        ``measured``: what all lanes of the run saw, shape (rows or more, lanes, 3).
+        ``seen``: by all lanes of the run, shape (rows or more, lanes, 3).
         """
         rows = int(self._flights.rows[plan.window])
-        lanes = slice(plan.first, plan.first + len(plan.order) + 2)
-        columns = measured[:rows, lanes].transpose(1, 2).reshape(3 * rows, -1)
-        for part in (columns[:, : plan.fine], columns[:, plan.fine :]):
-            part -= part[:, :1].clone()
-        steps = [
-            self._steps.tolist(),
-            [self._directions[d].step for d in plan.nuisances],
-            [LATENT_SIZES[axis] for axis, _ in plan.latents],
-        ]
-        order = torch.from_numpy(plan.order).to(columns.device)
-        parts = order.split([len(sizes) for sizes in steps])
-        return [
-            columns[:, part].div_(columns.new_tensor(sizes)) for part, sizes in zip(parts, steps)
-        ]
+        lanes = seen[:rows, plan.first : plan.first + len(plan.lanes)]
+        columns = lanes.transpose(1, 2).reshape(3 * rows, -1)
+        place, nominal = (torch.from_numpy(x).to(seen.device) for x in (plan.place, plan.nominal))
+        change = columns[:, place].sub_(columns[:, nominal])
+        return change.div_(columns.new_tensor(plan.steps))
 
     def _window(
         self,
         plan: Plan,
         channel: np.ndarray,
         residual: np.ndarray,
-        slopes: Sequence[np.ndarray],
+        slopes: np.ndarray,
         knots: Mapping[str, np.ndarray],
     ) -> Window:
         """Return the window that the lanes make up; ``knots``: quantities at those of all lanes.
@@ -213,8 +221,10 @@ class Linearisation:
         w = plan.window
         f = self._flights
         c = f.cuts[w]
-        effects, states, latents = slopes
-        axes, places = np.array(plan.latents).T
+        first_state = len(self._steps)
+        first_latent = first_state + len(plan.states)
+        states = slopes[:, first_state:first_latent]
+        axes, places = plan.latents.T
         rows = slice(plan.first_knot, plan.first_knot + f.knots[w])
         values = {name: value[rows] for name, value in knots.items()}
         window = Window(
@@ -222,12 +232,12 @@ class Linearisation:
             c.phase,
             f.time[w],
             channel,
-            residual + states @ self._states[MOVED][w, plan.nuisances],
+            residual + states @ self._states[MOVED][w, plan.states],
             f.sigma[w],
-            effects,
+            slopes[:, :first_state],
             states,
-            self._deviations[w, plan.nuisances],
-            latents,
+            self._deviations[w, plan.states],
+            slopes[:, first_latent:],
             axes // 3,
             axes % 3,
             c.start + KNOT_SPACING * places,
@@ -235,23 +245,6 @@ class Linearisation:
             c.after_slack,
         )
         return without_calm_speeds(window, self._blocks, self._setting.plant.air.wind_w)
-
-
-def _in_order(
-    lanes: Sequence[Lane], alike: np.ndarray, nominal: Lane, rough: Lane
-) -> tuple[list[Lane], int, np.ndarray]:
-    """Put lanes of nominal steps behind the nominal lane, first those that ride along, and the
-    others behind the rough one.
-
-    Returns all lanes, the place of the rough one, and of each given lane the place.
-    """
-    group = np.array([2 if lane.rough else 1 for lane in lanes])
-    group[: len(alike)][alike] = 0
-    order = np.argsort(group, kind="stable")
-    split = 1 + np.count_nonzero(group < 2)
-    flown = [nominal, *[lanes[i] for i in order]]
-    flown.insert(split, rough)
-    return flown, split, np.argsort(order) + 1 + (group == 2)
 
 
 def at_knots(

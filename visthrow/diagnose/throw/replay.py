@@ -31,7 +31,8 @@ from visthrow.diagnose.throw.recorded_flight import (
 KNOT_SPACING = 0.1  # of the latent forces [s]
 EARLY = 0.004  # after a window's start, before which no stamp is used: delays may move there [s]
 LATEST = 1.0  # by which commands may be late or early [s]; a window reads no others
-FINENESS = {"throw": 0.25}  # step in a phase against the one asked for: the rope whips in throws
+# step in a phase against the one asked for, and against a rough one: the rope whips in throws
+FINENESS = {"throw": (0.25, 0.5)}
 FINEST = 0.01  # of the square of the step: a tenth of the step asked for
 # added to the square of the step, in the nominal one, of rough lanes: twice as long steps
 ROUGHER = 3.0
@@ -154,7 +155,7 @@ class ReplayedFlights:
         self.knots = np.ceil(spans / KNOT_SPACING - 1e-6).astype(int) + 1
         counts = [len(f.command_time) for f in self.flights]
         self.first_command = np.cumsum(counts) - counts
-        self._fineness = np.array([FINENESS.get(c.phase, 1.0) for c in cuts])
+        self._fineness = np.array([FINENESS.get(c.phase, (1.0, 1.0)) for c in cuts])
         self.samples = [self._samples_in(c, delays) for c in self.cuts]
         rows = [self._row(w) for w in range(len(self.cuts))]
         fields = {name: np.array([row[name] for row in rows]) for name in rows[0]}
@@ -266,10 +267,9 @@ class ReplayedFlights:
             recording: the windows, if not as they are.
         """
         columns = {name: np.array(values) for name, values in zip(Lane._fields, zip(*lanes))}
-        columns["substep"] = (
-            simulation.steps[columns["plant"], columns.pop("rough").astype(int)]
-            * self._fineness[columns["window"]]
-        )
+        rough = columns.pop("rough").astype(int)
+        fineness = self._fineness[columns["window"], rough]
+        columns["substep"] = simulation.steps[columns["plant"], rough] * fineness
         retained = columns["keep"] >= 0
         knots = max(
             1, int(np.max((columns["keep"] + self.knots[columns["window"]])[retained], initial=1))
