@@ -1,9 +1,14 @@
 """Solvers behind the exchange: they end the hard throw where the fused chain does, and fly, let go
 and start anew as it does; closed forms of a box and of two cables."""
 
+import contextlib
+import gc
 import importlib.util
 import math
+import sys
+import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
@@ -14,6 +19,7 @@ from pytest import approx, importorskip, mark, param, raises
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import NONFINITE
 from sim.params import GRAVITY, LawParams, PlantParams
+from sim.solvers.mujoco import _on_gpu
 from tests.configs import load_experiment
 from tests.plants import SCENES, paper_plant
 from tests.scenes import load_scene
@@ -253,3 +259,26 @@ def test_a_rope_far_to_the_side_swings_on_as_it_was_placed(drag):
             sim.step()
         found.append(sim.get("payload_vel_w"))
     assert_allclose(found[1], found[0], atol=0.01)
+
+
+def test_mujoco_warps_model_lives_as_long_as_the_graph_that_reads_it(monkeypatch):
+    class Model:
+        body_mass = None
+
+    def put_model(*_args, **_options) -> Model:
+        model = Model()
+        made.append(weakref.ref(model))
+        return model
+
+    made: list = []
+    data = SimpleNamespace(qpos=None, qvel=None, ctrl=None)
+    engine = SimpleNamespace(
+        put_model=put_model, make_data=lambda *_, **__: data, step=lambda *_: 0
+    )
+    monkeypatch.setitem(sys.modules, "mujoco_warp", engine)
+    for name in ("ScopedDevice", "ScopedStream", "ScopedCapture", "Stream", "synchronize_device"):
+        capture = contextlib.nullcontext(SimpleNamespace(graph=None))
+        monkeypatch.setattr(wp, name, lambda *_, _made=capture, **__: _made)
+    parts = _on_gpu(None, {}, 1, "cuda:0")
+    gc.collect()
+    assert made[0]() is not None, parts

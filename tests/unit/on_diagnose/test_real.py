@@ -91,21 +91,6 @@ def test_two_drones_run_on_two_clocks():
 
 
 @mark.slow
-def test_streams_of_nanobench_are_not_aligned_to_half_a_millisecond():
-    (checked,) = check(
-        setups.read_logs(
-            [REAL / "nanobench_cf21" / "B3_figure8_fast_rep1.csv.gz"], "nanobench_cf21"
-        )
-    )
-    drift = [
-        row
-        for row in checked.rows
-        if row.channel == "pos_w, est_pos_w" and "delays_s" in row.figures
-    ]
-    assert np.ptp(drift[0].figures["delays_s"]) > 5e-3
-
-
-@mark.slow
 def test_pendulum_has_three_frictions():
     diagnosis, named, rms = explained(
         "pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
@@ -115,13 +100,6 @@ def test_pendulum_has_three_frictions():
     assert diagnosis["pendulum_length"].estimate == approx(-0.0167, abs=3e-4)
     assert diagnosis["encoder_scale"].verdict != FOUND  # a spring at the joint does the same
     assert rms(diagnosis.theta) < 0.1 * rms({})
-
-
-@mark.slow
-def test_ball_has_drag_and_sideways_forces_cannot_be_told_apart():
-    diagnosis, named, rms = explained("jugglebot", REAL / "jugglebot_throws" / "session7.csv.gz")
-    assert named & {"ball_drag", "linear_drag"}
-    assert rms(diagnosis.theta) < 0.5 * rms({})
 
 
 def test_a_cut_propeller_is_found_and_tape_is_not():

@@ -300,3 +300,19 @@ def test_mistakes_on_the_command_line_are_told(capsys, tmp_path, monkeypatch, ar
     printed = capsys.readouterr()
     assert said in printed.err
     assert printed.out == "", "before the search"
+
+
+def test_an_event_is_left_out_or_weighs_little(found):
+    """A flight that was left out has no windows any more; one whose window is far rougher than
+    others has.
+    """
+    _, diagnosis = found
+    flights = {w.flight for w in diagnosis.work.after.windows}
+    told = replace(diagnosis, events=(min(flights), max(flights) + 1))
+    little, out = (line for line in report.summary(told).splitlines() if line.startswith("EVENT"))
+    assert f"flight {min(flights)} " in little
+    assert little.endswith("weighs little")
+    assert f"flight {max(flights) + 1} " in out
+    assert out.endswith("left out")
+    parts = [part.text for part in report.sections(told)[0].parts if hasattr(part, "text")]
+    assert sum(text.startswith("**EVENT.**") for text in parts) == 2

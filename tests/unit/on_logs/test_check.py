@@ -608,3 +608,10 @@ def test_delays_of_pieces_that_noise_hides_are_no_drift():
 def test_values_in_steps_are_as_noisy_as_their_rounding():
     values = np.round(np.linspace(0.0, 1.0, 400)[:, None], 1)
     assert noise(Channel(0.01 * np.arange(400), values, "m")) == approx([0.1 / np.sqrt(12.0)])
+
+
+def test_a_thrust_that_the_model_reads_and_the_log_lacks_is_a_warning():
+    log = log_of(flight(5.0), thrust_cmd=Channel(np.arange(9.0), np.ones(9), "N"))
+    (row,) = thrust_checks.look(log, KnownVehicle(thrust_input="thrust_command"))
+    assert row.verdict == "warn"
+    assert "did you mean 'thrust_cmd'?" in row.text

@@ -15,7 +15,6 @@ from visthrow.paper.baseline import front, spline
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.fly_plan import (
     Delays,
-    _started,
     delays_of,
     fly_pendulum,
 )
@@ -24,7 +23,6 @@ from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import plan_throw
 from visthrow.task import Experiment, plant_of
 from visthrow.throws import results
-from visthrow.throws.reference_protocol import batch_plant, place_in_hover
 
 importorskip("piqp")
 
@@ -105,18 +103,6 @@ def test_thrust_stops_at_its_limit(below, limit):
     assert command[0] == approx(limit, abs=1e-3)
 
 
-def test_the_sign_of_a_quaternion_does_not_matter(plan):
-    states, inputs = plan.reference(0.1, 0.02, 62)
-    start = states[0].copy()
-    start[0] += 0.02
-    commands = []
-    for sign in (1.0, -1.0):
-        turned = start.copy()
-        turned[pm.QUAT] *= sign
-        commands.append(MPC(plan.model).step(turned, (states, inputs)))
-    assert np.allclose(*commands, atol=1e-6)
-
-
 def test_own_model_throws_land_near_the_target(plan):
     flown = fly_pendulum(plan, 2)
     assert flown.success.all()
@@ -124,19 +110,6 @@ def test_own_model_throws_land_near_the_target(plan):
     assert np.allclose(flown.duration, plan.duration, atol=0.02)
     again = fly_pendulum(plan, 2)
     assert np.array_equal(flown.landing_w, again.landing_w)
-
-
-def test_a_batch_on_a_reference_plant_starts_as_the_policies_do(plan, experiment):
-    importorskip("mujoco")
-    flown, _ = _started("reference-realistic", experiment, 2.0, 0, 3, 5, "cpu")
-    plant, rng = batch_plant(experiment, "reference-realistic", 2.0, 0, 3, 5)
-    place_in_hover(plant, experiment, rng)
-    command = np.tile([2.67, 0.0, 0.3, 0.0], (3, 1))
-    for _ in range(3):  # winds and build errors show once it flies
-        flown.step(command)
-        plant.step(command)
-    assert np.array_equal(flown.state.pos_w, plant.state.pos_w)
-    assert np.array_equal(flown.measured().pos_w, plant.measured().pos_w)
 
 
 def test_delays_by_name(experiment):

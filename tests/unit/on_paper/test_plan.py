@@ -5,7 +5,6 @@ from numpy.linalg import norm
 from pytest import approx, fixture, mark, raises
 
 from visthrow.common.errors import ConfigError
-from visthrow.logs.flightlog import FlightRecorder
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline import spline as sp
 from visthrow.paper.baseline.pendulum_model import Pendulum
@@ -13,7 +12,6 @@ from visthrow.paper.baseline.spline import PlanError, PlanParams
 from visthrow.paper.baseline.throw_plan import (
     landing_point,
     plan_throw,
-    read_release,
     release_for,
 )
 
@@ -37,19 +35,6 @@ def test_the_release_lands_on_the_target():
     assert point == approx([2.0, 0.0])
     assert time == approx(np.sqrt(2.0 * (1.13 - 0.04) / 9.81))
     assert release.fall_time == approx(time)
-
-
-def test_release_is_read_off_a_flight():
-    recorder = FlightRecorder({"times": {"separation": 0.5}})
-    for time, height, speed in ((0.4, 1.0, 2.0), (0.6, 1.2, 3.0)):
-        recorder.add(
-            time,
-            payload_pos_w=np.array([0.0, 0.0, height]),
-            payload_vel_w=np.array([speed, 0.0, 0.0]),
-        )
-    assert read_release(recorder.log()) == approx((1.1, 2.5))
-    with raises(ConfigError, match="let nothing go"):
-        read_release(FlightRecorder({"result": {"failure": "the vehicle tilted too far"}}).log())
 
 
 @mark.parametrize(("height", "speed"), [(0.04, 2.0), (1.0, 0.0), (1.0, float("nan"))])
