@@ -3,7 +3,6 @@ flight; what is refused.
 """
 
 from types import SimpleNamespace
-from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
@@ -138,15 +137,6 @@ def test_a_throw_flies_on_what_its_eyes_see_alone():
     assert seeing["success"].all()
     assert seeing["error"].max() < 0.2
     assert not (without["success"] & (without["error"] < 0.5)).any()
-
-
-def test_the_command_throws_with_the_eyes_that_its_options_name(monkeypatch, capsys):
-    made = create_autospec(RenderedEyes, return_value=Blind())
-    made.return_value.found = {"ball": 0, "goal": 0, "frames": 1, "refused": 0}
-    monkeypatch.setattr("visthrow.detector_training.eyes.RenderedEyes", made)
-    assert run_command("detector throw --by learnt --throws 1 --device cpu") == 0
-    assert made.call_args.kwargs["method"] == "learnt"
-    assert "vision by learnt on hybrid" in capsys.readouterr().out
 
 
 @mark.parametrize("name", ["ball", "goal"])
