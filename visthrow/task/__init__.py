@@ -6,6 +6,7 @@ One experiment file of ``configs/train`` names the files of vehicle, rope, camer
 the learning parameters; :func:`plant_of` gives what the simulator needs of it."""
 
 import math
+import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, Literal
@@ -31,6 +32,8 @@ Count = Annotated[int, Bound(1)]
 Counts = tuple[Count, ...]
 Share = Annotated[float, Bound(0.0, 1.0, "(]")]
 
+MAX_RATE = (10.0, 10.0, 4.0)
+"""Body rates that a 3-inch quadrotor follows well [rad/s]; not in the paper."""
 AIR_DENSITY = 1.2  # at 20 degrees [kg/m^3]
 SOUND = 343.0  # speed of sound in it [m/s]
 
@@ -39,8 +42,9 @@ SOUND = 343.0  # speed of sound in it [m/s]
 class ActionParams(Bounded):
     """Limits of the command; see :mod:`visthrow.onboard.actions`."""
 
-    max_rate: tuple[Positive, Positive, Positive]  # body rates at +-1 [rad/s]
-    # collective thrust at +1 [N]; an experiment replaces 0 by its vehicle's
+    # body rates at +-1 [rad/s] and collective thrust at +1 [N]; an experiment replaces 0 by its
+    # vehicle's
+    max_rate: tuple[NotNegative, NotNegative, NotNegative] = (0.0, 0.0, 0.0)
     max_thrust: NotNegative = 0.0
 
 
@@ -374,7 +378,9 @@ class Experiment:
         action = self.task.action
         if action.max_thrust == 0.0:
             action = replace(action, max_thrust=4.0 * self.vehicle.controller.max_thrust)
-            object.__setattr__(self, "task", replace(self.task, action=action))
+        rates = zip(action.max_rate, _followed_rates(self.vehicle))
+        action = replace(action, max_rate=tuple(rate or followed for rate, followed in rates))
+        object.__setattr__(self, "task", replace(self.task, action=action))
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             message = (
                 f"camera.payload_radius is {self.camera.payload_radius} m and rope.payload_radius"
@@ -383,6 +389,26 @@ class Experiment:
             raise ConfigError(f"{message}; expected the same ball")
         for wrong in () if self.fleet is not None else (*_out_of_place(self), *_no_vehicle(self)):
             raise ConfigError(wrong)
+
+
+def _followed_rates(vehicle: VehicleParams) -> tuple[float, float, float]:
+    """Return the body rates [rad/s] that a vehicle may be commanded: what a 3-inch quadrotor
+    follows well, and at most what half of its motors' range suffices for when the whole rate is
+    missing. Motors that give more for a rate have no say in the thrust any more.
+    """
+    controller = vehicle.controller
+    rotors = vehicle.rotors
+    room = 0.5 * (controller.max_thrust - controller.min_thrust)
+    roll_arm, pitch_arm = (
+        statistics.fmean(arm * arm for arm in arms) / max(map(abs, arms))
+        for arms in (rotors.y, rotors.x)
+    )
+    arms = (roll_arm, pitch_arm, vehicle.thrust.torque_ratio)
+    roll, pitch, yaw = (
+        min(most, 4.0 * room * arm / gain) if gain else most
+        for most, arm, gain in zip(MAX_RATE, arms, controller.p_gain)
+    )
+    return roll, pitch, yaw
 
 
 def _out_of_place(e: Experiment) -> Iterator[str]:

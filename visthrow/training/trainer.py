@@ -75,7 +75,8 @@ def fitted(experiment: Experiment, policy: Policy) -> Experiment:
     MismatchError where the experiment's task observes or acts otherwise; the message names every
     difference."""
     try:
-        policy.require(contract_of(experiment), TASK, ("observation.latency", "action.max_thrust"))
+        follow_vehicle = ("observation.latency", "action.max_thrust", "action.max_rate")
+        policy.require(contract_of(experiment), TASK, follow_vehicle)
     except MismatchError as error:
         raise MismatchError(f"--from: the task of this run is not the policy's; {error}") from None
     if (policy.estimator is None) == (experiment.algorithm == "distillation"):

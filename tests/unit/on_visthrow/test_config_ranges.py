@@ -96,6 +96,25 @@ def test_the_thrust_of_an_action_is_the_vehicles_unless_it_is_set():
     assert fitted(heavy, shipped).task.action == heavy.task.action  # a throttle fits any vehicle
 
 
+@mark.parametrize(
+    ("vehicle", "expected"),
+    [
+        ("paper", (10.0, 10.0, 4.0)),
+        ("five_inch", (10.0, 10.0, 3.043)),
+        ("x500", (5.540, 5.540, 0.4614)),
+    ],
+)
+def test_the_rates_of_an_action_are_those_that_the_motors_can_give(vehicle, expected):
+    """A missing rate of 1 rad/s takes 1.01 N of each motor of an X500 in roll and 12.1 N in yaw, of
+    a range of 11.2 N.
+    """
+    change = f"vehicle=vehicle/{vehicle}.toml"
+    rates = load_experiment("state", [change]).task.action.max_rate
+    assert rates == approx(expected, rel=1e-3)
+    stated = load_experiment("state", [change, "task.action.max_rate=[9,8,3]"])
+    assert stated.task.action.max_rate == (9.0, 8.0, 3.0)
+
+
 @mark.parametrize("name", ["vision", "vision_ideal", "state_far"])
 def test_a_copy_elsewhere_finds_its_base(name, tmp_path):
     shipped = config.find("train", name)

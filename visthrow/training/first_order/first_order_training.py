@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from sim.params import GRAVITY
 from sim.torch_bridge import ReplayedGraph, on_torch_stream
 from visthrow.common.errors import ConfigError
 from visthrow.common.free_fall import fall_time, free_flight
@@ -30,6 +31,8 @@ ALTITUDE = 0.15  # of altitude and distance [m]
 GROUND = 0.1  # of the payload over the ground [m]
 ABOVE = 0.08  # of the vehicle above the payload [m]
 UPRIGHT = 0.15  # of the cosine of the tilt
+PULL = 0.4  # of the rope on the payload, in its weights
+SLACK = 0.3  # [m] within a barrier that a weight of missing pull counts as
 BARRIER = 600.0  # cost of the square of how far a state is within it
 ROUND = 0.02
 """Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
@@ -185,6 +188,15 @@ class FirstOrder(Algorithm):
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
         return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
 
+    def _pull(self, x: SimpleNamespace) -> Tensor:
+        """Pull of the rope on the payload in its weights, of each step, shape (T, E).
+
+        Where a rope is slack nothing that the vehicle does moves the payload, and the jerk that
+        ends it is not the surrogate's."""
+        rope = torch.nn.functional.normalize(x.load_pos[1:] - x.pos[1:], dim=-1)
+        gain = (x.load_vel[1:] - x.load_vel[:-1]) / self.experiment.sim.control_period
+        return -(rope * gain).sum(-1) / GRAVITY - rope[..., 2]
+
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
         task = self.experiment.task
@@ -210,6 +222,7 @@ class FirstOrder(Algorithm):
             load - self.experiment.release.landing_height - GROUND,
             bounds.horizontal - ALTITUDE - x.pos[1:, :, :2].norm(dim=-1),
             upright - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
+            SLACK * (self._pull(x) - PULL),
         ]
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
