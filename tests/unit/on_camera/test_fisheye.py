@@ -89,6 +89,14 @@ def test_gradcheck_past_90_degrees(params, degrees):
 
 
 @LENSES
+def test_unprojection_gradient(params):
+    lens = Fisheye(params)
+    normalized = f64([[0.1, 0.2], [-0.6, 0.3], [0.0, -0.97]])
+    pixels = lens.denormalize(normalized).requires_grad_()
+    assert torch.autograd.gradcheck(lambda p: lens.unproject(p)[0], (pixels,))
+
+
+@LENSES
 @mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_value_and_gradient_are_finite_everywhere(params, dtype):
     lens = Fisheye(params)
