@@ -5,12 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.random import default_rng
-from pytest import mark, param
+from pytest import mark
 
 from hil.control.recording.playback import replay
 from hil.control.recording.record import lines
-from hil.control.runner import OperatorInput
-from hil.links.backends.base import Status
 from hil.poses.pose import Pose
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
@@ -36,28 +34,14 @@ def patchy(rng: np.random.Generator):
 
 RUNS = {
     "drop-outs": {"poses": patchy(default_rng(1)), "seconds": 3.0},
-    "operator's abort": {
-        "words": lambda t, s: OperatorInput(arm=s == "ready", abort=t > 1.0),
-        "seconds": 2.0,
-    },
     "mocap gone": {"poses": lambda t, poses: poses if t < 0.9 else [], "seconds": 2.0},
-    "autopilot gone": {"status": lambda t: Status(t < 0.9, "silent"), "seconds": 2.0},
-    "back after a second": {
-        "poses": lambda t, poses: [] if 0.3 < t < 1.6 else poses,
-        "seconds": 6.0,
-    },
     "late ticks": {"late": lambda t: 0.03 * (math.sin(40.0 * t) > 0.9), "seconds": 2.0},
     "disk full": {"recording": lambda t: t < 0.9, "seconds": 2.0},
 }
-
-
 QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.3")
-SHORT = ("drop-outs", "mocap gone", "late ticks")
 
 
-@mark.parametrize(
-    "name", [name if name in SHORT else param(name, marks=mark.slow) for name in RUNS]
-)
+@mark.parametrize("name", RUNS)
 def test_any_run_replays_bit_for_bit(name, tmp_path):
     folder = tmp_path / "run"
     record_run(folder, "policy=vision", "observe=true", *QUICK, **RUNS[name])

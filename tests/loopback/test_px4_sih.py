@@ -22,18 +22,18 @@ LATITUDE, LONGITUDE, ALTITUDE = np.float32([47.397742, 8.545594, 489.4]).astype(
 """SIH's origin by default [deg, deg, m], as its parameters hold it."""
 
 
-def fly(ball, seconds, place, interval=0.004, release=math.inf, phase=0.0):
+def fly(ball, seconds, place, interval=0.004):
     """Fly a ball below a vehicle whose place is a function of time, known every so often [s]; times
     and places of the ball.
     """
-    known, track = ball.time - (1.0 + phase) * interval, []
+    known, track = ball.time - interval, []
     while ball.time < seconds:
         while known < ball.time + ball.period:
             known += interval
             step = 1e-4
             vel = (place(known + step) - place(known - step)) / (2.0 * step)
             ball.follow(Motion(known, place(known), vel, LEVEL, STILL))
-        ball.step(np.zeros(4), ball.time >= release)
+        ball.step(np.zeros(4), False)
         track.append((ball.time, *ball.state["payload_pos_w"]))
     return np.array(track)
 

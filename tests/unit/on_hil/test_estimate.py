@@ -88,27 +88,6 @@ def test_what_the_source_gives_is_taken_and_a_gap_empties_the_window():
     assert slopes.update(Pose(1.0, 1.0, "vehicle", (5.0, 0.0, 0.0))) == (0.0, 0.0, 0.0)
 
 
-def test_spin_of_a_turn_that_quickens():
-    """About a fixed axis at 3 + 20 t rad/s a parabola finds both exactly; a line knows
-    no change.
-    """
-    slopes, out = run(
-        EstimateParams(window(6), 2),
-        PERIOD * np.arange(8),
-        lambda t: np.zeros(3),
-        lambda t: Rotation.from_rotvec([0.0, 3.0 * t + 10.0 * t * t, 0.0]),
-    )
-    assert_allclose(out[-1][1], (0.0, 3.0 + 20.0 * 7 * PERIOD, 0.0), atol=1e-6)
-    assert_allclose(slopes.spin, (0.0, 20.0, 0.0), atol=1e-4)
-    slopes, _ = run(
-        EstimateParams(window(6), 1),
-        PERIOD * np.arange(8),
-        lambda t: np.zeros(3),
-        lambda t: Rotation.identity(),
-    )
-    assert slopes.spin == (0.0, 0.0, 0.0)
-
-
 def test_a_state_is_carried_forward_with_a_share_of_its_accelerations():
     """A body that falls and turns ever faster: place and attitude with its velocities, these with
     half of what they change by.
