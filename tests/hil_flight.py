@@ -112,6 +112,13 @@ class Spy(DryRun):
         self.aborts += 1
 
 
+class Nobody:
+    """Never arms: the vehicle hovers."""
+
+    def words(self, state: str) -> OperatorInput:
+        return OperatorInput()
+
+
 class AutoOperator:
     """Arms whenever the run is ready."""
 

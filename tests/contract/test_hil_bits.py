@@ -12,6 +12,7 @@ from hil.control.recording.record import lines
 from hil.poses.pose import Pose
 from tests.hil_flight import TICK
 from tests.hil_runs import record_run, saved_policy
+from tests.loopback.wire import QUICK
 
 
 def patchy(rng: np.random.Generator):
@@ -38,7 +39,6 @@ RUNS = {
     "late ticks": {"late": lambda t: 0.03 * (math.sin(40.0 * t) > 0.9), "seconds": 2.0},
     "disk full": {"recording": lambda t: t < 0.9, "seconds": 2.0},
 }
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.3")
 
 
 @mark.parametrize("name", RUNS)

@@ -12,7 +12,7 @@ from pytest import mark
 from sim.hybrid import HybridSim
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.plants import paper_plant
-from tests.simulators import bare_quadrotor, numerics, random_commands
+from tests.simulators import numerics, random_commands
 from visthrow import config
 from visthrow.task import TaskParams
 
@@ -66,27 +66,8 @@ def test_graph_equals_launches():
         assert_same(everything(eager), everything(graphed))
 
 
-def test_members_alone_equal_their_batch():
-    batch = driven(HybridSim(paper_plant(), COUNT, DEVICE))
-    for e in (0, 77, COUNT - 1):
-        alone = driven(HybridSim(paper_plant(), 1, DEVICE), slice(e, e + 1))
-        assert_same(alone, {name: value[e : e + 1] for name, value in batch.items()})
-
-
 def test_cuda_agrees_with_the_cpu():
     plant = replace(paper_plant(), sim=numerics(precision="float64"))
     there, here = (driven(HybridSim(plant, COUNT, device)) for device in (DEVICE, "cpu"))
     for name in ("pos_w", "payload_pos_w", "landing_w"):
         assert_allclose(there[name], here[name], atol=SAME, err_msg=name)
-
-
-def test_quadrotor_alone():
-    sims = [
-        bare_quadrotor(paper_plant().vehicle, COUNT, device=device, precision="float64")
-        for device in (DEVICE, "cpu")
-    ]
-    for command in random_commands(2, STEPS, COUNT):
-        for sim in sims:
-            sim.set_command(command)
-            sim.step()
-    assert_allclose(sims[0].get("pos_w"), sims[1].get("pos_w"), atol=SAME)

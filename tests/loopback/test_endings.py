@@ -12,9 +12,9 @@ from hil.control.loop import Loop
 from hil.operator_terminal import ENDING, Terminal
 from tests.hil_flight import NEVER
 from tests.level import LevelPlant
-from tests.loopback.wire import AUTOPILOTS, peers
+from tests.loopback.wire import AUTOPILOTS, QUICK, peers
 
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1", "states.abort=0.6")
+ABORT = "states.abort=0.6"
 STATES = {"armed": ("states.armed_least=9.0",), "throw": ()}
 """In hover, and in a throw that the policy never ends."""
 
@@ -82,7 +82,12 @@ class Told:
 
 def with_fake(kind: str, state: str):
     """Runner, source, clock and fake."""
-    overrides = (*QUICK, *STATES[state], *(() if kind == "betaflight" else (f"{kind}.take=true",)))
+    overrides = (
+        *QUICK,
+        ABORT,
+        *STATES[state],
+        *(() if kind == "betaflight" else (f"{kind}.take=true",)),
+    )
     return peers(LevelPlant(), kind=kind, loaded=NEVER, overrides=overrides)
 
 

@@ -5,8 +5,7 @@ In lock step the whole chain runs on MAVLink bytes, on the plant's clock, the sa
 
 from pytest import approx, mark
 
-from hil.control.state_machine import OperatorInput
-from tests.hil_flight import AT_ONCE, NEVER
+from tests.hil_flight import AT_ONCE, NEVER, AutoOperator
 from tests.level import LevelPlant
 from tests.loopback.wire import QUICK, cut, peers
 from tests.mocap_faults import FAULTS
@@ -33,13 +32,6 @@ ENDS = {"stop", "repeat", "swap", "jump", "order", "zero-quaternion", "nan-quate
 FLOWN_THROUGH = {"none", "clock-forth", "clock-back", "shuffle", "double"}
 
 
-class OneWord:
-    """Arms one throw."""
-
-    def words(self, state: str) -> OperatorInput:
-        return OperatorInput(arm=state == "ready")
-
-
 def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
     """A run in which a fault happens in mid throw: runner, fake, and the first decision of each
     state.
@@ -53,7 +45,7 @@ def spoiled(name: str, seconds: float = 0.7, loaded=NEVER):
         mocap_fault=(name, START),
         pose_message="ODOMETRY" if more else "ATT_POS_MOCAP",
     )
-    cut(runner, source, clock, OneWord(), None, START + seconds, told.append)
+    cut(runner, source, clock, AutoOperator(), None, START + seconds, told.append)
     return runner, fake, [(d.state, d.reason, d.time) for d in told]
 
 
@@ -98,7 +90,7 @@ def test_a_fault_as_the_policy_asks_for_the_release(name):
     runner, source, clock, fake = peers(
         plant, overrides=(*QUICK, "states.check=1.0"), loaded=AT_ONCE, mocap_fault=(name, 0.0)
     )
-    cut(runner, source, clock, OneWord(), None, 3.0, lambda decision: None)
+    cut(runner, source, clock, AutoOperator(), None, 3.0, lambda decision: None)
     assert fake.witness.breaches == []
     assert fake.witness.releases == (1 if name in FLOWN_THROUGH else 0), runner.machine.reason
     assert runner.latch.count == fake.witness.releases

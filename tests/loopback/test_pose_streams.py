@@ -6,13 +6,12 @@ from pytest import mark
 
 from hil.control.loop import Loop
 from hil.control.runner import Runner
-from hil.control.state_machine import OperatorInput
 from hil.links.backends.base import DryRun
 from hil.links.clock import ManualClock
 from hil.params import HilParams
 from tests.commands import run_command
 from tests.configs import load_run
-from tests.hil_flight import simple_policy
+from tests.hil_flight import Nobody, simple_policy
 from tests.pose_streams import SECONDS, STREAMS, Sent
 
 SETTINGS = [
@@ -21,11 +20,6 @@ SETTINGS = [
     'source.senders=[{ body = "vehicle", message = "ODOMETRY", system = 1, component = 1 }, '
     '{ body = "payload", message = "ODOMETRY", system = 1, component = 25 }]',
 ]
-
-
-class Nobody:
-    def words(self, state):
-        return OperatorInput()
 
 
 def loaded() -> HilParams:

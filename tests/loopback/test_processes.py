@@ -15,8 +15,7 @@ from bench.processes import Pair
 from hil.control.recording.playback import replay
 from tests.commands import set_words
 from tests.hil_flight import NEVER
-
-QUICK = ("states.check_hold=0.2", "states.armed_least=0.1", "states.quiet=0.1")
+from tests.loopback.wire import QUICK
 
 FAKE = ("--seconds", "60", "--after", "1.5")
 """Time for which a fake flies at most, and for which it waits for its run [s]."""

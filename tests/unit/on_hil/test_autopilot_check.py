@@ -9,24 +9,16 @@ from pytest import approx, fixture, mark, raises
 from hil.check import SETTLING, AutopilotCheck, hover_of_run
 from hil.control.loop import Loop
 from hil.control.recording.record import TICKS, RunRecorder
-from hil.control.state_machine import OperatorInput
 from hil.errors import RunError
 from hil.fly_run import autopilot_record
 from hil.poses.pose import VEHICLE
 from tests.commands import run_command
 from tests.configs import load_run
-from tests.hil_flight import NEVER
+from tests.hil_flight import NEVER, Nobody
 from tests.level import LevelPlant
 from tests.loopback.wire import peers
 
 QUICK = ("states.check_hold=0.2",)
-
-
-class Nobody:
-    """Never arms: the vehicle hovers."""
-
-    def words(self, state):
-        return OperatorInput()
 
 
 @fixture(scope="module")

@@ -22,6 +22,7 @@ from hil.params import HilParams
 from hil.poses.detection import Detection
 from hil.poses.pose import Pose
 from tests.configs import load_run
+from tests.hil_flight import OURS
 from visthrow.common.errors import ConfigError
 from visthrow.onboard.calibration import Calibration, Hovered, Spreads, solved
 from visthrow.onboard.observations import rotation_from_quat
@@ -34,11 +35,6 @@ DELAY = 0.03
 """Of a frame, stated [s]; it is older than that by LATENCY."""
 SCALE = 0.02
 """Relative error of the focal length."""
-OURS = [
-    f"frames.{b}.{k}"
-    for b in ("vehicle", "payload")
-    for k in ('axes="x,y,z"', 'body_axes="x,y,z"', 'quaternion="xyzw"')
-]
 
 
 def run_params(*overrides: str) -> HilParams:
