@@ -1,6 +1,4 @@
-"""The same kernels on CUDA: graphs equal launches, members alone equal their batch, and the CPU
-agrees.
-"""
+"""The same kernels on CUDA: graphs equal launches, and the CPU agrees."""
 
 from dataclasses import replace
 
