@@ -2,7 +2,7 @@
 
 In modules that speak for a firmware no number stands outside of module constants and defaults, but
 those of arithmetic; parameter names stand in rows of the table. What a module constant may hold is
-ours: :data:`CHOICES` names each. Numbers that a page gives for a parameter are the table's or ours.
+ours: :data:`CHOICES` names each.
 """
 
 import ast
@@ -143,39 +143,3 @@ SAYINGS = [
 def test_a_page_gives_the_number_of_the_table(page, words, name):
     text = (ROOT / f"docs/pilots/{page}.md").read_text(encoding="utf-8")
     assert float(re.search(words, text)[1]) == FACTS[name].value
-
-
-def unfounded(line: str, firmware: str) -> list[str]:
-    """Return the numbers that a page's line gives for a parameter and no row of it has."""
-    parameters = re.findall(r"\b[A-Z][A-Z0-9]+_[A-Z0-9_]+", line)
-    given = line
-    if not line.startswith("| "):
-        given = " ".join(re.findall(r"\b[A-Z][A-Z0-9]+_[A-Z0-9_]+ (?:is )?(\d[\d.]*)", line))
-    elif not parameters or not line.startswith(f"| {parameters[0]} |"):
-        return []
-    words = [re.sub(r"^SERVO\d+_", "SERVOn_", parameter) for parameter in parameters]
-    rows = [
-        f"{fact.value} {fact.text} {fact.means}"
-        for fact in facts(firmware).values()
-        if any(word in fact.text + fact.means for word in words)
-    ]
-    known = {float(number) for number in NUMBER.findall(" ".join(rows))} | OURS
-    return [number for number in NUMBER.findall(given) if float(number) not in known]
-
-
-NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?(?!\w)")
-OURS = {row["maximum"] for name in ("ardupilot", "px4") for row in RULES[name] if "maximum" in row}
-"""Limits that the audit sets."""
-
-
-@mark.parametrize("firmware", ["ardupilot", "px4"])
-def test_numbers_of_parameters_on_a_page_stand_in_the_table(firmware):
-    text = (ROOT / f"docs/pilots/{firmware}.md").read_text(encoding="utf-8")
-    assert [line for line in text.splitlines() if unfounded(line, firmware)] == []
-
-
-def test_a_wrong_number_on_a_page_is_found():
-    assert unfounded("| GRIP_RELEASE | 1900 | opens |", "ardupilot") == ["1900"]
-    assert unfounded("| EK3_SRC1_POSXY | 3 | GPS |", "ardupilot") == ["3"]
-    assert unfounded("It writes SERVO9_FUNCTION 7.", "ardupilot") == ["7"]
-    assert unfounded("| GUID_TIMEOUT | 3 s by default |", "ardupilot") == []

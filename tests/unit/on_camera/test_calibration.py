@@ -186,7 +186,7 @@ def test_calibration_from_rendered_boards(name, used, rms_px, lens_px):
     assert error.max() < lens_px
 
 
-@mark.parametrize("kind", ["past 90 deg", "wrong corners"])
+@mark.parametrize("kind", ["past 90 deg", "past 90 deg, left", "wrong corners", "shifted corners"])
 def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch):
     truth = FisheyeParams(
         640, 640, 191.2, 191.0, 319.6, 321.1, -0.0132, -0.0041, 0.0017, -0.0005, 200.0
@@ -204,9 +204,13 @@ def test_one_board_that_does_not_fit_is_left_out_by_its_number(kind, monkeypatch
 
     views = [view(rng.normal(0.0, 0.4, 3), place()) for _ in range(15)]
     bad = view([0.0, 1.3, 0.0], [0.35, 0.0, 0.02])  # 117 deg off the axis
-    if kind == "wrong corners":
+    if kind == "past 90 deg, left":
+        bad = view([0.0, -1.3, 0.0], [-0.41, 0.0, -0.21])
+    elif kind == "wrong corners":
         pixels = views[0].pixels[::-1] + rng.normal(0.0, 30.0, (35, 2))
         bad = boards.View(board.corners_m(), pixels)
+    elif kind == "shifted corners":
+        bad = boards.View(board.corners_m(), np.roll(views[1].pixels, 7, axis=0))
     monkeypatch.setattr(
         boards, "find_boards", lambda *_: ((640, 640), [*views[:5], bad, *views[5:]])
     )

@@ -15,10 +15,8 @@ from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import (
-    BallSeen,
     Detector,
     FrameDetections,
-    GoalSeen,
     Prior,
     detected_keypoints,
     ordered_corners,
@@ -194,27 +192,3 @@ def test_corners_are_named_by_the_world(yaw):
     rays = corners_w / norm(corners_w, axis=1, keepdims=True) @ rot_wc
     for order in ([2, 3, 0, 1], [1, 0, 3, 2]):
         assert_allclose(ordered_corners(rays[order], rot_wc), rays, atol=1e-12)
-
-
-def test_exact_rays_give_the_keypoints_of_training():
-    """A detection without error reads as training's projection, to float32."""
-    true, _ = keypoints(CAMERA, POS, ROT, GOAL, BALL)
-    eye = POS[0] + ROT[0] @ CAMERA.position_b
-    to_c = (CAMERA.rot_cb @ ROT[0].T).numpy()
-    ball = to_c @ (BALL[0] - eye).numpy()
-    corners = (goal_square(0.25).numpy() + [*GOAL[0].tolist(), 0.0] - eye.numpy()) @ to_c.T
-    distance = norm(ball)
-    seen = FrameDetections(
-        BallSeen(ball / distance, math.asin(0.033 / distance), 1.0),
-        GoalSeen(
-            corners[[3, 0, 1, 2]] / norm(corners[[3, 0, 1, 2]], axis=1, keepdims=True),
-            1.0,
-        ),
-    )
-    camera = KeypointCamera(CAMERA.params)
-    found, valid = detected_keypoints(camera, seen, ROT[0].numpy())
-    assert valid.all()
-    assert_allclose(found.numpy(), true[0].numpy(), atol=2e-6)
-    found, valid = detected_keypoints(camera, FrameDetections(None, None), ROT[0].numpy())
-    assert not valid.any()
-    assert not found.any()
