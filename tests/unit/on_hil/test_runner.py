@@ -51,6 +51,31 @@ def when(decisions, state: str) -> float:
     return next(d.time for d in decisions if d.state == state)
 
 
+def test_a_throw_from_idle_to_done():
+    pilot, decisions = thrown(seconds=20.0)
+    assert [state for state, _ in changes(decisions)] == [
+        "idle",
+        "check",
+        "ready",
+        "armed",
+        "throw",
+        "recover",
+        "land",
+        "done",
+    ]
+    latch = next(d.time for d in decisions if d.release)
+    assert pilot.backend.release_times == [approx(latch + LAG)], (
+        "no mechanism: the runner waits the trained lag"
+    )
+    assert when(decisions, "recover") == approx(latch + LAG, abs=TICK)
+    (landing,) = pilot.latch.landings
+    np.testing.assert_allclose(landing.landing_w, (0.0, 0.0, 0.04), atol=0.02)
+    assert landing.error == approx(2.0, abs=0.02)
+    fall = math.sqrt(2 * (1.333 - pilot.hang - 0.04) / 9.81)
+    assert landing.duration == approx(LAG + fall, abs=0.02)
+    assert not pilot.errors
+
+
 def test_one_word_of_the_operator_is_one_throw():
     words = lambda time, state: OperatorInput(arm=state == "ready" and time < 3)  # noqa: E731
     _, decisions = thrown(overrides=("throws=2",), seconds=20.0, words=words)
