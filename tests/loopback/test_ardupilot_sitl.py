@@ -13,14 +13,12 @@ import numpy as np
 from numpy.testing import assert_allclose
 from pytest import approx, fixture, mark
 
-from hil.links.clock import ManualClock
 from hil.links.device import Device, UdpPort
 from hil.links.mavlink_link import Link
 from hil.rehearsal.bridges import ardupilot_bridge as ardupilot
 from hil.rehearsal.bridges.ardupilot_bridge import ArduPilotSitl, outputs
 from hil.rehearsal.fake import VEHICLE_ID, FakeOptions
 from hil.rehearsal.fake_mocap import FakeMocapParams
-from hil.rehearsal.process import serve
 from tests.configs import load_run
 from visthrow.throws.wire_plant import make_motors
 
@@ -129,33 +127,6 @@ def test_ardupilot_that_falls_silent_is_waited_for_once(bridge, monkeypatch):
     monkeypatch.setattr(ardupilot, "PATIENCE", 0.01)
     bridge.step()
     assert not bridge.paced
-
-
-def test_a_late_start_of_a_firmware_leaves_no_debt(monkeypatch):
-    """Periods on the firmware's own clock are not late, however far that is behind the wall's."""
-    clock = ManualClock()
-
-    class Paced:
-        paced, port, landing = False, None, {"landing_time": None}
-        period, time = 0.002, 0.0
-
-        def hear(self): ...
-
-        def deliver(self, time): ...
-
-        def step(self):
-            clock.time += 0.05 if self.time < 1.0 else self.period
-            self.time += self.period
-            self.paced = self.time > 1.0
-
-        def report(self):
-            return {}
-
-    fake = Paced()
-    fake.plant = fake
-    report = serve(fake, clock, 3.0)
-    assert report["late_periods"] <= 501
-    assert report["speed"] == approx(1.0)
 
 
 def test_strange_packets_are_none():

@@ -256,40 +256,6 @@ def test_a_tick_overrun(kind, length, event):
             )
 
 
-KILLED = {
-    "ardupilot": [(0.5, "levelled: no set-points")],
-    "px4": [(0.5, "left OFFBOARD: no set-points"), (0.5, "mode 4.3")],
-    "betaflight": [(0.3, "override: the pilot's sticks count again")],
-    "betaflight, all channels": [(0.36, "failsafe: motors idle"), (1.6, "failsafe: disarmed")],
-}
-"""What the vehicle does by itself, and how long after the last set-point [s]."""
-
-
-@mark.parametrize("way", KILLED)
-def test_the_runner_is_killed_in_mid_throw(way):
-    """It falls silent between two ticks and never comes back; the fake flies on and shows what its
-    failsafes do.
-    """
-    kind, all_channels = way.split(",")[0], "all" in way
-    more = (
-        {"all_channels": True, "overrides": ("betaflight.arm_channel=1",)} if all_channels else {}
-    )
-    fake, _, told = run(kind, START + 0.6 * all_channels, **more)
-    assert told[-1][0] == "throw"
-    fake.step()  # hears the last one
-    last, before = fake._last_command, len(fake.events)
-    for _ in range(round(2.5 / fake.plant.period)):
-        fake.step()
-    after = [(time - last, text) for time, text in fake.events[before:]]
-    assert [text for _, text in after] == [text for _, text in KILLED[way]]
-    for (found, _), (wanted, _) in zip(after, KILLED[way]):
-        assert found == approx(wanted, abs=0.02)
-    command = fake.plant.commands[-1]
-    assert command[0] == approx(0.0 if all_channels else 2.668, rel=0.02)
-    assert fake.witness.breaches == []
-    assert fake.witness.releases == 0
-
-
 @mark.parametrize("full_at", [0.0, START])
 def test_the_disk_is_full(tmp_path, full_at):
     """Before the throw: none is armed.

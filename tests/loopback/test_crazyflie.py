@@ -19,7 +19,7 @@ from hil.links.backends.base import ACCEPTED, FAILED, FOLLOW
 from hil.links.backends.crazyflie import MODES, Crazyflie
 from hil.links.facts import values
 from tests.configs import load_run
-from tests.fakes.fake_crazyflie import CRASHED, FLYING, LEVEL, LOCKED
+from tests.fakes.fake_crazyflie import CRASHED, FLYING, LOCKED
 from tests.loopback.test_backends import HOVER, Desk
 
 FACTS = values("crazyflie")
@@ -101,30 +101,13 @@ def test_a_firmware_without_manual_set_points_is_refused():
     assert one.backend.audit.problems == ["protocol is 10; expected 12 or newer"]
 
 
-def test_silence_levels_it_and_then_stops_the_motors():
-    """As of commander and supervisor: thrust as it was, roll and pitch level, then locked."""
+@mark.parametrize(("state", "note"), [(LOCKED, "locked: restart it"), (CRASHED, "crashed")])
+def test_a_vehicle_that_may_not_fly_any_more_is_said_to(state, note):
     one = desk().follow()
     one.turn(0.3, HOVER)
-    begun = one.now
-    while one.fake.supervisor != LOCKED:
-        one.fake.step()
-    told = {text: time - begun for time, text in one.fake.events}
-    assert told[LEVEL] == approx(FACTS["levels_after"], abs=0.06)
-    assert told[LOCKED] == approx(FACTS["stops_after"], abs=0.06)
-    one.fake.step()
-    assert one.fake.plant.commands[-1] == (0.0, 0.0, 0.0, 0.0)
-    one.turn(0.3, HOVER)
-    assert "locked: restart it" in one.status.note
-
-
-def test_a_vehicle_on_its_head_is_crashed_and_is_said_to_be():
-    one = desk().follow()
-    one.turn(0.3, HOVER)
-    one.fake._force = np.array([0.0, 0.0, -1.0])
-    one.fake._sense = lambda: None
+    one.fake.supervisor, one.fake._supervise = state, lambda: None
     one.turn(0.4, HOVER)
-    assert one.fake.supervisor == CRASHED
-    assert "crashed" in one.status.note
+    assert note in one.status.note
 
 
 def test_a_vehicle_that_is_handed_back_holds_its_place():
