@@ -24,7 +24,6 @@ from visthrow import config
 from visthrow.detector_training.fit_detector import (
     FitParams,
     other_lens,
-    platt,
 )
 
 LENS = Fisheye(FisheyeParams(320, 320, 80.0, 80.0, 159.5, 159.5, k1=0.01, fov_deg=200.0))
@@ -76,13 +75,6 @@ def test_places_are_where_the_grid_says():
     assert sizes[0] == approx(0.5 * CELL / LENS.params.fx)
 
 
-def test_probabilities_are_calibrated():
-    generator = torch.Generator().manual_seed(1)
-    logits = 4.0 * torch.randn(20000, generator=generator, dtype=torch.float64)
-    hits = (torch.rand(20000, generator=generator) < (0.5 * logits - 1.0).sigmoid()).double()
-    factor, offset = platt(logits, hits)
-    assert factor == approx(0.5, abs=0.03)
-    assert offset == approx(-1.0, abs=0.08)
 
 
 def test_networks_are_written_and_read(tmp_path):
