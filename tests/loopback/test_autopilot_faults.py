@@ -219,18 +219,10 @@ def test_a_release_that_does_not_happen(kind, answer):
     assert last[-1] <= latch + 0.11 + 2 * TICK, "none is sent after the time of separation"
 
 
-@mark.parametrize(
-    ("kind", "length", "event"),
-    [
-        ("ardupilot", 0.15, None),
-        ("ardupilot", 0.8, "levelled: no set-points"),
-        ("px4", 0.8, "left OFFBOARD: no set-points"),
-        ("betaflight", 0.8, "override: the pilot's sticks count again"),
-    ],
-)
-def test_a_tick_overrun(kind, length, event):
-    """A short one is flown through with ticks counted as missed; a long one finds the autopilot's
-    own failsafe at work.
+@mark.parametrize(("kind", "length"), [("ardupilot", 0.15), ("px4", 0.8)])
+def test_a_tick_overrun(kind, length):
+    """A short one is flown through with ticks counted as missed. A long one finds PX4 out of
+    OFFBOARD by its own failsafe: it is not taken back in mid throw.
     """
 
     def dawdle(now, runner, fake):
@@ -240,20 +232,12 @@ def test_a_tick_overrun(kind, length, event):
                 fake.step()
 
     late = []
-    fake, summary, told = run(kind, START + 1.2, watch=dawdle)
+    _, summary, told = run(kind, START + 1.2, watch=dawdle)
     assert summary["missed"] == approx(length / TICK, abs=2)
-    events = [text for _, text in fake.events]
-    if event is None:
-        assert told[-1][0] == "throw"
-        assert not any(
-            word in text for text in events for word in ("levelled", "left", "failsafe", "override")
-        )
+    if kind == "px4":
+        assert reason(told, "abort").startswith(GONE)
     else:
-        assert event in events
-        if kind == "px4":
-            assert reason(told, "abort").startswith(GONE), (
-                "out of OFFBOARD by a failsafe: it is not taken back in mid throw"
-            )
+        assert told[-1][0] == "throw"
 
 
 @mark.parametrize("full_at", [0.0, START])

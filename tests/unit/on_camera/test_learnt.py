@@ -75,8 +75,6 @@ def test_places_are_where_the_grid_says():
     assert sizes[0] == approx(0.5 * CELL / LENS.params.fx)
 
 
-
-
 def test_networks_are_written_and_read(tmp_path):
     torch.manual_seed(0)
     made = Networks()
