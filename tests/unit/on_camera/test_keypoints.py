@@ -146,20 +146,6 @@ def test_the_payloads_box_is_smooth():
     assert torch.autograd.gradcheck(lambda p: payload_keypoints(camera, p)[0], (ball_c,))
 
 
-@mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_keypoints_are_finite_in_every_pose(dtype):
-    camera = KeypointCamera(PARAMS, dtype=dtype)
-    special = torch.tensor(
-        [[0, 0, 1], [0, 0, -1], [0, 0, 0], [0.01, 0, 0], [0, 0, -0.033], [1, 0, 0], [0, 0, 1e4]],
-        dtype=dtype,
-    )
-    special.requires_grad_()
-    box, _ = payload_keypoints(camera, special)
-    (gradient,) = torch.autograd.grad(box.sum(), special)
-    assert box.isfinite().all()
-    assert gradient.isfinite().all()
-
-
 def test_target_past_90_degrees_is_seen_and_the_sky_is_not():
     # Nose down by 40 deg (a positive pitch about body y), target 62 deg off the vertical in front:
     # 102 deg off the axis.

@@ -20,11 +20,6 @@ from camera.detectors.learnt import (
 )
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
-from visthrow import config
-from visthrow.detector_training.fit_detector import (
-    FitParams,
-    other_lens,
-)
 
 LENS = Fisheye(FisheyeParams(320, 320, 80.0, 80.0, 159.5, 159.5, k1=0.01, fov_deg=200.0))
 NORTH = torch.tensor([[0.0, -1.0, 0.0]])
@@ -106,14 +101,3 @@ def test_frames_of_another_size_are_refused():
     detector = LearntDetector(LENS, 0.033, 0.25, networks=Networks())
     with raises(ValueError, match="expected"):
         detector.detect(np.zeros((10, 10, 3), np.uint8))
-
-
-def test_other_lenses_and_configs():
-    generator = torch.Generator().manual_seed(0)
-    for _ in range(50):
-        lens = Fisheye(other_lens(LENS.params, generator))
-        assert lens.circle_inside_image
-    for name in config.available("detector"):
-        assert config.load(FitParams, config.find("detector", name)).fresh >= 1
-    with raises(ValueError, match="no more fresh frames"):
-        FitParams(1, 1, 1, 9, 1, 8, 1, 1e-3, 0.0, 1, 0)

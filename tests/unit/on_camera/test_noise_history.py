@@ -84,8 +84,3 @@ def test_wrong_points_lie_anywhere_in_the_image_and_count_as_seen():
     # Uniform in -1 to 1: mean 0, spread 1 / sqrt(3); 40,000 of them.
     assert points[seen].mean(0).abs().max() < 0.015
     assert points[seen].std(0) == approx([3**-0.5, 3**-0.5], rel=0.015)
-
-
-@mark.parametrize(("latency", "length"), [(0.0, 1), (0.5, 2), (1.0, 2), (2.2, 4)])
-def test_history_length_holds_the_latency(latency, length):
-    assert KeypointNoiseParams(latency=latency).history_length == length

@@ -78,14 +78,6 @@ def test_a_clock_that_is_set_is_noticed(step):
     assert sync.steps == 1
 
 
-def test_one_wild_exchange_changes_nothing():
-    sync = TimeSync()
-    exchanges(sync, lambda t: t + 5.0, 3.0)
-    before = sync.offset
-    sync.take(int(99e9), TimeSync.stamp(3.0), 3.002)
-    assert (sync.offset, sync.steps) == (before, 0)
-
-
 def dated(offset, seconds=2.0, stamp_offset=None):
     """Poses of the fake over a pipe whose clock is off; with ``stamp_offset`` its stamps are of yet
     another clock.
