@@ -163,6 +163,29 @@ def test_other_payloads_hang_where_the_geometry_says(name):
     assert below == approx(rope.length + rope.payload_offset, abs=2e-3)
 
 
+def test_two_cables_turn_as_a_bifilar_pendulum():
+    """omega^2 = m g d^2 / (4 I L) for a small turn about the vertical, the mount held still by its
+    own inertia.
+    """
+    sim = hanging("two_cables", mass=1e4, inertia=(1e2, 1e2, 1e2))
+    solver, turn, angles = sim._exchange.solver, 0.05, []
+    solver.qpos.numpy()[0, 10:14] = math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)
+    solver._placed(sim._all)
+    for _ in range(100):
+        sim.set_command([[GRAVITY * sim.params.total_mass, 0.0, 0.0, 0.0]])
+        sim.step()
+        quat = solver.qpos.numpy()[0, 10:14]
+        angles.append(2.0 * math.atan2(quat[3], quat[0]))
+    angle, time = np.array(angles), 0.02 * np.arange(1, 101)
+    before = np.flatnonzero(np.diff(np.sign(angle)) != 0)
+    crossings = time[before] + 0.02 * angle[before] / (angle[before] - angle[before + 1])
+    rope = sim.params.rope
+    inertia = rope.payload_mass / 12.0 * (rope.payload_sides[0] ** 2 + rope.payload_sides[1] ** 2)
+    stiff = rope.payload_mass * GRAVITY * rope.cables_apart**2
+    expected = math.sqrt(stiff / (4.0 * inertia * rope.length))
+    assert math.pi / np.diff(crossings).mean() == approx(expected, rel=0.02)
+
+
 def test_a_cable_pulls_or_is_slack():
     """Under thrust the cables are as long as they are; a vehicle that is pushed down falls faster
     than the box."""

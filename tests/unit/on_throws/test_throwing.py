@@ -204,9 +204,8 @@ def test_a_flights_modes_and_commands(flown):
     assert len(flown["action"].time) == np.count_nonzero(flying)
     assert flown["command"].time[0] == 0.0
     assert np.abs(flown["pos_w"].values[-1] - [0, 0, 1.333]).max() < 0.1
-    assert flown["cable_points_w"].values[-1][:, 2].max() < 0.03, (
-        "the rope lies on the ground at last"
-    )
+    heights = flown["cable_points_w"].values[-1][:, 2]
+    assert -0.01 < heights.min() <= heights.max() < 0.03, "the rope lies on the ground at last"
 
 
 def test_a_flight_without_release_fails_and_recovers(tmp_path):
