@@ -82,11 +82,8 @@ def lies() -> list:
         mav.MAVLink_command_ack_message(mav.MAV_CMD_DO_GRIPPER, 4),
         mav.MAVLink_param_value_message(b"GUID_OPTIONS", 0.0, 9, 1, 0),
         mav.MAVLink_timesync_message(77, 78),
-        mav.MAVLink_timesync_message(0, 79),
         mav.MAVLink_servo_output_raw_message(5, 0, *([1900] * 16)),
-        mav.MAVLink_param_error_message(245, 191, b"GUID_OPTIONS", -1, 1),
         mav.MAVLink_named_value_int_message(0, b"SIMULATED", 0),
-        mav.MAVLink_attitude_target_message(0, 0, quat, 0.0, 0.0, 0.0, 0.9),
     ]
 
 

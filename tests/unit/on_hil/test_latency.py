@@ -36,18 +36,6 @@ def test_nothing_zero_and_very_long_times():
     assert stage.summary()["max_ms"] == 1e12
 
 
-def test_transport_is_counted_from_the_fastest_pose_and_starts_anew_at_a_step():
-    stages = Stages()
-    pose = lambda stamp, arrival, body=VEHICLE: Pose(stamp, arrival, body, (0.0, 0.0, 0.0))  # noqa: E731
-    assert stages.poses([pose(0.0, 100.01), pose(0.01, 100.03)], 100.035) == {
-        "arrival": approx(0.005)
-    }
-    assert stages.stages["transport"].most == approx(0.01)
-    stages.poses([pose(5.0, 100.05)], 100.06)
-    assert stages.stages["transport"].most == approx(0.01), "a step of the clock is no transport"
-    assert stages.poses([pose(5.0, 100.06, PAYLOAD), pose(float("nan"), 100.06)], 100.07) == {}
-
-
 def test_report_and_picture(tmp_path):
     stages, rng, names = Stages(), default_rng(0), ["poll", "observation", "total"]
     for _ in range(500):
