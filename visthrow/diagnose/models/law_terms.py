@@ -274,8 +274,6 @@ VECTORS = {
 }
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
-JOINT_NEEDS = VECTORS[JOINT]["joint_rate"].needs
-
 MOST_SCALARS = 2
 
 
