@@ -64,6 +64,7 @@ def build(p: PPOParams, own: bool, device: str = "cpu") -> PPO:
     cfg = rsl_rl_config(p, Ranks(device))
     if not own:
         cfg["algorithm"]["class_name"] = "PPO"
+        del cfg["algorithm"]["muon"]
         for name in ("actor", "critic"):
             cfg[name] = {k: v for k, v in cfg[name].items() if k != "bfloat16"} | {
                 "class_name": "MLPModel"

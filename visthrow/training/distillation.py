@@ -112,15 +112,10 @@ class Distillation(Algorithm):
         self.teacher.require(contract_of(experiment), ("action", "control_period", "release"))
         contract = self.teacher.contract["observation"]
         self._layout = layout = ob.layout_of(SimpleNamespace(**contract))
-        if layout.name != "state":
+        if layout.name != "state" or layout.motion or layout.located or layout.response:
             raise ConfigError(
-                f"distillation.teacher {p.teacher!r} has the layout {layout.name!r};"
-                " expected 'state'"
-            )
-        if layout.motion or layout.located or layout.response:
-            raise ConfigError(
-                f"distillation.teacher {p.teacher!r} is given more than the paper's state"
-                " policy; expected one without goal_velocity, located and response"
+                f"distillation.teacher {p.teacher!r} has the layout {layout.name!r}; expected"
+                " 'state', as the paper's: without goal_velocity, located and response"
             )
         self.env = env = ThrowEnv(experiment, device, seed)
         self.iterations = p.iterations

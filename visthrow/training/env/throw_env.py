@@ -384,21 +384,26 @@ class ThrowEnv(VecEnv):
             true_history = arrays.push(buffers["true_history"], offset[:, 2:], fresh)
             buffers["true_history"].copy_(true_history)
             parts = [vehicle, self.previous_action, offset[:, :2], true_history.flatten(1)]
-        quantities = (
-            ("payload_velocity", self.views.out["payload_vel_w"]),
-            ("release_timer", state["release_timer"][:, None]),
-            ("time", time[:, None]),
-            ("mass", state["mass_scale"][:, None]),
-            ("voltage", state["voltage"][:, None]),
-            ("exact", state["attached"].float()[:, None]),
-            ("goal_velocity", self.goals.velocity[:, :2] if self.goals is not None else None),
-            ("cargo", self._cargo),
-            ("mount", self.view.buffers["extrinsic_rotation"]),
-            ("mount", self.view.buffers["extrinsic_offset"]),
-            ("pose_age", self.delay.age[:, None]),
-            ("vehicle", self._fleet.exact if self._fleet else None),
-        )
-        parts += [value for name, value in quantities if name in named and value is not None]
+        quantities = {
+            "payload_velocity": self.views.out["payload_vel_w"],
+            "release_timer": state["release_timer"][:, None],
+            "time": time[:, None],
+            "mass": state["mass_scale"][:, None],
+            "voltage": state["voltage"][:, None],
+            "exact": state["attached"].float()[:, None],
+        }
+        if self.goals is not None:
+            quantities["goal_velocity"] = self.goals.velocity[:, :2]
+        if self._cargo is not None:
+            quantities["cargo"] = self._cargo
+        parts += [value for name, value in quantities.items() if name in named]
+        if "mount" in named:
+            mount = self.view.buffers
+            parts += [mount["extrinsic_rotation"], mount["extrinsic_offset"]]
+        if "pose_age" in named:
+            parts.append(self.delay.age[:, None])
+        if "vehicle" in named and self._fleet:
+            parts.append(self._fleet.exact)
         return torch.cat(parts, dim=-1)
 
     def _tensors(self) -> dict[str, Tensor]:

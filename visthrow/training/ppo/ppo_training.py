@@ -46,9 +46,8 @@ def rsl_rl_config(p: PPOParams, ranks: Ranks) -> dict:
         "value_loss_coef": p.value_coefficient,
         "max_grad_norm": p.max_grad_norm,
         "use_clipped_value_loss": True,
+        "muon": p.muon,
     }
-    if p.muon:
-        algorithm["muon"] = True
     return {
         "num_steps_per_env": p.steps,
         "algorithm": algorithm,
