@@ -170,23 +170,21 @@ class FirstOrder(Algorithm):
         # the simulator's values, the slopes of flight without drag
         landing = landing + (flights.landing[: len(fall)] - landing).detach()
         fall = fall + (flights.time[: len(fall)] - fall).detach()
-        share = (
-            torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
-            * fall[..., None]
-        )
+        shares = torch.linspace(0.0, 1.0, release.clearance_samples, device=fall.device)
+        times = shares * fall[..., None]
         offset = (x.load_pos - x.pos)[:, :, None]
-        path = free_flight(offset, x.load_vel[:, :, None], share[..., None])
+        path = free_flight(offset, x.load_vel[:, :, None], times[..., None])
         clearance = (path.square().sum(-1) + 1e-12).sqrt().amin(-1)
-        rows = [
-            (torch.arange(count, device=fall.device) + (self.lag + node)).clamp(min=0)
-            for node in NODES
-        ]
+        separation = torch.arange(count, device=fall.device) + self.lag
+        rows = [(separation + node).clamp(min=0) for node in NODES]
         landing, fall, clearance = (
             sum(w * v[i] for w, i in zip(self._shares, rows)) for v in (landing, fall, clearance)
         )
-        error = ((landing - self.env.views.goal_w[:, :2]).square().sum(-1) + ROUND**2).sqrt()
+        miss = landing - self.env.views.goal_w[:, :2]
+        error = (miss.square().sum(-1) + ROUND**2).sqrt()
         reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
-        return reward + rewards.proximity(p, clearance, release.clearance_margin), error, fall
+        reward = reward + rewards.proximity(p, clearance, release.clearance_margin)
+        return reward, error, fall
 
     def _pull(self, x: SimpleNamespace) -> Tensor:
         """Pull of the rope on the payload in its weights, of each step, shape (T, E).
@@ -208,13 +206,12 @@ class FirstOrder(Algorithm):
         load = x.load_pos[1:, :, 2]
         upright = ob.rotation_from_quat(x.quat[1:])[..., 2, 2]
         action = act.clip_action(x.action)
-        action, before = (
-            a.flatten(0, 1)
-            for a in (action, torch.cat([env.start_action.expand_as(action[:1]), action[:-1]]))
-        )
-        acting = rewards.command(p, action, env.rate_weights) + rewards.change(
-            p, action, before, env.change_weights
-        )
+        first = env.start_action.expand_as(action[:1])
+        before = torch.cat([first, action[:-1]]).flatten(0, 1)
+        action = action.flatten(0, 1)
+        commanding = rewards.command(p, action, env.rate_weights)
+        changing = rewards.change(p, action, before, env.change_weights)
+        acting = commanding + changing
         margins = [
             height - bounds.altitude[0] - ALTITUDE,
             bounds.altitude[1] - ALTITUDE - height,
@@ -226,12 +223,8 @@ class FirstOrder(Algorithm):
         ]
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
-        return (
-            moving
-            + acting.view_as(moving)
-            + rewards.carry_time(p, self.experiment.sim.control_period)
-            - barrier
-        )
+        time = rewards.carry_time(p, self.experiment.sim.control_period)
+        return moving + acting.view_as(moving) + time - barrier
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
@@ -252,17 +245,15 @@ class FirstOrder(Algorithm):
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
         carried = survival[(k[:, 0] - lag).clamp(0, K)] * (k < steps)
-        past = (x.action.abs() - 1.0).clamp(min=0.0).square().sum(-1) * carried.detach()
-        gain = (
-            (chance * reward).sum(0)
-            + (carried * self._carrying(x)).sum(0)
-            - p.termination * survival[-1]
-        )
+        excess = (x.action.abs() - 1.0).clamp(min=0.0)
+        past = excess.square().sum(-1) * carried.detach()
+        releasing = (chance * reward).sum(0)
+        carrying = (carried * self._carrying(x)).sum(0)
+        gain = releasing + carrying - p.termination * survival[-1]
         done = (chance * ~cut).detach()
         error = (error.square() - ROUND**2).clamp(min=0.0).sqrt()
-        duration = (
-            (k[:K] + 1) * self.experiment.sim.control_period + self.experiment.release.lag + fall
-        )
+        carry = (k[:K] + 1) * self.experiment.sim.control_period
+        duration = carry + self.experiment.release.lag + fall
         share = done / done.sum().clamp(min=1e-6)
         figures = {
             "landing_error": (share * error).sum(),

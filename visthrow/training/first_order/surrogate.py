@@ -186,9 +186,8 @@ def fit(flights: FlightBatch) -> dict[str, Tensor]:
     response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
     force = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
     pulled = -(rows["along"] * (rows["push"] @ force)).sum(-1) / rows["mass"]
-    tension = _solve(
-        torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None], rows["tension"]
-    )
+    pulls = torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None]
+    tension = _solve(pulls, rows["tension"])
     found = {"response": torch.stack(response, -1), "force": force, "tension": tension}
     return {name: value.float().contiguous() for name, value in found.items()}
 
@@ -212,20 +211,24 @@ def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Ten
     rot = ob.rotation_from_quat(f["quat"])
     y = f["response"]
     lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
-    thrust_w = 0.25 * (y[k, :, :1] + y[k + 1, :, :1]) * (rot[k, :, :, 2] + rot[k + 1, :, :, 2])
-    drag = [
-        -rot[k, :, :, i] * (rot[k, :, :, i] * f["vel"][k]).sum(-1, keepdim=True) for i in range(3)
-    ]
+    thrusts = y[k, :, :1] + y[k + 1, :, :1]
+    axes = rot[k].unbind(-1)
+    thrust_w = 0.25 * thrusts * (axes[2] + rot[k + 1, :, :, 2])
+    vel = f["vel"][k]
+    drag = [-axis * (axis * vel).sum(-1, keepdim=True) for axis in axes]
     gravity = torch.tensor([0.0, 0.0, GRAVITY], device=mass.device)
-    load_force = load_mass[:, None] * ((f["load_vel"][k + 1] - f["load_vel"][k]) / period + gravity)
-    momentum = mass[:, None] * ((f["vel"][k + 1] - f["vel"][k]) / period + gravity) + load_force
+    load_gain = (f["load_vel"][k + 1] - f["load_vel"][k]) / period
+    load_force = load_mass[:, None] * (load_gain + gravity)
+    gain = (f["vel"][k + 1] - vel) / period
+    momentum = mass[:, None] * (gain + gravity) + load_force
     arm = f["load_pos"] - f["pos"] - (rot @ flights.mount[:, :, None]).squeeze(-1)
     arm, u = (0.5 * (path[k] + path[k + 1]) for path in (arm, f["load_vel"] - f["vel"]))
     length = arm.norm(dim=-1)
     n = arm / length[..., None]
     tension = -(n * load_force).sum(-1)
     taut = tension > TAUT * GRAVITY * load_mass
-    swing = (u - (n * u).sum(-1, keepdim=True) * n).square().sum(-1) / length
+    along = (n * u).sum(-1, keepdim=True) * n
+    swing = (u - along).square().sum(-1) / length
     rows = {
         "next": y[k + 1],
         "lagged": torch.stack(lagged, -2),
