@@ -138,7 +138,7 @@ def test_the_vehicle_flies_on_alone():
     ideal = replace(paper_plant().vehicle.battery, kind="ideal")
     params = plant(0.0, "float64", aero=calm, battery=ideal)
     sim = HybridSim(params, 1)
-    weight = (params.vehicle.body.mass + params.rope.rope_mass + params.rope.payload_mass) * GRAVITY
+    weight = GRAVITY * params.total_mass
     speeds = []
     for k in range(10):
         sim.set_command([[weight, 0.0, 0.0, 0.0]], [k == 0])

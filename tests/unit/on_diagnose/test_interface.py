@@ -21,7 +21,7 @@ from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs.flightlog import Channel, FlightLog
 
 PLANT = paper_plant()
-WEIGHT = GRAVITY * (PLANT.vehicle.body.mass + PLANT.rope.payload_mass + PLANT.rope.rope_mass)
+WEIGHT = GRAVITY * PLANT.total_mass
 
 
 def flown(seed: int, lag: float = 0.05) -> FlightLog:

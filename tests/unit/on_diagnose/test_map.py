@@ -372,7 +372,7 @@ def test_a_throttle_becomes_a_command_in_newtons():
     it; attitudes come 3 ms after positions.
     """
     columns, plant = flight(20.0), paper_plant()
-    weight = 9.81 * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    weight = 9.81 * plant.total_mass
     force = np.linalg.norm(columns["acc_b"], axis=1) / 9.81
     smooth = np.convolve(np.pad(force, 5, mode="edge"), np.ones(11) / 11, "valid")
     share = 0.37 * (1.0 + (smooth - 1.0) / 0.8)
