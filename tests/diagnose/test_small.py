@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.linalg import norm
-from pytest import approx, mark, param, raises
+from pytest import approx, mark, raises
 from scipy.spatial.transform import Rotation
 
 from bench.diagnose import foreign, small
@@ -16,7 +16,6 @@ from sim.params import LawParams
 from tests.commands import run_command
 from tests.places import DATA
 from tests.unit.on_diagnose.test_models import BALL, FLYER
-from visthrow import cli, config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
@@ -108,57 +107,6 @@ def test_nothing_hidden_is_no_effect(kind):
     diagnosis = search.explain(small.model_of(kind, small.logs_of(kind, "", 1)))
     assert diagnosis.overall == "NO EFFECT"
     assert not diagnosis.laws
-
-
-@mark.parametrize(
-    ("kind", "law"),
-    [param(*case, marks=mark.slow) for case in (("trim", "ground"), ("pendulum", "brake"))],
-)
-def test_a_hidden_law_is_told_written_and_wins_back_what_it_hid(kind, law, tmp_path, capsys):
-    plain, extended, out = tmp_path / "plain.toml", tmp_path / "extended.toml", tmp_path / "out"
-    logs = [str(tmp_path / f"{i}.npz") for i in range(6)]
-    for path, log in zip(logs, small.logs_of(kind, law, 1, 6)):
-        log.save(path)
-    plain.write_text(
-        config.dumps(setups.Setup("flights of others", **{kind: small.WORLDS[kind][2]}))
-    )
-    assert run_command(f"diagnose explain --config {plain} --no-blind --out {out}", *logs[:4]) == 0
-    report = json.loads((out / "diagnosis.json").read_text())
-    assert report["overall"] == "UNKNOWN"
-    assert not report["theta"]
-    assert report["laws"][0]["formula"] == small.formula(kind, law)
-    assert run_command(f"diagnose apply {out}/diagnosis.json --laws 1 --out {extended}") == 0
-    (written,) = setups.load(extended).laws
-    told = report["explanations"][0][0]
-    assert written.coefficient == told["coefficient"]
-    assert f"{told['sd'] ** 2: .3e}" in extended.read_text()
-    capsys.readouterr()
-    worth = tmp_path / "worth.json"
-    assert (
-        cli.main(
-            [
-                "diagnose",
-                "explain",
-                *logs[:4],
-                "--config",
-                str(extended),
-                "--no-report",
-                "--out",
-                str(tmp_path),
-                "--json",
-                str(worth),
-                "--test",
-                *logs[4:],
-            ]
-        )
-        == 0
-    )
-    assert "on the tested flights" in capsys.readouterr().out
-    again = json.loads(worth.read_text())
-    assert again["overall"] == "NO EFFECT"
-    ((before, after, noise),) = again["tested"].values()
-    assert before > 3.0 * noise
-    assert before - after > 0.8 * (before - noise)
 
 
 def test_what_cannot_act_is_refused():

@@ -7,19 +7,8 @@ from pytest import importorskip
 from tests.commands import run_command
 from visthrow.cli import compare
 from visthrow.paper.baseline import spline, thrower
-from visthrow.throws import results
-from visthrow.throws.reference_protocol import BATCH
 
 importorskip("piqp")
-
-
-def test_units_are_cut_into_batches_on_reference_plants_alone():
-    assert [u["throws"] for u in thrower.units("hybrid", "both", 2.0, 2 * BATCH + 1)] == [
-        2 * BATCH + 1
-    ]
-    cut = thrower.units("reference", "both", 2.0, 2 * BATCH + 1)
-    assert [(u["throws"], u["batch"]) for u in cut] == [(BATCH, 0), (BATCH, 1), (1, 2)]
-    assert len({results.key_of(u) for u in cut}) == 3
 
 
 def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):
