@@ -100,14 +100,6 @@ def test_what_is_lost_for_long_is_not_seen():
     np.testing.assert_array_equal(seen[10:], within[10:] < GATE * LOST)
 
 
-def test_without_an_attitude_nothing_is_followed():
-    rots, rays = throw(4)
-    following = BallGoalTracker(RADIUS, SIDE, LENGTH * rays[0])
-    following.prior(rots[0], rots[0][:, 2], EYE, (0.2, 0.6), 0.0)
-    assert following.take(FrameDetections(None, None), None, 0.0) == FrameDetections(None, None)
-    assert following.prior(rots[1], rots[1][:, 2], EYE, (0.2, 0.6), 0.02).ball_ray_c is None
-
-
 def square(rot, place, score, eye=EYE):
     """A square about a place on the ground as a camera with an attitude, body axes and all, sees it
     from an eye.

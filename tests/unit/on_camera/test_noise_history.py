@@ -3,7 +3,7 @@
 import torch
 from pytest import approx, mark
 
-from camera.arrays import at_latency, push
+from camera.arrays import at_latency
 from camera.keypoint_noise import StepDraw, apply_latency, apply_noise
 from camera.params import KeypointNoiseParams
 
@@ -15,13 +15,6 @@ def draw_step(environments, keypoints, generator):
         torch.randn(environments, keypoints, 2, generator=generator),
         torch.rand(environments, keypoints, generator=generator),
     )
-
-
-def test_push_shifts_and_fills_on_reset():
-    history = torch.tensor([[[1.0], [2.0], [3.0]], [[4.0], [5.0], [6.0]]])
-    new = torch.tensor([[7.0], [8.0]])
-    pushed = push(history, new, torch.tensor([False, True]))
-    assert pushed[..., 0].tolist() == [[7.0, 1.0, 2.0], [8.0, 8.0, 8.0]]
 
 
 def test_latency_interpolates_between_whole_steps():

@@ -1,6 +1,4 @@
-"""The batched renderer: where things are in its pictures, against projection, motion and an
-independent renderer; seeds.
-"""
+"""The batched renderer: where things are in its pictures, against projection and motion; seeds."""
 
 from dataclasses import replace
 
@@ -11,9 +9,8 @@ from numpy.testing import assert_allclose
 from pytest import fixture, importorskip, raises
 
 from camera.fisheye import Fisheye
-from camera.mount import nominal_rot_cb, rotation_from_vector
+from camera.mount import rotation_from_vector
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
-from tests.drawn import render_scene
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import posed_scenes, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import photographs, pyramid
@@ -81,22 +78,6 @@ def test_ball_and_square_are_where_the_lens_puts_them(renderer):
     assert truth.ball_seen.all()
     assert truth.goal_seen.all()
     assert not image[0, 0].any(), "black outside the field of view"
-
-
-def test_the_other_renderer_draws_the_same_square_and_ball(renderer):
-    """Written before it and without Warp; shapes overlap but for pixels at the edges."""
-    scenes, lens = hovering(), Fisheye(LENS)
-    eye, mount = scenes.pose[0, :3], nominal_rot_cb(CAMERA.mount)
-    rot = rotation_from_vector(torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64)) @ mount.T
-    other = (
-        render_scene(lens, eye, rot, scenes.goal[0, :2], scenes.ball[0, :3], supersample=3).numpy()
-        * 255.0
-    )
-    ours = renderer.render(scenes)[0].numpy()
-    for shape in (yellow, green):
-        a, b = shape(ours), shape(other)
-        assert b.sum() > 30
-        assert (a & b).sum() / (a | b).sum() > 0.75
 
 
 def test_motion_and_rolling_shutter_move_things_as_the_truth_says(renderer):
