@@ -14,7 +14,7 @@ from visthrow.diagnose.inputs.unit_evidence import (
     SURE,
     THRUSTS,
     Attitude,
-    Reading,
+    PathReading,
     readings,
     rising,
     turn_to,
@@ -267,7 +267,7 @@ class Recognition:
         """
         attitudes = self._attitudes()
         ranked = [readings(self.time, group.values, _lengths(group), attitudes) for group in groups]
-        alone = [Reading("", way, way.doubt, "") for way in attitudes if way is not None]
+        alone = [PathReading("", way, way.doubt, "") for way in attitudes if way is not None]
         deciding = min(ranked, key=lambda listed: listed[0].doubt, default=alone)
         if alone:
             self._settle_attitude(sorted(deciding, key=lambda reading: reading.doubt))
@@ -287,7 +287,7 @@ class Recognition:
             paths.append(Path(group, best.unit, pos_w, "" if group.unit else f"; {best.why}"))
         return paths
 
-    def _settle_attitude(self, ranked: list[Reading]) -> None:
+    def _settle_attitude(self, ranked: list[PathReading]) -> None:
         """Take the likeliest way to read the attitude; ask where no path says which one is."""
         best, *others = ranked
         rivals = [r for r in others if r.attitude is not best.attitude]

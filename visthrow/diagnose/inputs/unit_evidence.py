@@ -63,7 +63,7 @@ class Attitude:
 
 
 @dataclass(frozen=True)
-class Reading:
+class PathReading:
     """One way to read the columns of a path, beside an attitude."""
 
     unit: str
@@ -80,7 +80,7 @@ class Reading:
 
 def readings(
     time: np.ndarray, path: np.ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
-) -> list[Reading]:
+) -> list[PathReading]:
     """Weigh all readings of a path, the likeliest first.
 
     Level, a rotor's lean accelerates by about g sin(tilt); what is thrown falls with g; and a path
@@ -127,7 +127,7 @@ def readings(
                 why += " makes"
             elif fall:
                 why = f"{unit} by gravity: a part of it falls freely"
-            listed.append(Reading(unit, attitude, doubt, why))
+            listed.append(PathReading(unit, attitude, doubt, why))
     return sorted(listed, key=lambda reading: reading.doubt)
 
 

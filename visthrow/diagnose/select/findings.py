@@ -43,7 +43,7 @@ def blank(effect: Effect) -> Finding:
 
 @dataclass(frozen=True)
 class Reading:
-    """What flights say of each effect beside the names."""
+    """The statements of flights about each effect beside the names."""
 
     problem: Problem
     point: Point  # with random shares integrated out

@@ -252,7 +252,7 @@ def measure(diagnosis: Diagnosis) -> HeldOut:
 
 @dataclass(frozen=True)
 class Doubt:
-    """What is held against names."""
+    """A reason against names."""
 
     names: Sequence[str] = ()
     verdict: str = result.CANDIDATE  # that their findings get instead
