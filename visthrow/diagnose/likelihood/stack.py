@@ -39,7 +39,6 @@ class _Batch:
     """W windows, of n columns [X, G] at most; padded columns are 0."""
 
     windows: np.ndarray  # rows of the noise's shares, shape (W,)
-    phases: tuple[list[str], np.ndarray]  # that occur, and each window's among them
     grams: list[Gram]
     hidden: torch.Tensor  # inner products of the columns, shape (W, C, n, n)
     cross: torch.Tensor  # shape (W, C, n)
@@ -136,8 +135,7 @@ class Stack:
         ]
         parts = [gram.inner[:, :size, :size] for gram, size in zip(grams, sizes)]
         hidden = side_by_side(parts, (channels, n, n), self.device)
-        phases, phase = np.unique([gram.phase for gram in grams], return_inverse=True)
-        return _Batch(windows, (phases.tolist(), phase), list(grams), hidden, *arrays)
+        return _Batch(windows, list(grams), hidden, *arrays)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
@@ -187,11 +185,11 @@ def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> 
 
 def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
     """Deviation of each window's latent forces by block, shape (W, B)."""
-    phases, phase = batch.phases
-    shared = np.array(
-        [[noise.latent_sd.get((b, name), 0.0) for b in range(BLOCKS)] for name in phases]
-    )
-    return shared[phase] * noise.share[batch.windows]
+    levels = [
+        [noise.latent_sd.get((block, gram.phase), 0.0) for block in range(BLOCKS)]
+        for gram in batch.grams
+    ]
+    return np.array(levels) * noise.share[batch.windows]
 
 
 def _shape(batch: _Batch, noise: Noise) -> _Shape:

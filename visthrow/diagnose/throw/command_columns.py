@@ -34,19 +34,16 @@ def without_each_command(
     which of them act in a window; ``simulation``: of one setting. Returns for each of these
     windows, shape (N, T), with the T commands that differ from the one before.
     """
-    commands = {w: _acting(flights, w, delay) for w in windows}
+    commands = {}
+    for w in windows:
+        c = flights.cuts[w]
+        f = flights.flights[c.flight]
+        commands[w] = find_acting(f.command_time, f.command, delay, c.start, c.end)
     lanes = [1 + len(numbers) for numbers in commands.values()]
     columns = []
     for part in grouped(windows, lanes, BATCH):
         columns += _flown(flights, {w: commands[w] for w in part}, simulation, states)
     return columns
-
-
-def _acting(flights: ReplayedFlights, w: int, delay: float) -> np.ndarray:
-    """Numbers of the commands that act in a window and differ from the one before."""
-    c = flights.cuts[w]
-    f = flights.flights[c.flight]
-    return find_acting(f.command_time, f.command, delay, c.start, c.end)
 
 
 def _flown(
@@ -58,22 +55,23 @@ def _flown(
     """Fly a few windows: a lane with all commands, then one without each of them, which leaves the
     first at the knot before.
     """
-    lanes = []
-    first = {}
-    rows_kept = 0
+    (setting,) = simulation.settings
+    lanes: list[Lane] = []
+    parents = []
+    first_knot = 0
     for w, numbers in commands.items():
-        c = flights.cuts[w]
-        acts = flights.flights[c.flight].command_time[numbers]
-        acts = acts + simulation.settings[0].plant.vehicle.queue.delay
+        flight = flights.cuts[w].flight
+        acts = flights.flights[flight].command_time[numbers] + setting.plant.vehicle.queue.delay
         last = flights.knots[w] - 2  # behind it is the end
-        resume = rows_kept + np.clip((acts - c.start) // KNOT_SPACING, 0, last).astype(int)
-        skip = flights.first_command[c.flight] + numbers
-        whole = first[w] = len(lanes)
-        lanes.append(Lane(w, 0, w, keep=rows_kept, rough=True))
-        lanes += [
-            Lane(w, 0, w, resume=row, parent=whole, rough=True, skip=number)
-            for row, number in zip(resume, skip)
-        ]
-        rows_kept += int(flights.knots[w])
+        knot = np.clip((acts - flights.cuts[w].start) // KNOT_SPACING, 0, last).astype(int)
+        parent = len(lanes)
+        parents.append(parent)
+        lanes.append(Lane(w, 0, w, keep=first_knot, rough=True))
+        for row, number in zip(first_knot + knot, flights.first_command[flight] + numbers):
+            lanes.append(Lane(w, 0, w, resume=row, parent=parent, rough=True, skip=number))
+        first_knot += int(flights.knots[w])
     seen = flights.fly(simulation, states, lanes).seen
-    return [flights.differences(seen, w, first[w], len(commands[w])) for w in commands]
+    return [
+        flights.differences(seen, w, parent, len(numbers))
+        for parent, (w, numbers) in zip(parents, commands.items())
+    ]

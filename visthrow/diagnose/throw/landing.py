@@ -49,12 +49,15 @@ class PredictedLandings:
         """Horizontal distance of the open-loop prediction from the measured landing [m], shape
         (F,).
         """
-        return np.linalg.norm((self.predicted - self.measured)[:, :2], axis=1)
+        return self._distance(self.predicted)
 
     @property
     def released_errors(self) -> np.ndarray:
         """Return the errors of the prediction from the separation [m], shape (F,)."""
-        return np.linalg.norm((self.released - self.measured)[:, :2], axis=1)
+        return self._distance(self.released)
+
+    def _distance(self, points: np.ndarray) -> np.ndarray:
+        return np.linalg.norm((points - self.measured)[:, :2], axis=1)
 
 
 def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, np.ndarray] | None:
