@@ -86,13 +86,15 @@ def _fly(
         previous = action
         ended = open_ & (done > 0)
         for name, value in env.last.items():
-            mask = ended.view(-1, *(1,) * (value.dim() - 1))
+            trailing = (1,) * (value.dim() - 1)
+            mask = ended.view(-1, *trailing)
             results[name] = torch.where(mask, value, results.get(name, value))
         open_ &= ~ended
         if not bool(open_.any()):  # most throws take a fifth of the time limit
             break
     results["smoothness"] = (change / steps.clamp(min=1)).sqrt()
-    success = (results["released"] & ~open_).cpu().numpy()
+    landed = results["released"] & ~open_
+    success = landed.cpu().numpy()
 
     measured = {}
     for name, tensor in results.items():

@@ -44,7 +44,8 @@ def landing(p: RewardParams, error: Tensor) -> Tensor:
     """r_land: k_l exp(-lambda error), shape (E,). error: distance of impact and goal [m], shape
     (E,).
     """
-    return p.landing * (-p.landing_decay * error).exp()
+    nearness = (-p.landing_decay * error).exp()
+    return p.landing * nearness
 
 
 def time_of_flight(p: RewardParams, time: Tensor) -> Tensor:
@@ -54,4 +55,5 @@ def time_of_flight(p: RewardParams, time: Tensor) -> Tensor:
 
 def proximity(p: RewardParams, clearance: Tensor, margin: float) -> Tensor:
     """r_prox: -k_p max(0, d_m - clearance), shape (E,). clearance, margin: [m]."""
-    return -p.proximity * (margin - clearance).clamp(min=0.0)
+    missing = (margin - clearance).clamp(min=0.0)
+    return -p.proximity * missing

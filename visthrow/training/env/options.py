@@ -27,7 +27,8 @@ def redraw(buffers: Mapping[str, Tensor], spreads: Mapping[str, float], fresh: T
     for name, std in spreads.items():
         if std > 0.0:
             old = buffers[name]
-            mask = fresh.view(-1, *(1,) * (old.dim() - 1))
+            trailing = (1,) * (old.dim() - 1)
+            mask = fresh.view(-1, *trailing)
             torch.where(mask, torch.randn_like(old) * std, old, out=old)
 
 
@@ -162,9 +163,9 @@ class DetectorView:
         mount = self._params.mount
         if mount.rotation_error_std == 0.0 and mount.position_error_std == 0.0:
             return None
-        return self.camera.extrinsics(
-            self.buffers["extrinsic_rotation"], self.buffers["extrinsic_offset"]
-        )
+        rotation = self.buffers["extrinsic_rotation"]
+        offset = self.buffers["extrinsic_offset"]
+        return self.camera.extrinsics(rotation, offset)
 
     def look(
         self, pos_w: Tensor, rot_wb: Tensor, goal_w: Tensor, payload_w: Tensor, fresh: Tensor
@@ -172,23 +173,29 @@ class DetectorView:
         """Return keypoints [-], shape (E, K, 2), and validity, shape (E, K)."""
         buffers = self.buffers
         noise = self._params.noise
-        points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, self._extrinsics())
+        mounts = self._extrinsics()
+        points, valid = keypoints(self.camera, pos_w, rot_wb, goal_w, payload_w, mounts)
         if noise.seen_radius < 1.0:
-            valid = valid & (points.square().sum(-1) <= noise.seen_radius**2)
+            distance = points.square().sum(-1)
+            valid = valid & (distance <= noise.seen_radius**2)
         if noise.scale_std > 0.0:
             points = points * (1.0 + buffers["scale_error"])
         if noise.latency > 0.0:
-            buffers["late_points"].copy_(arrays.push(buffers["late_points"], points, fresh))
-            buffers["late_valid"].copy_(arrays.push(buffers["late_valid"], valid, fresh))
-            points, valid = apply_latency(
-                buffers["late_points"], buffers["late_valid"], self._latency
-            )
-        draw = StepDraw(torch.randn_like(points), torch.rand_like(points[..., 0]))
+            late_points = buffers["late_points"]
+            late_valid = buffers["late_valid"]
+            late_points.copy_(arrays.push(late_points, points, fresh))
+            late_valid.copy_(arrays.push(late_valid, valid, fresh))
+            points, valid = apply_latency(late_points, late_valid, self._latency)
+        normals = torch.randn_like(points)
+        uniforms = torch.rand_like(points[..., 0])
+        draw = StepDraw(normals, uniforms)
         if noise.wrong_probability > 0.0:
-            draw = draw._replace(wrong=torch.rand(*points.shape[:2], 3, device=points.device))
+            wrong = torch.rand(*points.shape[:2], 3, device=points.device)
+            draw = draw._replace(wrong=wrong)
         points, valid = apply_noise(noise, points, valid, buffers["keypoint_bias"], draw)
         if noise.held_probability > 0.0:
-            repeated = (torch.rand_like(points[:, 0, 0]) < noise.held_probability) & ~fresh
+            share = torch.rand_like(points[:, 0, 0])
+            repeated = (share < noise.held_probability) & ~fresh
             points = torch.where(repeated[:, None, None], buffers["held_points"], points)
             valid = torch.where(repeated[:, None], buffers["held_valid"], valid)
             buffers["held_points"].copy_(points)

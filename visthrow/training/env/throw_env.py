@@ -64,7 +64,8 @@ class ThrowEnv(VecEnv):
         task = experiment.task
         self.num_envs = count or experiment.ppo.environments
         self.num_actions = act.ACTIONS
-        self.max_episode_length = round(task.bounds.time_limit / experiment.sim.control_period)
+        period = experiment.sim.control_period
+        self.max_episode_length = round(task.bounds.time_limit / period)
         fleet = members(experiment)
         ropes, share = self._build(fleet, seed)
         self.layout = ob.layout_of(task.observation)
@@ -72,7 +73,7 @@ class ThrowEnv(VecEnv):
         row = torch.arange(self.num_envs, device=device) % len(ropes)
         self._fleet = FleetSetup(fleet, task, row // share) if fleet else None
         unit = self._fleet.time_unit if self._fleet else None
-        self.delay = PoseDelay(task.observation, experiment.sim.control_period, like, unit)
+        self.delay = PoseDelay(task.observation, period, like, unit)
         self.goals = MovingGoals(task.target.speed, like) if task.target.moves else None
         self.view = DetectorView(experiment.camera, like)
         self._allocate(like)
@@ -89,9 +90,8 @@ class ThrowEnv(VecEnv):
         """Build the simulator; return its ropes, and how many of them each plant has."""
         experiment = self.cfg
         plants = [member.plant for member in fleet] or drawn_plants(experiment, seed)
-        ropes = [
-            rope for plant in plants for rope in rope_variants(plant.rope, experiment.task.start)
-        ]
+        start = experiment.task.start
+        ropes = [rope for plant in plants for rope in rope_variants(plant.rope, start)]
         share = len(ropes) // len(plants)
         variants = {}
         if fleet or len(plants) > 1:
@@ -119,7 +119,8 @@ class ThrowEnv(VecEnv):
         else:
             self._max_thrust = task.action.max_thrust
             weight = GRAVITY * plant_of(self.cfg).total_mass
-            self.start_action = like.new_tensor(act.hover_action(weight, self._max_thrust))
+            hover = act.hover_action(weight, self._max_thrust)
+            self.start_action = like.new_tensor(hover)
         self.max_rate = like.new_tensor(task.action.max_rate)
         self.rate_weights = like.new_tensor(task.reward.rate_command)
         self.change_weights = like.new_tensor(task.reward.command_change)
@@ -134,7 +135,6 @@ class ThrowEnv(VecEnv):
             # over finished episodes: their number, those released, and of these landing errors [m]
             # and durations [s]
             "totals": like.new_zeros(4, dtype=torch.float64),
-            "continued": like.new_zeros(E, dtype=torch.bool),
         }
         if self.layout.response:
             self.buffers["answers"] = like.new_zeros(E, 1 + self.layout.response, ob.RESPONSE)
@@ -211,7 +211,7 @@ class ThrowEnv(VecEnv):
         ``mask``: plants that move on, shape (E,), int32; default all.
         """
         self.previous_action.copy_(self._apply(actions, True, mask))
-        return self._look(self.buffers["continued"])
+        return self._look(~self._everywhere)
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict]:
         """Apply unclipped actions, shape (E, 5), for one control period; finished episodes start
@@ -237,10 +237,10 @@ class ThrowEnv(VecEnv):
         action = act.clip_action(actions)
         noise = torch.randn_like(buffers["command_bias"]) * task.noise.command_step
         noisy = action[:, : act.COMMANDS] + noise + buffers["command_bias"]
-        self.views.command.copy_(act.command_from_action(noisy, self._max_thrust, self.max_rate))
-        self.views.release.copy_(
-            act.release_asked(actions, self.cfg.release.threshold) & (not hold)
-        )
+        command = act.command_from_action(noisy, self._max_thrust, self.max_rate)
+        self.views.command.copy_(command)
+        asked = act.release_asked(actions, self.cfg.release.threshold)
+        self.views.release.copy_(asked & (not hold))
         with on_torch_stream(self.device):
             self.sim.step(mask)
         if self.goals is not None:
@@ -258,7 +258,7 @@ class ThrowEnv(VecEnv):
         time = self.episode_length_buf * period
         released = out["separated"] != 0
         latched = state["release_timer"] >= 0.0
-        negative = ~released & terminations.negative(
+        failed = terminations.negative(
             task.bounds,
             state["pos_w"],
             ob.rotation_from_quat(state["quat_wb"]),
@@ -268,8 +268,10 @@ class ThrowEnv(VecEnv):
             time,
             self.cfg.release.landing_height,
         )
+        negative = ~released & failed
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
-        error = (out["landing_w"] - goal)[:, :2].square().sum(-1).sqrt()
+        miss = out["landing_w"] - goal
+        error = miss[:, :2].square().sum(-1).sqrt()
         kinetic = rewards.kinetic(p, state["vel_w"], state["rate_b"], out["payload_vel_w"])
         command = rewards.command(p, action, self.rate_weights)
         change = rewards.change(p, action, self.previous_action, self.change_weights)
@@ -305,7 +307,8 @@ class ThrowEnv(VecEnv):
         with on_torch_stream(self.device):
             self.sim.randomize(self.cfg.task.start, wp.from_torch(self._fresh))
         if self._goal is not None:
-            self.views.goal_w.copy_(torch.where(fresh[:, None], self._goal, self.views.goal_w))
+            goal_w = self.views.goal_w
+            goal_w.copy_(torch.where(fresh[:, None], self._goal, goal_w))
         self.episode_length_buf.masked_fill_(fresh, 0)
         previous = self.previous_action
         torch.where(fresh[:, None], self.start_action, previous, out=previous)
@@ -328,7 +331,8 @@ class ThrowEnv(VecEnv):
         rot_wb = ob.rotation_from_quat(state["quat_wb"])
         vehicle = ob.vehicle_part(state["pos_w"], state["vel_w"], state["rate_b"], rot_wb)
         attached = state["attached"].float()
-        pose = self.delay.push(torch.cat([vehicle, payload], dim=-1), fresh)
+        pose = torch.cat([vehicle, payload], dim=-1)
+        pose = self.delay.push(pose, fresh)
         late_goal = self._goal_in(-self.delay.age)
         true_frame = self._state_frame(pose, late_goal)
         noise = torch.randn_like(true_frame) * self.cfg.task.noise.observation_step
@@ -339,10 +343,12 @@ class ThrowEnv(VecEnv):
                 rot_wb = ob.rotation_in(pose)
             payload_w = pose[:, ob.VEHICLE :]
             points, valid = self.view.look(pose[:, :3], rot_wb, late_goal, payload_w, fresh)
-            measured = torch.cat([measured[:, : ob.VEHICLE], points.flatten(1)], dim=-1)
+            vehicle_seen = measured[:, : ob.VEHICLE]
+            measured = torch.cat([vehicle_seen, points.flatten(1)], dim=-1)
         self.measured = measured, valid
         time = self.episode_length_buf.float() * self.cfg.sim.control_period
         goal_vel = places = answers = None
+        setup = self._fleet.observed if self._fleet else None
         if self.layout.fits:
             fitted = goal_motion.fitted_goal(
                 self.layout, measured, valid, self.view.camera, buffers["goal_fit"], time, fresh
@@ -364,7 +370,7 @@ class ThrowEnv(VecEnv):
             goal_vel,
             places,
             answers,
-            self._fleet.observed if self._fleet else None,
+            setup,
         )
         buffers["history"].copy_(history)
         critic = self._privileged(actor, vehicle, payload, time, fresh)
@@ -381,7 +387,8 @@ class ThrowEnv(VecEnv):
         parts = [actor]
         if "exact" in named:
             offset = ob.state_part(state["pos_w"], self.views.goal_w, payload)
-            true_history = arrays.push(buffers["true_history"], offset[:, 2:], fresh)
+            payload_offset = offset[:, 2:]
+            true_history = arrays.push(buffers["true_history"], payload_offset, fresh)
             buffers["true_history"].copy_(true_history)
             parts = [vehicle, self.previous_action, offset[:, :2], true_history.flatten(1)]
         quantities = {

@@ -73,12 +73,15 @@ class CapturedPPO(PPO):
         distribution = self.actor.distribution
         distribution.update(self.actor(batch.observations))
         value = self.critic(batch.observations)
-        ratio = (distribution.log_prob(batch.actions)[:, None] - batch.old_actions_log_prob).exp()
+        log_prob = distribution.log_prob(batch.actions)[:, None]
+        ratio = (log_prob - batch.old_actions_log_prob).exp()
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-batch.advantages * ratio, -batch.advantages * clipped).mean()
+        loss = -batch.advantages
+        surrogate = torch.max(loss * ratio, loss * clipped).mean()
         step = (value - batch.values).clamp(-self.clip_param, self.clip_param)
         error = (value - batch.returns).square()
-        largest = torch.max(error, (batch.values + step - batch.returns).square())
+        clipped_error = (batch.values + step - batch.returns).square()
+        largest = torch.max(error, clipped_error)
         error = torch.where(self.actor_learns > 0.0, largest, error).mean()
         entropy = distribution.entropy.mean()
         gain = surrogate - self.entropy_coef * entropy
