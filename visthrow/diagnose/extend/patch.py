@@ -22,7 +22,6 @@ from visthrow.diagnose.inputs.model_arguments import THROW
 from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.catalogue import beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import term_of
-from visthrow.diagnose.select.scatter import variances
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
 from visthrow.task import Experiment, plant_of
 
@@ -141,12 +140,13 @@ def with_scatter(
     """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to flight
     has the mean of those that were flown, and their scatter.
     """
-    rows = [row for row in report.get("scatter") or [] if row["found"]]
-    sizes = {name: float(row.get("mean", {}).get(name, 0.0)) for row in rows for name in row["of"]}
-    sizes = {**theta, **{name: size for name, size in sizes.items() if name not in theta}}
+    count, sizes, scatter = len(theta), dict(theta), {}
+    for row in report.get("scatter") or []:
+        for name in row["of"] if row["found"] else ():
+            sizes.setdefault(name, float(row.get("mean", {}).get(name, 0.0)))
+            scatter[name] = float(row["size"]) ** 2
     whole = np.zeros((len(sizes), len(sizes)))
-    whole[: len(theta), : len(theta)] = np.reshape(covariance, (len(theta), len(theta)))
-    scatter = variances(rows)
+    whole[:count, :count] = np.reshape(covariance, (count, count))
     return sizes, whole + np.diag([scatter.get(name, 0.0) for name in sizes])
 
 

@@ -46,15 +46,11 @@ NOTHING: Names = frozenset()
 
 def shared(effects: Sequence[Effect]) -> list[Candidate]:
     """Return every effect as a candidate whose size all flights share."""
-    return [
-        Candidate(
-            e.name,
-            (j,),
-            penalty=e.price if isinstance(e, TermEffect) else 0.0,
-            law=e.block if isinstance(e, TermEffect) else "",
-        )
-        for j, e in enumerate(effects)
-    ]
+    offered = []
+    for j, e in enumerate(effects):
+        penalty, law = (e.price, e.block) if isinstance(e, TermEffect) else (0.0, "")
+        offered.append(Candidate(e.name, (j,), penalty=penalty, law=law))
+    return offered
 
 
 def random_shares(
@@ -80,24 +76,17 @@ def random_shares(
         groups += [(DAY, by_day)] if 1 < len(by_day) < len(flown) else []
     offered = []
     for effect, penalty in _varying(effects):
-        columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
-        deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
         named = effect.name not in effect.of
         if not (named or all_effects):
             continue
-        offered += [
-            Candidate(
-                effect.name if named else f"{effect.name}_by_{group}",
-                tuple(columns),
-                group,
-                penalty,
-                deviations,
-                effect.floor / effect.prior_sd,
-                claims=1 if named else 2,
-            )
-            for group, informative in groups
-            if columns and informative[:, columns].any(1).sum() > 1
-        ]
+        columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
+        deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
+        floors = effect.floor / effect.prior_sd
+        for group, informative in groups:
+            if columns and informative[:, columns].any(1).sum() > 1:
+                name = effect.name if named else f"{effect.name}_by_{group}"
+                of = name, tuple(columns), group, penalty, deviations, floors
+                offered.append(Candidate(*of, claims=1 if named else 2))
     return offered + _events(effects, priors, statistics.flights, flown)
 
 
@@ -134,20 +123,16 @@ def _events(
 ) -> list[Candidate]:
     """Return each effect in each flight alone."""
     penalty = float(np.log(max(flown.size, 1)))
-    return [
-        Candidate(
-            f"{e.name} in flight {flight}",
-            (j,),
-            EVENT,
-            penalty,
-            (float(priors.slab[j]),),
-            flight=flight,
-        )
-        for j, e in enumerate(effects)
-        if priors.visible[j] and not e.switch
-        for flight in flights[flown[:, j]].tolist()
-        if flown[:, j].sum() >= FEWEST_FOR_EVENT
-    ]
+    offered = []
+    for j, e in enumerate(effects):
+        flights_with = flights[flown[:, j]].tolist()
+        if not priors.visible[j] or e.switch or len(flights_with) < FEWEST_FOR_EVENT:
+            continue
+        deviation = (float(priors.slab[j]),)
+        for flight in flights_with:
+            name = f"{e.name} in flight {flight}"
+            offered.append(Candidate(name, (j,), EVENT, penalty, deviation, flight=flight))
+    return offered
 
 
 def without_means(chosen: Iterable[Candidate]) -> list[Candidate]:

@@ -62,45 +62,26 @@ class CommandStatistics:
             columns: of each window's commands, shape (N, T).
             rows: numbers of the windows among the point's.
         """
-        longest = max(columns_of.shape[1] for columns_of in columns)
-        effect_count = len(point.theta)
-        wide = [
-            np.hstack(
-                (
-                    w.effects,
-                    np.pad(
-                        columns_of,
-                        (
-                            (0, len(w.residual) - len(columns_of)),
-                            (0, longest - columns_of.shape[1]),
-                        ),
-                    ),
-                )
-            )
-            for w, columns_of in zip(windows, columns)
-        ]
-        windows = [replace(w, effects=effects) for w, effects in zip(windows, wide)]
-        grams = grams_of(
-            windows,
-            np.append(problem.priors.floor, np.ones(longest)),
-            len(problem.model.channels),
-        )
-        grams = correlated_of(grams, windows, point.noise.correlation_time)
+        longest = max(changes.shape[1] for changes in columns)
+        wide = []
+        for window, changes in zip(windows, columns):
+            padded = np.zeros((len(window.residual), longest))
+            padded[: len(changes), : changes.shape[1]] = changes
+            wide.append(replace(window, effects=np.hstack((window.effects, padded))))
+        floors = np.append(problem.priors.floor, np.ones(longest))
+        grams = grams_of(wide, floors, len(problem.model.channels))
+        grams = correlated_of(grams, wide, point.noise.correlation_time)
         noise = levels.only(point.noise, grams, rows)
         shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
-        information = np.array([columns_of.information for columns_of in shares])
-        return CommandStatistics(
-            information,
-            np.array([columns_of.score for columns_of in shares])
-            + information[:, :, :effect_count] @ point.theta,
-            longest,
-        )
+        information = np.array([share.information for share in shares])
+        score = np.array([share.score for share in shares])
+        score += information[:, :, : len(point.theta)] @ point.theta
+        return CommandStatistics(information, score, longest)
 
     def gain(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
         """Nats of these shares of dropped commands against none, beside a set of effects."""
-        return np.array(
-            [self._evidence(float(p), priors, active) for p in shares]
-        ) - self._evidence(0.0, priors, active)
+        evidence = [self._evidence(p, priors, active) for p in [0.0, *shares.tolist()]]
+        return np.array(evidence[1:]) - evidence[0]
 
     def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
         effects, commands = slice(0, -self.commands), slice(-self.commands, None)
@@ -142,15 +123,13 @@ def verdict(
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         if not columns:
             return None
-        statistics = CommandStatistics.of(
-            problem, point, [point.windows[w] for w in rows], columns, rows
-        )
+        windows = [point.windows[w] for w in rows]
+        statistics = CommandStatistics.of(problem, point, windows, columns, rows)
         nats = np.minimum(*(statistics.gain(shares, priors, named) for named in sets))
         if nats.max() <= 0.0:
             return None
-    return judged(
-        v, reach, nats, threshold, sum(columns_of.shape[1] for columns_of in columns), COMMAND
-    )
+    count = sum(changes.shape[1] for changes in columns)
+    return judged(v, reach, nats, threshold, count, COMMAND)
 
 
 def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
@@ -159,24 +138,19 @@ def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
 
     ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these
     leave; ``scatter``: the verdict before."""
-    statistics = CommandStatistics.of(
-        problem,
-        point,
-        [point.about.windows[i] for i in problem.kept],
-        point.commands,
-        range(len(problem.kept)),
-    )
-    information = statistics.information[:, -statistics.commands :, -statistics.commands :]
-    score = statistics.score[:, -statistics.commands :]
+    windows = [point.about.windows[i] for i in problem.kept]
+    rows = range(len(windows))
+    statistics = CommandStatistics.of(problem, point, windows, point.commands, rows)
+    commands = slice(-statistics.commands, None)
+    information = statistics.information[:, commands, commands]
     spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)
-    off = (spread @ (score - EITHER * information.sum(2))[..., None])[..., 0]  # from half way
+    score = statistics.score[:, commands] - EITHER * information.sum(2)  # from half way
+    off = (spread @ score[..., None])[..., 0]
     clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
     count = np.count_nonzero(clear)
-    lost_commands = np.count_nonzero(clear & (off > 0.0))
     if not count:
         return scatter
-    size, low, high = (
-        float(x)
-        for x in beta.ppf((0.5, 0.025, 0.975), lost_commands + 0.5, count - lost_commands + 0.5)
-    )
+    lost_commands = np.count_nonzero(clear & (off > 0.0))
+    counts = lost_commands + 0.5, count - lost_commands + 0.5
+    size, low, high = beta.ppf((0.5, 0.025, 0.975), *counts).tolist()
     return replace(scatter, size=size, low=low, high=high)

@@ -314,10 +314,3 @@ def _shares(
         )
         shares[:, columns] = root * scaled[..., 0]
     return shares
-
-
-def variances(scatter: Sequence[Mapping]) -> dict[str, float]:
-    """Variance of each effect among flights, from the scatter that a diagnosis' JSON tells was
-    found.
-    """
-    return {name: float(s["size"]) ** 2 for s in scatter if s["found"] for name in s["of"]}

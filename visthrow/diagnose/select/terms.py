@@ -209,11 +209,11 @@ def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:
     plain = replace(problem, terms=())
     count = len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
-    term_count = len(problem.terms)
-    grams = [
-        replace(g, inner=g.inner[:, :-term_count, :-term_count], cross=g.cross[:, :-term_count])
-        for g in point.grams
-    ]
+    grams = []
+    for gram in point.grams:
+        kept = slice(gram.nuisances + gram.latents + count)
+        inner, cross = gram.inner[:, kept, kept], gram.cross[:, kept]
+        grams.append(replace(gram, inner=inner, cross=cross))
     return plain, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
 
 
@@ -229,30 +229,29 @@ def shortlist(
 
     ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
     nats that a term must bring beyond its price."""
-    causes = np.flatnonzero(problem.priors.visible[: len(problem.model.effects)])
+    priors = problem.priors
+    causes = np.flatnonzero(priors.visible[: len(problem.model.effects)])
     calm, parts = with_capped_gusts(point)
     values = [KnotValues(window.knots) for window in point.windows]
-    screens = {
-        block: screened
-        for block in strongest
-        if (screened := screen(calm, parts, block, values)) is not None
-    }
+    screens = {}
+    for block in strongest:
+        screened = screen(calm, parts, block, values)
+        if screened is not None:
+            screens[block] = screened
     depths = [term.depth for screened in screens.values() for term in screened.terms]
     price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
+    present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     ranked: list[tuple[float, Term, float]] = []
     for block, screened in screens.items():
-        gain, prior = gains(
-            calm, problem.priors, active, screened, UNKNOWN_RATIO * strongest[block]
-        )
-        gain[unsaid(calm, problem.priors, active, screened, causes) < LAW] = -np.inf
+        gain, prior = gains(calm, priors, active, screened, UNKNOWN_RATIO * strongest[block])
+        gain[unsaid(calm, priors, active, screened, causes) < LAW] = -np.inf
         # of terms that say the same in other words in these flights, the simplest comes first
         for i in np.unique(np.round(gain, 3), return_index=True)[1]:
             term = screened.terms[i]
-            ranked.append((float(gain[i]) - price[term.depth], term, float(prior[i])))
-    present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
-    best = sorted(
-        (f for f in ranked if f[0] > threshold and f[1] not in present), key=lambda f: -f[0]
-    )[:WEIGHED]
+            nats = float(gain[i]) - price[term.depth]
+            if nats > threshold and term not in present:
+                ranked.append((nats, term, float(prior[i])))
+    best = sorted(ranked, key=lambda f: -f[0])[:WEIGHED]
     return [as_effect(term, prior, price[term.depth]) for _, term, prior in best]
 
 
@@ -303,21 +302,14 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = covariance(point.information, problem.priors.deviation(list(active)))
     mean = sigma @ point.score
-    effects = problem.effects
-    columns = [j for j in active if isinstance(effects[j], TermEffect)]
-    floor = np.array([effects[j].floor for j in columns])
+    columns = [j for j in active if isinstance(problem.effects[j], TermEffect)]
+    effects = [problem.effects[j] for j in columns]
+    floor = np.array([e.floor for e in effects])
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
-    return tuple(
-        Law(
-            t.formula,
-            t.block,
-            t.factors,
-            t.vector,
-            float(mean[j] * floor[i]),
-            float(np.sqrt(spread[i, i])),
-            t.unit,
-            float(nats),
-            tuple(spread[i].tolist()),
-        )
-        for i, (j, t) in enumerate((j, effects[j].term) for j in columns)
-    )
+    sizes = mean[columns] * floor
+    sd = np.sqrt(np.diag(spread))
+    found = []
+    for i, term in enumerate(e.term for e in effects):
+        size = float(sizes[i]), float(sd[i]), term.unit, float(nats), tuple(spread[i].tolist())
+        found.append(Law(term.formula, term.block, term.factors, term.vector, *size))
+    return tuple(found)

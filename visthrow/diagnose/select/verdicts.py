@@ -154,23 +154,21 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
     again at their own size."""
     best, problem, priors = selection.best, selection.problem, selection.problem.priors
     random = {c for c in best.chosen if c.group not in (ALL, EVENT)}
+    selected = {c.name for c in random}
     catalogue = {v.name: v for v in random_effects()}
-    concerned = [
-        c
-        for c in selection.candidates
-        if c in random
-        or (c.name in catalogue and c.group != DAY and not any(c.name == o.name for o in random))
-    ]
     verdicts, shares = [], dict(best.shares)
-    for c in concerned:
-        statistics = best.point.plain
+    for c in selection.candidates:
+        unselected = c.name in catalogue and c.group != DAY and c.name not in selected
+        if not (c in random or unselected):
+            continue
+        statistics, named = best.point.plain, best.chosen
         if c in random and len(c.columns) == 1:
             statistics = _straight(problem, best.point, best.columns, c.columns[0])
+        if c not in random:
+            named |= {
+                o for o in selection.candidates if o.group == ALL and {*o.columns} & {*c.columns}
+            }
         fixed_shares = {o: size for o, size in best.shares.items() if o != c}
-        means = {
-            o for o in selection.candidates if o.group == ALL and set(o.columns) & set(c.columns)
-        }
-        named = best.chosen if c in random else best.chosen | means
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
         verdict = share_verdict(linear, c, named, fixed_shares, effect, selection.threshold)
@@ -199,19 +197,14 @@ def share_verdict(
     sizes, nats = linear.profile(chosen, fixed_shares, c)
     flights = by_day(linear.statistics, linear.days) if c.group == DAY else linear.statistics
     informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
-    return judged(
-        replace(effect, name=c.name),
-        sizes * effect.prior_sd,
-        nats,
-        threshold + c.penalty,
-        int(informative.sum()),
-        c.group,
-    )
+    count = int(informative.sum())
+    reach, needed = sizes * effect.prior_sd, threshold + c.penalty
+    return judged(replace(effect, name=c.name), reach, nats, needed, count, c.group)
 
 
 def _straight(problem: Problem, point: Point, active: Sequence[int], j: int) -> Statistics:
-    theta = np.zeros(len(point.theta))
-    theta[list(active)] = point.theta[list(active)]
+    named = np.isin(np.arange(len(point.theta)), list(active))
+    theta = np.where(named, point.theta, 0.0)
 
     def simulate(position: np.ndarray) -> Statistics | None:
         moved_point = moved(problem, point, position)
@@ -233,11 +226,12 @@ def _about_means(
 def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
     """Return the effects of each possible set with the same random shares, and its nats behind."""
     random = {c for c in selection.best.chosen if c.group != ALL}
-    return [
-        (tuple(t.columns), nats)
-        for t, nats in selection.window
-        if not laws_of(t.chosen) and {c for c in t.chosen if c.group != ALL} == random
-    ]
+    sets = []
+    for trial, nats in selection.window:
+        varying = {c for c in trial.chosen if c.group != ALL}
+        if varying == random and not laws_of(trial.chosen):
+            sets.append((tuple(trial.columns), nats))
+    return sets
 
 
 def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
@@ -249,22 +243,25 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
         return [], ""
     names = frozenset(c for c in best.chosen if not c.law)
     linear = selection.linear(best.point)
-    alternatives = {names | {c} for c in selection.candidates if c.law} | {best.chosen}
-    value = {s: linear.value(s) - linear.value(names) for s in alternatives}
-    ranked = sorted((s for s in alternatives if s != best.chosen), key=value.get, reverse=True)
-    sets = [best.chosen, *(s for s in ranked if value[s] > 0.0)]
-    shares = [repeated_share(problem, best.point, [c.columns[0] for c in laws_of(s)]) for s in sets]
-    if shares[0][1] <= 0.0:  # none in place of a better one
-        share, low, high = (100.0 * part for part in shares[0])
-        return [], (
-            "a formula explains these flights, but those that are left out do not repeat it: they"
-            f" bear out {share:.0f} % [{low:.0f}, {high:.0f}] of what it promises"
-        )
-    return [
-        terms.laws(problem, best.point, columns_of(s), value[s])
-        for s, (_, low, _) in zip(sets, shares)
-        if low > 0.0
-    ], ""
+    plain = linear.value(names)
+    value = {best.chosen: linear.value(best.chosen) - plain}
+    for c in selection.candidates:
+        if c.law:
+            value[names | {c}] = linear.value(names | {c}) - plain
+    ranked = sorted(value.keys() - {best.chosen}, key=value.get, reverse=True)
+    told = []
+    for chosen in (best.chosen, *(s for s in ranked if value[s] > 0.0)):
+        columns = [c.columns[0] for c in laws_of(chosen)]
+        share, low, high = repeated_share(problem, best.point, columns)
+        if low > 0.0:
+            told.append(terms.laws(problem, best.point, columns_of(chosen), value[chosen]))
+        elif chosen == best.chosen:  # none in place of a better one
+            return [], (
+                "a formula explains these flights, but those that are left out do not repeat it:"
+                f" they bear out {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of what it"
+                " promises"
+            )
+    return told, ""
 
 
 def _law(selection: Selector) -> tuple[set[int], str]:
@@ -296,8 +293,9 @@ def _law(selection: Selector) -> tuple[set[int], str]:
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
     """Return laws, each formula once, with the coefficient of the best."""
     laws: dict[str, Law] = {}
-    for law in (law for together in explanations for law in together):
-        laws.setdefault(law.formula, law)
+    for together in explanations:
+        for law in together:
+            laws.setdefault(law.formula, law)
     return tuple(laws.values())
 
 
@@ -305,16 +303,13 @@ def _events(selection: Selector, point: Point) -> tuple[int, ...]:
     """Return flights in which an effect has a size of its own, and flights with a window far
     rougher than its phase.
     """
-    square = TAIL / chi2.ppf(
-        (1.0 - CALIBRATION_QUANTILE) / point.noise.share.size, TAIL
-    )  # of the roughest, with Student's tails
-    rough = {
-        window.flight
-        for window, share in zip(point.windows, point.noise.share)
-        if share.max() ** 2 > square
-    }
+    least = (1.0 - CALIBRATION_QUANTILE) / point.noise.share.size
+    roughest = np.sqrt(TAIL / chi2.ppf(least, TAIL))  # share of the roughest, with Student's tails
     events = {c.flight for c in selection.best.chosen if c.group == EVENT}
-    return tuple(sorted(events | rough))
+    for window, share in zip(point.windows, point.noise.share):
+        if share.max() > roughest:
+            events.add(window.flight)
+    return tuple(sorted(events))
 
 
 def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: int) -> Diagnosis:
