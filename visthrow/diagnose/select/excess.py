@@ -69,14 +69,10 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
         positions_moved = window.latent[np.isin(window.channel, positions)]
         for block in np.unique(gram.latent_block) if len(positions_moved) else ():
             reach = positions_moved @ gram.factor[:, gram.latent_block == block]
-            moves.setdefault((int(block), gram.phase), []).append(
-                float(np.sqrt((reach**2).sum(1).max()))
-            )
-    return {
-        key: LANDING / median
-        for key, distances in moves.items()
-        if (median := float(np.median(distances))) > 0.0
-    }
+            distance = float(np.sqrt((reach**2).sum(1).max()))
+            moves.setdefault((int(block), gram.phase), []).append(distance)
+    medians = {key: float(np.median(distances)) for key, distances in moves.items()}
+    return {key: LANDING / median for key, median in medians.items() if median > 0.0}
 
 
 def positions_of(problem: Problem) -> list[int]:
@@ -155,14 +151,14 @@ def too_strong(point: Point, share: float) -> tuple[str, ...]:
     """
     thrusts: dict[str, list[float]] = {}
     for window in point.windows:
-        if "thrust" in window.knots and len(window.knots["thrust"]):
-            thrusts.setdefault(window.phase, []).append(
-                float(np.median(np.abs(window.knots["thrust"])))
-            )
+        thrust = window.knots.get("thrust", ())
+        if len(thrust):
+            of_phase = thrusts.setdefault(window.phase, [])
+            of_phase.append(float(np.median(np.abs(thrust))))
+    weight = max((float(np.median(of_phase)) for of_phase in thrusts.values()), default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")
-    weight = max((float(np.median(v)) for v in thrusts.values()), default=np.inf)
-    return tuple(
-        p
-        for (b, p), level in point.noise.latent_sd.items()
-        if b == block and level > share * weight
-    )
+    strong = []
+    for (b, phase), level in point.noise.latent_sd.items():
+        if b == block and level > share * weight:
+            strong.append(phase)
+    return tuple(strong)

@@ -226,10 +226,12 @@ def linearise(
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
-    commands = problem.model.without_commands(sizes, problem.kept) if problem.lost else ()
-    commands = [
-        np.pad(c, ((0, len(w.residual) - len(c)), (0, 0))) for c, w in zip(commands, windows_of)
-    ]  # nothing behind replayed samples
+    commands = []
+    if problem.lost:
+        changes = problem.model.without_commands(sizes, problem.kept)
+        for change, window in zip(changes, windows_of):
+            behind = len(window.residual) - len(change)  # nothing behind replayed samples
+            commands.append(np.pad(change, ((0, behind), (0, 0))))
     extended = windows_of
     if problem.terms:
         sizes_of = theta if flown is None else 0.0 * theta
@@ -280,24 +282,22 @@ def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
     """A window some of whose commands did not come: of each that share, and its deviation among
     what nobody knows.
     """
-    sd = np.append(window.nuisance_sd, np.full(columns.shape[1], np.sqrt(share * (1.0 - share))))
+    deviation = np.sqrt(share * (1.0 - share))
+    sd = np.append(window.nuisance_sd, np.full(columns.shape[1], deviation))
     nuisance = np.hstack((window.nuisance, columns))
-    return replace(
-        window, residual=window.residual - share * columns.sum(1), nuisance=nuisance, nuisance_sd=sd
-    )
+    residual = window.residual - share * columns.sum(1)
+    return replace(window, residual=residual, nuisance=nuisance, nuisance_sd=sd)
 
 
 def only(point: Point, windows: Sequence[int]) -> Point:
     """Return a point of some of its windows, with noise levels estimated from these."""
-    parts = {
-        name: [getattr(point, name)[w] for w in windows]
-        for name in ("windows", "grams", "commands")
-        if getattr(point, name)
+    grams = [point.grams[w] for w in windows]
+    noise = levels.maximised(grams, levels.only(point.noise, grams, windows), point.device)[0]
+    changes = {
+        "windows": [point.windows[w] for w in windows],
+        "commands": [point.commands[w] for w in windows if point.commands],
     }
-    noise = levels.maximised(
-        parts["grams"], levels.only(point.noise, parts["grams"], windows), point.device
-    )[0]
-    return regathered(point, noise=noise, **parts)
+    return regathered(point, noise=noise, grams=grams, **changes)
 
 
 def untracked_windows(point: Point) -> list[int]:
@@ -308,14 +308,12 @@ def untracked_windows(point: Point) -> list[int]:
     lost, but something is missing."""
     grams = with_shares(point, point.theta)
     shares, log_dets = point.integrals.shares(grams, point.noise), point.integrals.log_dets
-    misfit = [
-        (share.square - log_det) / max(gram.count.sum(), 1.0)
-        for share, log_det, gram in zip(shares, log_dets, grams)
-    ]
+    misfit = []
+    for share, log_det, gram in zip(shares, log_dets, grams):
+        misfit.append((share.square - log_det) / max(gram.count.sum(), 1.0))
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
-    limit = min(
-        (1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO
-    )  # what an unknown motion does is no effect's doing
+    # what an unknown motion does is no effect's doing
+    limit = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)
     distant = np.flatnonzero(np.array(misfit) > np.where(shaken, limit, UNKNOWN_RATIO))
     return distant.tolist() if len(distant) <= LOST_SHARE * len(misfit) else []
 
@@ -331,14 +329,14 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     count = len(problem.model.effects)  # a term's column stays that of where derivatives were taken
     sizes = problem.priors.floor[count:] * theta[count:] * (flown is None)
     simulated = (flown or problem.model).residuals(problem.sizes(theta), linearised)
-    residuals = [
-        simulated[i] - w.effects[:, count:] @ sizes for i, w in zip(problem.kept, point.windows)
-    ]
-    if point.commands:
-        lost = [problem.lost * c.sum(1) for c in point.commands]
-        residuals = [r - mean for r, mean in zip(residuals, lost)]
-    if not all(np.all(np.isfinite(r)) for r in residuals):
-        return None
+    residuals = []
+    for k, (i, window) in enumerate(zip(problem.kept, point.windows)):
+        residual = simulated[i] - window.effects[:, count:] @ sizes
+        if point.commands:
+            residual = residual - problem.lost * point.commands[k].sum(1)
+        if not np.all(np.isfinite(residual)):
+            return None
+        residuals.append(residual)
     windows = [replace(w, residual=r) for w, r in zip(point.windows, residuals)]
     grams = with_residuals(point.grams, point.windows, problem.priors.floor, residuals)
     return regathered(
@@ -360,12 +358,12 @@ def linearisation_bias(
     ``origin``: where the derivatives were taken; ``moved_point``: a point moved from it, with the
     same derivatives; ``active``: effects that are named."""
     change = problem.priors.floor * (moved_point.theta - origin.theta)
-    bent = [
-        new.residual - (old.residual - old.effects @ change)
-        for old, new in zip(origin.windows, moved_point.windows)
-    ]
+    bent = []
+    for old, new in zip(origin.windows, moved_point.windows):
+        bent.append(new.residual - (old.residual - old.effects @ change))
     grams = with_residuals(moved_point.grams, moved_point.windows, problem.priors.floor, bent)
-    total = sum(share.score for share in moved_point.integrals.shares(grams, moved_point.noise))
+    shares = moved_point.integrals.shares(grams, moved_point.noise)
+    total = sum(share.score for share in shares)
     return covariance(moved_point.information, problem.priors.deviation(list(active))) @ total
 
 
@@ -430,11 +428,9 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     ``point``: where the derivatives were taken; ``active``: effects that may move; all others go to
     0."""
     named = np.isin(np.arange(len(point.theta)), list(active))
-    best = (
-        point
-        if np.all(point.theta[~named] == 0.0)
-        else moved(problem, point, np.where(named, point.theta, 0.0))
-    )
+    best: Point | None = point
+    if np.any(point.theta[~named] != 0.0):
+        best = moved(problem, point, np.where(named, point.theta, 0.0))
     if best is None:
         return point
     for _ in range(ROUNDS):

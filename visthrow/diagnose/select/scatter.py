@@ -246,10 +246,11 @@ def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     """Statistics of flights added up by day; ``days`` are theirs, by the flight's number."""
     names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
     member = (row == np.arange(len(names))[:, None]).astype(float)
+    information = np.tensordot(member, statistics.information, 1)
     return replace(
         statistics,
         flights=names,
-        information=np.tensordot(member, statistics.information, 1),
+        information=information,
         score=member @ statistics.score,
         square=member @ statistics.square,
         samples=member @ statistics.samples,
@@ -268,11 +269,12 @@ def integrated(
         diagonal = column[:, j]
         part = size**2 / (1.0 + size**2 * diagonal)
         explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
+        known = part * score[:, j]
         statistics = replace(
             statistics,
             information=np.subtract(statistics.information, explained, out=explained),
-            score=score - (part * score[:, j])[:, None] * column,
-            square=statistics.square - part * score[:, j] ** 2 + np.log1p(size**2 * diagonal),
+            score=score - known[:, None] * column,
+            square=statistics.square - known * score[:, j] + np.log1p(size**2 * diagonal),
         )
     return statistics
 
@@ -286,13 +288,11 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
     positions = np.tile(theta, (len(statistics.flights), 1))
     if varies.drifts:
         by_days = by_day(integrated(statistics, varies.of(statistics)), varies.days)
-        row = np.searchsorted(
-            by_days.flights, [varies.days[f] for f in statistics.flights.tolist()]
-        )
-        drifts = {j: np.full(len(by_days.flights), size) for j, size in varies.drifts.items()}
-        positions = (
-            positions + _shares(by_days, np.tile(theta, (len(by_days.flights), 1)), drifts)[row]
-        )
+        days = [varies.days[f] for f in statistics.flights.tolist()]
+        row = np.searchsorted(by_days.flights, days)
+        count = len(by_days.flights)
+        drifts = {j: np.full(count, size) for j, size in varies.drifts.items()}
+        positions = positions + _shares(by_days, np.tile(theta, (count, 1)), drifts)[row]
     sizes: dict[int, np.ndarray] = {}
     for j, size in varies.of(statistics):
         sizes[j] = np.hypot(sizes.get(j, 0.0), size)
@@ -309,8 +309,7 @@ def _shares(
         score = statistics.score - np.einsum("fij,fj->fi", statistics.information, change)
         root = np.stack([deviation[j] for j in columns], axis=1)
         block = statistics.information[:, columns][:, :, columns] * root[:, :, None] * root[:, None]
-        scaled = np.linalg.solve(
-            np.eye(len(columns)) + block, (root * score[:, columns])[..., None]
-        )
+        precision = np.eye(len(columns)) + block
+        scaled = np.linalg.solve(precision, (root * score[:, columns])[..., None])
         shares[:, columns] = root * scaled[..., 0]
     return shares

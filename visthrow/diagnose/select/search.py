@@ -240,19 +240,16 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
     in either.
     """
     windows = [m.windows({}) for m in (model, rival)]
-    places = [
-        {(w.flight, w.time[0], len(w.time)): i for i, w in enumerate(windows_of) if finite(w)}
-        for windows_of in windows
-    ]
+    places = []
+    for of_model in windows:
+        finite_ones = {i: w for i, w in enumerate(of_model) if finite(w)}
+        places.append({(w.flight, w.time[0], len(w.time)): i for i, w in finite_ones.items()})
     shared = sorted(places[0].keys() & places[1].keys())
     if 2 * len(places[1]) < len(windows[1]) or not shared:  # the other fails in most
         return np.inf if 2 * len(places[0]) >= len(windows[0]) else -np.inf
-    value = []
-    for m, windows_of, number in zip((model, rival), windows, places):
-        problem = Problem.of(m, windows_of, [number[key] for key in shared])
-        value.append(
-            linearise(problem, np.zeros(len(m.effects)), windows=windows_of).evidence(
-                problem.priors, ()
-            )
-        )
-    return value[0] - value[1]
+    values = []
+    for m, of_model, number in zip((model, rival), windows, places):
+        problem = Problem.of(m, of_model, [number[key] for key in shared])
+        point = linearise(problem, np.zeros(len(m.effects)), windows=of_model)
+        values.append(point.evidence(problem.priors, ()))
+    return values[0] - values[1]
