@@ -79,16 +79,17 @@ def groups_of(point: Point) -> tuple[list[int], str]:
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
     order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
-    return [
-        f * PARTS + PARTS * order[f].index(i) // len(order[f]) for i, f in enumerate(flights)
-    ], "parts of flights"
+    groups = []
+    for i, flight in enumerate(flights):
+        windows = order[flight]
+        groups.append(flight * PARTS + PARTS * windows.index(i) // len(windows))
+    return groups, "parts of flights"
 
 
 def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
     parts = point.integrals.shares(point.grams, point.noise)
-    return gather(
-        [replace(gram, flight=g) for gram, g in zip(point.grams, groups)], parts, point.theta
-    )
+    grams = [replace(gram, flight=g) for gram, g in zip(point.grams, groups)]
+    return gather(grams, parts, point.theta)
 
 
 def crossed(diagnosis: Diagnosis) -> Crossed:
@@ -231,11 +232,8 @@ def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, flo
         return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
     with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
         without = np.log((after.sum() - after) / (before.sum() - before))
-    reach = (
-        0.5
-        * stdtrit(n - 1, 0.975)
-        * np.sqrt((n - 1.0) / n * ((without - without.mean()) ** 2).sum())
-    )
+    variance = (n - 1.0) / n * ((without - without.mean()) ** 2).sum()
+    reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt(variance)
     return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
 
 
@@ -502,7 +500,8 @@ def repeated_share(
     score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
     prior = np.diag(problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
-    training = total - information, score.sum(0) - score
-    trained = np.linalg.solve(training[0], training[1][..., None])[..., 0]
-    part = replace(statistics, information=information, score=score, theta=np.zeros(len(laws)))
+    other_information, other_score = total - information, score.sum(0) - score
+    trained = np.linalg.solve(other_information, other_score[..., None])[..., 0]
+    none = np.zeros(len(laws))
+    part = replace(statistics, information=information, score=score, theta=none)
     return borne_out(part, trained, np.linalg.solve(total, score.sum(0)))

@@ -72,7 +72,10 @@ class Linear:
         days: Sequence[int] = (),
     ) -> None:
         """Keep what values are made of; ``penalty``: of a set [nats]."""
-        self.statistics, self.priors, self.days, self.penalty = statistics, priors, days, penalty
+        self.statistics = statistics
+        self.priors = priors
+        self.days = days
+        self.penalty = penalty
         self.plain = [c for c in candidates if c.group == ALL and priors.visible[c.columns[0]]]
         self.random = [c for c in candidates if c.group != ALL]
         self._step = min((penalty(frozenset({c})) for c in self.plain), default=0.0)
@@ -115,10 +118,10 @@ class Linear:
         by which log Z is higher with each than without the share.
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
-        active, statistics = columns_of(chosen), self.statistics
+        active = columns_of(chosen)
         flights = {share: size for share, size in fixed.items() if share.group != DAY}
         days = {share: size for share, size in fixed.items() if share.group == DAY}
-        statistics = freed(statistics, varies_of(flights, self.days))
+        statistics = freed(self.statistics, varies_of(flights, self.days))
         nats = []
         for shares in (days, *({**days, c: size} for size in sizes.tolist())):
             varied = freed(statistics, varies_of(shares, self.days))

@@ -75,10 +75,8 @@ class Problem:
         """
         plain = Problem(model, tuple(numbers), days=tuple(model.days))
         slabs = plain.priors.slab * plain.priors.floor
-        return replace(
-            plain,
-            correlated=correlations([windows[i] for i in numbers], slabs, len(model.channels)),
-        )
+        kept = [windows[i] for i in numbers]
+        return replace(plain, correlated=correlations(kept, slabs, len(model.channels)))
 
     @cached_property
     def priors(self) -> Priors:
@@ -105,10 +103,11 @@ class Problem:
         """
         if not self.terms or not self.model.bends:
             return None
-        sizes = zip(self.terms, theta[-len(self.terms) :])
-        return self.model.with_laws(
-            [e.term.law(float(size * e.floor)) for e, size in sizes if size != 0.0]
-        )
+        laws = []
+        for effect, size in zip(self.terms, theta[-len(self.terms) :]):
+            if size != 0.0:
+                laws.append(effect.term.law(float(size * effect.floor)))
+        return self.model.with_laws(laws)
 
     def sizes(self, theta: np.ndarray) -> dict[str, float]:
         """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
@@ -117,11 +116,11 @@ class Problem:
         return dict(self.model.possible(self._within_bounds(theta)))
 
     def _within_bounds(self, theta: np.ndarray) -> dict[str, float]:
-        return {
-            e.name: float(np.clip(t * e.floor, *e.bounds))
-            for e, t in zip(self.model.effects, theta)
-            if t != 0.0
-        }
+        sizes = {}
+        for effect, size in zip(self.model.effects, theta):
+            if size != 0.0:
+                sizes[effect.name] = float(np.clip(size * effect.floor, *effect.bounds))
+        return sizes
 
     def possible(self, theta: np.ndarray) -> np.ndarray:
         """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
@@ -188,16 +187,10 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
     ``integrals``: of the grams under the noise levels, where they are known; ``changes``: fields of
     the point."""
     changed = replace(point, **changes)
-    integrals = (
-        stack.integrals(changed.grams, changed.noise, changed.device)
-        if integrals is None
-        else integrals
-    )
-    return replace(
-        changed,
-        integrals=integrals,
-        plain=_statistics(changed.grams, integrals, changed.noise, changed.theta),
-    )
+    if integrals is None:
+        integrals = stack.integrals(changed.grams, changed.noise, changed.device)
+    plain = _statistics(changed.grams, integrals, changed.noise, changed.theta)
+    return replace(changed, integrals=integrals, plain=plain)
 
 
 def _statistics(
@@ -271,11 +264,8 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -
     """A window with terms as its last effects, about their sizes at ``theta`` (in floors)."""
     columns = window.latent @ forces(window, terms)
     sizes = theta[-len(terms) :] * [e.floor for e in terms]
-    return replace(
-        window,
-        effects=np.hstack((window.effects, columns)),
-        residual=window.residual - columns @ sizes,
-    )
+    effects = np.hstack((window.effects, columns))
+    return replace(window, effects=effects, residual=window.residual - columns @ sizes)
 
 
 def _losing(window: Window, columns: np.ndarray, share: float) -> Window:

@@ -215,19 +215,22 @@ def between_flights(
     """
     information = statistics.information.diagonal(axis1=1, axis2=2)
     share = information / np.maximum(information.sum(0), 1e-300)  # 1 / F of F that say as much
+    sd = {j: allowed(theta[j]) for j in active}
     nats = []
     for u in REACH:
-        varies = Varies((), {(j, FLIGHT): u * allowed(theta[j]) for j in active})
+        varies = Varies((), {(j, FLIGHT): u * size for j, size in sd.items()})
         nats.append(evidence_of(freed(statistics, varies), priors, active))
-    value = np.array(nats)
-    weight = REACH * np.exp(value - value.max() - 0.5 * REACH**2)  # steps of u grow with u
-    return float(weight @ REACH**2 / weight.sum()) * bool(active), (share**2).sum(0)
+    value = np.array(nats) - max(nats)
+    weight = REACH * np.exp(value - 0.5 * REACH**2)  # steps of u grow with u
+    variance = float(weight @ REACH**2 / weight.sum())
+    return variance * bool(active), (share**2).sum(0)
 
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
     """Return log Z of a set of effects, comparable between shares that were integrated out."""
     total = statistics.information.sum(0), statistics.absolute.sum(0)
-    return log_evidence(*total, priors, named) - 0.5 * float(statistics.absolute_square.sum())
+    square = float(statistics.absolute_square.sum())
+    return log_evidence(*total, priors, named) - 0.5 * square
 
 
 def freed(statistics: Statistics, varies: Varies) -> Statistics:

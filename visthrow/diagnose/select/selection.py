@@ -379,11 +379,11 @@ class Selector:
     ) -> None:
         """Say what was selected, and keep what was compared for the report."""
         nats = {names_of(s): lead for s, lead in leads.items() if np.isfinite(lead)}
-        listed_best = {
-            names_of(s): n for s, n in sorted(listed.items(), key=lambda i: -i[1])[:REPORTED_SETS]
-        }
-        self.progress(f"{names_of(top.chosen)}: {top.lead:.1f} nats ahead")
-        self.steps.append(SelectionStep(names_of(top.chosen), top.lead, 0.0, listed_best, nats))
+        ranked = sorted(listed.items(), key=lambda item: -item[1])[:REPORTED_SETS]
+        screened = {names_of(s): gain for s, gain in ranked}
+        name = names_of(top.chosen)
+        self.progress(f"{name}: {top.lead:.1f} nats ahead")
+        self.steps.append(SelectionStep(name, top.lead, 0.0, screened, nats))
 
     def _propose(self) -> bool:
         """Offer the terms of laws that say most, beside the set and in place of its names; False

@@ -158,11 +158,8 @@ def _conditional(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
-    information = np.maximum(
-        screened.information
-        - np.einsum("tk,kl,tl->t", screened.cross, sigma, screened.cross, optimize=True),
-        0.0,
-    )
+    known = np.einsum("tk,kl,tl->t", screened.cross, sigma, screened.cross, optimize=True)
+    information = np.maximum(screened.information - known, 0.0)
     return information, screened.score - screened.cross @ (sigma @ point.score)
 
 
@@ -290,11 +287,13 @@ def strongest_forces(point: Point) -> dict[str, float]:
 
 def moves_landing(problem: Problem, point: Point, j: int) -> bool:
     """Whether an effect moves a position by ``LANDING`` within the median window of a phase."""
-    positions, size = positions_of(problem), point.theta[j] * problem.priors.floor[j]
+    positions = positions_of(problem)
+    size = point.theta[j] * problem.priors.floor[j]
     moves: dict[str, list[float]] = {}
     for window in point.windows:
         moved = size * window.effects[np.isin(window.channel, positions), j]
-        moves.setdefault(window.phase, []).append(np.abs(moved).max(initial=0.0))
+        distance = np.abs(moved).max(initial=0.0)
+        moves.setdefault(window.phase, []).append(distance)
     return any(np.median(distances) > LANDING for distances in moves.values())
 
 

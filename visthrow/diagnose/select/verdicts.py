@@ -318,23 +318,17 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
         f"the simulation stays finite in {usable} of {len(windows)} windows; check units, axes and"
         " the vehicle's configuration"
     )
-    findings = tuple(
-        replace(
-            blank(e),
-            verdict=result.NOT_IDENTIFIABLE,
-            manoeuvres=(),
-            sentence=(
-                f"{e.name}: nothing can be said, the simulation does not follow these flights."
-            ),
-        )
-        for e in model.effects
-    )
+    findings = []
+    for e in model.effects:
+        text = f"{e.name}: nothing can be said, the simulation does not follow these flights."
+        finding = replace(blank(e), manoeuvres=(), sentence=text)
+        findings.append(replace(finding, verdict=result.NOT_IDENTIFIABLE))
     flights = len({w.flight for w in windows})
     return Diagnosis(
         result.OUT_OF_DOMAIN,
         "",
         (reason,),
-        findings,
+        tuple(findings),
         {},
         (),
         float("nan"),
@@ -424,10 +418,12 @@ def _excess(level: Level) -> str:
 
 def _withdrawn(selection: Selector, excessive: Sequence[Level]) -> set[int]:
     """Return names that act in the unknown effect's block, and leave it as it was."""
-    blocks = {j: selection.block_of(j) for j in selection.best.columns}
-    in_excess = {j for j, block in blocks.items() if block in {level.block for level in excessive}}
     eased = {level.block: level.after < 0.5 * level.before for level in excessive}
-    return {j for j in in_excess if not eased.get(blocks[j], True)}
+    withdrawn = set()
+    for j in selection.best.columns:
+        if not eased.get(selection.block_of(j), True):
+            withdrawn.add(j)
+    return withdrawn
 
 
 def _on_bound(selection: Selector, j: int) -> bool:
@@ -435,12 +431,8 @@ def _on_bound(selection: Selector, j: int) -> bool:
     threshold.
     """
     point, priors = selection.best.point, selection.problem.priors
-    on_bound = (
-        min(abs(point.theta[j] - priors.low[j]), abs(point.theta[j] - priors.high[j])) < SMALL_STEP
-    )
+    nearest = min(abs(point.theta[j] - bound[j]) for bound in (priors.low, priors.high))
     push = point.statistics.score[:, j].sum()
-    return bool(
-        on_bound
-        and push * point.theta[j] > 0.0
-        and 0.5 * push**2 / point.information[j, j] > selection.threshold
-    )
+    if nearest >= SMALL_STEP or push * point.theta[j] <= 0.0:
+        return False
+    return bool(0.5 * push**2 / point.information[j, j] > selection.threshold)
