@@ -85,8 +85,8 @@ def random_shares(
         for group, informative in groups:
             if columns and informative[:, columns].any(1).sum() > 1:
                 name = effect.name if named else f"{effect.name}_by_{group}"
-                of = name, tuple(columns), group, penalty, deviations, floors
-                offered.append(Candidate(*of, claims=1 if named else 2))
+                fields = name, tuple(columns), group, penalty, deviations, floors
+                offered.append(Candidate(*fields, claims=1 if named else 2))
     return offered + _events(effects, priors, statistics.flights, flown)
 
 

@@ -249,19 +249,19 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
         if c.law:
             value[names | {c}] = linear.value(names | {c}) - plain
     ranked = sorted(value.keys() - {best.chosen}, key=value.get, reverse=True)
-    told = []
+    repeated = []
     for chosen in (best.chosen, *(s for s in ranked if value[s] > 0.0)):
         columns = [c.columns[0] for c in laws_of(chosen)]
         share, low, high = repeated_share(problem, best.point, columns)
         if low > 0.0:
-            told.append(terms.laws(problem, best.point, columns_of(chosen), value[chosen]))
+            repeated.append(terms.laws(problem, best.point, columns_of(chosen), value[chosen]))
         elif chosen == best.chosen:  # none in place of a better one
             return [], (
                 "a formula explains these flights, but those that are left out do not repeat it:"
                 f" they bear out {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of what it"
                 " promises"
             )
-    return told, ""
+    return repeated, ""
 
 
 def _law(selection: Selector) -> tuple[set[int], str]:
