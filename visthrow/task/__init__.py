@@ -378,8 +378,10 @@ class Experiment:
         action = self.task.action
         if action.max_thrust == 0.0:
             action = replace(action, max_thrust=4.0 * self.vehicle.controller.max_thrust)
-        rates = zip(action.max_rate, _followed_rates(self.vehicle))
-        action = replace(action, max_rate=tuple(rate or followed for rate, followed in rates))
+        roll, pitch, yaw = action.max_rate
+        followed = _followed_rates(self.vehicle)
+        rates = (roll or followed[0], pitch or followed[1], yaw or followed[2])
+        action = replace(action, max_rate=rates)
         object.__setattr__(self, "task", replace(self.task, action=action))
         if self.fleet is None and abs(self.camera.payload_radius - self.rope.payload_radius) > 1e-9:
             message = (
