@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from numpy.linalg import norm
 from numpy.random import default_rng
 from pytest import approx, mark, raises
 from scipy.integrate import solve_ivp
@@ -264,6 +265,23 @@ class TestFlyer:
             assert np.allclose(model.windows({})[0].knots["mount_b"], point, rtol=0.0, atol=1e-12)
         assert worst[0] < 1e-4
         assert worst[1] > 3e-3
+
+    def test_a_command_that_does_not_come_shows_by_its_column(self):
+        """Closed form: once the motors' lag is over, the speed is off by the impulse that is
+        missing while the one before is held.
+        """
+        time = np.arange(0.0, 4.0, 0.05)
+        thrust = FLYER.mass * G * (1.0 + 0.2 * np.sin(time / 0.05))
+        sent = Channel(time, np.column_stack([thrust] * 4), "N, rad/s", "body")
+        params = replace(FLYER, input="command", thrust_map=(0.0, 1.0, 0.0))
+        model = FlyerModel([with_channels(fly(4.0, noise=1e-6), command=sent)], params)
+        (columns,) = model.without_commands({}, [1])
+        k = np.searchsorted(time, model.stretches[1].data["start"], "right") + 4
+        path = columns[:, 5].reshape(-1, 3)
+        speed = norm(path[-1] - path[-6]) / 0.05  # samples of 10 ms
+        missing = abs(thrust[k - 1] - thrust[k]) * 0.05
+        assert speed == approx(missing / FLYER.mass, rel=0.01)
+        assert not FlyerModel([fly(4.0)], FLYER).without_commands({}, [1])
 
     def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
         logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
