@@ -79,7 +79,7 @@ class Loop:
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
     _ended: float = -math.inf
-    _rehearsal: float = 0.0  # duration of the last one [s]
+    _rehearsal: float = 0.0  # duration of the last one by the flight's clock, 0 in lock step [s]
     _state: str = ""
     _waits: str = ""
     # reasons to wait, without their numbers, and when they were said [s]
@@ -127,9 +127,9 @@ class Loop:
         early = source.poll(clock.now())
         runner.take_poses(early)
         _wait(clock, ticker.due() - self._rehearsal - MARGIN, backend, source)
-        start = perf_counter()
+        start = clock.now()
         runner.rehearse()
-        self._rehearsal = perf_counter() - start
+        self._rehearsal = clock.now() - start
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed
