@@ -27,6 +27,10 @@ two alone; earlier by a share of the second number that goes round from tick to 
 link is looked at, and peers are asked for their time, at any point of their periods.
 """
 
+REHEARSAL = 5e-3
+"""Time kept for the first rehearsal [s]. Later ones keep the longest that recent ones took."""
+
+FORGETTING = 0.98  # by which the time that is kept shrinks from rehearsal to rehearsal
 MARGIN = 2e-4  # left between the rehearsal's end and the tick [s]
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
@@ -79,7 +83,7 @@ class Loop:
     count: int = 0
     throws: list[float] = field(default_factory=list)  # times of the latches [s]
     _ended: float = -math.inf
-    _rehearsal: float = 0.0  # duration of the last one by the flight's clock, 0 in lock step [s]
+    _rehearsal: float = REHEARSAL  # time kept for one [s]
     _state: str = ""
     _waits: str = ""
     # reasons to wait, without their numbers, and when they were said [s]
@@ -122,14 +126,14 @@ class Loop:
         ticker = self.ticker
         backend = self.runner.backend
         source.hold(runner.in_flight)
-        lead = LEAD + LEAD_SPREAD * (self.count * GOLDEN % 1.0) + self._rehearsal
+        lead = LEAD + LEAD_SPREAD * (self.count * GOLDEN % 1.0)
+        if runner.policy_flies:
+            lead += self._rehearsal
         _wait(clock, ticker.due() - lead, backend, source)
         early = source.poll(clock.now())
         runner.take_poses(early)
-        _wait(clock, ticker.due() - self._rehearsal - MARGIN, backend, source)
-        start = clock.now()
-        runner.rehearse()
-        self._rehearsal = clock.now() - start
+        if runner.policy_flies:
+            self._rehearse()
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed
@@ -172,6 +176,21 @@ class Loop:
         self.count += 1
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
+
+    def _rehearse(self) -> None:
+        """Rehearse the next tick just before it is due, if there is time for it.
+
+        The flight's clock measures the time: it stands still in lock step, where ticks must not
+        depend on how fast the computer is.
+        """
+        clock = self.clock
+        due = self.ticker.due()
+        _wait(clock, due - self._rehearsal - MARGIN, self.runner.backend, self.source)
+        start = clock.now()
+        if start + self._rehearsal > due:
+            return
+        self.runner.pilot.rehearse()
+        self._rehearsal = max(clock.now() - start, FORGETTING * self._rehearsal)
 
     def _tick(self, time: float, *inputs: Any) -> TickRecord:
         """Decide one tick by what the team agreed on; tell it what this vehicle is ready for."""

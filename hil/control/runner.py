@@ -61,10 +61,10 @@ class Runner(FlightParts):
         except Exception as error:  # as in tick
             self._early_error = error
 
-    def rehearse(self) -> None:
-        """Bring the policy into the processor's caches before a tick in which it flies."""
-        if self.machine.state is State.THROW or self.params.observe:
-            self.pilot.rehearse()
+    @property
+    def policy_flies(self) -> bool:
+        """Whether the policy decides the next tick."""
+        return self.machine.state is State.THROW or self.params.observe
 
     def tick(
         self,

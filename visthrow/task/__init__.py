@@ -394,9 +394,11 @@ class Experiment:
 
 
 def _followed_rates(vehicle: VehicleParams) -> tuple[float, float, float]:
-    """Return the body rates [rad/s] that a vehicle may be commanded: what a 3-inch quadrotor
-    follows well, and at most what half of its motors' range suffices for when the whole rate is
-    missing. Motors that give more for a rate have no say in the thrust any more.
+    """Return the largest body rates that a vehicle is commanded [rad/s].
+
+    They are at most those that a 3-inch quadrotor follows well. A rate error of the largest rate
+    asks for at most half of the motors' range: beyond that the mixer saturates, and the collective
+    thrust no longer follows its command.
     """
     controller = vehicle.controller
     rotors = vehicle.rotors

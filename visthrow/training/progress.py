@@ -1,6 +1,7 @@
 """Progress of a training run: printed lines, and a CSV row an iteration."""
 
 import csv
+import io
 import math
 import time
 from datetime import timedelta
@@ -51,12 +52,13 @@ class TrainLog:
         self.last = last
         self.done = done
         self.minutes = minutes
-        lines = _lines(path, done) if done and path.exists() else []
-        header = ",".join(COLUMNS) + "\n"
-        atomic_write(path, header + "".join(lines))
-        self._before = 0.0
-        if lines:
-            self._before = float(lines[-1].split(",")[COLUMNS.index("wall_s")])
+        rows = _rows(path, done) if done and path.exists() else []
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+        atomic_write(path, text.getvalue())
+        self._before = float(rows[-1]["wall_s"]) if rows else 0.0
         self._start = time.perf_counter()
         self._file = path.open("a", newline="", encoding="utf-8")
         self._writer = csv.DictWriter(
@@ -120,9 +122,13 @@ def evaluated(throws: Throws) -> dict[str, float]:
     }
 
 
-def _lines(path: Path, done: int) -> list[str]:
-    """Whole rows of a log up to an iteration."""
+def _rows(path: Path, done: int) -> list[dict]:
+    """Return the whole rows of a log up to an iteration."""
+    rows = []
     with path.open(newline="", encoding="utf-8") as file:
-        _, *rows = file
-    whole = [row for row in rows if row.endswith("\n")]
-    return [row for row in whole if int(row.split(",")[0]) <= done]
+        for row in csv.DictReader(file):
+            iteration = row.get("iteration") or ""
+            whole = iteration.isdigit() and row.get(COLUMNS[-1]) is not None
+            if whole and int(iteration) <= done:
+                rows.append(row)
+    return rows

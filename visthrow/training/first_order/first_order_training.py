@@ -31,8 +31,8 @@ ALTITUDE = 0.15  # of altitude and distance [m]
 GROUND = 0.1  # of the payload over the ground [m]
 ABOVE = 0.08  # of the vehicle above the payload [m]
 UPRIGHT = 0.15  # of the cosine of the tilt
-PULL = 0.4  # of the rope on the payload, in its weights
-SLACK = 0.3  # [m] within a barrier that a weight of missing pull counts as
+PULL = 0.4  # least pull of the rope that costs nothing, in weights of the payload
+SLACK = 0.3  # a missing pull of one weight costs as much as a state this far within a barrier [m]
 BARRIER = 600.0  # cost of the square of how far a state is within it
 ROUND = 0.02
 """Landing errors are smooth below this [m]: the slope of a distance turns round at the goal, which
@@ -187,10 +187,10 @@ class FirstOrder(Algorithm):
         return reward, error, fall
 
     def _pull(self, x: SimpleNamespace) -> Tensor:
-        """Pull of the rope on the payload in its weights, of each step, shape (T, E).
+        """Return the rope's pull in weights of the payload, for each step, shape (T, E).
 
-        Where a rope is slack nothing that the vehicle does moves the payload, and the jerk that
-        ends it is not the surrogate's."""
+        While the rope is slack the vehicle does not move the payload, and the surrogate does not
+        model the jerk that follows."""
         rope = torch.nn.functional.normalize(x.load_pos[1:] - x.pos[1:], dim=-1)
         gain = (x.load_vel[1:] - x.load_vel[:-1]) / self.experiment.sim.control_period
         return -(rope * gain).sum(-1) / GRAVITY - rope[..., 2]

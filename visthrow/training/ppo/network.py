@@ -76,7 +76,7 @@ class Network(MLPModel):
         """Start from a policy of the same layers: its weights, and its normaliser, which hardly
         moves from there.
         """
-        layers = [*self.mlp][::2]  # activations lie between
+        layers = self._linear_layers()
         for layer, weight, bias in zip(layers, policy.weights, policy.biases, strict=True):
             layer.weight.copy_(weight)
             layer.bias.copy_(bias)
@@ -85,10 +85,13 @@ class Network(MLPModel):
                 normalizer_state(policy.mean, policy.std + (policy.eps - RSL_RL_EPS))
             )
 
+    def _linear_layers(self) -> list[torch.nn.Linear]:
+        return [layer for layer in self.mlp if isinstance(layer, torch.nn.Linear)]
+
     @property
     def matrices(self) -> list[Tensor]:
         """Weights of the hidden layers."""
-        return [layer.weight for layer in [*self.mlp][:-1:2]]
+        return [layer.weight for layer in self._linear_layers()[:-1]]
 
     def output(self, latent: Tensor) -> Tensor:
         """Output of the layers for normalised observations, shape (N, D)."""

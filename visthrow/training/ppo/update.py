@@ -76,8 +76,8 @@ class CapturedPPO(PPO):
         log_prob = distribution.log_prob(batch.actions)[:, None]
         ratio = (log_prob - batch.old_actions_log_prob).exp()
         clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        loss = -batch.advantages
-        surrogate = torch.max(loss * ratio, loss * clipped).mean()
+        cost = -batch.advantages
+        surrogate = torch.max(cost * ratio, cost * clipped).mean()
         step = (value - batch.values).clamp(-self.clip_param, self.clip_param)
         error = (value - batch.returns).square()
         clipped_error = (batch.values + step - batch.returns).square()
