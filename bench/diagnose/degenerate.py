@@ -121,7 +121,7 @@ DEGREE = 0.0175
 
 Two short hovers in gusts tell a tilt to 2 mrad. Of 8 mrad they hold 4 nats at the best size of any
 one cause, and 3 for wind, frame, markers and drag together, where a cause needs 7: then "no effect;
-if there at all, between 2 and 10 mrad" is the right answer, and there is no class to be
+if present at all, between 2 and 10 mrad" is the right answer, and there is no class to be
 reported."""
 LATE = (1.0,)
 """The only sign in which a delay of commands and one of stamps are a pair: nothing is measured

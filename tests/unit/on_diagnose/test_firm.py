@@ -120,7 +120,7 @@ def test_nothing_is_named_over_an_interval_that_holds_zero():
     findings = [replace(f, nats=-1.0) if f.name == "effect_05" else f for f in findings]
     unasked = held_out.judged(replace(diagnosis, findings=tuple(findings)))["effect_05"]
     assert (unasked.verdict, unasked.estimate) == (result.BOUNDED, 0.0)
-    assert unasked.sentence.endswith("if there at all.")
+    assert unasked.sentence.endswith("if present at all.")
 
 
 def test_names_that_do_harm_are_withdrawn(monkeypatch):

@@ -44,12 +44,13 @@ def run(args: argparse.Namespace) -> int:
     account = origin(report, args.diagnosis)
     if of_throw:
         theta, covariance, transient = patch.without_transient(theta, covariance)
-        account += _report_transient(transient)
+        if transient:
+            account.append(f"Not written: {', '.join(transient)}; a state of these flights only.")
+            print(account[-1])
     if not theta and not laws:
-        unused = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
-        unused = unused if report.get("laws") else ""
+        hint = ", but a law outside the catalogue explains the flights: --laws 1 writes it"
         what = "configuration" if of_throw else "setup"
-        print(f"nothing to write{unused}; the {what} stands as it is")
+        print(f"nothing to write{hint if report.get('laws') else ''}; the {what} stands as it is")
         return 0
     _bear_out(report, args.anyway)
     folder, option, schema = (
@@ -72,14 +73,6 @@ def run(args: argparse.Namespace) -> int:
         named.append(f"{law.coefficient:.4g} {' '.join((*law.factors, law.vector))} ({law.block})")
     print(f"{args.out}: {', '.join(named)} on top of {base}")
     return 0
-
-
-def _report_transient(names: list[str]) -> list[str]:
-    """Print and return the line on effects that the file leaves out, none without such effects."""
-    lines = [f"Not written: {', '.join(names)}; a state of these flights only."] if names else []
-    for line in lines:
-        print(line)
-    return lines
 
 
 def _apply_firmware(args: argparse.Namespace) -> int:

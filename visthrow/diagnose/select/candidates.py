@@ -33,7 +33,7 @@ class Candidate:
     floors: float = 0.0  # negligible deviation of random shares, in the prior's
     flight: int = -1  # of an event
     law: str = ""  # block of the law whose term it is
-    claims: int = 1  # thresholds that it must beat: that an effect is there, that it differs
+    claims: int = 1  # thresholds that it must beat: that an effect exists, that it differs
 
     def __hash__(self) -> int:
         """Hash numbers alone: with names, the order of a set would differ from run to run."""
@@ -84,9 +84,16 @@ def random_shares(
         floors = effect.floor / effect.prior_sd
         for group, informative in groups:
             if columns and informative[:, columns].any(1).sum() > 1:
-                name = effect.name if named else f"{effect.name}_by_{group}"
-                fields = name, tuple(columns), group, penalty, deviations, floors
-                offered.append(Candidate(*fields, claims=1 if named else 2))
+                candidate = Candidate(
+                    effect.name if named else f"{effect.name}_by_{group}",
+                    tuple(columns),
+                    group,
+                    penalty,
+                    deviations,
+                    floors,
+                    claims=1 if named else 2,
+                )
+                offered.append(candidate)
     return offered + _events(effects, priors, statistics.flights, flown)
 
 
@@ -136,7 +143,7 @@ def _events(
 
 
 def without_means(chosen: Iterable[Candidate]) -> list[Candidate]:
-    """Return candidates without the means of those whose being there is one of their claims."""
+    """Return candidates without the means of those whose existence is one of their claims."""
     varying = {c.columns for c in chosen if c.claims > 1}
     return [c for c in chosen if c.claims > 1 or c.columns not in varying]
 

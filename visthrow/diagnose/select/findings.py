@@ -1,4 +1,4 @@
-"""Verdicts on single effects: found, one of a class, bounded, or not to be seen."""
+"""Verdicts on single effects: found, one of a class, bounded, or not observable."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,8 +18,8 @@ from visthrow.diagnose.select.result import Finding
 from visthrow.diagnose.select.scatter import allowed, unit_suffix
 
 BIT = 0.5
-"""An effect whose posterior deviation exceeds this share of its prior's was not seen: flights say
-less than a bit about it.
+"""Flights say less than a bit about an effect whose posterior deviation exceeds this share of its
+prior's.
 """
 
 
@@ -43,7 +43,7 @@ def blank(effect: Effect) -> Finding:
 
 @dataclass(frozen=True)
 class Reading:
-    """The statements of flights about each effect beside the names."""
+    """The flights' information and the selected sets, from which each verdict follows."""
 
     problem: Problem
     point: Point  # with random shares integrated out
@@ -58,11 +58,11 @@ class Reading:
         finding = blank(effect)
         if not priors.visible[j]:
             missing = tuple(c for c in effect.channels if c not in self.problem.model.channels)
-            sentence = f"{effect.name}: not to be seen without {', '.join(missing)}."
+            sentence = f"{effect.name}: not observable without {', '.join(missing)}."
             return replace(finding, missing=missing, sentence=sentence)
         partners, together = self._class_of(j)
         remaining = [k for k in together if k != j]
-        homes = [home for home in self.sets if j in home[0] and self.active]
+        homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
         mean, sd = averaged(self.point.information, self.point.score, priors, j, homes)
         deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor

@@ -107,8 +107,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
     trained, named = np.zeros((count, len(priors.floor))), Counter()
-    candidates = shared(effects)
-    selected = frozenset(candidates[j] for j in work.active)
+    offered = shared(effects)
+    selected = frozenset(offered[j] for j in work.active)
 
     def penalty(chosen: Names) -> float:
         return sum(diagnosis.threshold + c.penalty for c in chosen)
@@ -117,7 +117,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         training = np.setdiff1d(np.arange(count), fold)
         if not len(training):
             continue
-        linear = Linear(statistics.only(training), priors, candidates, penalty)
+        linear = Linear(statistics.only(training), priors, offered, penalty)
         window_sets = occam_window(linear, {NOTHING, selected}, selected, pairs=False)
         chosen = max(window_sets, key=window_sets.get)
         if window_sets[chosen] < linear.value(selected) + STRONG:
@@ -283,16 +283,17 @@ def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
     uncompared = not compares_phases(diagnosis.work.after)
     names, flights = list(diagnosis.theta), f"held-out {measured.left_out}"
     text = ", ".join(names)
+    borne = share_text(measured.share, measured.low, measured.high)
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
     if measured.share <= 0.0 or harmed:
-        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or _share(measured)
+        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or borne
         why = "held-out flights are explained worse with it"
         reason = f"{flights} are explained worse with {text} ({how}); withdrawn"
         return Doubt(names, result.NOT_IDENTIFIABLE, why, reason)
     falls = [c.low if uncompared else c.gain for c in measured.channels]
     fallen = not falls or any(fall > 0.0 for fall in falls)
     if not (measured.low > 0.0 and fallen):
-        failed = _no_gain(measured) if measured.low > 0.0 else _share(measured)
+        failed = _no_gain(measured) if measured.low > 0.0 else borne
         reason = f"{flights} do not confirm {text} ({failed})"
         if np.isnan(measured.low) or measured.folds < PARTS:
             reason += f"; {_one_more(diagnosis, names)}"
@@ -423,13 +424,12 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     return replace(left, overall=result.UNKNOWN, block=block, reasons=reasons)
 
 
-def _share(measured: HeldOut) -> str:
-    if np.isnan(measured.low):
+def share_text(share: float, low: float, high: float) -> str:
+    """Return in words what :func:`borne_out` returns, as a clause on held-out flights."""
+    if np.isnan(low):
         return "only one of them can tell"
     return (
-        f"they bear out {100 * measured.share:.0f} % [{100 * measured.low:.0f}, "
-        f"{100 * measured.high:.0f}] of"
-        " what it promises"
+        f"they bear out {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of what it promises"
     )
 
 

@@ -283,11 +283,9 @@ def only(point: Point, windows: Sequence[int]) -> Point:
     """Return a point of some of its windows, with noise levels estimated from these."""
     grams = [point.grams[w] for w in windows]
     noise = levels.maximised(grams, levels.only(point.noise, grams, windows), point.device)[0]
-    changes = {
-        "windows": [point.windows[w] for w in windows],
-        "commands": [point.commands[w] for w in windows if point.commands],
-    }
-    return regathered(point, noise=noise, grams=grams, **changes)
+    kept = [point.windows[w] for w in windows]
+    commands = [point.commands[w] for w in windows] if point.commands else []
+    return regathered(point, noise=noise, grams=grams, windows=kept, commands=commands)
 
 
 def untracked_windows(point: Point) -> list[int]:

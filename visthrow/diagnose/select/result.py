@@ -25,7 +25,7 @@ VERDICTS = {
         "the flights ask for it, but held-out flights do not confirm it, or the search does not"
         " always name it without some of them"
     ),
-    BOUNDED: "if it is there, then within these limits",
+    BOUNDED: "if present, then within these limits",
     NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
     UNOBSERVABLE: "a channel is missing that would show it",
 }
@@ -79,9 +79,8 @@ class Finding:
 def bounded(finding: Finding) -> Finding:
     """Return the finding as a bound on an effect that need not exist."""
     unit = unit_suffix(finding.unit)
-    sentence = (
-        f"{finding.name}: between {finding.low:.3g} and {finding.high:.3g}{unit}, if there at all."
-    )
+    limits = f"{finding.low:.3g} and {finding.high:.3g}{unit}"
+    sentence = f"{finding.name}: between {limits}, if present at all."
     return replace(finding, verdict=BOUNDED, estimate=0.0, partners=(), joint="", sentence=sentence)
 
 

@@ -117,11 +117,11 @@ def relinearised_per_flight(
     unit = np.eye(len(theta))[j]
     places = np.unique(np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])) - theta[j]
     simulated = {size: simulate(theta + size * unit) for size in places.tolist()}
-    simulated = {size: there for size, there in simulated.items() if there is not None}
+    simulated = {size: part for size, part in simulated.items() if part is not None}
     if len(simulated) < len(SIZES) // 2:
         return statistics
     sizes = list(simulated)
-    scores = np.stack([there.score for there in simulated.values()])
+    scores = np.stack([part.score for part in simulated.values()])
     score = statistics.score.copy()
     for f in flown:
         best = np.interp(0.0, -scores[:, f, j], sizes)

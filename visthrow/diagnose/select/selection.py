@@ -113,7 +113,7 @@ class Selector:
     def penalty(self, chosen: Names) -> float:
         """Return the penalty of a set [nats].
 
-        That an effect differs among flights is a second claim beside its being there. What acts in
+        That an effect differs among flights is a second claim beside its existence. What acts in
         the block of a law may be a part of its form and must be worth more than elsewhere. Without
         a calm phase to compare with, a law stands in place of all names."""
         total = sum(c.claims * self.threshold + c.penalty for c in without_means(chosen))
@@ -253,11 +253,11 @@ class Selector:
         ]
         trials = []
         simulated = candidates(self.problem, points, columns)
-        for s, there, size in zip(sets, simulated, shares):
-            if isinstance(there, DiagnoseError):
-                self.progress(f"{names_of(s)}: not simulated, {there}")
+        for s, outcome, size in zip(sets, simulated, shares):
+            if isinstance(outcome, DiagnoseError):
+                self.progress(f"{names_of(s)}: not simulated, {outcome}")
                 continue
-            trial = Trial(s, there, *size)
+            trial = Trial(s, outcome, *size)
             trial = replace(trial, lead=self._value(trial) - self.value)
             # what may not be named gains nothing
             nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)
@@ -301,8 +301,8 @@ class Selector:
 
     def _followed_up(self, listed: Mapping[Names, float]) -> list[Trial]:
         """Return the set that promises most of those that kept far less, simulated from derivatives
-        and initial states of where it leads, if it is worth more there than the present set from
-        there.
+        and initial states of where it leads, if it is worth more than the present set simulated
+        from the same derivatives and states.
 
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
@@ -320,17 +320,17 @@ class Selector:
         active = columns_of(chosen)
         goal = estimate(point.information, point.score, self.problem.priors, active)
         try:
-            there = self._linearised(goal, point)
+            origin = self._linearised(goal, point)
         except DiagnoseError as error:
             self.progress(f"{names_of(chosen)}: not followed, {error}")
             return []
-        trials = {t.chosen: t for t in self._tried(there, [chosen, self.best.chosen])}
+        trials = {t.chosen: t for t in self._tried(origin, [chosen, self.best.chosen])}
         if len(trials) < 2 or not self.is_admissible(trials[chosen]):
             return []
         lead = trials[chosen].lead - max(trials[self.best.chosen].lead, 0.0)
         if lead <= ENOUGH_NATS:
             return []
-        self.origin = there
+        self.origin = origin
         return [replace(trials[chosen], lead=lead)]
 
     def _go(self, trial: Trial) -> None:

@@ -306,9 +306,18 @@ def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> 
     floor = np.array([e.floor for e in effects])
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
     sizes = mean[columns] * floor
-    sd = np.sqrt(np.diag(spread))
     found = []
     for i, term in enumerate(e.term for e in effects):
-        size = float(sizes[i]), float(sd[i]), term.unit, float(nats), tuple(spread[i].tolist())
-        found.append(Law(term.formula, term.block, term.factors, term.vector, *size))
+        law = Law(
+            term.formula,
+            term.block,
+            term.factors,
+            term.vector,
+            float(sizes[i]),
+            float(np.sqrt(spread[i, i])),
+            term.unit,
+            float(nats),
+            tuple(spread[i].tolist()),
+        )
+        found.append(law)
     return tuple(found)

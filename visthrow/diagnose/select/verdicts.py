@@ -33,7 +33,7 @@ from visthrow.diagnose.select.candidates import (
 )
 from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
 from visthrow.diagnose.select.findings import Reading, blank
-from visthrow.diagnose.select.held_out import Work, repeated_share
+from visthrow.diagnose.select.held_out import Work, repeated_share, share_text
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
@@ -258,18 +258,17 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
         elif chosen == best.chosen:  # none in place of a better one
             return [], (
                 "a formula explains these flights, but those that are left out do not repeat it:"
-                f" they bear out {100 * share:.0f} % [{100 * low:.0f}, {100 * high:.0f}] of what it"
-                " promises"
+                f" {share_text(share, low, high)}"
             )
     return repeated, ""
 
 
 def _law(selection: Selector) -> tuple[set[int], str]:
-    """Return the names that are not told beside the set's laws, and why there are laws in words.
+    """Return the names that are withdrawn beside the set's laws, and the reason for the laws.
 
     Names that act in a law's block may be a part of its form. A name acts there by its column or by
     what the other names cannot stand in for, as two delays that differ by a force. What is not
-    surely there without those is not told either."""
+    sure without those is withdrawn too."""
     best = selection.best
     names = selection.names
     blocks = terms.acts_in(c.law for c in laws_of(best.chosen))
