@@ -240,6 +240,24 @@ def test_a_tick_overrun(kind, length):
         assert told[-1][0] == "throw"
 
 
+@mark.parametrize(
+    ("kind", "event"),
+    [
+        ("ardupilot", "levelled: no set-points"),
+        ("px4", "left OFFBOARD: no set-points"),
+        ("betaflight", "override: the pilot's sticks count again"),
+    ],
+)
+def test_a_runner_that_is_killed_in_mid_throw_leaves_the_vehicle_to_its_failsafe(kind, event):
+    """Nothing that it sent before releases the payload later."""
+    fake, _, told = run(kind, START)
+    assert told[-1][0] == "throw"
+    for _ in range(round(2.5 / fake.plant.period)):
+        fake.step()
+    assert event in [text for _, text in fake.events]
+    assert (fake.witness.breaches, fake.witness.releases) == ([], 0)
+
+
 @mark.parametrize("full_at", [0.0, START])
 def test_the_disk_is_full(tmp_path, full_at):
     """Before the throw: none is armed.

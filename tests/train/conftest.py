@@ -1,9 +1,11 @@
 """What the tests of training share."""
 
 import os
+import signal
 
 from pytest import fixture
 
+from tests.commands import run_python
 from visthrow import cli
 from visthrow.training import trainer
 
@@ -40,5 +42,30 @@ def signalled(monkeypatch):
         assert cli.main(words) == 130
         monkeypatch.setattr(algorithm, "learn", learn)
         assert cli.main([*words, "--resume"]) == 0
+
+    return run
+
+
+KILLED = """
+import os, signal, sys
+from visthrow import cli
+from visthrow.training.ppo.ppo_training import PPOTraining
+learn = PPOTraining.learn
+PPOTraining.learn = lambda self, done: (
+    os.kill(os.getpid(), signal.SIGKILL) if done == 3 / 4 else learn(self, done)
+)
+cli.main(sys.argv[1:])
+"""
+
+
+@fixture
+def killed():
+    """Function that runs a command's training of four iterations in a process that is killed in the
+    last one.
+    """
+
+    def run(*words):
+        process = run_python("-c", KILLED, *words, env={**os.environ, "OMP_NUM_THREADS": "1"})
+        assert process.returncode == -signal.SIGKILL, process.stderr
 
     return run

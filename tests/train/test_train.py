@@ -199,6 +199,18 @@ def test_what_cannot_be_trained_is_refused_before_a_folder_is_made(tmp_path, ref
     assert not (tmp_path / "a").exists()
 
 
+def test_a_killed_training_goes_on_bit_for_bit(whole, killed, tmp_path):
+    """Its third iteration is in the log, its checkpoint has two."""
+    folder = tmp_path / "run"
+    command, *changes = words(folder, "--checkpoint-every", "2")
+    killed(*command.split(), *changes)
+    assert iterations_of(folder) == [1, 2, 3]
+    assert train(folder, "--resume") == 0
+    assert iterations_of(folder) == [1, 2, 3, 4]
+    for a, b in zip(weights(whole), weights(folder), strict=True):
+        assert_array_equal(a, b)
+
+
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "run"
     fsync, calls = os.fsync, []

@@ -46,6 +46,19 @@ def test_the_witness_catches_commands(command, text):
     assert text in witness.breaches[0]
 
 
+@mark.parametrize(
+    ("armed", "payload_w", "text"),
+    [(False, INSIDE, "disarmed"), (True, INSIDE + [3.5, 0.0, 0.0], "outside of its fence")],
+)
+def test_the_witness_catches_releases(armed, payload_w, text):
+    witness = Witness(LIMITS)
+    for time in (1.0, 1.04):  # a repetition before the answer is one release
+        witness.release(time, True, INSIDE)
+    assert witness.breaches == []
+    witness.release(1.08, armed, payload_w)
+    assert [text in breach for breach in witness.breaches] == [True]
+
+
 def test_a_fake_reports_what_its_witness_saw():
     """Over the wire, a thrust that is none: taken, as by the real ones, and the vehicle falls."""
     here, there = pipe()

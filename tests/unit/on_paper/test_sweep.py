@@ -3,12 +3,13 @@ it.
 """
 
 import json
+import math
 import signal
 import subprocess
 import sys
 
 import numpy as np
-from pytest import approx, fixture, mark, raises
+from pytest import approx, fixture, importorskip, mark, raises
 
 from tests.commands import run_command
 from tests.waiting import eventually
@@ -358,3 +359,22 @@ def test_shipped_lists_name_what_exists():
         sum(s.iterations * (0.142 if s.config.startswith("state") else 0.153) for s in paper)
         < 3 * 3600
     ), "hours of one H200"
+
+
+def test_a_slurm_job_asks_for_what_it_needs(path, tmp_path, monkeypatch, refused):
+    """A stand-in for sbatch keeps the script that it is given; without one, that is said."""
+    importorskip("submitit")
+    from visthrow.paper.sweep.cluster import Cluster
+
+    monkeypatch.setenv("PATH", str(tmp_path))
+    command = f"sweep run {path} --out {tmp_path}/out --slurm partition=gpu --devices 2 --minutes 9"
+    refused(command, said="no jobs can be submitted from here")
+    keep = f"/bin/cat $1 >> {tmp_path}/script; echo Submitted batch job 7"
+    for name, text in (("srun", ""), ("sbatch", keep)):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    cluster = Cluster(path, tmp_path, "slurm", 2, 1, 9.0, options={"slurm_partition": "gpu"})
+    cluster.start(pool.Task("state-1", ("state-1",), gpu=True), "job 0", math.inf)
+    script = (tmp_path / "script").read_text()
+    for wanted in ("--partition=gpu", "--time=15", "--gpus-per-node=1", "--job-name=state-1"):
+        assert wanted in script
