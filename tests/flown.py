@@ -13,7 +13,6 @@ from bench.worlds.pilot import FreeFlight, Throw, Tracker
 from sim.effects.effect import apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
-from sim.params import PlantParams
 from tests.plants import EVERYTHING, paper_plant
 from visthrow.config.effects import chosen
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -25,9 +24,9 @@ RATIO = 4  # samples a command
 NOISE = {"pos_w": 5e-4, "quat_wb": np.radians(0.2), "payload_pos_w": 8e-4}
 
 
-def setting_with(theta: dict[str, float], plant: PlantParams | None = None) -> Setting:
+def setting_with(theta: dict[str, float]) -> Setting:
     """The paper's plant with effects of the catalogue."""
-    return apply(chosen(theta), Setting(plant or paper_plant()), theta)
+    return apply(chosen(theta), Setting(paper_plant()), theta)
 
 
 def fly(

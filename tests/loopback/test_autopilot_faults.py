@@ -249,7 +249,7 @@ def test_a_tick_overrun(kind, length):
     ],
 )
 def test_a_runner_that_is_killed_in_mid_throw_leaves_the_vehicle_to_its_failsafe(kind, event):
-    """Nothing that it sent before releases the payload later."""
+    """It falls silent between two ticks and never comes back."""
     fake, _, told = run(kind, START)
     assert told[-1][0] == "throw"
     for _ in range(round(2.5 / fake.plant.period)):

@@ -78,8 +78,9 @@ def test_a_throw_from_idle_to_done():
 
 def test_one_word_of_the_operator_is_one_throw():
     words = lambda time, state: OperatorInput(arm=state == "ready" and time < 3)  # noqa: E731
-    _, decisions = thrown(overrides=("throws=2",), seconds=20.0, words=words)
+    pilot, decisions = thrown(overrides=("throws=2",), seconds=20.0, words=words)
     assert decisions[-1].state == "ready"
+    assert len(pilot.backend.release_times) == 1
 
 
 START = 3.0  # the policy that never releases throws from about 2.1 s to 7.1 s
