@@ -448,6 +448,16 @@ def test_betaflights_mechanism_closes_again(answer, after):
     assert desk.fake.channels[channel] < 1100
 
 
+@mark.parametrize("kind", AUTOPILOTS)
+def test_a_release_that_is_stopped_before_its_hour_is_not_sent(kind):
+    desk = Desk(kind).follow()
+    desk.backend.release(desk.now + 0.1)
+    desk.turn(0.04, HOVER)
+    desk.backend.stop_release()
+    desk.turn(1.0, HOVER)
+    assert (desk.fake.witness.releases, desk.status.release) == (0, "idle")
+
+
 def test_px4_says_in_progress_first_and_that_is_pending():
     desk = Desk("px4").follow()
     desk.backend.release(desk.now)
