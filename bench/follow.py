@@ -1,7 +1,7 @@
 """Follow pages to the letter, as a stranger does: every block as it is shown, nothing added,
 nothing reused, processes of their own.
 
-    python -m bench.follow docs/howto/rope.md docs/howto/report.md    # from the root of a
+    python -m bench.follow docs/howto/rope.md docs/howto/camera.md    # from the root of a
     clone, its environment active
 
 It prints minutes a block and a page, beside the processor's. What is marked with a reason of
