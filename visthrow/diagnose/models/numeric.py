@@ -185,8 +185,9 @@ class NumericModel(Model, ABC):
                 raise LogError(f"{beyond} in this model")
         first = self.stretches[0]
         lanes = self._lanes(base)
+        known = self.knots(lanes, self.simulate(lanes))[0] if laws else {}
         for term in map(term_of, laws):
-            lacking = sorted(term.needs - self.knots(lanes, self.simulate(lanes))[0].keys())
+            lacking = sorted(term.needs - known.keys())
             if not lacking and not carries(first.latent_block, term.block):
                 lacking = [term.block]
             if lacking:

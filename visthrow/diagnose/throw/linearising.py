@@ -195,15 +195,17 @@ class Linearisation:
         nominal = rough_first * rough
         return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
-    def _slopes(self, seen: torch.Tensor, plan: Plan) -> torch.Tensor:
+    def _slopes(self, samples: torch.Tensor, plan: Plan) -> torch.Tensor:
         """Derivatives of a window's samples by its columns, shape (N, columns).
 
-        ``seen``: by all lanes of the run, shape (rows or more, lanes, 3).
+        ``samples``: of all lanes of the run, shape (rows or more, lanes, 3).
         """
         rows = int(self._flights.rows[plan.window])
-        lanes = seen[:rows, plan.first : plan.first + len(plan.lanes)]
+        lanes = samples[:rows, plan.first : plan.first + len(plan.lanes)]
         columns = lanes.transpose(1, 2).reshape(3 * rows, -1)
-        place, nominal = (torch.from_numpy(x).to(seen.device) for x in (plan.place, plan.nominal))
+        place, nominal = (
+            torch.from_numpy(x).to(samples.device) for x in (plan.place, plan.nominal)
+        )
         change = columns[:, place].sub_(columns[:, nominal])
         return change.div_(columns.new_tensor(plan.steps))
 
