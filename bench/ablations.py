@@ -27,7 +27,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.logs.flightlog import FlightLog
 from visthrow.task import Experiment, plant_of
-from visthrow.throws.flight import Flight, Phase, Policies, hover
+from visthrow.throws.flight_loop import Flight, Phase, Policies, hover
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
 from visthrow.throws.recorded import LogRecorder

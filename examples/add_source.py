@@ -7,8 +7,8 @@ import argparse
 
 import numpy as np
 
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput
+from hil.control.tick.runner import Runner
 from hil.links.backends import make_backend
 from hil.params import HilParams
 from hil.poses.pose import Pose

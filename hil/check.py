@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.recording.record import TICKS, lines, load_setup, require_run
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State
+from hil.control.tick.runner import Runner
 from hil.errors import RunError
 from hil.fly_run import key_of, params_of
 from hil.links.backends import make_backend

@@ -15,7 +15,7 @@ from hil.control.recording.latency import Stages
 from hil.control.recording.record import RunRecorder, begun, pack
 from hil.control.recording.run_report import finish, summary_text
 from hil.control.recording.view import start_viewer
-from hil.control.runner import Runner
+from hil.control.tick.runner import Runner
 from hil.errors import ConfigError, RunError
 from hil.links.backends import make_backend, mechanism_lag, require_reach
 from hil.links.clock import Clock, MonotonicClock

@@ -8,8 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import torch
 
-from hil.control.runner import OperatorInput, Runner, TickRecord
 from hil.control.state_machine import State
+from hil.control.tick.runner import OperatorInput, Runner, TickRecord
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.pose import Pose

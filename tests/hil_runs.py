@@ -5,7 +5,7 @@ command records them.
 from pathlib import Path
 
 from hil.control.recording.record import RunRecorder
-from hil.control.runner import Runner, TickRecord
+from hil.control.tick.runner import Runner, TickRecord
 from tests.hil_flight import HOVER, Spy, fly, params, simple_policy
 from visthrow.onboard.policy import Policy, find_policy
 

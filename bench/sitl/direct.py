@@ -24,8 +24,8 @@ from hil.control.loop import Loop
 from hil.control.recording.flightlogs import read, throws
 from hil.control.recording.record import RunRecorder
 from hil.control.recording.run_report import throw_path
-from hil.control.runner import Runner
 from hil.control.state_machine import State
+from hil.control.tick.runner import Runner
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.device import Device, check_device, open_port
 from hil.links.mavlink_link import Link

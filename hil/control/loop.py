@@ -12,8 +12,8 @@ from hil.control.calibrating import Calibrating, CalibrationSolver
 from hil.control.realtime import collected
 from hil.control.recording.latency import Stages
 from hil.control.recording.record import RunRecorder
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State, TickRecord
+from hil.control.tick.runner import Runner
 from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
 from hil.links.team_link import TeamLink

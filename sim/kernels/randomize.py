@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from sim.kernels.quadrotor.start import build_start
+from sim.kernels.quadrotor.steady_hover import build_steady_hover
 from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.state import rope_of, vehicle_of
 from sim.kernels.structs import Types
@@ -34,7 +34,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
     vec3 = t.vec3
     Plants = t.Plants
     L = params.rope.segments
-    start = build_start(t, params.vehicle, State)
+    set_steady_hover = build_steady_hover(t, params.vehicle, State)
     attached = int(hangs)
     x_axis, y_axis, z_axis = (vec3(*row) for row in np.eye(3))
 
@@ -55,7 +55,7 @@ def build_reset(t: Types, params: PlantParams, State: type, hangs: bool) -> Rese
         mass = p.body.mass
         if wp.static(hangs):
             mass = mass + rope.total_mass
-        start(p, state, env, mass * gravity, used)
+        set_steady_hover(p, state, env, mass * gravity, used)
         below = rope.last_mass * rope.last_center
         state.stiffness[L - 1, env] = below * gravity
         hanging = rope.last_mass

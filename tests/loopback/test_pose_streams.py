@@ -5,7 +5,7 @@ reason that is true, and a run hovers on those alone that the check passes.
 from pytest import mark
 
 from hil.control.loop import Loop
-from hil.control.runner import Runner
+from hil.control.tick.runner import Runner
 from hil.links.backends.base import DryRun
 from hil.links.clock import ManualClock
 from hil.params import HilParams

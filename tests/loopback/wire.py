@@ -6,7 +6,7 @@ import math
 from collections import deque
 
 from hil.control.loop import Loop
-from hil.control.runner import Runner
+from hil.control.tick.runner import Runner
 from hil.links.backends import make_backend, mechanism_lag
 from hil.links.backends.betaflight import Betaflight
 from hil.links.backends.crazyflie import Crazyflie

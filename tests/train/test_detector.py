@@ -19,7 +19,7 @@ from visthrow import config
 from visthrow.cli.fly import _rendered_eyes
 from visthrow.detector_training.eyes import RenderedEyes
 from visthrow.detector_training.scenes.scene import Nuisances
-from visthrow.throws.flight import Flight, Policies, hover, throw
+from visthrow.throws.flight_loop import Flight, Policies, hover, throw
 from visthrow.throws.loading import load_policy
 from visthrow.throws.reference_protocol import Job, batch_plant, fly_batch, place_in_hover
 

@@ -12,7 +12,7 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError
 from visthrow.logs.flightlog import Channel, FlightLog, FlightRecorder
-from visthrow.throws.flight import Decision, Flight, FlightObserver, Phase, Policies, Sight
+from visthrow.throws.flight_loop import Decision, Flight, FlightObserver, Phase, Policies, Sight
 from visthrow.throws.loading import Loaded
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import PLANTS, Snapshot, make_plant, random_ropes

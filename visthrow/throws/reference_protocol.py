@@ -20,7 +20,7 @@ from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
 from visthrow.task import Experiment, plant_of
 from visthrow.task.measurement import Throws, pilots_hover
-from visthrow.throws.flight import Decision, Flight, Policies, Scores, Sight, hover, throw
+from visthrow.throws.flight_loop import Decision, Flight, Policies, Scores, Sight, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
 from visthrow.training.compute_device import cores

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from hil.control.recording.record import SUMMARY, load_run, opened, pack
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput, State, TickRecord
+from hil.control.tick.runner import Runner
 from hil.links.backends.base import DryRun, Status
 from hil.params import HilParams
 from hil.poses.body_track import BodyState

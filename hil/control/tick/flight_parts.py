@@ -46,7 +46,7 @@ class FlightParts:
     def __init__(
         self, params: HilParams, policy: Policy, backend: Backend, mechanism_lag: float
     ) -> None:
-        """Build the parts; arguments and errors as of `hil.control.runner.Runner`."""
+        """Build the parts; arguments and errors as of `hil.control.tick.runner.Runner`."""
         self.params = params
         self.backend = backend
         self.pilot = pilot = Pilot(policy, params.camera)

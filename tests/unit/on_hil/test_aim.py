@@ -9,7 +9,7 @@ from pytest import approx, mark
 from scipy.integrate import solve_ivp
 
 from hil.control.aim import AimParams, ReleaseCheck
-from hil.control.runner import Runner
+from hil.control.tick.runner import Runner
 from hil.poses.body_track import BodyState
 from tests.hil_flight import AT_ONCE, Spy, fly, params
 

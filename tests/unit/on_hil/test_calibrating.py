@@ -15,8 +15,8 @@ from pytest import approx, fixture, raises
 from camera.keypoints import KeypointCamera, goal_corners_w, keypoints
 from camera.mount import rotation_from_vector
 from hil.control.calibrating import Calibrating, CalibrationParams
-from hil.control.runner import Runner
 from hil.control.state_machine import OperatorInput
+from hil.control.tick.runner import Runner
 from hil.links.backends.base import DryRun
 from hil.params import HilParams
 from hil.poses.detection import Detection

@@ -6,7 +6,7 @@ from numpy.random import default_rng
 from pytest import approx, mark
 
 from hil.control.recording.latency import STAGES, Stage, Stages, draw, table
-from hil.control.runner import Runner
+from hil.control.tick.runner import Runner
 from hil.poses.pose import PAYLOAD, VEHICLE, Pose
 from tests.hil_flight import Spy, params, simple_policy
 

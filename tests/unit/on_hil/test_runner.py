@@ -9,9 +9,9 @@ import numpy as np
 from pytest import approx, mark, raises
 
 from hil.control.hovering import Hovering
-from hil.control.runner import OperatorInput, Runner
 from hil.control.state_machine import Inputs, Machine
 from hil.control.tick.commander import can_hand_over
+from hil.control.tick.runner import OperatorInput, Runner
 from hil.links.backends.base import HOLD, Status
 from hil.poses.body_track import BodyState
 from hil.poses.detection import Detection, Detections

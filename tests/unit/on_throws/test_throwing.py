@@ -23,7 +23,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import contract_of, plant_of
 from visthrow.task.measurement import Throws
 from visthrow.throws import reference_protocol
-from visthrow.throws.flight import Flight
+from visthrow.throws.flight_loop import Flight
 from visthrow.throws.loading import load_policy, unique_names
 from visthrow.throws.loose_rope import LooseRope
 from visthrow.throws.plants import HybridPlant, make_plant

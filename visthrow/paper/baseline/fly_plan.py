@@ -23,7 +23,7 @@ from visthrow.paper.baseline.pendulum_model import Pendulum
 from visthrow.paper.baseline.throw_plan import ThrowPlan, landing_point
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws, pilots_hover, without_failed
-from visthrow.throws.flight import (
+from visthrow.throws.flight_loop import (
     FALL_TIME,
     Decision,
     Flight,
@@ -284,7 +284,7 @@ class Controllers(Pilots):
         self._period = 0
 
     def decide(self, flight: Flight, snapshot: Snapshot, latched: ndarray) -> Decision:
-        """See `visthrow.throws.flight.Pilots`; a vehicle whose programme has no solution has
+        """See `visthrow.throws.flight_loop.Pilots`; a vehicle whose programme has no solution has
         failed, and is held.
         """
         command = latched.copy()

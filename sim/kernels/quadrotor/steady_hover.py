@@ -38,8 +38,8 @@ def hover_voltage(p: Any, used: Any, thrust: Any, speed: Any):
     return type(thrust)(0.5) * (source + wp.sqrt(wp.max(root, root - root)))
 
 
-def build_start(t: Types, vehicle: VehicleParams, State: type):
-    """Build ``start(p, state, env, thrust, used)`` for a struct of state arrays.
+def build_steady_hover(t: Types, vehicle: VehicleParams, State: type):
+    """Build ``set_steady_hover(p, state, env, thrust, used)`` for a struct of state arrays.
 
     It puts motors, filters, battery and queue of an environment in hover under a collective thrust
     [N] with a fraction ``used`` of the charge gone. Nothing of the last episode stays. The body
@@ -50,7 +50,7 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
     ideal = vehicle.battery.kind == "ideal"
 
     @wp.func
-    def start(p: t.Vehicle, state: State, env: int, thrust: real, used: real):
+    def set_steady_hover(p: t.Vehicle, state: State, env: int, thrust: real, used: real):
         voltage = p.battery.reference_voltage
         charge_used = used
         if wp.static(ideal):
@@ -71,4 +71,4 @@ def build_start(t: Types, vehicle: VehicleParams, State: type):
         for k in range(state.queue.shape[0]):
             state.queue[k, env] = vec4(thrust, zero, zero, zero)
 
-    return start
+    return set_steady_hover
