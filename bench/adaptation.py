@@ -25,7 +25,7 @@ from bench import report as records
 from visthrow import config
 from visthrow.common import statistics
 from visthrow.common.storage import write_json
-from visthrow.diagnose.extend.patch import extended
+from visthrow.diagnose.apply.patch import extended
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
 from visthrow.training import compute_device

@@ -37,7 +37,7 @@ from visthrow import config
 from visthrow.common import mocap, statistics, toml_text, workers
 from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
-from visthrow.diagnose.extend.patch import extended
+from visthrow.diagnose.apply.patch import extended
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.task import Experiment
 from visthrow.throws.loading import Loaded, load_policy

@@ -27,7 +27,7 @@ import numpy as np
 
 from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
-from visthrow.diagnose.extend import patch
+from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.reporting.gain import on_others

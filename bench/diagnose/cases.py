@@ -158,7 +158,7 @@ def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: t
 def configured(theta: dict[str, float], path: Path) -> str:
     """Write the configuration in which the model has these effects; the path as text."""
     from visthrow import config
-    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.apply import patch
     from visthrow.task import Experiment
 
     experiment = config.load(Experiment, config.find("train", "state"))

@@ -25,7 +25,7 @@ from hil.rehearsal.bridges.betaflight_firmware import Firmware, needed
 from hil.rehearsal.fake_mocap import FakeMocapParams
 from tests.sitl.test_betaflight import program
 from visthrow import config
-from visthrow.diagnose.extend import patch
+from visthrow.diagnose.apply import patch
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.logs import read
 from visthrow.logs.flightlog import FlightLog

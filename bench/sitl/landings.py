@@ -18,7 +18,7 @@ import numpy as np
 
 from hil.params import HilParams
 from visthrow import config
-from visthrow.diagnose.extend import patch
+from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.task import Experiment
 

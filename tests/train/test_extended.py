@@ -8,7 +8,7 @@ from pytest import mark
 from sim.params import LawParams
 from tests.configs import load_experiment
 from tests.flown import fly, setting_with
-from visthrow.diagnose.extend.patch import extended
+from visthrow.diagnose.apply.patch import extended
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import DiagnosedParams
 from visthrow.training.trainer import Trainer

@@ -16,7 +16,7 @@ from tests.unit.on_diagnose.test_models import ball_log
 from visthrow import config
 from visthrow.common.errors import ConfigError, LogError
 from visthrow.config.effects import catalogue
-from visthrow.diagnose.extend import patch
+from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.task import DiagnosedParams, Experiment, drawn_plants, plant_of
 

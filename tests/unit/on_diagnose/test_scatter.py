@@ -12,7 +12,7 @@ from pytest import mark
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
 from tests.synthetic_diagnosis import SyntheticModel
 from visthrow.config.effects import catalogue, random_effects
-from visthrow.diagnose.extend import patch
+from visthrow.diagnose.apply import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import result, search, verdicts

@@ -18,7 +18,7 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.inputs.model_arguments import THROW
     from visthrow.logs import BLACKBOX
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
 def _apply_firmware(args: argparse.Namespace) -> int:
     """Write the configuration that flies the rate controller of a blackbox's firmware."""
     from visthrow.common.storage import atomic_write
-    from visthrow.diagnose.extend import patch
+    from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
     from visthrow.task import Experiment
 
