@@ -23,6 +23,7 @@ import numpy as np
 from bench import start
 from bench.loop import PLANT, add_arguments, explained, named, recorded
 from visthrow import config
+from visthrow.common.compute_device import resolve
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.logs.flightlog import FlightLog
@@ -32,7 +33,6 @@ from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
 from visthrow.throws.recorded import LogRecorder
 from visthrow.throws.reference_protocol import place_in_hover
-from visthrow.training.compute_device import resolve
 
 LACKS = {
     "no_aerodynamics": "aerodynamics",

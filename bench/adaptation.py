@@ -23,12 +23,11 @@ import numpy as np
 from bench import loop, start
 from bench import report as records
 from visthrow import config
-from visthrow.common import statistics
+from visthrow.common import compute_device, statistics
 from visthrow.common.storage import write_json
 from visthrow.diagnose.apply.patch import extended
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, contract_of
-from visthrow.training import compute_device
 from visthrow.training.protocol import throw
 from visthrow.training.trainer import ADAPTATION, Trainer, fitted
 

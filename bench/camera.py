@@ -182,7 +182,7 @@ def run(args: argparse.Namespace) -> int:
             " numbers"
         )
     from camera.params import CameraParams
-    from visthrow.training.compute_device import resolve
+    from visthrow.common.compute_device import resolve
 
     params = config.load(CameraParams, config.find("camera", "fisheye"), args.overrides)
     return finish(measure(params, args.environments, resolve(args.device), args.repeats), args)

@@ -25,13 +25,13 @@ from camera.overlay import draw_overlay
 from camera.params import CameraParams
 from visthrow import config
 from visthrow.common.arguments import WHOLE, add_common
+from visthrow.common.compute_device import resolve
 from visthrow.common.errors import VisthrowError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.detector_training.eyes import HANGING
 from visthrow.detector_training.scenes.renderer import Renderer
 from visthrow.detector_training.scenes.scene import Nuisances, random_scenes, truth_of
 from visthrow.detector_training.scenes.textures import HELD_OUT, TRAINING, photographs
-from visthrow.training.compute_device import resolve
 
 LEVELS = {
     "clean": {},

@@ -14,10 +14,10 @@ from pathlib import Path
 from bench import start
 from bench.report import Report, Table, add_arguments_of_measurements, finish
 from sim.cores import cores
+from visthrow.common.compute_device import resolve
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.reporting import explain_cli
 from visthrow.diagnose.select import search
-from visthrow.training.compute_device import resolve
 
 VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
 """Bars for ten throws and a minute of flight with the whole catalogue: two quiet CPU cores, an

@@ -53,9 +53,9 @@ class Row:
 
 def run(args: argparse.Namespace) -> int:
     """Train, throw, print, write."""
+    from visthrow.common.compute_device import resolve
     from visthrow.onboard.policy import Policy, find_policy
     from visthrow.throws.loading import trained_in
-    from visthrow.training.compute_device import resolve
 
     device = resolve(args.device)
     folder = Path(args.out)

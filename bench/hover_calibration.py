@@ -14,18 +14,19 @@ import numpy as np
 import torch
 
 from camera.keypoints import KeypointCamera, keypoints
+from sim.cores import cores
 from sim.reference.reference_extras import ReferenceExtras
 from visthrow import config
+from visthrow.common.compute_device import resolve
 from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
 from visthrow.onboard.calibration import HOVER, SWAY, Hovered, Spreads, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.task.measurement import hover_start
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
-from visthrow.training.compute_device import cores, resolve
 from visthrow.training.env import ThrowEnv
-from visthrow.training.protocol import hover_start
 
 DRAWN = ["camera.mount.rotation_error_std=0.0524", "camera.noise.scale_std=0.03"]
 TILT_DEG = 0.2

@@ -33,8 +33,10 @@ from typing import Any
 import numpy as np
 
 from bench import start
+from sim.cores import cores
 from visthrow import config
 from visthrow.common import mocap, statistics, toml_text, workers
+from visthrow.common.compute_device import resolve
 from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.diagnose.apply.patch import extended
@@ -44,7 +46,6 @@ from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.recorded import fly
 from visthrow.throws.reference_protocol import Throwing
 from visthrow.throws.results import DIGITS
-from visthrow.training.compute_device import cores, resolve
 
 PLANT = "reference"
 """The reference plant without extras: what the diagnosis finds is what was hidden, or a mistake."""

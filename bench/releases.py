@@ -21,10 +21,10 @@ from tensordict import TensorDict
 from bench import start
 from sim.hybrid import rope_variants
 from visthrow.common.arguments import add_common
+from visthrow.common.compute_device import resolve
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.paper.sweep.work_units import load_list
 from visthrow.throws.loading import Loaded, load_policy
-from visthrow.training.compute_device import resolve
 from visthrow.training.env import ThrowEnv
 from visthrow.training.protocol import throw
 

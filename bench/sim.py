@@ -371,7 +371,7 @@ def run(args: argparse.Namespace) -> int:
             )
     else:
         from bench import sim_gpu
-        from visthrow.training import compute_device
+        from visthrow.common import compute_device
 
         name = compute_device.resolve(args.device)
         if name == "cpu":

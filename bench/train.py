@@ -24,8 +24,8 @@ from bench.report import (
 )
 from visthrow import config
 from visthrow.common.arguments import add_common
+from visthrow.common.compute_device import rounded_products
 from visthrow.common.errors import VisthrowError
-from visthrow.training.compute_device import rounded_products
 
 # iterations before measuring: the first runs eagerly, the second captures the CUDA graph
 WARM_UP = 3
@@ -152,8 +152,8 @@ def run(args: argparse.Namespace) -> int:
             f" --until {args.until}, --evaluate-every {args.evaluate_every}, --fresh {args.fresh}:"
             " expected positive numbers"
         )
+    from visthrow.common import compute_device
     from visthrow.task import Experiment
-    from visthrow.training import compute_device
 
     paths = [config.find("train", name) for name in args.configs]
     experiments = {path.stem: config.load(Experiment, path, args.overrides) for path in paths}

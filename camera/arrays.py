@@ -8,7 +8,7 @@ never holds zeros that were no measurement.
 On one row NumPy takes a fraction of torch's time. Both give the same bits: sums, products,
 quotients and roots round alike, and angles are torch's own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from types import SimpleNamespace
 from typing import Any
 
@@ -95,3 +95,15 @@ def latency_weights(length: int, latency: Tensor, like: Tensor) -> Tensor:
     ages = torch.arange(length, device=like.device, dtype=like.dtype)
     age = latency.to(like.dtype).reshape(-1, 1).clamp(0.0, length - 1.0)
     return (1.0 - (ages - age).abs()).clamp(min=0.0)
+
+
+def redraw(buffers: Mapping[str, Tensor], spreads: Mapping[str, float], fresh: Tensor) -> None:
+    """Draw each buffer, shape (E, ...), anew where an episode begins, bool, shape (E,), as normal
+    noise with its deviation; 0 leaves it as it is.
+    """
+    for name, std in spreads.items():
+        if std > 0.0:
+            old = buffers[name]
+            trailing = (1,) * (old.dim() - 1)
+            mask = fresh.view(-1, *trailing)
+            torch.where(mask, torch.randn_like(old) * std, old, out=old)

@@ -2,7 +2,7 @@
 
 python examples/add_reward.py train laptop --minutes 5 --out runs/calmer
 
-To keep a term, add its function to visthrow/training/rewards.py, its coefficient to RewardParams in
+To keep a term, add its function to visthrow/task/rewards.py, its coefficient to RewardParams in
 visthrow/task and to configs/task/state.toml, and a line to ThrowEnv._judge. PPO alone uses it:
 first-order training has its own reward in visthrow/training/first_order.
 """
@@ -12,7 +12,7 @@ import sys
 import torch
 
 from visthrow import cli
-from visthrow.training import rewards
+from visthrow.task import rewards
 
 PENALTY = 0.002  # for each (m/s)^2 of the payload's vertical speed
 plain = rewards.kinetic

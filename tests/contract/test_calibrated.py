@@ -11,9 +11,9 @@ from camera.keypoints import KeypointCamera, corrected_keypoints, keypoints
 from camera.mount import rotation_from_vector
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
+from visthrow.task.measurement import hover_start
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.training.env import ThrowEnv
-from visthrow.training.protocol import hover_start
 
 
 def experiment(*changes):

@@ -14,7 +14,7 @@ from sim.kernels.state import COLLISION, NONFINITE
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError
 from visthrow.onboard import actions, observations
-from visthrow.training import terminations
+from visthrow.task import terminations
 from visthrow.training.env import ThrowEnv
 
 PERIOD = 0.02

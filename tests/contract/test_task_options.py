@@ -15,6 +15,7 @@ from tests.commands import run_command
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError, MismatchError
 from visthrow.task import Experiment, TargetParams, contract_of
+from visthrow.task.measurement import hover_start
 from visthrow.throws.loading import load_policy
 from visthrow.throws.plants import ReferenceAdapter
 from visthrow.training import protocol
@@ -104,7 +105,7 @@ def test_payloads_vary_in_every_combination():
 
 
 def test_what_varies_in_training_varies_in_its_throws():
-    start = protocol.hover_start(experiment("state_payload")).task.start
+    start = hover_start(experiment("state_payload")).task.start
     assert (start.payload_variants, start.payload_spread, start.tether_spread) == (5, 0.2, 0.1)
     assert start.position == (0.03, 0.03, 0.03)
     with raises(ValueError, match="expected 1 or more, and 0 to below 1"):

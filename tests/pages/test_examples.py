@@ -14,7 +14,8 @@ from hil.poses.sources import images
 from tests import boards
 from tests.places import ROOT
 from visthrow import config
-from visthrow.training import rewards, trainer
+from visthrow.task import rewards
+from visthrow.training import trainer
 
 BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
 LONGEST = 60

@@ -79,9 +79,9 @@ def run(args: argparse.Namespace) -> int:
     for name in args.policies or ():
         if name != BASELINE:
             find_policy(name)  # said before anything heavy is imported
+    from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy, unique_names
     from visthrow.throws.plants import known_plant
-    from visthrow.training.compute_device import resolve
 
     known_plant(args.plant)
     if args.calibrate and args.plant != "hybrid":

@@ -24,9 +24,9 @@ add_arguments = declared(__file__)
 def run(args: argparse.Namespace) -> int:
     """Fly, write, tell."""
     find_policy(args.policy)  # said before anything heavy is imported
+    from visthrow.common.compute_device import resolve
     from visthrow.throws.loading import load_policy
     from visthrow.throws.recorded import check_goal, fly
-    from visthrow.training.compute_device import resolve
 
     _check(args)
     loaded = load_policy(args.policy, args.config, args.overrides, args.allow)
@@ -96,8 +96,8 @@ def _check(args: argparse.Namespace) -> None:
 
 def _fly_alone(args: argparse.Namespace, experiment, goal: list[float]) -> int:
     """Fly without a rope; write the log and print where the vehicle ended."""
+    from visthrow.common.compute_device import resolve
     from visthrow.throws.vehicle_alone import SECONDS, fly_alone
-    from visthrow.training.compute_device import resolve
 
     log = fly_alone(experiment, (goal[0], goal[1]), args.no_rope, resolve(args.device))
     path = Path(args.out) / "flight.npz"

@@ -103,7 +103,7 @@ def declared(module: str) -> Callable[[argparse.ArgumentParser], None]:
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
     """Add the options that commands share:
 
-    ``--set``, ``--device`` (see ``visthrow.training.compute_device.resolve``) and ``--json``.
+    ``--set``, ``--device`` (see ``visthrow.common.compute_device.resolve``) and ``--json``.
     """
     for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
         if wanted:

@@ -13,17 +13,16 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import arrays
+from camera.keypoint_noise import DetectorView
 from sim.params import GRAVITY
 from sim.torch_bridge import TorchViews, on_torch_stream
+from visthrow.common.compute_device import rounded_products
 from visthrow.common.free_fall import free_flight
 from visthrow.cooperative.team import TeamExperiment, between, layout_of, members
 from visthrow.cooperative.team_sim import TeamSim
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
-from visthrow.task import plant_of
-from visthrow.training import rewards, terminations
-from visthrow.training.compute_device import rounded_products
-from visthrow.training.env.options import DetectorView, redraw
+from visthrow.task import plant_of, rewards, terminations
 
 RESULTS = {
     "released": "episodes",
@@ -322,7 +321,7 @@ class TeamEnv(VecEnv):
         memory["first"].masked_fill_(fresh, 1e6)
         memory["tripped"].masked_fill_(fresh, 0.0)
         spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
-        redraw(memory, spreads, rows)
+        arrays.redraw(memory, spreads, rows)
         self.view.begin(rows)
         age = memory["pose_age"]
         latency = between(task.observation.latency, torch.rand_like(age))

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from visthrow.common.compute_device import rounded_products
 from visthrow.cooperative.team import TeamExperiment, as_flown, team_contract
 from visthrow.cooperative.team_env import TeamEnv
 from visthrow.onboard import actions as act
 from visthrow.onboard.policy import Policy
-from visthrow.training.compute_device import rounded_products
 from visthrow.training.ppo.ppo_training import PPOTraining
 from visthrow.training.ranks import Ranks
 

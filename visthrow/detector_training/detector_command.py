@@ -14,8 +14,8 @@ import numpy as np
 
 from visthrow import config
 from visthrow.common.arguments import declared
+from visthrow.common.compute_device import resolve
 from visthrow.common.errors import VisthrowError
-from visthrow.training.compute_device import resolve
 
 TOGETHER = 20  # throws in one process at a time
 

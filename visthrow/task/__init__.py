@@ -124,7 +124,7 @@ class BoundsParams(Bounded):
 @dataclass(frozen=True)
 class RewardParams(Bounded):
     """Coefficients of Table II, by the names of its meanings; see
-    :mod:`visthrow.training.rewards`.
+    :mod:`visthrow.task.rewards`.
     """
 
     scale: float  # of the whole reward; the learner's only, the paper's is 1

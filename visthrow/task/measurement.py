@@ -5,13 +5,14 @@ Landing error is the horizontal distance of the landing point from the goal, dur
 the policy's start to the landing (Sec. IV-A). A throw succeeds when the payload was released and
 landed; one that ends otherwise has no landing error and counts against the success rate."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray
 
 from sim.params import RandomizationParams
 from visthrow import config
+from visthrow.task import Experiment
 
 TARGETS = (1.5, 2.0, 2.5)  # targets along x [m]; the last lies outside the training distribution
 
@@ -21,6 +22,32 @@ LANDED = 0.95  # share of throws that must land before their mean error says any
 def pilots_hover() -> RandomizationParams:
     """Return the variation of starts in a pilot's hover, ``configs/start/hover.toml``."""
     return config.load(RandomizationParams, config.find("start", "hover"))
+
+
+def hover_start(experiment: Experiment) -> Experiment:
+    """Return the experiment with its episodes started from hover; cables and payloads vary as in
+    the experiment.
+    """
+    fields = (
+        "tether_variants",
+        "tether_spread",
+        "payload_variants",
+        "payload_spread",
+        "drag_spread",
+    )
+    drawn = {name: getattr(experiment.task.start, name) for name in fields}
+    start = replace(pilots_hover(), **drawn)
+    task = replace(experiment.task, start=start)
+    return replace(experiment, task=task)
+
+
+def as_flown(experiment: Experiment) -> Experiment:
+    """Return the experiment as its policies are flown and measured: without training's faults."""
+    if not experiment.flown:
+        return experiment
+    text = config.dumps(experiment)
+    name = "the configuration of the training"
+    return config.loads(Experiment, text, experiment.flown, name=name)
 
 
 def without_failed(success: ndarray, columns: dict[str, ndarray]) -> dict[str, ndarray]:

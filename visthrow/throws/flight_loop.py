@@ -15,11 +15,10 @@ from numpy import ndarray
 
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.onboard.pilot import Pilot
-from visthrow.task import Experiment
+from visthrow.task import Experiment, terminations
 from visthrow.task.measurement import without_failed
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot
-from visthrow.training import terminations
 
 FALL_TIME = 1.5
 """Longest flight after separation that is waited for [s]."""

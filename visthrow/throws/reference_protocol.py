@@ -16,6 +16,7 @@ from functools import partial
 import numpy as np
 from numpy import ndarray
 
+from sim.cores import cores
 from visthrow.common.errors import ConfigError
 from visthrow.common.workers import Workers, progress
 from visthrow.task import Experiment, plant_of
@@ -23,7 +24,6 @@ from visthrow.task.measurement import Throws, pilots_hover
 from visthrow.throws.flight_loop import Decision, Flight, Policies, Scores, Sight, hover, throw
 from visthrow.throws.loading import Loaded
 from visthrow.throws.plants import Plant, Snapshot, make_plant, random_ropes
-from visthrow.training.compute_device import cores
 
 BATCH = 100  # throws that share one plant: about 12 s of one core a batch and 1 s a throw
 

@@ -1,1 +1,1 @@
-"""Training: the task as an environment, its rewards and ends, the trainer and its progress."""
+"""Training: the task as an environment, the trainer and its progress."""

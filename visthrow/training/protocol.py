@@ -2,43 +2,15 @@
 :mod:`visthrow.task.measurement` says.
 """
 
-import dataclasses
 from collections.abc import Callable
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 
-from visthrow import config
 from visthrow.task import Experiment
-from visthrow.task.measurement import Throws, pilots_hover
+from visthrow.task.measurement import Throws, hover_start
 from visthrow.training.env import ThrowEnv
-
-
-def hover_start(experiment: Experiment) -> Experiment:
-    """Return the experiment with its episodes started from hover; cables and payloads vary as in
-    the experiment.
-    """
-    fields = (
-        "tether_variants",
-        "tether_spread",
-        "payload_variants",
-        "payload_spread",
-        "drag_spread",
-    )
-    drawn = {name: getattr(experiment.task.start, name) for name in fields}
-    start = dataclasses.replace(pilots_hover(), **drawn)
-    task = dataclasses.replace(experiment.task, start=start)
-    return dataclasses.replace(experiment, task=task)
-
-
-def as_flown(experiment: Experiment) -> Experiment:
-    """Return the experiment as its policies are flown and measured: without training's faults."""
-    if not experiment.flown:
-        return experiment
-    text = config.dumps(experiment)
-    name = "the configuration of the training"
-    return config.loads(Experiment, text, experiment.flown, name=name)
 
 
 def throw(
@@ -55,7 +27,7 @@ def throw(
     target [m] along x.
 
     Args:
-        experiment: its start is replaced by :func:`hover_start`.
+        experiment: its start is replaced by :func:`~visthrow.task.measurement.hover_start`.
         policy: function of observations (E, D) -> actions (E, 5), on the device.
         target, count, device, seed: of starts and noise; torch's generators are put back
             afterwards.

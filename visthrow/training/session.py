@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow import config
-from visthrow.common import provenance, statistics
+from visthrow.common import compute_device, provenance, statistics
 from visthrow.common.arguments import EXIT_INTERRUPTED, StopRequest
 from visthrow.common.errors import CheckpointError, StorageError, TrainError
 from visthrow.common.storage import write_json
@@ -26,7 +26,6 @@ from visthrow.common.toml_text import tables_beside
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment
 from visthrow.task.measurement import Throws
-from visthrow.training import compute_device
 from visthrow.training.progress import TrainLog
 from visthrow.training.ranks import Ranks
 from visthrow.training.trainer import ADAPTATION, CHECKPOINT, Trainer, finish, fitted

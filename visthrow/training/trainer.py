@@ -12,13 +12,13 @@ import torch
 
 from visthrow import config
 from visthrow.common import provenance
+from visthrow.common.compute_device import rounded_products
 from visthrow.common.errors import CheckpointError, MismatchError, TrainError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, contract_of
-from visthrow.task.measurement import TARGETS, Throws
+from visthrow.task.measurement import TARGETS, Throws, as_flown
 from visthrow.training import protocol
-from visthrow.training.compute_device import rounded_products
 from visthrow.training.distillation import Distillation
 from visthrow.training.first_order.first_order_training import FirstOrder
 from visthrow.training.ppo.algorithm import Algorithm
@@ -184,7 +184,7 @@ class Trainer:
         ``flown`` are the conditions that ``visthrow compare`` flies, ``trained`` those of the
         training with its faults, where the two differ.
         """
-        conditions = {"flown": protocol.as_flown(self.experiment)}
+        conditions = {"flown": as_flown(self.experiment)}
         if self.experiment.flown:
             conditions["trained"] = self.experiment
         return {

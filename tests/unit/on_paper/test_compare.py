@@ -13,7 +13,7 @@ importorskip("piqp")
 
 def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
+    monkeypatch.setattr("visthrow.paper.baseline.thrower.cores", lambda: 1)
     out = tmp_path / "rows.json"
     command = "compare state baseline --throws 2 --targets 1.5 --device cpu"
     assert run_command(f"{command} --out {tmp_path} --json {out}") == 0

@@ -135,7 +135,7 @@ def test_front_and_hypervolume_by_hand():
 
 def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.training.compute_device.cores", lambda: 1)
+    monkeypatch.setattr("visthrow.paper.baseline.thrower.cores", lambda: 1)
     packed = tmp_path / "all.json"
     command = f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}"
     assert run_command(command) == 0

@@ -14,7 +14,8 @@ from tests.configs import QUIET, load_experiment
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy, find_policy
-from visthrow.training import protocol, rewards
+from visthrow.task import rewards
+from visthrow.training import protocol
 from visthrow.training.first_order.surrogate import TAUT
 from visthrow.training.trainer import Trainer
 

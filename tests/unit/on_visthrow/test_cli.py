@@ -14,10 +14,9 @@ from pytest import fixture, mark, raises
 from tests.commands import run_command, run_python, start
 from tests.places import ROOT
 from visthrow import cli
-from visthrow.common import arguments
+from visthrow.common import arguments, compute_device
 from visthrow.common.errors import ConfigError, DeviceError, VisthrowError, suggest
 from visthrow.config import kinds
-from visthrow.training import compute_device
 
 HELP_BUDGET = 0.5
 """[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few

@@ -139,11 +139,11 @@ def throw_model(
     commands put right.
     """
     from visthrow import config
+    from visthrow.common.compute_device import resolve
     from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.search import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import Experiment, plant_of
-    from visthrow.training.compute_device import resolve
 
     threads.keep_freed_memory()
     experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)

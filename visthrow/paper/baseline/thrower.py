@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from sim.cores import cores
 from visthrow import config
+from visthrow.common import compute_device
 from visthrow.paper.baseline import NAME
 from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
 from visthrow.paper.baseline.pendulum_model import pendulum_of
@@ -19,7 +21,6 @@ from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_
 from visthrow.task import Experiment, contract_of, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
-from visthrow.training import compute_device
 
 IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
     "pendulum"
@@ -171,7 +172,7 @@ def flown(
         folder,
         fly_unit,
         None,
-        compute_device.cores(),
+        cores(),
         lambda text: say(f"TO+MPC: {text}"),
     )
     return [join(solutions[key_of(u)] for u in part)[0] for part in sets]

@@ -40,11 +40,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, work: Any, out: Path) -> int:
+    from sim.cores import cores
+    from visthrow.common import compute_device
     from visthrow.paper.sweep.pool import Local, ProcessPool
-    from visthrow.training import compute_device
 
     changes = tuple(args.overrides)
-    jobs = args.jobs or compute_device.cores()
+    jobs = args.jobs or cores()
     begin = time.monotonic()
 
     def say(text: str) -> None:

@@ -154,8 +154,8 @@ def fly(unit: ThrowUnit, out: Path, device: str) -> None:
 
 
 def _columns(unit: ThrowUnit, out: Path, device: str) -> dict[str, np.ndarray]:
+    from visthrow.common.compute_device import resolve
     from visthrow.throws.reference_protocol import Job, fly_batch
-    from visthrow.training.compute_device import resolve
     from visthrow.training.protocol import throw
 
     loaded = load(unit, out)

@@ -11,23 +11,17 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from camera import arrays
+from camera.keypoint_noise import DetectorView
 from sim.hybrid import HybridSim, rope_variants
 from sim.params import GRAVITY, RopeParams
 from sim.torch_bridge import TorchViews, on_torch_stream
+from visthrow.common.compute_device import rounded_products
 from visthrow.onboard import actions as act
 from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
-from visthrow.task import Experiment, drawn_plants, plant_of
+from visthrow.task import Experiment, drawn_plants, plant_of, rewards, terminations
 from visthrow.task.fleet import Member, members
-from visthrow.training import rewards, terminations
-from visthrow.training.compute_device import rounded_products
-from visthrow.training.env.options import (
-    DetectorView,
-    FleetSetup,
-    MovingGoals,
-    PoseDelay,
-    redraw,
-)
+from visthrow.training.env.options import FleetSetup, MovingGoals, PoseDelay
 
 
 class ThrowEnv(VecEnv):
@@ -313,7 +307,7 @@ class ThrowEnv(VecEnv):
         previous = self.previous_action
         torch.where(fresh[:, None], self.start_action, previous, out=previous)
         spreads = {"frame_bias": noise.observation_bias, "command_bias": noise.command_bias}
-        redraw(self.buffers, spreads, fresh)
+        arrays.redraw(self.buffers, spreads, fresh)
         for part in self._parts():
             part.begin(fresh)
 

@@ -17,8 +17,7 @@ from visthrow.common.free_fall import fall_time, free_flight
 from visthrow.onboard import actions as act
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
-from visthrow.task import Experiment
-from visthrow.training import rewards
+from visthrow.task import Experiment, rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, step
 from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit

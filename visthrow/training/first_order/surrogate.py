@@ -28,7 +28,7 @@ from sim.params import GRAVITY
 from sim.torch_bridge import on_torch_stream
 from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
-from visthrow.training import terminations
+from visthrow.task import terminations
 from visthrow.training.env import ThrowEnv
 
 # spread of random actions about hover; three times as much saturates the motors of a heavy vehicle,

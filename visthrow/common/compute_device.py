@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from sim.cores import cores as cores
 from visthrow.common.errors import DeviceError
 
 
