@@ -8,6 +8,7 @@ from pathlib import Path
 
 from visthrow import __version__
 from visthrow.common.storage import atomic_write
+from visthrow.common.templates import rendered
 from visthrow.view.parts import Grid, Picture, Section, Text
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
@@ -24,18 +25,22 @@ def _marked(text: str) -> str:
 
 def html_of(title: str, lead: str, sections: Sequence[Section]) -> str:
     """Return the whole page; it loads nothing from elsewhere."""
-    import jinja2
     import markupsafe
 
-    loader = jinja2.PackageLoader("visthrow.view", "data")
-    how = {"autoescape": True, "trim_blocks": True, "lstrip_blocks": True}
-    environment = jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, **how)
-    environment.filters["marked"] = lambda text: markupsafe.Markup(_marked(text))
-    environment.filters["inline"] = lambda png: (
-        "data:image/png;base64," + base64.b64encode(png).decode("ascii")
+    return rendered(
+        Path(__file__).with_name("data") / "page.html.j2",
+        {"marked": lambda text: markupsafe.Markup(_marked(text)), "inline": _inline},
+        escape=True,
+        title=title,
+        lead=lead,
+        sections=sections,
+        version=__version__,
     )
-    template = environment.get_template("page.html.j2")
-    return template.render(title=title, lead=lead, sections=sections, version=__version__)
+
+
+def _inline(png: bytes) -> str:
+    """Return a picture as an address that holds it."""
+    return "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
