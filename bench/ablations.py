@@ -22,12 +22,11 @@ import numpy as np
 
 from bench import start
 from bench.loop import PLANT, add_arguments, explained, named, recorded
-from visthrow import config
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.logs.flightlog import FlightLog
-from visthrow.task import Experiment, plant_of
+from visthrow.task import load_experiment, plant_of
 from visthrow.throws.flight_loop import Flight, Phase, Policies, hover
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.plants import make_plant
@@ -216,7 +215,7 @@ def on_held_back(
     from visthrow.diagnose.throw.throw_model import ThrowModel
 
     sizes: list[Mapping[str, float]] = [{}, theta, {lacks: 1.0}]
-    plant = plant_of(config.load(Experiment, config.find("train", base)))
+    plant = plant_of(load_experiment(base))
     only = sorted({lacks, *theta})
     model = ThrowModel([FlightLog.load(path) for path in logs], plant, device=device, only=only)
     (before, after, _), samples = shortfalls(model, sizes)

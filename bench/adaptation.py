@@ -22,12 +22,11 @@ import numpy as np
 
 from bench import loop, start
 from bench import report as records
-from visthrow import config
 from visthrow.common import compute_device, statistics
 from visthrow.common.storage import write_json
 from visthrow.diagnose.apply.patch import extended
 from visthrow.onboard.policy import Policy, find_policy
-from visthrow.task import Experiment, contract_of
+from visthrow.task import Experiment, contract_of, load_experiment
 from visthrow.training.protocol import throw
 from visthrow.training.trainer import ADAPTATION, Trainer, fitted
 
@@ -61,7 +60,7 @@ def measured(folder: Path, hidden: Mapping[str, float], args: argparse.Namespace
     kept = folder / "errors.json"
     if kept.exists():
         return json.loads(kept.read_text())
-    own = config.load(Experiment, config.find("train", "state"), [ADAPTATION, *args.changes])
+    own = load_experiment("state", [ADAPTATION, *args.changes])
     shipped = Policy.load(find_policy("state"))
     altered = extended(own, hidden)
     policy, figures = adapted(altered, shipped, args)

@@ -163,11 +163,10 @@ def _rivals(
     """Train a policy for each of some vehicles, as far as the time goes: vehicle -> policy and
     experiment.
     """
-    from visthrow import config
     from visthrow.onboard.policy import Policy
-    from visthrow.task import Experiment
+    from visthrow.task import load_experiment
 
-    recipe = config.load(Experiment, config.find("train", RIVAL))
+    recipe = load_experiment(RIVAL)
     ppo = replace(recipe.ppo, iterations=args.rival_iterations or recipe.ppo.iterations)
     task = replace(
         experiment.task, observation=replace(experiment.task.observation, setup="none", response=0)

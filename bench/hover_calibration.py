@@ -22,7 +22,7 @@ from visthrow.common.workers import Workers
 from visthrow.onboard import observations as ob
 from visthrow.onboard.calibration import HOVER, SWAY, Hovered, Spreads, solved, sway
 from visthrow.onboard.hover import HoverController, HoverParams
-from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.task.measurement import hover_start
 from visthrow.throws.calibrated import calibrated_start
 from visthrow.throws.reference_protocol import HOVER_TIME, batch_plant, place_in_hover
@@ -126,7 +126,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu", help="of the training simulator (default: cpu)")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    flown = hover_start(config.load(Experiment, config.find("train", "vision_ideal"), DRAWN))
+    flown = hover_start(load_experiment("vision_ideal", DRAWN))
     asked = TILT_DEG
     if args.plant == "hybrid":
         found, turn, scale = in_training(flown, args.count, args.seed, resolve(args.device))

@@ -41,7 +41,7 @@ from visthrow.common.errors import ConfigError, DiagnoseError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.diagnose.apply.patch import extended
 from visthrow.logs.flightlog import Channel, FlightLog
-from visthrow.task import Experiment
+from visthrow.task import Experiment, load_experiment
 from visthrow.throws.loading import Loaded, load_policy
 from visthrow.throws.recorded import fly
 from visthrow.throws.reference_protocol import Throwing
@@ -118,7 +118,7 @@ class Loop:
 
     def run(self, say: Callable[[str], None]) -> dict[str, Any]:
         """Go round, or on from where an earlier run stopped; returns the record."""
-        nominal = config.load(Experiment, config.find("train", self.base))
+        nominal = load_experiment(self.base)
         truth = extended(nominal, self.hidden)
         self.folder.mkdir(parents=True, exist_ok=True)
         self._config("hidden", truth)

@@ -9,7 +9,6 @@ import numpy as np
 from bench import start
 from bench.report import Report, Table, finish
 from bench.sim import on_one_core
-from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 
@@ -22,9 +21,9 @@ def run(args: argparse.Namespace) -> int:
     """Fly plans and time every step of the controller."""
     if args.throws < 1:
         raise VisthrowError(f"--throws {args.throws}; expected 1 or more")
-    from visthrow.task import Experiment
+    from visthrow.task import load_experiment
 
-    experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
+    experiment = load_experiment(args.config, args.overrides)
     with on_one_core(args.core) as core:
         report = measure(experiment, args.throws, core)
     return finish(report, args)

@@ -21,10 +21,9 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.oracle.converged import converged
 from tests.simulators import fly
-from visthrow import config
 from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
-from visthrow.task import Experiment, plant_of
+from visthrow.task import Experiment, load_experiment, plant_of
 
 BATCH = 1024
 """Environments of the batch: what they share, the launch and the fetching of code, is spread over
@@ -358,7 +357,7 @@ def run(args: argparse.Namespace) -> int:
             f"--seconds {args.seconds}, --repeats {args.repeats}, --batch {args.batch}, --threads"
             f" {args.threads}: expected positive numbers"
         )
-    experiment = config.load(Experiment, config.find("train", args.config), args.overrides)
+    experiment = load_experiment(args.config, args.overrides)
     if args.device == "cpu":
         if args.batch and len(args.batch) > 1:
             raise VisthrowError(f"--batch {args.batch}: one core is measured at one batch size")

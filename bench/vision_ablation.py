@@ -21,7 +21,6 @@ from typing import Any
 
 from bench import start
 from bench.vision_throws import conditions
-from visthrow import config
 from visthrow.common.storage import write_json
 
 LOCATED = "task.observation.located"
@@ -88,7 +87,7 @@ def thrown(policy: Any, device: str, count: int) -> dict[str, Any]:
 
 def job(args: argparse.Namespace) -> int:
     """Train one variant with one seed, throw, and write what came of it."""
-    from visthrow.task import Experiment
+    from visthrow.task import load_experiment
     from visthrow.training.trainer import Trainer, finish
 
     name = args.job
@@ -96,7 +95,7 @@ def job(args: argparse.Namespace) -> int:
     folder = Path(args.work) / f"{args.job}-{args.seed}"
     base, changes = VARIANTS[name]
     limit = min(args.longest, args.deadline - time.time() - RESERVE)
-    experiment = config.load(Experiment, config.find("train", base), [*changes, *args.overrides])
+    experiment = load_experiment(base, [*changes, *args.overrides])
     folder.mkdir(parents=True, exist_ok=True)
     trainer = Trainer(experiment, args.devices[0], seed)
     figures = trained(trainer, limit)

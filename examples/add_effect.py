@@ -11,8 +11,7 @@ from sim.effects.effect import Change, SettingEffect, apply
 from sim.effects.setting import Setting
 from sim.hybrid import HybridSim
 from sim.params import GRAVITY
-from visthrow import config
-from visthrow.task import Experiment, plant_of
+from visthrow.task import load_experiment, plant_of
 
 EFFECT = SettingEffect(  # as a table of configs/effects
     name="mount_forward",
@@ -45,7 +44,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=float, default=0.02, help="of the effect [m]")
     args = parser.parse_args()
-    setting = Setting(plant_of(config.load(Experiment, config.find("train", "state"))))
+    setting = Setting(plant_of(load_experiment("state")))
     changed = apply({EFFECT.name: EFFECT}, setting, {EFFECT.name: args.size})
     print("the ball moves by", np.round(hover(changed) - hover(setting), 4), "m")
 

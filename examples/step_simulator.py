@@ -8,8 +8,7 @@ import argparse
 import numpy as np
 
 from sim.hybrid import HybridSim
-from visthrow import config
-from visthrow.task import Experiment, plant_of
+from visthrow.task import load_experiment, plant_of
 
 
 def main() -> None:
@@ -18,7 +17,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=1.0)
     parser.add_argument("--device", default="cpu", help="cpu or cuda:0")
     args = parser.parse_args()
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     sim = HybridSim(plant_of(experiment), count=args.count, device=args.device)
     sim.place(pos_w=np.tile([0.0, 0.0, 1.5], (args.count, 1)))
     pitch = np.linspace(0.0, 1.0, args.count)  # body rate [rad/s]

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from hil.params import HilParams
 from visthrow import config
-from visthrow.task import Experiment
+from visthrow.task import Experiment, load_experiment
 
 QUIET = (
     *("task.noise.observation_step=0.0", "task.noise.observation_bias=0.0"),
@@ -16,11 +16,6 @@ QUIET = (
     *("camera.mount.rotation_error_std=0.0", "camera.mount.position_error_std=0.0"),
 )
 """Overrides after which what is measured is exact and current, and commands arrive as sent."""
-
-
-def load_experiment(name: str, overrides: Sequence[str] = ()) -> Experiment:
-    """Load an experiment of ``configs/train``."""
-    return config.load(Experiment, config.find("train", name), overrides)
 
 
 def quiet(name: str, *overrides: str) -> Experiment:

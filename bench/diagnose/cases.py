@@ -157,11 +157,10 @@ def same(one: dict, other: dict, sizes: Callable[[dict], dict] = lambda theta: t
 
 def configured(theta: dict[str, float], path: Path) -> str:
     """Write the configuration in which the model has these effects; the path as text."""
-    from visthrow import config
     from visthrow.diagnose.apply import patch
-    from visthrow.task import Experiment
+    from visthrow.task import load_experiment
 
-    experiment = config.load(Experiment, config.find("train", "state"))
+    experiment = load_experiment("state")
     zero = [[0.0] * len(theta) for _ in theta]
     path.write_text(patch.text(BASE, experiment, theta, zero, 1, ()))
     return str(path)
@@ -227,13 +226,12 @@ def scramble(recipe: Recipe, folder: Path) -> dict:
 
 def flip(recipe: Recipe, _: Path) -> dict:
     """Residuals of every other flight turned around: what is common to all flights is gone."""
-    from visthrow import config
     from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.select import search
     from visthrow.diagnose.throw.throw_model import ThrowModel
-    from visthrow.task import Experiment, plant_of
+    from visthrow.task import load_experiment, plant_of
 
-    experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
+    experiment = load_experiment("state", model_of(recipe))
     model = ThrowModel(logs_of(recipe), plant_of(experiment))
     verdict = report.to_json(search.explain(altered.Flipped(model, recipe.seed)))
     return {"passed": not names(verdict), "said": verdict}

@@ -263,14 +263,13 @@ def on_held_back(
     ``samples`` their number. A law outside the catalogue has no size: it is the model as it was
     then that has 0."""
     from bench.diagnose.shortfalls import shortfalls
-    from visthrow import config
     from visthrow.diagnose.throw.throw_model import ThrowModel
-    from visthrow.task import Experiment, plant_of
+    from visthrow.task import load_experiment, plant_of
 
     sizes = {**answers, "before": {}}
     if not any(name.startswith("law_") for name in recipe.effects):
         sizes["oracle"] = recipe.effects | dust_of(recipe)
-    experiment = config.load(Experiment, config.find("train", "state"), model_of(recipe))
+    experiment = load_experiment("state", model_of(recipe))
     logs = [FlightLog.load(path) for path in sorted(held.glob("*.npz"))]
     names = sorted(set().union(*sizes.values()))
     model = ThrowModel(

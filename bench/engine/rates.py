@@ -15,8 +15,7 @@ from bench import commands, start
 from bench.engine import SUBSTEPS, overrides
 from bench.report import Report, Table, device_name, finish, rate
 from bench.sim_gpu import Graph
-from visthrow import config
-from visthrow.task import Experiment
+from visthrow.task import load_experiment
 
 PAPERS_SUBSTEPS = 10  # a control step, whatever the solver's own step
 SECONDS = 1.0  # of a measurement, at least
@@ -25,7 +24,7 @@ SECONDS = 1.0  # of a measurement, at least
 def measure(solver: str, count: int, args: Namespace) -> dict:
     """Rate of one solver in substeps of 2 ms a second."""
     changes = [*overrides(solver), *args.overrides]
-    experiment = config.load(Experiment, config.find("train", "state"), changes)
+    experiment = load_experiment("state", changes)
     begin = time.perf_counter()
     graph = Graph(experiment, count, "hover", args.device)
     built = time.perf_counter() - begin

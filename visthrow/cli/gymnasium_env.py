@@ -13,15 +13,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy import ndarray
 
-from visthrow import config
 from visthrow.onboard import actions as act
-from visthrow.task import Experiment
+from visthrow.task import load_experiment
 from visthrow.training.env import ThrowEnv
-
-
-def load_experiment(name: str, overrides: tuple[str, ...] = ()) -> Experiment:
-    """Load a configuration of ``configs/train`` or a TOML file, with ``--set`` overrides."""
-    return config.load(Experiment, config.find("train", name), list(overrides))
 
 
 class ThrowVectorEnv(VectorEnv):
@@ -42,7 +36,7 @@ class ThrowVectorEnv(VectorEnv):
         """Build the simulator.
 
         Args:
-            name, overrides: configuration, as :func:`load_experiment` takes it.
+            name, overrides: configuration, as :func:`visthrow.task.load_experiment` takes it.
             count: number of throws E.
             device: "cpu" or "cuda:0".
             seed: of everything random; ``reset(seed=...)`` replaces it.

@@ -7,8 +7,9 @@ the learning parameters; :func:`plant_of` gives what the simulator needs of it."
 
 import math
 import statistics
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from camera.params import CameraParams
@@ -25,6 +26,7 @@ from sim.params import (
     VehicleParams,
 )
 from sim.scaling.vehicle_class import FleetParams
+from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bound, Bounded, NotNegative, Positive
 
@@ -475,6 +477,14 @@ def _no_vehicle(e: Experiment) -> Iterator[str]:
         )
 
 
+def load_experiment(name: str | Path, changes: Iterable[str] = ()) -> Experiment:
+    """Load a configuration of ``configs/train`` or a TOML file, with changes ``key=value``.
+
+    Raises ConfigError: there is none, or a change is wrong.
+    """
+    return config.load(Experiment, config.find("train", name), changes)
+
+
 def plant_of(experiment: Experiment) -> PlantParams:
     """Return the plant of an experiment."""
     return PlantParams(
@@ -495,7 +505,6 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
     stay out. An entry whose field has a default enters where it differs from that: a policy from
     before the field was there fits what it is off in. ``whole``: every entry that a contract may
     have, whatever the policy sees and flies."""
-    from visthrow import config
     from visthrow.onboard.observations import layout_of
     from visthrow.onboard.pilot import camera_conditions
 

@@ -11,7 +11,7 @@ from visthrow import config
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
 from visthrow.onboard.policy import Policy, find_policy, flattened
-from visthrow.task import Experiment, contract_of
+from visthrow.task import Experiment, contract_of, load_experiment
 from visthrow.task.fleet import specialised
 
 Kind = TypeVar("Kind", bound=Experiment)
@@ -55,9 +55,7 @@ def load_policy(
         rule = policy.contract.get("camera", {}).get("invalid_reads")
         # of the program, not of the camera
         trained = [] if rule is None else [f"camera.noise.invalid_reads={rule}"]
-        experiment = config.load(
-            Experiment, config.find("train", config_name), [*trained, *overrides]
-        )
+        experiment = load_experiment(config_name, [*trained, *overrides])
     else:
         experiment = trained_in(policy, path, overrides)
     contract_here = contract_of(experiment)
@@ -115,7 +113,7 @@ def trained_in(
     # Learning parameters are today's: they play no part in flight, and an older policy may lack a
     # newer one.
     layout = policy.contract.get("observation", {}).get("layout", "state")
-    learning = config.to_dict(config.load(Experiment, config.find("train", layout)).ppo)
+    learning = config.to_dict(load_experiment(layout).ppo)
     text = toml_text.dumps(config.without_none({**trained, "ppo": learning}))
     return config.loads(
         kind,

@@ -80,7 +80,7 @@ def _apply_firmware(args: argparse.Namespace) -> int:
     from visthrow.common.storage import atomic_write
     from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs.model_arguments import DEFAULT_PLANT
-    from visthrow.task import Experiment
+    from visthrow.task import Experiment, load_experiment
 
     if args.hover is None:
         raise DiagnoseError(
@@ -89,7 +89,7 @@ def _apply_firmware(args: argparse.Namespace) -> int:
         )
     plant = args.plant or DEFAULT_PLANT
     base = _named("train", plant)
-    experiment = config.load(Experiment, config.find("train", plant))
+    experiment = load_experiment(plant)
     text = patch.with_firmware(args.diagnosis, base, experiment, args.hover, args.delay)
     atomic_write(args.out, text)
     config.load(Experiment, Path(args.out))

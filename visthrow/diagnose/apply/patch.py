@@ -23,7 +23,7 @@ from visthrow.diagnose.inputs.setup import Setup
 from visthrow.diagnose.models.catalogue import beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.logs.readers.blackbox.decoder import read_blackbox
-from visthrow.task import Experiment, plant_of
+from visthrow.task import Experiment, load_experiment, plant_of
 
 
 def extended(experiment: Experiment, theta: Mapping[str, float]) -> Experiment:
@@ -95,7 +95,7 @@ def text(
         extended(experiment, theta), diagnosed=varied, laws=(*experiment.laws, *laws)
     )
     check_laws(after.laws)
-    plain = config.load(Experiment, config.find("train", base))
+    plain = load_experiment(base)
     changed = differences(config.to_dict(plain), config.to_dict(after))
     lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
     return "\n".join([*lines, *_commented(changed, named, theta, covariance)]).rstrip() + "\n"

@@ -138,15 +138,14 @@ def throw_model(
     """The whole throw, with the plant of an experiment, and its logs with their
     commands put right.
     """
-    from visthrow import config
     from visthrow.common.compute_device import resolve
     from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.search import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
-    from visthrow.task import Experiment, plant_of
+    from visthrow.task import load_experiment, plant_of
 
     threads.keep_freed_memory()
-    experiment = config.load(Experiment, config.find("train", args.plant), args.overrides)
+    experiment = load_experiment(args.plant, args.overrides)
     only = args.only.split(",") if args.only is not None else None
     measured = {
         "sensing": experiment.sensing,

@@ -112,9 +112,9 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
         return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map, VELOCITIES)
     if plant is None:
         return KnownVehicle(unread=VELOCITIES)
-    from visthrow.task import Experiment, plant_of
+    from visthrow.task import load_experiment, plant_of
 
-    trained = plant_of(config.load(Experiment, config.find("train", plant)))
+    trained = plant_of(load_experiment(plant))
     rope = trained.rope
     return KnownVehicle(
         rope.length + rope.payload_offset,

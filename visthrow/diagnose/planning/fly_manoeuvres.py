@@ -12,7 +12,6 @@ import numpy as np
 from sim.effects.effect import apply
 from sim.params import PlantParams, changed
 from sim.scaling.units import Units, in_units
-from visthrow import config
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
@@ -26,7 +25,7 @@ from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
 from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
-from visthrow.task import Experiment, plant_of
+from visthrow.task import load_experiment, plant_of
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
@@ -87,7 +86,7 @@ def simulator_of(
         model_of = partial(_throw_model, model)
         adapted = copy
     elif isinstance(model, FlyerModel) and isinstance(model.params, FlyerParams):
-        known = plant_of(config.load(Experiment, config.find("train", "state")))
+        known = plant_of(load_experiment("state"))
         plant = vehicle_of(model.params, known)
         model_of = partial(_setup_model, model, build)
         adapted = partial(carried, params=model.params)

@@ -4,21 +4,20 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from sim.cores import cores
-from visthrow import config
 from visthrow.common import compute_device
 from visthrow.paper.baseline import NAME
 from visthrow.paper.baseline.fly_plan import delays_of, fly_pendulum, fly_plant
 from visthrow.paper.baseline.pendulum_model import pendulum_of
 from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_throw
-from visthrow.task import Experiment, contract_of, plant_of
+from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.throws.reference_protocol import batches
 from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
 
@@ -35,6 +34,8 @@ MADE_UP = {
 
 BOUNDS = ("payload and thrust", "payload")
 """What plans bound: ours, and the payload alone as the paper's do."""
+
+_experiment = cache(load_experiment)
 
 
 def title_of(plant: str, compensation: str) -> str:
@@ -104,11 +105,6 @@ def units(
     return [
         unit(plant, compensation, target, size, seed, batch=i, **how) for i, size in batches(throws)
     ]
-
-
-@lru_cache(maxsize=8)
-def _experiment(name: str, overrides: tuple[str, ...]) -> Experiment:
-    return config.load(Experiment, config.find("train", name), overrides)
 
 
 def plan_of(experiment: Experiment, unit: dict[str, Any]) -> ThrowPlan:

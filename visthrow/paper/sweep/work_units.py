@@ -16,7 +16,7 @@ from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.onboard.policy import find_policy
 from visthrow.paper.sweep import SweepList, ThrowParams
-from visthrow.task import Experiment
+from visthrow.task import Experiment, load_experiment
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
 
@@ -26,6 +26,8 @@ FULL = {"state": "state", "vision": "vision_ideal"}
 POLICY = "policy.npz"
 SUMMARY = "summary.json"
 PROGRESS = "progress.csv"
+
+_experiment = cache(load_experiment)
 
 
 @dataclass(frozen=True)
@@ -250,11 +252,6 @@ def _throws(source: ResultSource, name: str, params: ThrowParams) -> list[ThrowU
 @cache
 def _hash(path: Path, changed: int) -> str:
     return results.hash_of(path)
-
-
-@cache
-def _experiment(name: str, changes: tuple[str, ...]) -> Experiment:
-    return config.load(Experiment, config.find("train", name), changes)
 
 
 @cache
