@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy import ndarray
 from scipy.optimize import minimize
+from tensordict import TensorDict
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -76,41 +77,34 @@ class FitParams(Bounded):
             )
 
 
-@dataclass(frozen=True)
-class Labels:
-    """The true places in frames; `Truth` on the device, float32."""
+def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> TensorDict:
+    """Labels of F frames: their true places, float32 unless stated.
 
-    rays: dict[str, Tensor]  # by kind, unit ray to the middle, shape (F, 3)
-    sizes: dict[str, Tensor]  # by kind [rad], shape (F,)
-    seen: dict[str, Tensor]  # by kind, whole in view, shape (F,), bool
-    corners: Tensor  # unit rays, shape (F, 4, 3)
-    north: Tensor  # the world's x in the camera frame, shape (F, 3)
-    distractor: Tensor  # unit ray to something else, shape (F, 3)
-
-
-def labels_of(truth: Truth, things_c: Tensor, radius: float, device: str) -> Labels:
-    """Labels of frames.
+    ``rays`` by kind, unit ray to the middle, shape (F, 3); ``sizes`` by kind [rad], shape (F,);
+    ``seen`` by kind, whole in view, shape (F,), bool; ``corners``, unit rays, shape (F, 4, 3);
+    ``north``, the world's x in the camera frame, shape (F, 3); ``distractor``, unit ray to
+    something else, shape (F, 3).
 
     Args:
         truth: of their scenes. things_c: place of one other thing [m], shape (F, 3), camera frame.
         radius: of the ball [m]. device: where they go.
     """
-    unit = lambda v: F.normalize(v, dim=-1)  # noqa: E731
-    corners = unit(truth.corners_c)
-    middle = unit(corners.mean(1))
+    corners = F.normalize(truth.corners_c, dim=-1)
+    middle = F.normalize(corners.mean(1), dim=-1)
     sizes = {
         "ball": (radius / truth.ball_c.norm(dim=-1)).clamp(max=0.99).asin(),
         "goal": (corners @ middle[:, :, None])[..., 0].clamp(max=1.0).acos().mean(1),
     }
-    move = lambda v: v.to(device, torch.float32)  # noqa: E731
-    return Labels(
-        {"ball": move(truth.ball_ray), "goal": move(middle)},
-        {kind: move(size) for kind, size in sizes.items()},
-        {"ball": truth.ball_seen.to(device), "goal": truth.goal_seen.to(device)},
-        move(corners),
-        move(truth.rot_wc[:, 0]),
-        move(unit(things_c)),
-    )
+    places = {
+        "rays": {"ball": truth.ball_ray, "goal": middle},
+        "sizes": sizes,
+        "corners": corners,
+        "north": truth.rot_wc[:, 0],
+        "distractor": F.normalize(things_c, dim=-1),
+    }
+    labels = TensorDict(places, batch_size=[len(corners)]).float()
+    labels["seen"] = {"ball": truth.ball_seen, "goal": truth.goal_seen}
+    return labels.to(device)
 
 
 def other_lens(lens, generator: torch.Generator):
@@ -128,7 +122,7 @@ def other_lens(lens, generator: torch.Generator):
 
 def rendered(
     camera: CameraParams, renderer: Renderer, count: int, seed: int
-) -> tuple[Tensor, Labels, Fisheye]:
+) -> tuple[Tensor, TensorDict, Fisheye]:
     """Frames of random scenes, their labels and their lens."""
     lens = Fisheye(camera.fisheye)
     scenes = random_scenes(camera, renderer.textures, count, seed)
@@ -144,7 +138,7 @@ def rendered(
     )
 
 
-def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
+def search_loss(grids: Tensor, labels: TensorDict, lens: Fisheye) -> Tensor:
     """Loss of places, after Zhou et al., "Objects as Points", 2019: focal about a soft peak; place
     and size at the peak's cell.
     """
@@ -154,12 +148,12 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
         torch.meshgrid(torch.arange(width), torch.arange(height), indexing="xy"), -1
     ).to(grids)
     for k, kind in enumerate(KINDS):
-        pixels, visible = lens.project(labels.rays[kind])
+        pixels, visible = lens.project(labels["rays", kind])
         position = (pixels + 0.5) / CELL
         cell = position.floor().long()
         visible = visible & (cell >= 0).all(-1) & (cell[:, 0] < width) & (cell[:, 1] < height)
         cell = torch.where(visible[:, None], cell, 0)
-        present = labels.seen[kind] & visible
+        present = labels["seen", kind] & visible
         distance = (cells + 0.5 - position[:, None, None]).square().sum(-1)
         same_cell = (cells.long() == cell[:, None, None]).all(-1)
         soft = (
@@ -178,13 +172,13 @@ def search_loss(grids: Tensor, labels: Labels, lens: Fisheye) -> Tensor:
         p = peak[:, 0].sigmoid().clamp(1e-5, 1 - 1e-5)
         positive = -((1 - p) ** 2 * p.log())
         off = (peak[:, 1:3] - (position - cell - 0.5)).abs().sum(-1)
-        size_off = (peak[:, 3] - log_size(labels.sizes[kind], lens)).abs()
+        size_off = (peak[:, 3] - log_size(labels["sizes", kind], lens)).abs()
         total = total + (negative + present * (positive + off + 0.5 * size_off)).mean()
     return total
 
 
 def looks(
-    kind: str, labels: Labels, count: int, peaks: tuple[Tensor, Tensor], generator
+    kind: str, labels: TensorDict, count: int, peaks: tuple[Tensor, Tensor], generator
 ) -> tuple[Tensor, ...]:
     """Places to look at: frame, ray, size; half of them about the thing, the others at other
     things, anywhere, or where the search erred.
@@ -193,33 +187,35 @@ def looks(
         kind: of the thing. labels: of the frames. count: of places.
         peaks: of the search, rays (F, 3) and sizes (F,). generator: on the labels' device.
     """
-    device = labels.corners.device
+    device = labels["corners"].device
     draw = lambda *shape: torch.randn(*shape, generator=generator, device=device)  # noqa: E731
-    index = torch.randint(len(labels.corners), (count,), generator=generator, device=device)
-    size = labels.sizes[kind][index] * (0.25 * draw(count)).exp()
-    ray = labels.rays[kind][index]
+    index = torch.randint(len(labels["corners"]), (count,), generator=generator, device=device)
+    size = labels["sizes", kind][index] * (0.25 * draw(count)).exp()
+    ray = labels["rays", kind][index]
     ray = F.normalize(ray + 0.45 * size[:, None] * draw(count, 3), dim=-1)
     source = torch.randint(8, (count,), generator=generator, device=device)
     other_kind = "goal" if kind == "ball" else "ball"
     anywhere = F.normalize(draw(count, 3), dim=-1)
     anywhere[:, 2] = anywhere[:, 2].abs()
     peak, peak_size = (value[index] for value in peaks)
-    candidates = (labels.distractor[index], anywhere, labels.rays[other_kind][index], peak)
+    candidates = (labels["distractor"][index], anywhere, labels["rays", other_kind][index], peak)
     for number, rays in enumerate(candidates, 4):
         ray = torch.where((source == number)[:, None], rays, ray)
     return index, ray, torch.where(source == 7, peak_size.clamp(5e-3, 0.5), size)
 
 
-def offsets(kind: str, views: Views, detections: Tensor, labels: Labels, index: Tensor) -> Tensor:
+def offsets(
+    kind: str, views: Views, detections: Tensor, labels: TensorDict, index: Tensor
+) -> Tensor:
     """Return the error of detections in half sides; of a ball the last column is of its
     log size.
     """
     if kind == "ball":
-        size = (labels.sizes["ball"][index] * REACH["ball"] / views.reach).log()
-        point = views.points(labels.rays["ball"][index, None])[:, 0]
+        size = (labels["sizes", "ball"][index] * REACH["ball"] / views.reach).log()
+        point = views.points(labels["rays", "ball"][index, None])[:, 0]
         true = torch.cat([point, size[:, None]], -1)
         return (detections[:, 2:5] - true) * true.new_tensor([1.0, 1.0, 0.5])
-    corners = views.points(labels.corners[index])
+    corners = views.points(labels["corners"][index])
     quadrants = corners.new_tensor([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     off = corners - corners.mean(1, keepdim=True)
     scores = [(off.roll(-k, 1) * quadrants).sum((1, 2)) for k in range(4)]
@@ -288,7 +284,7 @@ class Fit:
         frames, labels, lens = self.pool[int(torch.randint(len(self.pool), (1,), generator=host))]
         chosen = torch.randperm(len(frames), generator=host)[: p.batch].to(self.device)
         frames = frames[chosen]
-        labels = _chosen(labels, chosen)
+        labels = labels[chosen]
         grids = self.networks.search(self.augment(halved(frames)))
         losses = {"search": search_loss(grids, labels, lens)}
         for k, kind in enumerate(KINDS):
@@ -303,7 +299,7 @@ class Fit:
         self.step += 1
         return {name: float(value.detach()) for name, value in losses.items()}
 
-    def _render(self) -> tuple[Tensor, Labels, Fisheye]:
+    def _render(self) -> tuple[Tensor, TensorDict, Fisheye]:
         """Render the fresh frames of this step."""
         p = self.params
         seed = p.seed * 1_000_003 + self.step
@@ -314,24 +310,24 @@ class Fit:
         return rendered(replace(self.camera, fisheye=lens), self.renderer, p.fresh, seed)
 
     def look_loss(
-        self, kind: str, frames: Tensor, labels: Labels, lens: Fisheye, places, generator
+        self, kind: str, frames: Tensor, labels: TensorDict, lens: Fisheye, places, generator
     ) -> Tensor:
         """Loss of one kind's close looks: whether the thing is there, where and how large, and how
         far off that is.
         """
         index, ray, size = places
-        north = labels.north[index] + 0.15 * torch.randn(
+        north = labels["north"][index] + 0.15 * torch.randn(
             len(index), 3, generator=generator, device=ray.device
         )
         views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
         patches = patches_of(frames, index, views, lens, PATCH[kind])
         outputs = getattr(self.networks, kind)(self.augment(patches))
-        true = labels.rays[kind][index]
+        true = labels["rays", kind][index]
         point = views.points(true[:, None])[:, 0]
         radius = point.norm(dim=-1)
         in_front = (views.axes[:, 2] * true).sum(-1) > 0.2
-        ratio = (labels.sizes[kind][index] / size).log().abs()
-        present = labels.seen[kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
+        ratio = (labels["sizes", kind][index] / size).log().abs()
+        present = labels["seen", kind][index] & in_front & (radius < 0.75) & (ratio < 0.8)
         absent = ~in_front | (radius > 1.2)
         judged = present | absent
         loss = F.binary_cross_entropy_with_logits(outputs[:, 0], present.float(), reduction="none")
@@ -405,7 +401,7 @@ class Fit:
             count = min(16, total - first)
             frames, labels, lens = rendered(self.camera, self.renderer, count, 900_000_001 + first)
             for e in range(count):
-                one = _chosen(labels, torch.tensor([e]))
+                one = labels[e : e + 1]
                 scores = findings(self.networks, frames[e : e + 1], one, lens)
                 for kind, rows in scores.items():
                     samples[kind].append(rows)
@@ -429,7 +425,9 @@ class Fit:
         return figures
 
 
-def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -> dict[str, Tensor]:
+def findings(
+    networks: Networks, frame: Tensor, labels: TensorDict, lens: Fisheye
+) -> dict[str, Tensor]:
     """Score the places of one frame: logit, whether it is of the thing, error [rad], told
     accuracy [rad]; a row each.
     """
@@ -438,16 +436,16 @@ def findings(networks: Networks, frame: Tensor, labels: Labels, lens: Fisheye) -
     for kind in KINDS:
         rays, sizes = places[kind]
         views, out, rays, sizes = look_closely(
-            networks, kind, frame, rays, sizes, lens, labels.north
+            networks, kind, frame, rays, sizes, lens, labels["north"]
         )
-        error = _angle_between(rays, labels.rays[kind])
-        size = labels.sizes[kind]
-        visible = labels.seen[kind]
+        error = _angle_between(rays, labels["rays", kind])
+        size = labels["sizes", kind]
+        visible = labels["seen", kind]
         hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
         clear = visible | (error > 2.0 * size)  # else half in view
         if kind == "goal":
             first = views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1]
-            error = _angle_between(first, labels.corners).amin(-1)
+            error = _angle_between(first, labels["corners"]).amin(-1)
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
         scores[kind] = rows[clear.expand(len(rows))]
     return scores
@@ -473,15 +471,6 @@ def _angle_between(rays: Tensor, references: Tensor) -> Tensor:
     """Angles between unit rays [rad], exact for small ones."""
     sine = torch.linalg.cross(*torch.broadcast_tensors(rays, references)).norm(dim=-1)
     return torch.atan2(sine, (rays * references).sum(-1))
-
-
-def _chosen(labels: Labels, rows: Tensor) -> Labels:
-    rows = rows.to(labels.corners.device)
-    tables = (
-        {kind: value[rows] for kind, value in table.items()}
-        for table in (labels.rays, labels.sizes, labels.seen)
-    )
-    return Labels(*tables, labels.corners[rows], labels.north[rows], labels.distractor[rows])
 
 
 def _peaks(grids: Tensor, lens: Fisheye) -> tuple[Tensor, Tensor]:

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from visthrow import __version__
 from visthrow.common.storage import atomic_write
-from visthrow.common.templates import rendered
 from visthrow.view.parts import Grid, Picture, Section, Text
+from visthrow.view.templates import rendered
 
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
 LEADS = {"missing": "*Missing.* ", "finding": "- "}

@@ -5,8 +5,8 @@ from pathlib import Path
 from torch import Tensor
 
 from visthrow.common.storage import atomic_write
-from visthrow.common.templates import rendered
 from visthrow.onboard.policy import Policy, named_activation
+from visthrow.view.templates import rendered
 
 
 def write_c(policy: Policy, path: str | Path) -> None:
