@@ -201,6 +201,43 @@ def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
     assert not diagnosis.named
 
 
+class Sinking(SyntheticModel):
+    """A push on the vehicle wherever it sinks faster than 0.3 m/s: no product of factors."""
+
+    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
+        force = np.zeros((2, 3, len(motion["time"])))
+        force[0, 2] = self.law_size * (motion["vel_w"][:, 2] < -0.3)
+        return force.ravel()
+
+
+class LinearDrag(SyntheticModel):
+    """Drag along the vertical of the same motion."""
+
+    def _law(self, motion: dict[str, np.ndarray]) -> np.ndarray:
+        force = np.zeros((2, 3, len(motion["time"])))
+        force[0, 2] = -self.law_size * motion["vel_w"][:, 2]
+        return force.ravel()
+
+
+@mark.parametrize(("kind", "size"), [(Sinking, 0.1), (LinearDrag, 0.05)])
+def test_a_name_of_another_form_than_the_truth_is_withdrawn(kind, size):
+    """Drag explains a part of a push that begins at a speed; what it leaves follows that speed."""
+    model = kind(law="along", law_size=size, seed=3)
+    drag = LinearDrag(law="along", law_size=1.0, seed=3).by_law
+    model.effects = (EFFECTS[0], replace(EFFECTS[1], prior_sd=0.05), *EFFECTS[2:])
+    for w, moved in zip(model._windows, drag):
+        w.effects[:, 1] = moved
+    diagnosis = search.explain(model)
+    if kind is LinearDrag:
+        assert diagnosis.overall == result.KNOWN
+        assert diagnosis.named == ("effect_01",)
+        return
+    assert (diagnosis.overall, diagnosis.block) == (result.UNKNOWN, "vehicle force")
+    assert not diagnosis.named
+    assert diagnosis["effect_01"].verdict == result.NOT_IDENTIFIABLE
+    assert "F = f(v_z)" in diagnosis.reasons[0]
+
+
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 
@@ -239,12 +276,12 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
             at.problem, [at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
         )
         scale = problem.priors.floor[-1]
-        assert point.information[-1, -1] == approx(scale**2 * of.information[i], rel=1e-6)
+        assert point.information[-1, -1] == approx(scale**2 * of.information[i, 0, 0], rel=1e-6)
         assert point.score[-1] == approx(
-            scale * of.score[i], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.information[i])
+            scale * of.score[i, 0], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.information[i, 0, 0])
         )
         cross, most = scale * of.cross, scale * np.abs(of.cross).max()
-        assert_allclose(point.information[-1, :-1], cross[i], rtol=1e-5, atol=1e-9 * most)
+        assert_allclose(point.information[-1, :-1], cross[i, 0], rtol=1e-5, atol=1e-9 * most)
 
 
 def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
@@ -320,10 +357,12 @@ def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
     priors = Priors.of(effects, ("pos_w", "payload_pos_w"))
     point = SimpleNamespace(information=information, score=score)
     both, name = 0.5 * score @ np.linalg.solve(information, score), 0.5 * score[0] ** 2 / 4.0
-    screened = terms.Screen((), np.ones(1), *(a[1:] for a in (information[1], score, information)))
+    screened = terms.Screen(
+        (), np.ones(1), information[1:, 1:, None], score[1:, None], information[1:, None]
+    )
     beside = SimpleNamespace(information=information[:1, :1], score=score[:1])
     known = replace(priors, **{n: getattr(priors, n)[:1] for n in ("floor", "slab", "low", "high")})
-    screened.cross = screened.cross[:, :1]
+    screened.cross = screened.cross[:, :, :1]
     (nats,) = terms.unsaid(beside, known, [], screened, [0])
     assert nats == approx(both - name, rel=1e-3)
     (law,) = terms.laws(SimpleNamespace(priors=priors, effects=effects), point, [0, 1], 5.0)

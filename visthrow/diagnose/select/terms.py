@@ -9,7 +9,7 @@ any other."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.models.law_terms import (
     JOINT,
+    SCALARS,
+    SYMBOLS,
+    VECTORS,
     KnotValues,
     Term,
     carries,
@@ -56,6 +59,14 @@ name in that of one of any size.
 
 SAME = 1e-9  # share of a term's information from which what a cause leaves of it is rounding
 
+PIECES = 7
+"""Places between which a curve is linear: a step is told from a line, and of 5 or 9 places the
+evidence is the same within a few nats.
+"""
+
+OUTER = 1.0, 99.0  # percentiles of what was flown, between which the places lie
+LEAST_REACH = 1e-6  # of a scalar that never changes, whose curve is a constant
+
 # terms that become effects to be weighed: as many as other sets that are simulated in their place
 WEIGHED = 6
 
@@ -67,13 +78,15 @@ def _terms(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
 
 @dataclass
 class Screen:
-    """Information of all terms about one point, summed over windows."""
+    """Information of all terms, or curves, about one point, summed over windows.
+
+    A term is one column of latent forces; a curve is ``m`` of them, see :func:`best_curve`."""
 
     terms: tuple[Term, ...]
     size: np.ndarray  # root mean square over the knots, shape (T,)
-    information: np.ndarray  # shape (T,)
-    score: np.ndarray
-    cross: np.ndarray  # with the effects, shape (T, K)
+    information: np.ndarray  # shape (T, m, m)
+    score: np.ndarray  # shape (T, m)
+    cross: np.ndarray  # with the effects, shape (T, m, K)
 
 
 def acts_in(laws: Iterable[str]) -> set[str]:
@@ -114,9 +127,15 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
 
 
 def screen(
-    point: Point, parts: Sequence[LatentStatistics], block: str, quantities: Sequence[KnotValues]
+    point: Point,
+    parts: Sequence[LatentStatistics],
+    block: str,
+    quantities: Sequence[KnotValues],
+    curves: bool = False,
 ) -> Screen | None:
-    """Gather what each term of a block says; None where the windows carry no knots for any."""
+    """Gather what each term of a block says, or each curve; None where the windows carry no knots
+    for any.
+    """
     carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
     names = [set(point.windows[w].knots) for w in carriers]
     shared = tuple(sorted(set.intersection(*names))) if names else ()
@@ -124,20 +143,59 @@ def screen(
     if not terms:
         return None
     latent_block = LATENT_BLOCKS.index(level_block(block))
+    pieces = partial(_proportional, terms)
+    if curves:
+        terms = tuple(term for term in terms if len(term.factors) == 1)
+        pieces = partial(_hats, terms, _places(terms, [quantities[w] for w in carriers]))
 
     def in_window(w: int) -> tuple[np.ndarray, ...]:
         """Square, information, score and cross information of all terms."""
         part, transfer = parts[w], through_latents(point.windows[w], quantities[w], block)
-        values = table(terms, quantities[w]).reshape(transfer.shape[1], -1)
+        values = pieces(quantities[w])
+        count, columns = values.shape[2:]
+        values = values.reshape(transfer.shape[1], -1)
         exerted = transfer[point.grams[w].latent_block == latent_block] @ values
+        square = (exerted**2).sum(0).reshape(count, columns).sum(1)
         loads = transfer @ values
-        information = (loads * (part.latent_information @ loads)).sum(0)
-        score = part.latent_score + part.latent_effects @ point.theta
-        return (exerted**2).sum(0), information, score @ loads, loads.T @ part.latent_effects
+        informed = (part.latent_information @ loads).reshape(-1, count, columns)
+        score = (part.latent_score + part.latent_effects @ point.theta) @ loads
+        cross = (loads.T @ part.latent_effects).reshape(count, columns, -1)
+        loads = loads.reshape(informed.shape)
+        information = np.einsum("lti,ltj->tij", loads, informed)
+        return square, information, score.reshape(count, columns), cross
 
     square, information, score, cross = map(sum, zip(*parallel_map(in_window, carriers)))
     count = sum(int((point.grams[w].latent_block == latent_block).sum()) // 3 for w in carriers)
     return Screen(terms, np.sqrt(square / max(count, 1)), information, score, cross)
+
+
+def _proportional(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
+    """Return terms as one column each, shape (k, 3, T, 1)."""
+    return table(terms, values)[..., None]
+
+
+def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> np.ndarray:
+    """Return where the curve of each term's scalar may bend, evenly over what was flown, shape
+    (T, m).
+    """
+    places = {}
+    for name in {term.factors[0] for term in terms}:
+        flown = np.concatenate([SCALARS[name].read(v) for v in values])
+        low, high = np.percentile(flown, OUTER)
+        places[name] = np.linspace(low, max(high, low + LEAST_REACH), PIECES)
+    return np.array([places[term.factors[0]] for term in terms])
+
+
+def _hats(terms: Sequence[Term], places: np.ndarray, values: KnotValues) -> np.ndarray:
+    """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m)."""
+    columns = []
+    for term, bends in zip(terms, places):
+        scalar = SCALARS[term.factors[0]].read(values)
+        place = np.interp(scalar, bends, np.arange(len(bends)))
+        hats = np.maximum(1.0 - np.abs(place[:, None] - np.arange(len(bends))), 0.0)
+        vector = VECTORS[term.block][term.vector].read(values)
+        columns.append(vector[:, :, None] * hats[:, None, :])
+    return np.stack(columns, axis=2)
 
 
 def gains(
@@ -148,7 +206,10 @@ def gains(
     """
     information, score = _conditional(point, priors.deviation(list(active)), screened)
     prior = reach / np.maximum(screened.size, 1e-12 * screened.size.max() + 1e-300)
-    gain = -0.5 * np.log1p(prior**2 * information) + 0.5 * score**2 / (information + prior**-2.0)
+    variance = prior[:, None] ** 2
+    precision = np.eye(score.shape[1]) + variance[:, None] * information
+    explained = (score * np.linalg.solve(precision, (variance * score)[..., None])[..., 0]).sum(1)
+    gain = 0.5 * (explained - np.linalg.slogdet(precision)[1])
     gain[screened.size <= 1e-9 * screened.size.max()] = -np.inf
     return gain, prior
 
@@ -158,9 +219,33 @@ def _conditional(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Information and score of each term, of what effects of these prior deviations leave."""
     sigma = covariance(point.information, deviation)
-    known = np.einsum("tk,kl,tl->t", screened.cross, sigma, screened.cross, optimize=True)
-    information = np.maximum(screened.information - known, 0.0)
+    known = np.einsum("tik,kl,tjl->tij", screened.cross, sigma, screened.cross, optimize=True)
+    information = screened.information - known
+    diagonal = np.einsum("tii->ti", information)  # a view
+    np.maximum(diagonal, 0.0, out=diagonal)
     return information, screened.score - screened.cross @ (sigma @ point.score)
+
+
+def best_curve(
+    problem: Problem, point: Point, active: Sequence[int], block: str, reach: float
+) -> tuple[float, str]:
+    """Return the nats that the best curve of a block brings beside a set of names, less the log of
+    how many were tried, and its formula; 0 and "" where none can be told.
+
+    A curve is a force f(q) v along a vector v, with any function f of one scalar q: pieces that
+    are linear between ``PIECES`` places. It tells whether names have the right form. No name is
+    given up for a law that is a little better: a curve that holds no more than the names say
+    brings nothing. ``reach``: prior deviation of f v at each place."""
+    calm, parts = with_capped_gusts(point)
+    values = [KnotValues(window.knots) for window in point.windows]
+    screened = screen(calm, parts, block, values, curves=True)
+    if screened is None:
+        return 0.0, ""
+    gain, _ = gains(calm, problem.priors, active, screened, reach)
+    best = int(np.argmax(gain))
+    scalar, vector = screened.terms[best].parts
+    formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
+    return float(gain[best] - np.log(len(gain))), formula
 
 
 def unsaid(
@@ -174,7 +259,8 @@ def unsaid(
     deviation = priors.deviation(list(active))
     sigma = covariance(point.information, deviation)
     information, score = _conditional(point, deviation, screened)
-    shared, mean = (screened.cross @ sigma)[:, causes], (sigma @ point.score)[causes]
+    information, score = information[:, 0, 0], score[:, 0]
+    shared, mean = (screened.cross[:, 0] @ sigma)[:, causes], (sigma @ point.score)[causes]
     spread = np.maximum(deviation**2 - sigma.diagonal(), SAME * deviation**2)[causes]
     alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
     left = score[:, None] - shared * mean / spread

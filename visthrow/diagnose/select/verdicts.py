@@ -37,6 +37,7 @@ from visthrow.diagnose.select.held_out import Work, repeated_share, share_text
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
+    UNKNOWN_RATIO,
     Point,
     Problem,
     moved,
@@ -264,29 +265,33 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
 
 
 def _law(selection: Selector) -> tuple[set[int], str]:
-    """Return the names that are withdrawn beside the set's laws, and the reason for the laws.
-
-    Names that act in a law's block may be a part of its form. A name acts there by its column or by
-    what the other names cannot stand in for, as two delays that differ by a force. What is not
-    sure without those is withdrawn too."""
+    """Return the names that are withdrawn beside the set's laws, and the reason for the laws."""
     best = selection.best
-    names = selection.names
+    laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
+    text = " and ".join(
+        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
+        for law in laws_of_set
+    )
     blocks = terms.acts_in(c.law for c in laws_of(best.chosen))
+    return _parts_of(selection, blocks), f"{text} explains what no cause of the catalogue does"
+
+
+def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
+    """Return the names that may be a part of the form of something unknown in some blocks.
+
+    A name acts in a block by its column or by what the other names cannot stand in for, as two
+    delays that differ by a force. What is not sure without those is such a part too."""
+    best, names = selection.best, selection.names
     in_block = set()
     for j in names:
         remaining = [k for k in names if k != j]
         residual_block = acts_on(best.point, [j], free_effects=remaining)[0]
         if {selection.block_of(j), residual_block} & blocks:
             in_block.add(j)
-    point = best.point
     columns = [j for j in best.columns if j not in in_block]
-    sure = surely_there(point.information, point.score, selection.problem.priors, columns)
-    laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
-    text = " and ".join(
-        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
-        for law in laws_of_set
-    )
-    return set(names) - set(sure), f"{text} explains what no cause of the catalogue does"
+    priors = selection.problem.priors
+    sure = surely_there(best.point.information, best.point.score, priors, columns)
+    return set(names) - set(sure)
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
@@ -370,6 +375,8 @@ def _overall(
         names = ", ".join(selection.problem.effects[j].name for j in parts)
         reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
         return result.UNKNOWN, block, [*reasons, reason], set(parts)
+    for block, reason in _misshapen(selection).items():
+        return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
         return result.UNKNOWN, worst.block, reasons, _withdrawn(selection, excessive)
@@ -389,22 +396,50 @@ def _overall(
     return result.NO_EFFECT, "", [nothing], set()
 
 
+def _by_block(selection: Selector) -> dict[str, list[int]]:
+    """Return the names that act in each block; none where no calm phase tells what gusts are, for
+    what is left over then speaks of a wrong form.
+    """
+    blocks: dict[str, list[int]] = {}
+    for j in selection.names if compares_phases(selection.nominal) else ():
+        blocks.setdefault(selection.block_of(j), []).append(j)
+    blocks.pop("", None)
+    return blocks
+
+
 def _crowded(selection: Selector) -> dict[str, list[int]]:
     """Return the blocks whose names cost more together than a law that nobody wrote down, and of
     which the flights hardly tell some apart, with these names: parts of it are likelier.
     """
-    by_block: dict[str, list[int]] = {}
-    compared = compares_phases(selection.nominal)  # else what is left over speaks of a wrong form
-    for j in selection.names if compared else ():
-        by_block.setdefault(selection.block_of(j), []).append(j)
     crowded = {}
-    for block, members in by_block.items():
+    for block, members in _by_block(selection).items():
         part = selection.best.point.information[np.ix_(members, members)]
         unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
         law = selection.threshold + terms.LAW
-        if block and len(members) * selection.threshold > law and unlike.min() < 0.5:
+        if len(members) * selection.threshold > law and unlike.min() < 0.5:
             crowded[block] = members
     return crowded
+
+
+def _misshapen(selection: Selector) -> dict[str, str]:
+    """Return the blocks in which some function of one quantity explains what the names there leave,
+    and the reason: their form is another.
+    """
+    strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
+    reasons = {}
+    for block, members in _by_block(selection).items():
+        if block not in strongest:
+            continue
+        reach = UNKNOWN_RATIO * strongest[block]
+        problem, best = selection.problem, selection.best
+        nats, formula = terms.best_curve(problem, best.point, best.columns, block, reach)
+        if nats > selection.threshold:
+            names = ", ".join(problem.effects[j].name for j in members)
+            reasons[block] = (
+                f"a force {formula}, with any function f, explains {nats:.0f} nats that are left"
+                f" beside {names}; the form is another"
+            )
+    return reasons
 
 
 def _excess(level: Level) -> str:
