@@ -133,6 +133,15 @@ def test_training_draws_what_varies():
     assert_allclose(covariance, [[1.01e-4]])
 
 
+def test_what_varies_by_flight_and_by_day_varies_by_both_in_training():
+    rows = [
+        {"name": f"by_{by}", "found": True, "size": size, "of": ["release_lag"]}
+        for by, size in (("flight", 0.01), ("day", 0.02))
+    ]
+    covariance = patch.with_scatter({}, [], {"scatter": rows})[1]
+    assert_allclose(covariance, [[5e-4]])
+
+
 DELAYED = tuple(replace(e, name="cmd_delay") if i == 4 else e for i, e in enumerate(MADE_UP))
 FLOOR = DELAYED[4].floor
 

@@ -138,13 +138,13 @@ def with_scatter(
     theta: Mapping[str, float], covariance: Sequence[Sequence[float]], report: Mapping[str, Any]
 ) -> tuple[dict[str, float], np.ndarray]:
     """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to flight
-    has the mean of those that were flown, and their scatter.
+    has the mean of those that were flown, and their scatter, to which that of days adds.
     """
     count, sizes, scatter = len(theta), dict(theta), {}
     for row in report.get("scatter") or []:
         for name in row["of"] if row["found"] else ():
             sizes.setdefault(name, float(row.get("mean", {}).get(name, 0.0)))
-            scatter[name] = float(row["size"]) ** 2
+            scatter[name] = scatter.get(name, 0.0) + float(row["size"]) ** 2
     whole = np.zeros((len(sizes), len(sizes)))
     whole[:count, :count] = np.reshape(covariance, (count, count))
     return sizes, whole + np.diag([scatter.get(name, 0.0) for name in sizes])
