@@ -290,10 +290,9 @@ class TeamEnv(VecEnv):
         attached = rewards.kinetic(p, state["vel_w"], state["rate_b"], load_vel)
         attached = attached + rewards.command(p, action, self._rate_weights)
         attached = attached + rewards.change(p, action, previous, self._change_weights)
-        at_release = rewards.landing(p, error)
-        at_release = at_release + rewards.time_of_flight(p, landing["time_to_impact"])
-        proximity = rewards.proximity(p, landing["clearance"], release.clearance_margin)
-        at_release = at_release + proximity
+        at_release = rewards.at_release(
+            p, error, landing["time_to_impact"], landing["clearance"], release.clearance_margin
+        )
         shared = rewards.carry_time(p, period) - p.termination * negative.float()
         shared = shared - team.contact_cost * contact.float()
         shared = shared - team.margin_cost * (team.margin - gap).clamp(0.0, team.margin)

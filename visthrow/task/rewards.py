@@ -19,18 +19,18 @@ def kinetic(p: RewardParams, vel_w: Tensor, rate_b: Tensor, payload_vel_w: Tenso
 
 
 def command(p: RewardParams, action: Tensor, weights: Tensor) -> Tensor:
-    """r_cmd: -beta sum_i c^omega_i u_i^2 over the three rate commands, shape (E,). weights:
-    c^omega, shape (3,).
+    """r_cmd: -beta sum_i c^omega_i u_i^2 over the three rate commands, shape (..., E). action:
+    shape (..., E, 5). weights: c^omega, shape (3,).
     """
-    squares = action[:, 1:4].square()
+    squares = action[..., 1:4].square()
     return -p.smoothness * (weights * squares).sum(-1)
 
 
 def change(p: RewardParams, action: Tensor, previous: Tensor, weights: Tensor) -> Tensor:
     """r_rate, which keeps commands smooth: -beta sum_j c^Delta_j (eta |du_j| + du_j^2) punishes
-    jerks of the four, shape (E,). weights: shape (4,).
+    jerks of the four, shape (..., E). action, previous: shape (..., E, 5). weights: shape (4,).
     """
-    delta = action[:, :4] - previous[:, :4]
+    delta = action[..., :4] - previous[..., :4]
     jerk = p.l1_mix * delta.abs() + delta.square()
     return -p.smoothness * (weights * jerk).sum(-1)
 
@@ -57,3 +57,12 @@ def proximity(p: RewardParams, clearance: Tensor, margin: float) -> Tensor:
     """r_prox: -k_p max(0, d_m - clearance), shape (E,). clearance, margin: [m]."""
     missing = (margin - clearance).clamp(min=0.0)
     return -p.proximity * missing
+
+
+def at_release(
+    p: RewardParams, error: Tensor, time: Tensor, clearance: Tensor, margin: float
+) -> Tensor:
+    """r_land + r_tof + r_prox of a release, shape (E,); arguments as of :func:`landing`,
+    :func:`time_of_flight` and :func:`proximity`.
+    """
+    return landing(p, error) + time_of_flight(p, time) + proximity(p, clearance, margin)

@@ -28,9 +28,9 @@ from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.network import MuonAdam, averaged, cosine_rate, normalizer_state
 from visthrow.training.ranks import Ranks
 
-SCALES = (0.02, 0.05, 0.2, 0.02, 0.01, 0.005)
-"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-], goal
-and payload offsets [m].
+SCALES = (0.02, 0.05, 0.2, 0.02, 1.0, 0.01, 0.005, 1.0)
+"""Errors that count alike: of position [m], velocity [m/s], body rates [rad/s], rotation [-],
+action, goal and payload offsets [m], latch.
 """
 
 AVERAGED = 100  # gradient steps that the exported weights are a mean of, at most
@@ -127,8 +127,7 @@ class Distillation(Algorithm):
         self.network = EstimatorNetwork(passed, learnt, env.layout.dimension, p).to(device)
         ranks.share(self.network)
         widths = [3, 3, 3, 6, act.ACTIONS, 2, 3 * (1 + layout.history), 1]
-        scales = torch.tensor([*SCALES[:4], 1.0, *SCALES[4:], 1.0])
-        self._scales = scales.repeat_interleave(torch.tensor(widths)).to(device)
+        self._scales = torch.tensor(SCALES).repeat_interleave(torch.tensor(widths)).to(device)
         self._obs = torch.zeros(T, E, env.layout.dimension, device=device)
         self._truth = torch.zeros(T, E, layout.dimension, device=device)
         self._alive = torch.zeros(T, E, device=device)
@@ -177,19 +176,16 @@ class Distillation(Algorithm):
         self.rollout()
 
     def learn(self, done: float) -> dict[str, float]:
-        rate = cosine_rate(self.optimizer, done, self.p.learning_rate, self.p.final_rate)
+        p = self.p
+        rate = cosine_rate(self.optimizer, done, p.learning_rate, p.final_rate)
         if done * self.iterations < WATCHED:
             self.network.normalizer.update(self._obs.flatten(0, 1))
-        return self._descend() | self.env.episode_means() | {"learning_rate": rate}
-
-    def _descend(self) -> dict[str, float]:
-        """Fit the last rollout, each throw once an epoch."""
-        p = self.p
         losses = []
-        for _ in range(p.epochs):
+        for _ in range(p.epochs):  # each throw once
             order = torch.randperm(self.env.num_envs, device=self.env.device)
             losses += [self._step(rows) for rows in order.chunk(p.minibatches)]
-        return {"value": float(sum(losses)) / len(losses)}
+        figures = {"value": float(sum(losses)) / len(losses), "learning_rate": rate}
+        return figures | self.env.episode_means()
 
     def _step(self, rows: Tensor) -> Tensor:
         """Take one gradient step on these throws; return their mean error in :data:`SCALES`."""
@@ -250,12 +246,11 @@ def _passed(vision: ob.Layout, state: ob.Layout) -> tuple[Tensor, Tensor]:
     these are learnt.
     """
     known = ob.VEHICLE + 5
-    places = vision.dimension - vision.motion - vision.located
     columns = torch.full((state.dimension,), vision.dimension)
     columns[:known] = torch.arange(known)
     if vision.located:
-        columns[known : known + 2] = torch.tensor([places, places + 1])
-    columns[-1] = places - vision.validity - 1
+        columns[known : known + 2] = torch.tensor(vision.columns("located")[:2])
+    columns[-1:] = torch.tensor(vision.columns("attached"))
     learnt = torch.ones(state.dimension, dtype=torch.bool)
     # the action before and the latch are known
     learnt[ob.VEHICLE : known] = False

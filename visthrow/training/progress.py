@@ -84,7 +84,12 @@ class TrainLog:
         elapsed = time.perf_counter() - self._start
         figures = figures | {"wall_s": self._before + elapsed}
         if throws is not None:
-            figures |= evaluated(throws)
+            result = throws.summary()  # has no error where none landed
+            figures |= {
+                "error_2m": result.get("error_mean", math.nan),
+                "duration_2m": result.get("duration_mean", math.nan),
+                "landed_2m": result["success"],
+            }
         self._writer.writerow(figures)
         self._file.flush()
         speed = self.samples / (figures["rollout_s"] + figures["learning_s"]) / 1e6
@@ -95,13 +100,11 @@ class TrainLog:
             f" {timedelta(seconds=round(self._remaining(figures['iteration'], elapsed)))} left"
         )
         if throws is not None:
-            landed = 100 * figures["landed_2m"]
-            print(
-                f"{text}  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s,"
-                f" landed {landed:.1f} %",
-                flush=True,
+            text += (
+                f"  at 2.0 m: {figures['error_2m']:.4f} m, {figures['duration_2m']:.3f} s,"
+                f" landed {100 * figures['landed_2m']:.1f} %"
             )
-        elif figures["iteration"] % SAID_EVERY == 0:
+        if throws is not None or figures["iteration"] % SAID_EVERY == 0:
             print(text, flush=True)
 
     def _remaining(self, iteration: int, elapsed: float) -> float:
@@ -110,16 +113,6 @@ class TrainLog:
         if self.minutes is None:
             return remaining
         return max(min(remaining, 60.0 * self.minutes - elapsed), 0.0)
-
-
-def evaluated(throws: Throws) -> dict[str, float]:
-    """Columns of an evaluation; no error where none landed."""
-    row = throws.summary()
-    return {
-        "error_2m": row.get("error_mean", math.nan),
-        "duration_2m": row.get("duration_mean", math.nan),
-        "landed_2m": row["success"],
-    }
 
 
 def _rows(path: Path, done: int) -> list[dict]:

@@ -62,7 +62,10 @@ class Options:
 def run(args: Options) -> int:
     """Train; returns the exit status of the command."""
     _check(args)
-    experiment, policy, folder, seed = _resumed(args) if args.resume else _begun(args)
+    path = config.find("train", args.config) if args.config else None
+    folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
+    begun = _resumed if args.resume else _begun
+    experiment, policy, seed = begun(args, path, folder)
     name = compute_device.resolve(args.device)
     ranks = Ranks.join(name != "cpu") if int(os.environ.get("WORLD_SIZE", "1")) > 1 else Ranks(name)
     start = time.perf_counter()
@@ -82,12 +85,13 @@ def run(args: Options) -> int:
             summary["from"] = {"policy": Path(args.start).name, **files}
         provenance.write_run_folder(folder, config.dumps(experiment), resume=args.resume, **summary)
     why = _loop(args, trainer, folder, last)
+    finished = why in (DONE, REACHED)
     if ranks.lead:
-        _report(args, trainer, folder, time.perf_counter() - start, finished=why in (DONE, REACHED))
+        _report(args, trainer, folder, time.perf_counter() - start, finished)
     iteration = trainer.iteration
     del trainer  # its captured graphs hold the processes' communicator
     ranks.leave()
-    if why in (DONE, REACHED):
+    if finished:
         return 0
     if ranks.lead:
         command = f"visthrow train --resume --out {folder}"
@@ -121,27 +125,23 @@ def _check(args: Options) -> None:
         raise TrainError("no CONFIG; name one of configs/train, such as laptop, or a TOML file")
 
 
-def _begun(args: Options) -> tuple:
-    """Experiment, policy to start from or None, folder and seed of a new run; StorageError where
-    the folder holds one already.
+def _begun(args: Options, path: Path, folder: Path) -> tuple:
+    """Experiment, policy to start from or None, and seed of a new run; StorageError where the
+    folder holds one already.
     """
-    path = config.find("train", args.config)
     seed = 1 if args.seed is None else args.seed
-    folder = Path(args.out or f"runs/{path.stem}-{seed}")
     provenance.check_free(folder)
     if args.start is None:
-        return config.load(Experiment, path, args.overrides), None, folder, seed
+        return config.load(Experiment, path, args.overrides), None, seed
     policy = Policy.load(find_policy(args.start))
     experiment = config.load(Experiment, path, [ADAPTATION, *args.overrides])
-    return fitted(experiment, policy), policy, folder, seed
+    return fitted(experiment, policy), policy, seed
 
 
-def _resumed(args: Options) -> tuple:
-    """Experiment, None, folder and seed of the run in the folder; CheckpointError where there is
-    none, or what is named contradicts it.
+def _resumed(args: Options, path: Path | None, folder: Path) -> tuple:
+    """Experiment, None and seed of the run in the folder; CheckpointError where there is none, or
+    what is named contradicts it.
     """
-    path = config.find("train", args.config) if args.config else None
-    folder = Path(args.out or f"runs/{path.stem}-{1 if args.seed is None else args.seed}")
     if not (folder / CHECKPOINT).exists():
         raise CheckpointError(f"{folder}: no {CHECKPOINT} to resume from")
     experiment = config.load(Experiment, folder / "config.toml")
@@ -161,7 +161,7 @@ def _resumed(args: Options) -> tuple:
     seed = json.loads((folder / "provenance.json").read_text(encoding="utf-8"))["seed"]
     if args.seed not in (None, seed):
         raise CheckpointError(f"{folder}: a run of another seed, {seed}; resume without --seed")
-    return experiment, None, folder, seed
+    return experiment, None, seed
 
 
 DONE, REACHED, OUT_OF_TIME, STOPPED = ENDS = (

@@ -38,6 +38,7 @@ end, and of one that did not.
 ADAPTATION = 'ppo="ppo/adapt.toml"'
 
 EVALUATED = 200  # throws of an evaluation
+EVALUATION_SEED = 12345  # of its starts and noise
 FINAL = 5  # times as many at the end of a training
 
 TASK = ("observation", "action", "control_period")
@@ -163,7 +164,6 @@ class Trainer:
         self,
         target: float,
         count: int = EVALUATED,
-        seed: int = 12345,
         experiment: Experiment | None = None,
     ) -> Throws:
         """Throw from hover with the current policy; see :mod:`visthrow.training.protocol`.
@@ -171,12 +171,13 @@ class Trainer:
         Args:
             target: distance along x [m].
             count: of throws.
-            seed: of starts and noise.
             experiment: conditions of the throws (default: those of the training).
         """
         policy = self.algorithm.export(contract_of(self.experiment), {}).to(self.device)
         conditions = experiment or self.experiment
-        return protocol.throw(conditions, policy.actor(count), target, count, self.device, seed)
+        return protocol.throw(
+            conditions, policy.actor(count), target, count, self.device, EVALUATION_SEED
+        )
 
     def final_throws(self) -> dict[str, list[Throws]]:
         """Throw :data:`FINAL` times :data:`EVALUATED` at each target, by conditions.

@@ -242,27 +242,29 @@ class ThrowEnv(VecEnv):
         self.episode_length_buf += 1
         return action
 
+    def failed(self) -> Tensor:
+        """Whether a negative end has come, bool, shape (E,)."""
+        state = self.views.state
+        return terminations.negative(
+            self.cfg.task.bounds,
+            state["pos_w"],
+            ob.rotation_from_quat(state["quat_wb"]),
+            self.views.out["payload_pos_w"],
+            state["status"],
+            state["release_timer"] >= 0.0,
+            self.episode_length_buf * self.cfg.sim.control_period,
+            self.cfg.release.landing_height,
+        )
+
     def _judge(self, action: Tensor) -> tuple[Tensor, Tensor]:
         """Reward and end of the step just made."""
-        task = self.cfg.task
         state = self.views.state
         out = self.views.out
         period = self.cfg.sim.control_period
-        p = task.reward
+        p = self.cfg.task.reward
         time = self.episode_length_buf * period
         released = out["separated"] != 0
-        latched = state["release_timer"] >= 0.0
-        failed = terminations.negative(
-            task.bounds,
-            state["pos_w"],
-            ob.rotation_from_quat(state["quat_wb"]),
-            out["payload_pos_w"],
-            state["status"],
-            latched,
-            time,
-            self.cfg.release.landing_height,
-        )
-        negative = ~released & failed
+        negative = ~released & self.failed()
         goal = self._goal_in(out["separation_time"] + out["time_to_impact"] - period)
         miss = out["landing_w"] - goal
         error = miss[:, :2].square().sum(-1).sqrt()
@@ -270,9 +272,8 @@ class ThrowEnv(VecEnv):
         command = rewards.command(p, action, self.rate_weights)
         change = rewards.change(p, action, self.previous_action, self.change_weights)
         attached = kinetic + command + change
-        landing = rewards.landing(p, error) + rewards.time_of_flight(p, out["time_to_impact"])
         margin = self.cfg.release.clearance_margin
-        at_release = landing + rewards.proximity(p, out["clearance"], margin)
+        at_release = rewards.at_release(p, error, out["time_to_impact"], out["clearance"], margin)
         reward = torch.where(released, at_release, attached) + rewards.carry_time(p, period)
         reward = reward - p.termination * negative
         self.last = {
@@ -397,14 +398,14 @@ class ThrowEnv(VecEnv):
             quantities["goal_velocity"] = self.goals.velocity[:, :2]
         if self._cargo is not None:
             quantities["cargo"] = self._cargo
+        mount = self.view.buffers
+        quantities["mount"] = torch.cat(
+            [mount["extrinsic_rotation"], mount["extrinsic_offset"]], dim=-1
+        )
+        quantities["pose_age"] = self.delay.age[:, None]
+        if self._fleet:
+            quantities["vehicle"] = self._fleet.exact
         parts += [value for name, value in quantities.items() if name in named]
-        if "mount" in named:
-            mount = self.view.buffers
-            parts += [mount["extrinsic_rotation"], mount["extrinsic_offset"]]
-        if "pose_age" in named:
-            parts.append(self.delay.age[:, None])
-        if "vehicle" in named and self._fleet:
-            parts.append(self._fleet.exact)
         return torch.cat(parts, dim=-1)
 
     def _tensors(self) -> dict[str, Tensor]:

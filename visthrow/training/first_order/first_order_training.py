@@ -66,7 +66,6 @@ class FirstOrder(Algorithm):
         self.p = experiment.first_order
         self._ranks = ranks
         p = experiment.ppo
-        on_gpu = device.startswith("cuda")
         _require_supported(experiment)
         lag = experiment.release.lag / experiment.sim.control_period
         self.lag = int(lag + 1e-6)
@@ -83,13 +82,14 @@ class FirstOrder(Algorithm):
         simulated = dataclasses.replace(experiment, ppo=without_critic)
         self.env = env = ThrowEnv(simulated, device, seed)
         self.samples = env.num_envs * self.p.horizon * ranks.world
-        shape = {
-            "hidden_dims": p.hidden,
-            "activation": p.activation,
-            "obs_normalization": p.normalize,
-        }
         self.network = Network(
-            env.get_observations(), {"actor": ["actor"]}, "actor", act.ACTIONS, **shape
+            env.get_observations(),
+            {"actor": ["actor"]},
+            "actor",
+            act.ACTIONS,
+            hidden_dims=p.hidden,
+            activation=p.activation,
+            obs_normalization=p.normalize,
         ).to(device)
         self.flights = FlightBatch(env, self.p.horizon)
         with torch.no_grad():
@@ -105,31 +105,24 @@ class FirstOrder(Algorithm):
         self._requests = torch.zeros_like(self.flights.steps)
         self.layers = Layers(self.network, self.flights.obs)
         self._launches = self._recorded()
+        self.iterations = self.p.iterations
         self._adapting = False
         self._schedule(0.0)
-        rate = torch.tensor(self.p.learning_rate, device=device) if on_gpu else self.p.learning_rate
         weights = self.network.mlp.parameters()
         self.optimizer = MuonAdam(
-            weights, self.network.matrices, lr=rate, betas=(0.9, 0.95), capturable=on_gpu
+            weights, self.network.matrices, lr=self.p.learning_rate, betas=(0.9, 0.95)
         )
         self.rollout, self.backward = (
-            ReplayedGraph(work) if on_gpu else work for work in (self._fly, self._run_backward)
+            ReplayedGraph(work) if device.startswith("cuda") else work
+            for work in (self._fly, self._run_backward)
         )
-
-    @property
-    def iterations(self) -> int:
-        """Gradients of a whole training."""
-        return self.p.adapting if self._adapting else self.p.iterations
 
     def _schedule(self, done: float) -> None:
         """Width of the hazard, share of the latch in it, and first step that it counts at, at this
         share of the training.
         """
         p = self.p
-        if self._adapting:
-            self._width = p.adapting_width
-        else:
-            self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
+        self._width = p.width * (p.final_width / p.width) ** min(done / p.sharp, 1.0)
         self._latched, freed = (
             min(max((done - low) / (high - low), 0.0), 1.0) for low, high in (p.latched, p.free)
         )
@@ -181,8 +174,7 @@ class FirstOrder(Algorithm):
         )
         miss = landing - self.env.views.goal_w[:, :2]
         error = (miss.square().sum(-1) + ROUND**2).sqrt()
-        reward = rewards.landing(p, error) + rewards.time_of_flight(p, fall)
-        reward = reward + rewards.proximity(p, clearance, release.clearance_margin)
+        reward = rewards.at_release(p, error, fall, clearance, release.clearance_margin)
         return reward, error, fall
 
     def _pull(self, x: SimpleNamespace) -> Tensor:
@@ -206,8 +198,7 @@ class FirstOrder(Algorithm):
         upright = ob.rotation_from_quat(x.quat[1:])[..., 2, 2]
         action = act.clip_action(x.action)
         first = env.start_action.expand_as(action[:1])
-        before = torch.cat([first, action[:-1]]).flatten(0, 1)
-        action = action.flatten(0, 1)
+        before = torch.cat([first, action[:-1]])
         commanding = rewards.command(p, action, env.rate_weights)
         changing = rewards.change(p, action, before, env.change_weights)
         acting = commanding + changing
@@ -223,7 +214,7 @@ class FirstOrder(Algorithm):
         barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
         time = rewards.carry_time(p, self.experiment.sim.control_period)
-        return moving + acting.view_as(moving) + time - barrier
+        return moving + acting + time - barrier
 
     def _cost(self, x: SimpleNamespace) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean cost of the flights and figures of what is released."""
@@ -339,13 +330,7 @@ class FirstOrder(Algorithm):
         p = self.p
         parameters = list(self.network.mlp.parameters())
         T = self.flights.last
-        if self._adapting:
-            highest = p.adapting_rate
-            lowest = 0.1 * p.adapting_rate
-        else:
-            highest = p.learning_rate
-            lowest = p.final_rate
-        rate = cosine_rate(self.optimizer, done, highest, lowest)
+        rate = cosine_rate(self.optimizer, done, p.learning_rate, p.final_rate)
         figures = self.derivatives()
         size = self.layers.by_action[:T].square().sum((0, 2)).sqrt().clamp(min=1e-12)
         # a few wild flights must not outweigh the rest
@@ -362,17 +347,31 @@ class FirstOrder(Algorithm):
         }
 
     def take_up(self, policy: Policy) -> None:
-        """Start from a policy of the same layers: it releases as it has learnt to, and the rate
-        starts at that of adaptation.
-        """
+        """Start from a policy of the same layers."""
         super().take_up(policy)
+        self._adapt()
+
+    def _adapt(self) -> None:
+        """Take the schedules of a training that starts from a policy: it releases as it has learnt
+        to.
+        """
+        p = self.p
         self._adapting = True
+        self.iterations = p.adapting
+        self.p = dataclasses.replace(
+            p,
+            learning_rate=p.adapting_rate,
+            final_rate=0.1 * p.adapting_rate,
+            width=p.adapting_width,
+            final_width=p.adapting_width,
+        )
 
     def state_dict(self) -> dict:
         return super().state_dict() | {"adapting": self._adapting, "surrogate": self.surrogate}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         super().load_state_dict(saved, own_throws)
-        self._adapting = saved["adapting"]
+        if saved["adapting"]:
+            self._adapt()
         for name, value in saved["surrogate"].items():
             self.surrogate[name].copy_(value)

@@ -28,7 +28,6 @@ from sim.params import GRAVITY
 from sim.torch_bridge import on_torch_stream
 from visthrow.onboard import actions
 from visthrow.onboard import observations as ob
-from visthrow.task import terminations
 from visthrow.training.env import ThrowEnv
 
 # spread of random actions about hover; three times as much saturates the motors of a heavy vehicle,
@@ -89,7 +88,7 @@ class FlightBatch:
         self.obs = torch.zeros(steps, E, env.layout.dimension, **make)
         self.landing = torch.zeros(steps + 1, E, 2, **make)
         self.time = torch.zeros(steps + 1, E, **make)
-        self.status = torch.zeros(steps + 1, E, dtype=torch.int32, **make)
+        self.failed = torch.zeros(steps + 1, E, dtype=torch.bool, **make)
         self.flying, self.steps = (torch.zeros(E, dtype=torch.int32, **make) for _ in range(2))
         self._mask = wp.from_torch(self.flying)
         (vehicle, rope) = env.sim.plants()
@@ -136,7 +135,7 @@ class FlightBatch:
                 x[name][k] = source
             x["response"][k, :, 0] = self._thrust * state["motor_speed"].square().sum(-1)
             x["response"][k, :, 1:] = state["rate_b"]
-            self.status[k] = state["status"]
+            self.failed[k] = env.failed()
             self.landing[k] = env.views.foreseen["landing_w"][:, :2]
             self.time[k] = env.views.foreseen["time_to_impact"]
             self.last = k
@@ -148,17 +147,7 @@ class FlightBatch:
             self.steps.add_(self.flying)
             observation = env.carry(action, self._mask)["actor"]
             x["command"][k] = env.views.command
-        pos = x["pos"][1:].flatten(0, 1)
-        rot = ob.rotation_from_quat(x["quat"][1:].flatten(0, 1))
-        load_pos = x["load_pos"][1:].flatten(0, 1)
-        status = self.status[1:].flatten()
-        latched = torch.zeros_like(status, dtype=torch.bool)
-        time = torch.zeros_like(pos[:, 0])
-        height = env.cfg.release.landing_height
-        ends = terminations.negative(
-            env.cfg.task.bounds, pos, rot, load_pos, status, latched, time, height
-        )
-        self.steps.clamp_(max=(~ends).view(len(self.obs), -1).int().cumprod(0).sum(0))
+        self.steps.clamp_(max=(~self.failed[1:]).int().cumprod(0).sum(0))
 
 
 def fit(flights: FlightBatch) -> dict[str, Tensor]:

@@ -56,7 +56,12 @@ class Network(MLPModel):
         """Output for observations; a sample of the distribution where
         ``stochastic_output`` is set.
         """
-        output = self.output(self.get_latent(obs))
+        *layers, last = self.mlp
+        latent = self.get_latent(obs)
+        with torch.autocast(latent.device.type, torch.bfloat16, enabled=self.bfloat16):
+            for layer in layers:
+                latent = layer(latent)
+        output = last(latent.float())
         if self.distribution is None or not stochastic_output:
             return output
         self.distribution.update(output)
@@ -92,14 +97,6 @@ class Network(MLPModel):
     def matrices(self) -> list[Tensor]:
         """Weights of the hidden layers."""
         return [layer.weight for layer in self._linear_layers()[:-1]]
-
-    def output(self, latent: Tensor) -> Tensor:
-        """Output of the layers for normalised observations, shape (N, D)."""
-        *layers, last = self.mlp
-        with torch.autocast(latent.device.type, torch.bfloat16, enabled=self.bfloat16):
-            for layer in layers:
-                latent = layer(latent)
-        return last(latent.float())
 
 
 class MuonAdam(torch.optim.Adam):
@@ -147,7 +144,7 @@ def cosine_rate(
     """
     rate = lowest + 0.5 * (highest - lowest) * (1.0 + math.cos(math.pi * done))
     for group in optimizer.param_groups:
-        group["lr"] = group["lr"].fill_(rate) if isinstance(group["lr"], Tensor) else rate
+        group["lr"] = rate
     return rate
 
 
