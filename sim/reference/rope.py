@@ -27,8 +27,6 @@ from sim.reference.rotation_arrays import (
 class RopeDynamics:
     """Ropes of E environments, each with its own masses and lengths.
 
-    Raises ValueError: different numbers of segments.
-
     Args:
         body: of all vehicles.
         ropes: one an environment, all with the same number of segments.
@@ -45,11 +43,6 @@ class RopeDynamics:
         mount_damping: float = 0.0,
     ) -> None:
         self.segments = ropes[0].segments
-        if any(rope.segments != self.segments for rope in ropes):
-            raise ValueError(
-                f"ropes have {sorted({rope.segments for rope in ropes})} segments, expected one"
-                " number"
-            )
         self.count = len(ropes)
         self.stretch = stretch
         self.length = np.array([rope.segment_length for rope in ropes])

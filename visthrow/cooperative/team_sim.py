@@ -26,10 +26,8 @@ class TeamSim(HybridSim):
         """Allocate ``worlds`` teams; the rest is as for :class:`sim.hybrid.HybridSim`.
 
         ``options["build"]`` makes another solver of the bodies, called with a world and
-        ``team=``. Raises ValueError: fewer than one vehicle, or air that acts on the load.
+        ``team=``. Raises ValueError: air that acts on the load.
         """
-        if team < 1:
-            raise ValueError(f"a team of {team} vehicles; expected 1 or more")
         self.team = team
         self.worlds = worlds
         self._build = options.pop("build", TreeSolver)

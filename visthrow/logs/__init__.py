@@ -131,21 +131,17 @@ def table_of(path: str | Path) -> dict[str, np.ndarray]:
 
     path, ending = Path(path), Path(path).suffix.lower()
     bag = (path / BAG).is_file()
-    if ending not in SELF_DESCRIBING and not path.is_file() and not bag:
-        raise _missing(path)
-    if path.name.lower().endswith(TABLES):
-        return table.read_table(path)
-    if (
-        bag
-        or ending in recordings.READERS
-        or (ending not in SELF_DESCRIBING and recordings.is_card(path))
-    ):
-        return recordings.read_recording(path)
-    if ending in SELF_DESCRIBING:
+    if ending in SELF_DESCRIBING and not bag:
         raise LogError(
             f"{path}: describes its own contents and needs no mapping; look at it with: visthrow"
             f" diagnose check {path}"
         )
+    if not path.is_file() and not bag:
+        raise _missing(path)
+    if path.name.lower().endswith(TABLES):
+        return table.read_table(path)
+    if bag or ending in recordings.READERS or recordings.is_card(path):
+        return recordings.read_recording(path)
     if _is_text(path):  # .tum, .dat, .log, .asc, ...
         return table.read_table(path)
     of_tables = ", ".join((*TABLES, *recordings.READERS, *SELF_DESCRIBING))

@@ -101,20 +101,21 @@ class Channel:
             self, time=self.time[keep], values=self.values[keep], valid=np.asarray(self.valid)[keep]
         )
 
+    @property
+    def rows(self) -> np.ndarray:
+        """All samples as rows of numbers, float64, shape (T, components)."""
+        width = np.prod(self.values.shape[1:], dtype=int)
+        return self.values.reshape(len(self.time), width).astype(float)
+
     def at(self, time: float) -> np.ndarray:
         """Return the value at a time [s], linear between samples."""
-        columns = self.values.reshape(len(self.time), -1).T
-        return np.array([np.interp(time, self.time, column) for column in columns]).reshape(
-            self.values.shape[1:]
-        )
+        values = [np.interp(time, self.time, column) for column in self.rows.T]
+        return np.array(values).reshape(self.values.shape[1:])
 
     def samples(self) -> Samples:
         """Return the valid samples, float64."""
-        rows = np.asarray(self.valid)
-        values = self.values[rows].astype(float)
-        return Samples(
-            self.time[rows], values.reshape(len(values), np.prod(values.shape[1:], dtype=int))
-        )
+        valid = np.asarray(self.valid)
+        return Samples(self.time[valid], self.rows[valid])
 
     def hold(self, time: np.ndarray) -> np.ndarray:
         """Return the last valid sample at or before each time (the first one where there is none

@@ -113,5 +113,3 @@ def test_photographs_that_are_none(tmp_path):
     (tmp_path / "a.png").write_bytes(b"no picture")
     with raises(ValueError, match="no picture that OpenCV can read"):
         pyramid(photographs(tmp_path))
-    with raises(ValueError, match="samples 0"):
-        Renderer(LENS, samples=0)

@@ -24,7 +24,7 @@ class Renderer:
         files: list[Path] | None = None,
         samples: int = 6,
     ) -> None:
-        """Load the photographs. Raises ValueError: samples below 1, or no photographs.
+        """Load the photographs. Raises ValueError: no photographs.
 
         Args:
             lens: size of the pictures. device: "cpu" or "cuda:0".
@@ -35,8 +35,6 @@ class Renderer:
 
         from camera.warp_start import start
 
-        if samples < 1:
-            raise ValueError(f"renderer: samples {samples}; expected 1 or more")
         start()
         self.lens = lens
         self.device = device

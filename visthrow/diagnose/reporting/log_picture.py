@@ -54,8 +54,7 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
 
 def _channel(axis, log: FlightLog, name: str) -> None:
     channel = log[name]
-    values = channel.values.reshape(len(channel.values), -1).astype(float)
-    values = np.where(channel.valid[:, None], values, np.nan)
+    values = np.where(channel.valid[:, None], channel.rows, np.nan)
     step = max(1, len(values) // _POINTS)
     time = channel.time[::step]
     values = values[::step]

@@ -259,7 +259,7 @@ def _prints(log: FlightLog) -> set[bytes]:
             or channel.values.dtype.kind == "b"
         ):
             continue
-        rows = channel.values.reshape(len(channel.values), -1).astype(float)
+        rows = channel.rows
         moving = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
         first = moving[:: max(1, len(moving) // 2000)]
         runs = rows[first[first + 4 <= len(rows), None] + np.arange(4)].reshape(

@@ -75,7 +75,7 @@ def noise(channel: Channel) -> np.ndarray:
 
     Returns one value a component, in the channel's unit; NaN where there are too few samples.
     """
-    values = channel.values.reshape(len(channel.values), -1).astype(float)
+    values = channel.rows
     steps = np.diff(channel.time)
     even = np.abs(steps - np.median(steps)) < 0.5 * np.median(steps) if len(steps) else steps > 0.0
     good = channel.valid[:-3] & channel.valid[3:] & even[:-2] & even[1:-1] & even[2:]
@@ -183,9 +183,7 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
 
 
 def _values(name: str, channel: Channel) -> list[Row]:
-    values = channel.values.reshape(len(channel.values), -1).astype(float)
-    values = values[channel.valid]
-    time = channel.time[channel.valid]
+    time, values = channel.samples()
     if len(values) < FEW_SAMPLES:
         return [Row("values", name, "bad", f"{len(values)} valid samples")]
     rows = []

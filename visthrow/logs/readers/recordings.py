@@ -58,11 +58,7 @@ def read_recording(path: Path) -> Table:
 
 
 def is_card(path: Path) -> bool:
-    """Tell whether a file without a known ending is of a Crazyflie's card; LogError where there is
-    none.
-    """
-    if not path.is_file():
-        raise LogError(f"{path}: no such file")
+    """Tell whether a file without a known ending is of a Crazyflie's card."""
     with path.open("rb") as file:
         head = file.read(5)
     return len(head) == 5 and head[0] == _CARD and struct.unpack("<H", head[1:3])[0] in (1, 2)

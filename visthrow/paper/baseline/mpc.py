@@ -124,8 +124,7 @@ class MPC:
         """One real-time iteration from a state, shape (16,): the command [N, rad/s] for the coming
         period, shape (4,).
 
-        Raises SolverError: the programme was not solved; the message carries the solver's status;
-        ValueError: a reference of another length.
+        Raises SolverError: the programme was not solved; the message carries the solver's status.
 
         Args:
             state: now.
@@ -134,11 +133,6 @@ class MPC:
         began = time.perf_counter()
         n = self.params.stages
         target, effort = reference
-        if target.shape != (n + 1, STATES) or effort.shape != (n, INPUTS):
-            raise ValueError(
-                f"reference of shapes {target.shape}, {effort.shape}; expected ({n + 1}, 16),"
-                f" ({n}, 4)"
-            )
         if self._states is None:
             self._states = target.copy()
             self._inputs = effort.copy()

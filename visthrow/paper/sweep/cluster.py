@@ -45,8 +45,7 @@ class ClusterJob:
         """Cancel it: Slurm's signal lets a training write its checkpoint."""
         self._job.cancel()
 
-    def kill(self) -> None:
-        self._job.cancel()
+    kill = stop
 
 
 @dataclass
