@@ -389,10 +389,10 @@ def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     A ball is darker towards its rim, so the levels are taken next to the edge, a blur's width away
     from it."""
     plateau = np.quantile(values, 0.75, axis=1)
-    bright = values > 0.4 * plateau[:, None]
-    falls = bright[:, :-1] & ~bright[:, 1:]
-    last = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
-    hit = falls.any(axis=1) & (plateau > LEAST_LEVEL) & ~bright[:, -1]
+    threshold = 0.4 * plateau
+    falls = _falls(values, threshold)
+    last = _last(falls)
+    hit = falls.any(axis=1) & (plateau > LEAST_LEVEL) & (values[:, -1] <= threshold)
     start = round(BLUR_WIDTH / STEP)
     rows = np.arange(len(values))[:, None]
     peak = values.shape[1] - 1
@@ -403,10 +403,8 @@ def _last_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     low = np.median(values[rows, outer], axis=1)
     window = np.clip(last + np.arange(-2 * start, 2 * start + 1), 0, peak)
     level = low + RIM_LEVEL * (high - low)
-    local = values[rows, window]
-    above = local > level[:, None]
-    falls = above[:, :-1] & ~above[:, 1:]
-    index = falls.shape[1] - 1 - np.argmax(falls[:, ::-1], axis=1)
+    falls = _falls(values[rows, window], level)
+    index = _last(falls)
     hit &= falls.any(axis=1) & (high - low > LEAST_LEVEL)
     place = np.minimum(window[rows[:, 0], index], peak - 1)
     return hit, _between(values, reach, place, level)
@@ -418,10 +416,20 @@ def _first_crossing(values: ndarray, reach: ndarray) -> tuple[ndarray, ndarray]:
     """
     plateau = np.median(values[:, : max(2, len(reach) // 5)], axis=1)
     level = 0.5 * plateau
-    above = values > level[:, None]
-    falls = above[:, :-1] & ~above[:, 1:]
+    falls = _falls(values, level)
     hit = falls.any(axis=1) & (plateau > LEAST_LEVEL)
     return hit, _between(values, reach, np.argmax(falls, axis=1), level)
+
+
+def _falls(values: ndarray, level: ndarray) -> ndarray:
+    """Whether each row falls through its level between a sample and the next one."""
+    above = values > level[:, None]
+    return above[:, :-1] & ~above[:, 1:]
+
+
+def _last(marks: ndarray) -> ndarray:
+    """Index of the last mark of each row."""
+    return marks.shape[1] - 1 - np.argmax(marks[:, ::-1], axis=1)
 
 
 def _between(values: ndarray, reach: ndarray, index: ndarray, level: ndarray) -> ndarray:

@@ -269,7 +269,7 @@ class LearntDetector(Detector):
         if kind == "ball":
             things = ball_of(views, outputs)
         else:
-            things = views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
+            things = corners_of(views, outputs)
         return probability, things
 
     def _best_ball(self, probability: Tensor, things: Tensor, prior: Prior) -> BallSeen | None:
@@ -345,10 +345,15 @@ def middle_of(kind: str, views: Views, outputs: Tensor) -> tuple[Tensor, Tensor]
     if kind == "ball":
         thing = ball_of(views, outputs)
         return thing[:, :3], thing[:, 3]
-    corners = views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
+    corners = corners_of(views, outputs)
     middle = F.normalize(corners.mean(1), dim=-1)
     cosines = (corners @ middle[:, :, None])[..., 0]
     return middle, cosines.clamp(max=1.0 - 1e-7).acos().mean(1)
+
+
+def corners_of(views: Views, outputs: Tensor) -> Tensor:
+    """Unit rays to the corners of squares, shape (B, 4, 3)."""
+    return views.rays(outputs[:, 2:].unflatten(1, (4, 2)))
 
 
 def ball_of(views: Views, outputs: Tensor) -> Tensor:

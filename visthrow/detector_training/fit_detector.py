@@ -29,6 +29,7 @@ from camera.detectors.learnt import (
     REACH,
     Networks,
     Views,
+    corners_of,
     halved,
     log_size,
     look_closely,
@@ -444,7 +445,7 @@ def findings(
         hit = visible & (error < MATCH_RADIUS * size) & ((sizes / size).log().abs() < 0.5)
         clear = visible | (error > 2.0 * size)  # else half in view
         if kind == "goal":
-            first = views.rays(out[:, 2:].unflatten(1, (4, 2)))[:, 0:1]
+            first = corners_of(views, out)[:, 0:1]
             error = _angle_between(first, labels["corners"]).amin(-1)
         rows = torch.stack([out[:, 0], hit.float(), error, spread_of(out, views)], -1)
         scores[kind] = rows[clear.expand(len(rows))]

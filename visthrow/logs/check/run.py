@@ -1,7 +1,7 @@
 """All checks of several logs; their verdict and table."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -36,14 +36,12 @@ class Checked:
 
 def check(logs: Sequence[FlightLog], vehicle: KnownVehicle = NOTHING) -> list[Checked]:
     """Look at logs one by one, and at what they have in common."""
-    common = [_copies(logs), _shared_payloads(logs), _masses(logs, vehicle)]
-    rows = [
-        (*_look(log, vehicle), *(row for shared in common for row in shared.get(i, ())))
-        for i, log in enumerate(logs)
-    ]
-    return [
-        Checked(label(log, i), rows_of_log) for i, (log, rows_of_log) in enumerate(zip(logs, rows))
-    ]
+    common = [*_copies(logs), *_shared_payloads(logs), *_masses(logs, vehicle)]
+    checked = []
+    for i, log in enumerate(logs):
+        shared = [row for number, row in common if number == i]
+        checked.append(Checked(label(log, i), (*_look(log, vehicle), *shared)))
+    return checked
 
 
 CONTRADICT = ("vehicle", "frames", "units", "delay", "thrust", "excited")
@@ -171,9 +169,9 @@ def _clocks(log: FlightLog) -> list[Row]:
     return rows
 
 
-def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
+def _copies(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
+    """Report logs that hold what another one holds, each by its number."""
     prints = [_prints(log) for log in logs]
-    rows_of: dict[int, list[Row]] = {}
     for j in range(len(logs)):
         for i in range(j):
             shared = len(prints[i] & prints[j]) / max(min(len(prints[i]), len(prints[j])), 1)
@@ -182,13 +180,10 @@ def _copies(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
                     f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy"
                     " counts once"
                 )
-                rows_of.setdefault(j, []).append(
-                    Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
-                )
-    return rows_of
+                yield j, Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
 
 
-def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[Row]]:
+def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> Iterator[tuple[int, Row]]:
     """Report logs whose ratio of force to thrust differs from the others': another battery,
     vehicle, payload or map.
     """
@@ -198,9 +193,8 @@ def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[
         if (mass := thrust_checks.mass_of(log, vehicle)) is not None
     }
     if len(masses) < 2:
-        return {}
+        return
     middle = float(np.median(list(masses.values())))
-    rows_of = {}
     for i, mass in masses.items():
         if abs(np.log(mass / middle)) > _OTHER_SCALE:
             text = (
@@ -208,13 +202,11 @@ def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> dict[int, list[
                 " middle: "
             )
             text += "the thrust's scale differs from flight to flight"
-            rows_of[i] = [Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})]
-    return rows_of
+            yield i, Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})
 
 
-def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
+def _shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
     """Compare the clocks of several vehicles that carry one payload."""
-    rows_of: dict[int, list[Row]] = {}
     named = [
         i
         for i, log in enumerate(logs)
@@ -243,10 +235,7 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> dict[int, list[Row]]:
                 "delay_sd_s": relation.delay_sd,
                 "rms_m": off,
             }
-            rows_of.setdefault(second, []).append(
-                Row("clock", "payload_pos_w", "warn", text, figures)
-            )
-    return rows_of
+            yield second, Row("clock", "payload_pos_w", "warn", text, figures)
 
 
 def _prints(log: FlightLog) -> set[bytes]:

@@ -136,14 +136,7 @@ def _section(rows: Rows) -> tuple[Rows, list[str]]:
 def _separator(lines: list[str]) -> str:
     """Return the mark that cuts most lines into the same number of cells, most of them numbers."""
     sample = [line for line in lines[-2000:] if line.strip()][-SAMPLED:]
-    best = 0.0
-    separator = ","
-    for mark in MARKS:
-        score = _regularity(sample, mark)
-        if score > best + 1e-6:
-            best = score
-            separator = mark
-    return separator
+    return max(MARKS, key=lambda mark: round(_regularity(sample, mark), 6))
 
 
 def _regularity(sample: list[str], mark: str) -> float:
