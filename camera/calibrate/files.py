@@ -22,8 +22,6 @@ from typing import Any
 import numpy as np
 
 from camera.calibrate.foreign import (
-    ANGULAR,
-    DENOMINATORS,
     DISTORTIONS,
     LARGEST_DECENTRING,
     FitReport,
@@ -492,8 +490,6 @@ def _fitted(
 ) -> tuple[FisheyeParams, FitReport]:
     """Fit our lens; ocam's polynomial is told how far the image reaches."""
     core = model.partition("-")[0]
-    if core not in (*DENOMINATORS, *ANGULAR):
-        raise ValueError(f"camera model {model!r} is not known")
     if core == "ocam":
         x, y = values["cx"], values["cy"]
         width, height = size

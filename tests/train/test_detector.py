@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.linalg import norm
-from pytest import mark, raises
+from pytest import mark
 
 from camera.detectors.learnt import Networks
 from camera.keypoints import KeypointCamera, keypoints
@@ -96,8 +96,6 @@ def test_keypoints_of_a_picture_are_those_that_poses_project_to(by):
     assert valid.all()
     assert np.abs(points - true.numpy()).max() < NEAR[by]
     assert eyes.found == {"ball": 1, "goal": 1, "frames": 1, "refused": 0}
-    with raises(ValueError, match="expected one of learnt, contours"):
-        RenderedEyes(camera, rope, 1, 0, method="magic")
 
 
 def test_fly_draws_the_pictures_that_its_eyes_saw(tmp_path):

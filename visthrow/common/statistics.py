@@ -110,10 +110,8 @@ def paired(a: ndarray, b: ndarray) -> Interval:
     """Mean of ``a - b`` where entry n of both met the same vehicle, wind and start; pairs with a
     failed throw are left out.
 
-    Raises ValueError: arrays of different lengths, or no pair in which both landed.
+    Raises ValueError: no pair in which both landed.
     """
-    if len(a) != len(b):
-        raise ValueError(f"pairs of {len(a)} and {len(b)} throws; expected the same throws of both")
     differences = np.asarray(a, dtype=float) - np.asarray(b, dtype=float)
     return mean(differences[np.isfinite(differences)])
 

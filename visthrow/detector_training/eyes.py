@@ -29,8 +29,6 @@ HANGING = (0.2, 0.6)  # distance of a hanging ball from the lens [m]
 
 SURE = 0.5  # share of the looks in a hover in which ball and goal must be found
 
-METHODS = ("learnt", "contours")  # detectors
-
 THINGS = ("ball", "goal")  # what they look for
 
 
@@ -79,17 +77,15 @@ class RenderedEyes:
         weights: str | None = None,
         keep: bool = False,
     ) -> None:
-        """Draw the halls; ValueError for another detector, no weights, no photographs.
+        """Draw the halls; ValueError for no weights, no photographs.
 
         Args:
             params: camera. rope: that the ball hangs on.
-            count: E. seed: of halls and sensors. device: of the renderer. method: one of `METHODS`.
+            count: E. seed: of halls and sensors. device: of the renderer. method: "learnt" or "contours".
             samples: rays a pixel.
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
                 shipped. keep: whether frames are kept.
         """
-        if method not in METHODS:
-            raise ValueError(f"detector '{method}'; expected one of {', '.join(METHODS)}")
         self.params = params
         self.count = count
         self._keep = keep

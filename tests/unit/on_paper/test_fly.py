@@ -5,11 +5,10 @@ plants, front and command.
 from dataclasses import replace
 
 import numpy as np
-from pytest import approx, fixture, importorskip, mark, raises
+from pytest import approx, fixture, importorskip, mark
 
 from tests.commands import run_command
 from tests.configs import load_experiment
-from visthrow.common.errors import ConfigError
 from visthrow.common.statistics import pareto
 from visthrow.paper.baseline import front, spline
 from visthrow.paper.baseline import pendulum_model as pm
@@ -114,13 +113,10 @@ def test_own_model_throws_land_near_the_target(plan):
 
 def test_delays_by_name(experiment):
     assert delays_of(experiment, "none") == Delays()
-    assert delays_of(experiment, "release") == Delays(release=0.11)
     both = delays_of(experiment)
     assert both.command == approx(0.022 + 0.008 + 0.033)
     instant = replace(experiment.vehicle, motor=replace(experiment.vehicle.motor, kind="instant"))
     assert delays_of(replace(experiment, vehicle=instant)).command == approx(0.022 + 0.008)
-    with raises(ConfigError, match="did you mean 'delay'"):
-        delays_of(experiment, "delays")
 
 
 def test_front_and_hypervolume_by_hand():

@@ -5,8 +5,7 @@ The own model knows no delay, no noise, no lag of the release and no aerodynamic
 there is an upper bound. On the plants the pendulum's state is put together from what the plant
 measures, payload velocity included, and smoothed by the model. To make up for delays the controller
 looks ahead by what it knows of them (measurement, command queue, motors) through its own model
-under the commands on their way, and trips the latch early by the release's lag;
-:data:`COMPENSATIONS` names which of the two it does."""
+under the commands on their way, and trips the latch early by the release's lag."""
 
 import math
 from dataclasses import dataclass
@@ -15,7 +14,6 @@ import numpy as np
 from numpy import ndarray
 
 from sim.params import GRAVITY
-from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import matrix_of_quat
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.mpc import MPC, MPCParams, SolverError
@@ -186,22 +184,12 @@ class Delays:
     release: float = 0.0  # from the latch to separation
 
 
-COMPENSATIONS = ("none", "release", "delay", "both")
-"""What is made up for: nothing, as in the paper; the release's lag; delays of measurement, command
-and motors; all.
-"""
-
-
 def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
     """Known delays of a plant: mean age of measurements; command queue, set-point filter and
     motors; release.
 
-    Raises ConfigError: no compensation of that name.
+    ``compensation``: "none", as in the paper; "delay", all but the release's lag; "both".
     """
-    if compensation not in COMPENSATIONS:
-        raise ConfigError(
-            f"no compensation '{compensation}'; {suggest(compensation, COMPENSATIONS)}"
-        )
     vehicle = experiment.vehicle
     latency = experiment.task.observation.latency
     motors = vehicle.motor.time_constant if vehicle.motor.kind == "first_order" else 0.0
@@ -211,7 +199,7 @@ def delays_of(experiment: Experiment, compensation: str = "both") -> Delays:
         setpoint = 0.0
     effect = vehicle.queue.delay + setpoint + motors
     means = (float(np.mean(latency)), effect) if compensation in ("delay", "both") else (0.0, 0.0)
-    return Delays(*means, experiment.release.lag if compensation in ("release", "both") else 0.0)
+    return Delays(*means, experiment.release.lag if compensation == "both" else 0.0)
 
 
 def look_ahead(

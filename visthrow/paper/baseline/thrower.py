@@ -30,7 +30,7 @@ MADE_UP = {
     "delay": "all delays but the release's lag made up for",
     "both": "all delays made up for",
 }
-"""Compensations that are compared, of :data:`visthrow.paper.baseline.fly_plan.COMPENSATIONS`."""
+"""Compensations that are compared, see :func:`visthrow.paper.baseline.fly_plan.delays_of`."""
 
 BOUNDS = ("payload and thrust", "payload")
 """What plans bound: ours, and the payload alone as the paper's do."""
@@ -64,8 +64,7 @@ def unit(
     Args:
         plant: :data:`IDEAL`, or of :data:`visthrow.throws.plants.PLANTS`, where ``batch`` is the
             number of the batch.
-        compensation: of :data:`~visthrow.paper.baseline.fly_plan.COMPENSATIONS`; "none" in the
-            own model.
+        compensation: of :data:`MADE_UP`; "none" in the own model.
         target, throws, seed: of starts and noise.
         height, speed: of the payload at release [m], [m/s]; default the learnt policy's.
         w_t, rho: weights of duration and energy; default those of
