@@ -81,7 +81,8 @@ class RenderedEyes:
 
         Args:
             params: camera. rope: that the ball hangs on.
-            count: E. seed: of halls and sensors. device: of the renderer. method: "learnt" or "contours".
+            count: E. seed: of halls and sensors. device: of the renderer.
+            method: "learnt" or "contours".
             samples: rays a pixel.
             nuisances: left out, all. weights: of the learnt detector; left out, those that are
                 shipped. keep: whether frames are kept.
