@@ -33,6 +33,8 @@ from camera.params import FisheyeParams, MountParams, monotonic_limit
 
 Node = dict[str, Any]
 Values = dict[str, float]
+Entry = tuple[str, Node, str]
+"""A camera in a file: its box, its node and what it is called there."""
 Camera = tuple[str, Values]
 """Model, as `camera.calibrate.foreign.project` calls it, and its numbers."""
 
@@ -120,7 +122,7 @@ def read_mount(path: str | Path, camera: int | str = 0) -> MountParams | None:
     )
 
 
-def _chosen(entries: list[tuple[str, Node, str]], camera: int | str) -> tuple[str, Node, str]:
+def _chosen(entries: list[Entry], camera: int | str) -> Entry:
     names = [name for *_, name in entries]
     number = int(camera) if str(camera).isdigit() else -1
     if camera in names:
@@ -180,7 +182,7 @@ def _tree_of_xml(text: str) -> Any:
         raise ValueError(f"is no complete XML (cut short?): {error}") from error
 
 
-def _cameras_of(path: str | Path) -> list[tuple[str, Node, str]]:
+def _cameras_of(path: str | Path) -> list[Entry]:
     """Cameras of a file, each by a name of its own or its number."""
     cameras = _cameras(_tree(path))
     names = [name for *_, name in cameras]
@@ -191,7 +193,7 @@ def _cameras_of(path: str | Path) -> list[tuple[str, Node, str]]:
     return named
 
 
-def _cameras(tree: Any, name: str = "") -> list[tuple[str, Node, str]]:
+def _cameras(tree: Any, name: str = "") -> list[Entry]:
     """Each camera in a tree: its box, its node and what it is called there."""
     if isinstance(tree, list):
         named = [(str(i), entry) for i, entry in enumerate(tree)]

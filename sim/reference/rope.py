@@ -23,6 +23,13 @@ from sim.reference.rotation_arrays import (
     turned_back,
 )
 
+RopeState = tuple[ndarray, ...]
+"""Directions of the segments and their derivatives, shapes (e, L, 3), elongation [m] and its rate,
+shapes (e,).
+"""
+Motion = tuple[ndarray, ndarray, ndarray]
+"""Three quantities of a motion; the docstring of what takes or returns them names them."""
+
 
 class RopeDynamics:
     """Ropes of E environments, each with its own masses and lengths.
@@ -63,9 +70,9 @@ class RopeDynamics:
         body: ndarray,
         rotation: ndarray,
         wrench: tuple[ndarray, ndarray],
-        rope: tuple[ndarray, ...],
+        rope: RopeState,
         force_w: ndarray,
-    ) -> tuple[ndarray, ndarray, ndarray]:
+    ) -> Motion:
         """Return accelerations of quadrotors with their ropes.
 
         Args:
@@ -74,8 +81,6 @@ class RopeDynamics:
             rotation: rot_wb, shape (e, 3, 3).
             wrench: force [N], world frame, and torque [N m], body frame, about the quadrotor's
                 centre of mass, shapes (e, 3).
-            rope: directions and their derivatives, shapes (e, L, 3), elongation [m] and its rate,
-                shapes (e,).
             force_w: on the payload's centre [N], shape (e, 3).
 
         Returns:
@@ -94,16 +99,15 @@ class RopeDynamics:
         self,
         ids: ndarray,
         root: tuple[ndarray, ndarray],
-        rope: tuple[ndarray, ...],
+        rope: RopeState,
         force_w: ndarray,
-    ) -> tuple[ndarray, ndarray, ndarray]:
+    ) -> Motion:
         """Return accelerations of ropes alone: of the upper end, of the directions and of the
         elongation.
 
         Args:
             ids: environments, shape (e,); every other argument has their rows only.
             root: position [m] and velocity [m/s] of the upper end, world frame, shapes (e, 3).
-            rope: as in ``attached``.
             force_w: on the payload's centre [N], shape (e, 3).
         """
         count = len(ids)
@@ -115,11 +119,11 @@ class RopeDynamics:
         bound: tuple,
         ids: ndarray,
         root: tuple[ndarray, ndarray],
-        above: tuple[ndarray, ndarray, ndarray],
+        above: Motion,
         upper_damping: ndarray,
-        rope: tuple[ndarray, ...],
+        rope: RopeState,
         force_w: ndarray,
-    ) -> tuple[ndarray, ndarray, ndarray]:
+    ) -> Motion:
         """Return the accelerations of root, directions and elongation from a batch of models.
 
         Args:
@@ -129,7 +133,6 @@ class RopeDynamics:
             above: rotation, angular velocity and wrench of the body above the first rod, world
                 frame; MuJoCo ignores a wrench on the world.
             upper_damping: of the first joint [N m s], shape (e,).
-            rope: as in ``attached``.
             force_w: on the payload's centre [N], shape (e, 3).
         """
         batch, positions, velocities, wrenches, accelerations = bound
@@ -178,16 +181,13 @@ class RopeDynamics:
         damping[:, 0] = upper_damping
         return -damping[..., None] * relative
 
-    def points(
-        self, root_pos: ndarray, root_vel: ndarray, rope: tuple[ndarray, ...]
-    ) -> tuple[ndarray, ndarray, ndarray]:
+    def points(self, root_pos: ndarray, root_vel: ndarray, rope: RopeState) -> Motion:
         """Return mount, joints and end of the rope [m], shape (E, L+1, 3), and position and
         velocity of the payload.
 
         Args:
             root_pos: upper end [m], shape (E, 3).
             root_vel: its velocity [m/s], shape (E, 3).
-            rope: as in ``attached``.
         """
         n, _, elongation, _ = rope
         root = root_pos[:, None]
@@ -196,7 +196,7 @@ class RopeDynamics:
         pos = points[:, -1] + (self.offset + elongation)[:, None] * n[:, -1]
         return points, pos, self.payload_velocity(root_vel, rope)
 
-    def payload_velocity(self, root_vel: ndarray, rope: tuple[ndarray, ...]) -> ndarray:
+    def payload_velocity(self, root_vel: ndarray, rope: RopeState) -> ndarray:
         """Return the velocity of the payload's centre [m/s], world frame, shape (E, 3); arguments
         as of :meth:`points`.
         """

@@ -29,6 +29,9 @@ PROTOCOL = 1
 
 DIGITS = 4  # after the decimal point, in SI units: 0.1 mm, a hundredth of what throws scatter by
 
+Unit = dict[str, Any]
+"""All that throws depend on: name -> value, plain numbers, texts and lists."""
+
 
 @dataclass(frozen=True)
 class Result:
@@ -37,7 +40,7 @@ class Result:
     Its columns have a row a throw: ``success`` (bool), ``landing_w`` [m] (N, 2), ``error`` [m],
     ``duration`` [s] and whatever else was measured; NaN where a throw failed."""
 
-    unit: dict[str, Any]  # what they depend on
+    unit: Unit  # what they depend on
     columns: dict[str, ndarray]
     # commit, command, time [UTC], seconds of work
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -80,7 +83,7 @@ class Entry:
     throws: Sequence
 
 
-def key_of(unit: dict[str, Any]) -> str:
+def key_of(unit: Unit) -> str:
     """Hash of a unit: 16 hexadecimal digits, independent of the order of its entries."""
     return _digest(json.dumps(unit, sort_keys=True, allow_nan=False).encode())
 
@@ -107,7 +110,7 @@ def policy_unit(
     variant: str = "full",
     train_seed: int | None = None,
     departures: dict[str, Any] | None = None,
-) -> dict[str, Any]:
+) -> Unit:
     """Return the unit of so many throws with a learnt policy at a target [m] along x.
 
     Args:
@@ -231,9 +234,9 @@ def pack(results: Iterable[Result], path: str | Path) -> None:
 
 
 def work(
-    units: Sequence[dict[str, Any]],
+    units: Sequence[Unit],
     folder: str | Path,
-    function: Callable[[dict], tuple[dict[str, ndarray], dict[str, Any]]],
+    function: Callable[[Unit], tuple[dict[str, ndarray], dict[str, Any]]],
     recorded: dict[str, Result] | None = None,
     processes: int = 1,
     say: Callable[[str], None] = lambda text: None,
@@ -258,9 +261,7 @@ def work(
     return {key_of(unit): results[key_of(unit)] for unit in units}
 
 
-def finish(
-    folder: str | Path, function: Callable, commit: str, command: str, unit: dict[str, Any]
-) -> Result:
+def finish(folder: str | Path, function: Callable, commit: str, command: str, unit: Unit) -> Result:
     """Do one unit as :func:`work` does, and write its result with commit, command, time and
     seconds.
     """

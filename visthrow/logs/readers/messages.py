@@ -32,6 +32,9 @@ Fields = dict[str, np.ndarray]
 written, both [s].
 """
 
+FieldsByMessage = dict[tuple[str, int], Fields]
+"""Name and instance of a message -> its fields."""
+
 # times that a reader may step back to one and the same byte; one that is led astray by a damaged
 # length does so for ever
 MOST_RETURNS = 8
@@ -49,7 +52,7 @@ class Messages:
 
     path: Path
     kind: str  # ulog, dataflash, telemetry
-    fields: dict[tuple[str, int], Fields] = field(default_factory=dict)  # by message and instance
+    fields: FieldsByMessage = field(default_factory=dict)
     meta: dict[str, Any] = field(default_factory=dict)
     parameters: dict[str, float] = field(default_factory=dict)  # of the autopilot
 
@@ -183,7 +186,7 @@ OTHER_CLOCK = 1.0
 """Difference of delays beyond which stamps are of another clock, and not late [s]."""
 
 
-def _share_clock(fields: dict[tuple[str, int], Fields]) -> None:
+def _share_clock(fields: FieldsByMessage) -> None:
     """Move stamps of messages onto one clock, in place: that of those that count from boot."""
     delays = {
         key: float(np.min(series["arrival"] - series["time"])) for key, series in fields.items()
@@ -265,7 +268,7 @@ class _Columns:
             for name, values in rows.items():
                 values.append(numbers[name])
 
-    def arrays(self) -> dict[tuple[str, int], Fields]:
+    def arrays(self) -> FieldsByMessage:
         return {
             key: {name: np.array(values) for name, values in rows.items()}
             for key, rows in self.rows.items()

@@ -38,12 +38,16 @@ KITTI = "Rot[0] Rot[3] Rot[6] x Rot[1] Rot[4] Rot[7] y Rot[2] Rot[5] Rot[8] z"
 """Columns of trajectories that are written without a head; of matrices column after column."""
 
 
+Rows = list[tuple[int, list[str]]]
+"""Numbers of lines, and their cells."""
+
+
 @dataclass
 class TextTable:
     """A text table, its cells still text."""
 
     names: list[str]  # of the columns, with their unit in brackets where it is known
-    rows: list[tuple[int, list[str]]]  # number of the line, and its cells
+    rows: Rows
     comma: bool  # whether decimals are written with a comma
     settings: dict[str, str] = field(default_factory=dict)  # of the lines above
     rate: float = 0.0  # of the frames, where the table says it [Hz]
@@ -82,10 +86,6 @@ def layout_of(text: str, name: str = "") -> TextTable:
     names = _names(named, width, settings) if named else _marker_names(width, settings)
     names = names or _headless_names(body, width, blank)
     return TextTable(names, body, _commas(mark, body), settings, rate, left_out)
-
-
-Rows = list[tuple[int, list[str]]]
-"""Numbers of lines, and their cells."""
 
 
 def _cells(text: str, mark: str, name: str) -> Rows:
@@ -169,7 +169,7 @@ def _holds_numbers(cells: list[str]) -> bool:
     return 2 * good >= len(filled) > 0 and (early or 3 * good >= 2 * len(filled))
 
 
-def _commas(mark: str, body: list[tuple[int, list[str]]]) -> bool:
+def _commas(mark: str, body: Rows) -> bool:
     cells = [cell for _, row in body[:SAMPLED] for cell in row]
     return (
         mark != ","
@@ -179,7 +179,7 @@ def _commas(mark: str, body: list[tuple[int, list[str]]]) -> bool:
 
 
 def _sorted_head(
-    head: list[tuple[int, list[str]]], cut: int, width: int, blank: bool
+    head: Rows, cut: int, width: int, blank: bool
 ) -> tuple[list[list[str]], dict[str, str], float]:
     """Lines above the numbers: those that name columns, the settings, and the rate."""
     named = []
@@ -307,7 +307,7 @@ def _prefixed(names: list[str]) -> list[str]:
     return joined
 
 
-def _headless_names(body: list[tuple[int, list[str]]], width: int, blank: bool) -> list[str]:
+def _headless_names(body: Rows, width: int, blank: bool) -> list[str]:
     """Names of a trajectory without a head, known by what its numbers are: TUM's eight columns end
     in a unit quaternion xyzw, KITTI's twelve are a rotation matrix and a place, row by row.
     """

@@ -19,7 +19,7 @@ from visthrow.paper.baseline.spline import PlanParams
 from visthrow.paper.baseline.throw_plan import ThrowPlan, default_release, plan_throw
 from visthrow.task import Experiment, contract_of, load_experiment, plant_of
 from visthrow.throws.reference_protocol import batches
-from visthrow.throws.results import PROTOCOL, Result, columns_of, join, key_of, work
+from visthrow.throws.results import PROTOCOL, Result, Unit, columns_of, join, key_of, work
 
 IDEAL = (  # the controller's own model, beside the plants of :data:`visthrow.throws.plants.PLANTS`
     "pendulum"
@@ -58,7 +58,7 @@ def unit(
     config_name: str = "state",
     overrides: Sequence[str] = (),
     batch: int = 0,
-) -> dict[str, Any]:
+) -> Unit:
     """Return the unit of so many throws with the baseline at a target [m] along x.
 
     Args:
@@ -97,7 +97,7 @@ def unit(
 
 def units(
     plant: str, compensation: str, target: float, throws: int, seed: int = 0, **how: Any
-) -> list[dict[str, Any]]:
+) -> list[Unit]:
     """:func:`unit`, cut into the batches in which reference plants are flown."""
     if plant in (IDEAL, "hybrid"):
         return [unit(plant, compensation, target, throws, seed, **how)]
@@ -106,7 +106,7 @@ def units(
     ]
 
 
-def plan_of(experiment: Experiment, unit: dict[str, Any]) -> ThrowPlan:
+def plan_of(experiment: Experiment, unit: Unit) -> ThrowPlan:
     """Return the plan of a unit on an experiment's plant."""
     params = replace(PlanParams(), duration=unit["w_t"], energy=unit["rho"])
     if unit["bounds"] != BOUNDS[0]:  # the paper's plan, which a vehicle need not be able to follow
@@ -124,7 +124,7 @@ def plan_of(experiment: Experiment, unit: dict[str, Any]) -> ThrowPlan:
     )
 
 
-def fly_unit(unit: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def fly_unit(unit: Unit) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Plan and fly a unit; returns columns of the throws, and the planned duration [s] and times of
     the controller's steps [ms].
     """
@@ -157,7 +157,7 @@ def rows(plants: Sequence[str]) -> list[tuple[str, str]]:
 
 
 def flown(
-    sets: Sequence[list[dict[str, Any]]], folder: str | Path, say: Callable[[str], None]
+    sets: Sequence[list[Unit]], folder: str | Path, say: Callable[[str], None]
 ) -> list[Result]:
     """Results of sets of units, the batches of each joined; those that the folder holds are not
     flown again.

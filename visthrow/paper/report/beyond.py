@@ -8,7 +8,15 @@ from collections import defaultdict
 import numpy as np
 from numpy import ndarray
 
-from visthrow.paper.report.result_set import SHIPPED, SHORT, WORDS, ResultSet, cells, line
+from visthrow.paper.report.result_set import (
+    SHIPPED,
+    SHORT,
+    WORDS,
+    Points,
+    ResultSet,
+    cells,
+    line,
+)
 from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
@@ -83,7 +91,7 @@ def _changes(departures: dict) -> str:
     )
 
 
-def _speeds(thrown: ResultSet, policy: str, plant: str) -> list[tuple[float, Result]]:
+def _speeds(thrown: ResultSet, policy: str, plant: str) -> Points:
     """Return ascending speeds of the target [m/s] and a policy's throws."""
     points = [
         (float(speed[1]), result)

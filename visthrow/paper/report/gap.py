@@ -13,12 +13,12 @@ from visthrow.paper.report.result_set import (
     SHIPPED,
     SHORT,
     WORDS,
+    Points,
     ResultSet,
     cells,
     errors,
     line,
 )
-from visthrow.throws.results import Result
 from visthrow.view import figures, parts
 from visthrow.view.parts import Grid, Picture, Section, Text
 
@@ -81,7 +81,7 @@ def section(thrown: ResultSet) -> Section:
     )
 
 
-def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, Result]]:
+def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
     """Points of a curve, the policy's own value among them: value in the axis' units and throws,
     ascending.
     """
@@ -95,7 +95,7 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> list[tuple[float, 
     return sorted(points.items())
 
 
-def _rows(sweep: GapSweep, points: list[tuple[float, Result]]) -> list[dict[str, str]]:
+def _rows(sweep: GapSweep, points: Points) -> list[dict[str, str]]:
     nominal = dict(points).get(sweep.own)
     rows = []
     for value, r in points:

@@ -18,6 +18,9 @@ from visthrow.view.figures import Line
 
 SHIPPED = ("state", "vision")  # the paper's two policies, as they come with the package
 
+Points = list[tuple[float, Result]]
+"""Values, and what was thrown with each."""
+
 ANY = object()  # any departures
 
 PARTS = ("throws", "training", "findings")  # folders of a folder of records
@@ -151,9 +154,7 @@ def cells(*results: Result) -> dict[str, str]:
     return row
 
 
-def line(
-    label: str, points: list[tuple[float, Result]], series: int, nominal: float | None = None
-) -> Line:
+def line(label: str, points: Points, series: int, nominal: float | None = None) -> Line:
     """Return the curve of mean landing errors over values; ``nominal``: the policy's value."""
     intervals = [st.mean(result.of("error")) for _, result in points]
     values = [value for value, _ in points]

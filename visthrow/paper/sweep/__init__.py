@@ -11,6 +11,9 @@ from visthrow.common.errors import ConfigError, suggest
 from visthrow.config.bounds import Bounded, Positive
 from visthrow.throws.plants import known_plant
 
+Changes = tuple[str, ...]
+"""Changes of a config, ``key=value`` each."""
+
 
 @dataclass(frozen=True)
 class ThrowParams(Bounded):
@@ -23,7 +26,7 @@ class ThrowParams(Bounded):
     fly_in: Literal["own", "full"] = (
         "own"  # the policy's training config, or its layout's full one (state, vision_ideal)
     )
-    changes: tuple[str, ...] = ()  # key=value of that config
+    changes: Changes = ()  # key=value of that config
     allow: tuple[
         str, ...
     ] = ()  # parts of the policy's contract that may be broken so; recorded as departures
@@ -44,7 +47,7 @@ class RunGroup:
     throws: tuple[str, ...]  # names of tables of throws
     configs: tuple[str, ...] = ()  # of configs/train, or TOML files
     seeds: tuple[int, ...] = (1,)  # every config with every one of them, seed after seed
-    changes: tuple[str, ...] = ()  # key=value of the configs
+    changes: Changes = ()  # key=value of the configs
     policies: tuple[str, ...] = ()  # shipped names, or files, that need no training
 
 
@@ -55,7 +58,7 @@ class SweepList:
     runs: dict[str, RunGroup]
     throws: dict[str, ThrowParams]
     commit: Literal["any", "same"] = "any"  # whether a run by another commit counts as done
-    changes: tuple[str, ...] = ()  # key=value of every training config
+    changes: Changes = ()  # key=value of every training config
     most_throws: int | None = None  # in any set; for a trial of the list
     checkpoint_every: int = (
         100  # iterations: what a killed training loses at most, about 14 s of one H200

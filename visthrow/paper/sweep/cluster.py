@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from visthrow.common.errors import ConfigError
+from visthrow.paper.sweep import Changes
 from visthrow.paper.sweep.pool import Task
 from visthrow.paper.sweep.work import EXIT_STOPPED, work
 from visthrow.paper.sweep.work_units import load_list
@@ -58,7 +59,7 @@ class Cluster:
     gpus: int
     jobs: int
     minutes: float  # length of a piece; what is not done then is submitted again
-    changes: tuple[str, ...] = ()
+    changes: Changes = ()
     # of submitit's executor, for instance ``slurm_partition``
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -94,7 +95,7 @@ class Cluster:
 def do(
     list_name: str,
     out: str,
-    changes: tuple[str, ...],
+    changes: Changes,
     folder: str,
     ids: tuple[str, ...],
     device: str,

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from visthrow.paper.sweep import Changes
 from visthrow.paper.sweep.work import EXIT_BUSY, EXIT_STOPPED
 from visthrow.paper.sweep.work_units import ResultSource, SweepWork, ThrowUnit
 
@@ -57,7 +58,7 @@ class Local:
     out: Path
     devices: list[str]
     jobs: int
-    changes: tuple[str, ...] = ()
+    changes: Changes = ()
 
     def start(self, task: Task, device: str, minutes: float) -> Process:
         environment = {**os.environ, "PYTHONUNBUFFERED": "1"}

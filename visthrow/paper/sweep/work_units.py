@@ -15,7 +15,7 @@ from visthrow import config
 from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.onboard.policy import find_policy
-from visthrow.paper.sweep import SweepList, ThrowParams
+from visthrow.paper.sweep import Changes, SweepList, ThrowParams
 from visthrow.task import Experiment, load_experiment
 from visthrow.throws import results
 from visthrow.throws.reference_protocol import batches
@@ -37,7 +37,7 @@ class ResultSource:
     # <config>-<seed> where it is trained, <config>-<group>-<seed> with changes of its group
     name: str
     config: str = ""  # of configs/train; empty for a policy that is there already
-    changes: tuple[str, ...] = ()
+    changes: Changes = ()
     seed: int = 0
     key: str = ""  # of the training; empty likewise
 
@@ -68,7 +68,7 @@ class ResultSource:
         return _experiment(self.config, self.changes)
 
     @property
-    def flown(self) -> tuple[str, ...]:
+    def flown(self) -> Changes:
         """Changes of the config that its policy is flown with."""
         return self.changes + self.experiment().flown if self.config else ()
 
@@ -92,7 +92,7 @@ class ThrowUnit:
         place = "" if self.batch is None else f":{self.batch}"
         return f"{self.source.id}:{self.set}:{self.target:g}{place}"
 
-    def unit(self, out: Path) -> dict[str, Any]:
+    def unit(self, out: Path) -> results.Unit:
         """Return the key of :mod:`visthrow.throws.results`; the policy must exist."""
         source = self.source
         params = self.params
@@ -121,7 +121,7 @@ class ThrowUnit:
         """
         source = self.source
 
-        def stated(name: str, changes: tuple[str, ...]) -> dict[str, Any]:
+        def stated(name: str, changes: Changes) -> dict[str, Any]:
             if name:
                 values = config.to_dict(_experiment(name, changes))
             else:
@@ -131,7 +131,7 @@ class ThrowUnit:
         nominal = stated(source.config, source.flown)
         return nominal, stated(*self.flown_in(nominal["task"]["observation"]["layout"]))
 
-    def flown_in(self, layout: str) -> tuple[str, tuple[str, ...]]:
+    def flown_in(self, layout: str) -> tuple[str, Changes]:
         """Config of ``configs/train`` to fly in, empty for that in the policy's file, and its
         changes.
         """
@@ -179,7 +179,7 @@ def variant_of(run: str) -> str:
     return "full" if stem in FULL.values() else variant if layout in FULL and variant else stem
 
 
-def load_list(name: str, overrides: tuple[str, ...] = ()) -> SweepWork:
+def load_list(name: str, overrides: Changes = ()) -> SweepWork:
     """Load a list by a name of ``configs/sweep`` or a file, and cut it into units; ConfigError
     where something is wrong in it.
     """
@@ -229,9 +229,7 @@ def differences(base: dict, flown: dict, path: str = "") -> dict[str, Any]:
     return changed
 
 
-def _trained(
-    name: str, mark: str, changes: tuple[str, ...], seed: int, commit: str
-) -> ResultSource:
+def _trained(name: str, mark: str, changes: Changes, seed: int, commit: str) -> ResultSource:
     # without defaults, so that a field that is added later changes no key
     stated = config.to_dict(_experiment(name, changes), defaults=False)
     key = results.key_of({"config": stated, "seed": seed, **({"commit": commit} if commit else {})})
@@ -255,7 +253,7 @@ def _hash(path: Path, changed: int) -> str:
 
 
 @cache
-def _shipped_config(path: Path, changes: tuple[str, ...] = ()) -> dict[str, Any]:
+def _shipped_config(path: Path, changes: Changes = ()) -> dict[str, Any]:
     from visthrow.throws.loading import load_policy
 
     return config.to_dict(load_policy(path, None, changes, allow=_ANYTHING).experiment)

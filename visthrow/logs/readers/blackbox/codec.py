@@ -70,6 +70,10 @@ class Reader:
         return float(np.frombuffer(bytes(self.byte() for _ in range(4)), "<f4")[0])
 
 
+Decoder = Callable[[Reader, int], list[int]]
+"""What reads so many fields."""
+
+
 def extend(value: int, bits: int) -> int:
     """Read the lowest bits as a two's complement number."""
     value &= (1 << bits) - 1
@@ -83,7 +87,7 @@ def _tag8_8svb(r: Reader, count: int) -> list[int]:
     return [r.signed() if tag >> i & 1 else 0 for i in range(count)]
 
 
-def _three(one: tuple, two: tuple) -> Callable[["Reader", int], list[int]]:
+def _three(one: tuple, two: tuple) -> Decoder:
     """Three fields by the two highest bits: within a byte, one or two more (where each field's bits
     end, and how many), or byte by byte.
     """
@@ -118,7 +122,7 @@ def _tag8_4s16(r: Reader, count: int) -> list[int]:
     return values
 
 
-DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
+DECODERS: dict[int, Decoder] = {
     SIGNED_VB: lambda r, n: [r.signed()],
     UNSIGNED_VB: lambda r, n: [r.unsigned()],
     NEG_14BIT: lambda r, n: [-extend(r.unsigned(), 14)],
@@ -130,9 +134,7 @@ DECODERS: dict[int, Callable[[Reader, int], list[int]]] = {
 }
 
 
-def plan(
-    encodings: list[int], skipped: list[bool]
-) -> list[tuple[Callable[[Reader, int], list[int]], int, int]]:
+def plan(encodings: list[int], skipped: list[bool]) -> list[tuple[Decoder, int, int]]:
     """Return decoder, first field and number of fields of each group of fields that are packed
     together, by the encoding of each field.
 

@@ -35,6 +35,8 @@ FRAMES = b"IPSGHE"
 _LONGEST_FRAME = 256  # bytes
 _LONGEST_GAP_US = 10_000_000
 _MOST_ITERATIONS = 5000 * 10
+Frame = list[int]
+"""Values of one frame, in the order of its fields."""
 _EVENTS = {
     0: "sync beep",
     13: "adjustment",
@@ -112,7 +114,7 @@ class _Decoder:
         self.fields: dict[str, Fields] = {}
         self.reader = Reader(data, self._read_header(data))
         self._prepare()
-        self.history: list[list[int]] = []  # last frames, newest first; empty: not valid
+        self.history: list[Frame] = []  # last frames, newest first; empty: not valid
         self.last_time = self.last_iteration = None
 
     def _read_header(self, data: bytes) -> int:
@@ -174,7 +176,7 @@ class _Decoder:
         self.p_num, self.p_denom = (int(num), int(denom)) if denom else (1, max(1, int(num)))
 
     def decode(self) -> BlackboxLog:
-        rows: list[list[int]] = []
+        rows: list[Frame] = []
         log = BlackboxLog(self.header, self.fields["I"].names, np.empty((0, 0)))
         reader = self.reader
         lost = False
@@ -203,7 +205,7 @@ class _Decoder:
         log.main = np.array(rows, dtype=np.int64).reshape(len(rows), len(log.names))
         return log
 
-    def _frame(self, kind: str, log: BlackboxLog) -> list[int] | None:
+    def _frame(self, kind: str, log: BlackboxLog) -> Frame | None:
         """Values of the next frame; empty: not to be used; None: no frame."""
         reader = self.reader
         start = reader.pos
@@ -229,7 +231,7 @@ class _Decoder:
             self.last_iteration = values[self.at_iteration]
         return values
 
-    def _noted(self, log: BlackboxLog) -> list[int] | None:
+    def _noted(self, log: BlackboxLog) -> Frame | None:
         """Note the next event; None: no event."""
         event = _event(self.reader)
         if event is None:
@@ -241,7 +243,7 @@ class _Decoder:
             self.last_time = int(event[1][1])
         return [1]
 
-    def _values(self, kind: str, base: list[list[int]]) -> list[int]:
+    def _values(self, kind: str, base: list[Frame]) -> Frame:
         definition = self.fields[kind]
         reader = self.reader
         values = [0] * len(definition.names)
@@ -255,7 +257,7 @@ class _Decoder:
             values[i] = values[i] & 0xFFFFFFFF if unsigned else extend(values[i], 32)
         return values
 
-    def _predicted(self, predictor: int, i: int, values: list[int], base: list[list[int]]) -> int:
+    def _predicted(self, predictor: int, i: int, values: Frame, base: list[Frame]) -> int:
         value = values[i]
         if predictor in self.constant:
             return value + self.constant[predictor]
@@ -285,7 +287,7 @@ class _Decoder:
         )
         return next((count for count, keep in enumerate(logged) if keep), self.interval)
 
-    def _continuous(self, values: list[int], kind: str) -> bool:
+    def _continuous(self, values: Frame, kind: str) -> bool:
         """Whether time and iteration go on; one I frame that jumps is refused, and the next one
         believed wherever it stands.
         """
