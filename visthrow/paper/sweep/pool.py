@@ -142,6 +142,8 @@ class ProcessPool:
         self.outcome = Outcome()
         self._done = set()
         self._todo = []
+        # devices and cores that are free, by whether a task goes to one of the devices
+        self._free = {True: list(starter.devices), False: ["cpu"] * starter.jobs}
         self._running: dict[str, tuple[Task, str, Any]] = {}
         self._wait: dict[str, float] = {}  # task -> time before which it is not tried again
 
@@ -169,32 +171,24 @@ class ProcessPool:
     def _fill(self, remaining: float) -> None:
         """Start what there is room for."""
         clock = time.monotonic()
-        used = [device for _, device, _ in self._running.values()]
-        free = [device for device in self.starter.devices if device not in used]
-        cores = self.starter.jobs - used.count("cpu core")
         for task in self._todo:
             if task.name in self._running or self._wait.get(task.name, 0.0) > clock:
                 continue
-            if task.gpu and free:
-                self._start(task, free.pop(0), remaining)
-            elif not task.gpu and cores > 0:
-                self._start(task, "cpu core", remaining)
-                cores -= 1
-            if not free and cores <= 0:
-                break
+            if self._free[task.gpu]:
+                self._start(task, self._free[task.gpu].pop(0), remaining)
 
-    def _start(self, task: Task, slot: str, remaining: float) -> None:
-        device = "cpu" if slot == "cpu core" else slot
-        self._running[task.name] = (task, slot, self.starter.start(task, device, remaining))
+    def _start(self, task: Task, device: str, remaining: float) -> None:
+        self._running[task.name] = (task, device, self.starter.start(task, device, remaining))
         if task.gpu:
             self.say(f"{task.name} begins on {device}")
 
     def _reap(self) -> bool:
         """Take note of what ended; whether anything did."""
-        polled = [(task, handle.poll()) for task, _, handle in self._running.values()]
-        ended = [(task, status) for task, status in polled if status is not None]
-        for task, status in ended:
+        polled = [(*started, handle.poll()) for *started, handle in self._running.values()]
+        ended = [row for row in polled if row[-1] is not None]
+        for task, device, status in ended:
             del self._running[task.name]
+            self._free[task.gpu].append(device)
             if status in (EXIT_BUSY, EXIT_STOPPED):
                 self._wait[task.name] = time.monotonic() + BUSY_PAUSE
             elif status != 0:
@@ -208,19 +202,18 @@ class ProcessPool:
 
     def _stop(self) -> None:
         """Have everything write its checkpoint and end."""
-        for _, _, handle in self._running.values():
-            if handle.poll() is None:
-                handle.stop()
+        for handle in self._alive():
+            handle.stop()
         end = time.monotonic() + GRACE
-        while (
-            any(handle.poll() is None for _, _, handle in self._running.values())
-            and time.monotonic() < end
-        ):
+        while self._alive() and time.monotonic() < end:
             time.sleep(POLL)
-        for _, _, handle in self._running.values():
-            if handle.poll() is None:
-                handle.kill()
+        for handle in self._alive():
+            handle.kill()
         self._running.clear()
+
+    def _alive(self) -> list[Any]:
+        """Handles of what runs."""
+        return [handle for *_, handle in self._running.values() if handle.poll() is None]
 
 
 def last_line(log: Path) -> str:
