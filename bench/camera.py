@@ -12,12 +12,12 @@ import numpy as np
 import torch
 
 from bench import start
+from bench.common_options import add_common
 from bench.report import Report, Table, device_name, finish, rate
 from bench.sim import on_one_core
 from camera.keypoints import KEYPOINTS, KeypointCamera, keypoints
 from camera.mount import points_c_from_w
 from visthrow import config
-from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 
 STRETCH = 0.2  # [s], wall time of one measurement, about

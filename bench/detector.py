@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from bench import start
+from bench.common_options import add_common
 from camera.detectors.contours import Detector, Prior, detected_keypoints
 from camera.detectors.learnt import SHIPPED, LearntDetector, Networks
 from camera.fisheye import Fisheye
@@ -24,7 +25,7 @@ from camera.mount import nominal_rot_cb
 from camera.overlay import draw_overlay
 from camera.params import CameraParams
 from visthrow import config
-from visthrow.common.arguments import WHOLE, add_common
+from visthrow.common.arguments import WHOLE
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import VisthrowError
 from visthrow.common.storage import atomic_write, write_json

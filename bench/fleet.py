@@ -20,8 +20,9 @@ from typing import Any
 import numpy as np
 
 from bench import start
+from bench.common_options import add_common
 from bench.report import Report, Table, finish
-from visthrow.common.arguments import add_common, add_option
+from visthrow.common.arguments import add_option
 from visthrow.common.storage import atomic_write
 from visthrow.common.workers import status
 from visthrow.paper.measurements import body

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from bench import start
+from bench.common_options import add_common
 from bench.report import Report, Table, finish
 from bench.sim import on_one_core
-from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 
 TARGETS = (1.5, 2.0, 2.5)

@@ -19,8 +19,8 @@ import torch
 from tensordict import TensorDict
 
 from bench import start
+from bench.common_options import add_common
 from sim.hybrid import rope_variants
-from visthrow.common.arguments import add_common
 from visthrow.common.compute_device import resolve
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.paper.sweep.work_units import load_list

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from bench import commands, start
+from bench.common_options import add_common
 from bench.report import Report, Table, finish
 from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import OUTPUT_FIELDS, STATE_FIELDS
 from tests.oracle.converged import converged
 from tests.simulators import fly
-from visthrow.common.arguments import add_common
 from visthrow.common.errors import VisthrowError
 from visthrow.task import Experiment, load_experiment, plant_of
 

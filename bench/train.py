@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from bench import start
+from bench.common_options import add_common
 from bench.report import (
     Report,
     Table,
@@ -23,7 +24,6 @@ from bench.report import (
     rate,
 )
 from visthrow import config
-from visthrow.common.arguments import add_common
 from visthrow.common.compute_device import rounded_products
 from visthrow.common.errors import VisthrowError
 

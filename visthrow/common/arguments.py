@@ -100,16 +100,6 @@ def declared(module: str) -> Callable[[argparse.ArgumentParser], None]:
     return partial(add_table, tables[Path(module).stem])
 
 
-def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
-    """Add the options that commands share:
-
-    ``--set``, ``--device`` (see ``visthrow.common.compute_device.resolve``) and ``--json``.
-    """
-    for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
-        if wanted:
-            add_option(parser, name, shared=True)
-
-
 def add_commands(
     parser: argparse.ArgumentParser, commands: Commands, dest: str, **group: Any
 ) -> None:

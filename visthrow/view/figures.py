@@ -130,13 +130,11 @@ def marks(
         paper = row.paper
         y = -names.index(row.label) - 0.2 * (row.series - 0.5 * (count - 1))
         axis.plot([value.low, value.high], [y, y], "-", color=colour, **LOOKS["interval"])
-        artists = axis.plot(value.value, y, marker, color=colour, **LOOKS["value"])
-        handles[row.series] = artists[0]
+        handles[row.series] = axis.plot(value.value, y, marker, color=colour, **LOOKS["value"])[0]
         if paper is not None:
             ends = [max(paper.low, 0.1 * paper.value) if log else paper.low, paper.high]
             axis.plot(ends, [y + 0.14] * 2, "-", **LOOKS["paper_interval"])
-            artists = axis.plot(paper.value, y + 0.14, "x", **LOOKS["paper_value"])
-            handles[len(series)] = artists[0]
+            handles[len(series)] = axis.plot(paper.value, y + 0.14, "x", **LOOKS["paper_value"])[0]
     if zero is not None:
         axis.axvline(zero, **LOOKS["zero"])
     if log:
@@ -244,8 +242,9 @@ def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
         bar = {"color": colour, **LOOKS["bar"]}
         axis.plot([duration.value] * 2, [error.low, error.high], "-", **bar)
         axis.plot([duration.low, duration.high], [error.value] * 2, "-", **bar)
-        artists = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])
-        labels[label] = artists[0]
+        labels[label] = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])[
+            0
+        ]
     return labels
 
 
@@ -260,8 +259,7 @@ def trades(panels: Sequence[Trade]) -> bytes:
             colour, marker = _look(series)
             best = points[pareto(points)]
             axis.plot(*points.T, marker, color=colour, **LOOKS["settings"])
-            artists = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])
-            labels[label] = artists[0]
+            labels[label] = axis.plot(*best.T, marker + "-", color=colour, **LOOKS["front"])[0]
         for label, points in panel.crosses:
             look = LOOKS["paper_stars" if len(points) <= 2 else "paper_front"]
             labels[label] = axis.plot(*points.T, **look)[0]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import types
+from functools import partial
 from pathlib import Path
 
 from pytest import fixture, mark, raises
@@ -22,6 +23,9 @@ HELP_BUDGET = 0.5
 """[s], bar of the project for ``visthrow --help``, interpreter start included; the best of a few
 runs counts.
 """
+
+OPTIONS = ("--set", "--device", "--json")
+"""Of the command that tests install."""
 
 
 def run(*arguments: str, **options) -> subprocess.CompletedProcess:
@@ -39,7 +43,9 @@ def command(monkeypatch):
             return outcome
 
         module = types.ModuleType("fake_command")
-        module.add_arguments = lambda parser: arguments.add_common(parser)
+        module.add_arguments = partial(
+            arguments.add_table, {"arguments": dict.fromkeys(OPTIONS, {"shared": True})}
+        )
         module.run = run
         monkeypatch.setitem(sys.modules, "fake_command", module)
         monkeypatch.setitem(cli.COMMANDS, "try", ("try it", "fake_command"))

@@ -1,0 +1,12 @@
+"""Options that measuring programs share with the product's commands."""
+
+import argparse
+
+from visthrow.common.arguments import add_option
+
+
+def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
+    """Add ``--set``, ``--device`` (see ``visthrow.common.compute_device.resolve``) and ``--json``."""
+    for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
+        if wanted:
+            add_option(parser, name, shared=True)
