@@ -6,7 +6,7 @@ from visthrow.common.arguments import add_option
 
 
 def add_common(parser: argparse.ArgumentParser, *, device: bool = True, json: bool = True) -> None:
-    """Add ``--set``, ``--device`` (see ``visthrow.common.compute_device.resolve``) and ``--json``."""
+    """Add ``--set``, ``--device`` and ``--json``."""
     for name, wanted in (("--set", True), ("--device", device), ("--json", json)):
         if wanted:
             add_option(parser, name, shared=True)

@@ -44,7 +44,7 @@ def command(monkeypatch):
 
         module = types.ModuleType("fake_command")
         module.add_arguments = partial(
-            arguments.add_table, {"arguments": dict.fromkeys(OPTIONS, {"shared": True})}
+            arguments.add_table, {"arguments": {name: {"shared": True} for name in OPTIONS}}
         )
         module.run = run
         monkeypatch.setitem(sys.modules, "fake_command", module)
