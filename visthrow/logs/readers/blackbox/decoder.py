@@ -160,10 +160,10 @@ class _Decoder:
             kind: plan(definition.encoding, [p == INC for p in definition.predictor])
             for kind, definition in self.fields.items()
         }
-        names = self.fields["I"].names
-        self.at_time = names.index("time") if "time" in names else None
-        self.at_iteration = names.index("loopIteration") if "loopIteration" in names else None
-        self.at_motor0 = names.index("motor[0]") if "motor[0]" in names else None
+        place = {name: i for i, name in enumerate(self.fields["I"].names)}
+        self.at_time = place.get("time")
+        self.at_iteration = place.get("loopIteration")
+        self.at_motor0 = place.get("motor[0]")
         output = _numbers(self.header.get("motorOutput", "0"), "motorOutput")
         self.constant = {
             MINTHROTTLE: _int(self.header, "minthrottle"),
