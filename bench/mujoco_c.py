@@ -39,7 +39,8 @@ def started(
         scene: the rope and its start.
         step: [s]. integrator: RK4 or implicitfast. armature: of the hinges [kg m^2].
     """
-    model = build_attached(*vehicle_and_rope(scene), "universal", armature)
+    model = build_attached(*vehicle_and_rope(scene), "universal")
+    model.dof_armature[6:] = armature  # of the hinges, behind the free joint
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data = initial_data(model, scene)

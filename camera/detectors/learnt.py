@@ -34,7 +34,7 @@ REACH = {"ball": 2.2, "goal": 1.9}
 middle to its corners.
 """
 
-LEAST_REACH = {"ball": 0.05, "goal": 0.05}
+LEAST_REACH = 0.05
 """Half side of a patch at least, as a tangent: what is far is looked at with its surroundings."""
 
 PLACES = 3  # of a kind that are looked at closely
@@ -332,7 +332,7 @@ def look_closely(
     """
     index = torch.zeros(len(rays), dtype=torch.long, device=rays.device)
     for _ in range(2):
-        reach = (REACH[kind] * sizes).clamp(LEAST_REACH[kind], 1.0)
+        reach = (REACH[kind] * sizes).clamp(LEAST_REACH, 1.0)
         views = views_about(rays, reach, north.expand_as(rays))
         patches = patches_of(frame, index, views, lens, PATCH[kind])
         outputs = getattr(networks, kind)(patches)

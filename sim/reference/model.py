@@ -37,9 +37,7 @@ def set_inertial(
     body.explicitinertial = True
 
 
-def add_joints(
-    body: "mujoco.MjsBody", index: int, joints: str, damping: float, armature: float = 0.0
-) -> None:
+def add_joints(body: "mujoco.MjsBody", index: int, joints: str, damping: float) -> None:
     """Hang a body on the one above by the joints of rod ``index``."""
     if joints == "ball":
         body.add_joint(name=f"ball{index}", type=mujoco.mjtJoint.mjJNT_BALL)
@@ -47,7 +45,6 @@ def add_joints(
     for name, axis in (("y", [0, 1, 0]), ("x", [1, 0, 0])):
         joint = body.add_joint(name=f"{name}{index}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
         joint.damping[0] = damping
-        joint.armature = armature
 
 
 def new_spec(constraints: bool = False) -> "mujoco.MjSpec":
@@ -86,7 +83,6 @@ def build_attached(
     body: BodyParams,
     rope: RopeParams,
     joints: Literal["universal", "ball"] = "universal",
-    armature: float = 0.0,
     stretch: tuple[float, float] | None = None,
 ) -> "mujoco.MjModel":
     """Build the quadrotor with its rope.
@@ -95,7 +91,6 @@ def build_attached(
         body: mass and inertia of the quadrotor.
         rope: masses and lengths.
         joints: kind of the rope's joints.
-        armature: reflected inertia added to every hinge [kg m^2]; 0 is the physical model.
         stretch: stiffness [N/m] and damping [N s/m] of a slide along the rope between last segment
             and payload.
 
@@ -103,7 +98,7 @@ def build_attached(
         Compiled model with the bodies ``vehicle``, ``rod0`` .. and, with ``stretch``, ``payload``.
     """
     spec = new_spec()
-    add_chain(rope, add_vehicle(spec, body), joints, armature, stretch)
+    add_chain(rope, add_vehicle(spec, body), joints, stretch)
     return spec.compile()
 
 
@@ -118,7 +113,6 @@ def add_chain(
     rope: RopeParams,
     parent: "mujoco.MjsBody",
     joints: str,
-    armature: float = 0.0,
     stretch: tuple[float, float] | None = None,
     free_root: bool = False,
     load: bool = True,
@@ -139,7 +133,7 @@ def add_chain(
         if i == 0 and free_root:
             rod.add_freejoint(name="root")
         else:
-            add_joints(rod, i, joints, rope.joint_damping, armature)
+            add_joints(rod, i, joints, rope.joint_damping)
         parent = rod
         anchor = [0.0, 0.0, -rope.segment_length]
     below = [0.0, 0.0, -rope.segment_length - rope.payload_offset]

@@ -66,7 +66,8 @@ def converged(
     Raises:
         ValueError: a time or a switch off the step edges.
     """
-    model = build_attached(*vehicle_and_rope(scene), "universal", armature)
+    model = build_attached(*vehicle_and_rope(scene), "universal")
+    model.dof_armature[6:] = armature  # of the hinges, behind the free joint
     model.opt.timestep = step
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
     data = initial_data(model, scene)

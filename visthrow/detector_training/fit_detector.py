@@ -320,7 +320,7 @@ class Fit:
         north = labels["north"][index] + 0.15 * torch.randn(
             len(index), 3, generator=generator, device=ray.device
         )
-        views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH[kind], 1.0), north)
+        views = views_about(ray, (REACH[kind] * size).clamp(LEAST_REACH, 1.0), north)
         patches = patches_of(frames, index, views, lens, PATCH[kind])
         outputs = getattr(self.networks, kind)(self.augment(patches))
         true = labels["rays", kind][index]

@@ -2,6 +2,8 @@
 and rotor against rotor.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from visthrow.common.errors import suggest
@@ -36,6 +38,7 @@ _FOLLOWS = 0.4
 _AGAINST = 8.0
 _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
+_OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < _LATEST)  # delays that motors have
 _MOTORS = 0.07  # what they usually take [s]
 _CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
 MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
@@ -80,9 +83,8 @@ def follows(log: FlightLog, name: str) -> float | None:
     thrust = thrust_of(log, KnownVehicle(thrust_input=name))
     if thrust is None or np.median(thrust[2]) <= 0.0:
         return None
-    correlations = [c for felt in ("acc_b", "path") if (c := _correlations(log, *thrust[1:], felt))]
-    motors = (_DELAYS > -0.005) & (_DELAYS < _LATEST)
-    return max((float(np.max(curve[motors])) for curve, _ in correlations), default=None)
+    curves = [curve for _, curve, _ in _correlations(log, *thrust[1:])]
+    return max((float(np.max(curve[_OF_MOTORS])) for curve in curves), default=None)
 
 
 def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
@@ -127,18 +129,13 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
         period = 1e3 * float(np.median(np.diff(time)))
         text = f"comes every {period:.0f} ms: too seldom to be held against the force"
         return [*rows, Row("thrust", name, "warn", text)]
-    correlations = [
-        (felt, *c)
-        for felt in ("acc_b", "path")
-        if (c := _correlations(log, time, command, felt)) is not None
-    ]
+    correlations = list(_correlations(log, time, command))
     if not correlations:
         return rows
     felt, curve, against = max(correlations, key=lambda correlation: np.max(correlation[1]))
-    motors = (_DELAYS > -0.005) & (_DELAYS < _LATEST)
-    peak = float(np.max(curve[motors]))
+    peak = float(np.max(curve[_OF_MOTORS]))
     best = float(np.max(curve))
-    delay = float(_DELAYS[np.argmax(np.where(motors, curve, -1.0))])
+    delay = float(_DELAYS[np.argmax(np.where(_OF_MOTORS, curve, -1.0))])
     figures = {"correlation": peak, "delay_s": delay, "nats_against": against, "felt_by": felt}
     text = f"the force follows the thrust {1e3 * delay:.0f} ms later, correlation {peak:.2f}"
     topic = "delay"
@@ -193,26 +190,26 @@ def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _correlations(
-    log: FlightLog, time: np.ndarray, command: np.ndarray, felt: str
-) -> tuple[np.ndarray, float] | None:
+    log: FlightLog, time: np.ndarray, command: np.ndarray
+) -> Iterator[tuple[str, np.ndarray, float]]:
     """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
-    explains the force better.
-
-    None where one of them is not known or does not vary.
+    explains the force better, for each measurement of the force that is known and varies.
     """
-    force = _along_z(log, felt)
-    if force is None or len(force[0]) < 50:
-        return None
-    flies = time[command[:, 0] > 0.6 * np.median(command[command > 0.2 * np.max(command)])]
-    start = max(flies[0] + 0.5, force[0][0] + 0.3)
-    end = min(flies[-1] - 0.5, force[0][-1] - 0.5)
-    grid = np.arange(start, end, 0.01)
-    if len(grid) < 200:
-        return None
-    x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
-    y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
-    curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
-    return max(filter(None, curves), key=lambda curve: np.max(curve[0]), default=None)
+    for felt in ("acc_b", "path"):
+        force = _along_z(log, felt)
+        if force is None or len(force[0]) < 50:
+            continue
+        flies = time[command[:, 0] > 0.6 * np.median(command[command > 0.2 * np.max(command)])]
+        start = max(flies[0] + 0.5, force[0][0] + 0.3)
+        end = min(flies[-1] - 0.5, force[0][-1] - 0.5)
+        grid = np.arange(start, end, 0.01)
+        if len(grid) < 200:
+            continue
+        x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
+        y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
+        curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
+        if known := list(filter(None, curves)):
+            yield felt, *max(known, key=lambda curve: np.max(curve[0]))
 
 
 def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -224,7 +221,7 @@ def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
-    best = int(np.argmax(np.where((_DELAYS > -0.005) & (_DELAYS < _LATEST), curve, -1.0)))
+    best = int(np.argmax(np.where(_OF_MOTORS, curve, -1.0)))
     independent = 0.01 * len(x) / (2.0 * _SPAN)
     return curve, float(0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best])))
 
