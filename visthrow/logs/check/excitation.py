@@ -1,5 +1,6 @@
 """What a log excites, and what it can therefore answer."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import chain
 
@@ -47,21 +48,22 @@ def _questions() -> tuple[Question, ...]:
 QUESTIONS = _questions()
 
 
-def look(log: FlightLog) -> list[Row]:
-    """Say what is excited, and which questions the log can answer."""
+def look(log: FlightLog) -> Iterator[Row]:
+    """Yield what is excited, and which questions the log can answer."""
     figures = excitation(log)
-    rows = [Row("excited", "", "ok", _words(figures), figures)]
+    yield Row("excited", "", "ok", _words(figures), figures)
     if figures.get("still"):
         why = "the autopilot was never armed and in the air"
         why = why if "grounded" in figures else "the vehicle never left its place"
         text = f"{why}: nothing about its flight can be answered"
-        rows.append(Row("excited", "", "bad", text, {"still": 1}))
+        yield Row("excited", "", "bad", text, {"still": 1})
     elif figures.get("idle"):
         text = "no sign of flight: the throttle stays at zero, or the motors hardly above idle"
-        rows.append(Row("excited", "", "bad", text, {"idle": 1}))
-    # not things of which the log holds nothing at all
-    concern = [q for q in QUESTIONS if any(name in log for name in q.needs[0])]
-    return rows + [_answer(question, log, figures) for question in concern]
+        yield Row("excited", "", "bad", text, {"idle": 1})
+    for question in QUESTIONS:
+        # not things of which the log holds nothing at all
+        if any(name in log for name in question.needs[0]):
+            yield _answer(question, log, figures)
 
 
 def _words(figures: dict) -> str:

@@ -52,24 +52,23 @@ _HEAVIEST = 0.9  # share of the mass that a payload may have
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
 
-def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> list[Row]:
-    """Return the findings of all checks of what moves how in one flight."""
-    rows = list(_plausible(log))
+def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
+    """Yield the findings of all checks of what moves how in one flight."""
+    yield from _plausible(log)
     for prefix in _PREFIXES:
         pos = f"{prefix}pos_w"
         vel = f"{prefix}vel_w"
         quat = f"{prefix}quat_wb"
         if pos in log and vel in log:
-            rows += _velocity(log, pos, vel)
+            yield from _velocity(log, pos, vel)
         if quat in log and prefix != "payload_":
-            rows += _rates(log, quat)
-            rows += _gravity(log, quat, pos)
-            rows += _forces(log, quat, vel if vel in log else pos)
-    rows += _still_gravity(log)
-    rows += _commands(log)
-    rows += _cable(log, vehicle)
-    rows += _same(log)
-    return rows
+            yield from _rates(log, quat)
+            yield from _gravity(log, quat, pos)
+            yield from _forces(log, quat, vel if vel in log else pos)
+    yield from _still_gravity(log)
+    yield from _commands(log)
+    yield from _cable(log, vehicle)
+    yield from _same(log)
 
 
 def usable(samples: Samples, threshold: float) -> bool:
@@ -146,44 +145,48 @@ def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
                 )
 
 
-def _velocity(log: FlightLog, pos: str, vel: str) -> list[Row]:
+def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
     place = log[pos].samples()
     velocity = log[vel].samples()
     if not (usable(place, 0.02) and usable(velocity, 0.0)):
-        return []
+        return
     notes = log.meta.get("ingest", {})
     messages = {notes.get(name, {}).get("message") for name in (pos, vel)}
     one_clock = len(messages) == 1 and None not in messages
-    return _compared(relations.derivative(*place), velocity, f"d({pos})/dt, {vel}", one_clock)
+    yield from _compared(relations.derivative(*place), velocity, f"d({pos})/dt, {vel}", one_clock)
 
 
-def _rates(log: FlightLog, quat: str) -> list[Row]:
+def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
     if "rate_b" not in log:
-        return []
+        return
     measured = log["rate_b"].samples()
     derived = relations.rates_of(*log[quat].samples())
     both = derived, measured
     if not all(usable(rates, 0.0) for rates in both) or not any(usable(r, MOVES) for r in both):
-        return []
-    return _compared(*both, f"rate of {quat}, rate_b")
+        return
+    yield from _compared(*both, f"rate of {quat}, rate_b")
 
 
-def _compared(first: Samples, second: Samples, channels: str, one_clock: bool = False) -> list[Row]:
+def _compared(
+    first: Samples, second: Samples, channels: str, one_clock: bool = False
+) -> Iterator[Row]:
     """Rows about a pair that should be one and the same motion; ``one_clock``: of one message."""
     relation = relations.relate(first, second)
     if relation is None:
-        return []
+        return
     figures = _figures(relation)
     if _disagrees(relation):
         text = (
             f"hardly go together in any axes (correlation {relation.axes_correlation:.2f}): not the"
             " same flight, or noise"
         )
-        return [Row("frames", channels, "bad", text, figures)]
+        yield Row("frames", channels, "bad", text, figures)
+        return
     if _turned(relation):
-        return [_in_other_axes(relation, channels, "go together")]
+        yield _in_other_axes(relation, channels, "go together")
+        return
     together = f"go together as they are, correlation {relation.correlation:.2f}"
-    rows = [Row("frames", channels, "ok", together, figures)]
+    yield Row("frames", channels, "ok", together, figures)
     if not 0.67 < relation.scale < 1.5:
         hint = relations.unit_hint(relation.scale) or "no unit explains it"
         weak = abs(relation.correlation) < 0.7 and 0.4 < relation.scale < 1.5
@@ -191,8 +194,8 @@ def _compared(first: Samples, second: Samples, channels: str, one_clock: bool = 
             f"the second is {relation.scale:.4g} times the first:"
             f" {'noise dilutes it' if weak else hint}"
         )
-        rows.append(Row("units", channels, "warn" if weak else "bad", text, figures))
-    return [*rows, _late(relation, channels, figures, one_clock)]
+        yield Row("units", channels, "warn" if weak else "bad", text, figures)
+    yield _late(relation, channels, figures, one_clock)
 
 
 def _figures(relation: relations.Relation) -> dict[str, float]:
@@ -256,14 +259,14 @@ def _disagrees(relation: relations.Relation) -> bool:
     )
 
 
-def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
+def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
     """Check that the mean force on the body, turned to the world, carries the vehicle."""
     if "acc_b" not in log:
-        return []
+        return
     time_q, q = log[quat].samples()
     time_a, acc = log["acc_b"].samples()
     if len(time_q) < 50 or len(time_a) < 50:
-        return []
+        return
     nearest = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
     mean_w = np.mean(matrix_of_quat(q) @ acc[nearest][..., None], axis=0)[:, 0]
     extra = np.zeros(3)
@@ -282,16 +285,17 @@ def _gravity(log: FlightLog, quat: str, pos: str) -> list[Row]:
             f"the mean force is {size:.4g} m/s^2, not {GRAVITY}:"
             f" {hint or 'axes are exchanged, or gravity is missing'}"
         )
-        return [Row("units" if hint else "frames", channels, "bad", text, figures)]
-    if tilt > 30.0:
+        yield Row("units" if hint else "frames", channels, "bad", text, figures)
+    elif tilt > 30.0:
         text = f"the mean force points {tilt:.0f} deg off up: turned or mirrored axes"
-        return [Row("frames", channels, "bad", text, figures)]
-    verdict = "warn" if tilt > 3.0 or abs(size / GRAVITY - 1.0) > 0.03 else "ok"
-    text = f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up"
-    return [Row("frames", channels, verdict, text, figures)]
+        yield Row("frames", channels, "bad", text, figures)
+    else:
+        verdict = "warn" if tilt > 3.0 or abs(size / GRAVITY - 1.0) > 0.03 else "ok"
+        text = f"the mean force is {size:.3f} m/s^2 and {tilt:.2f} deg off up"
+        yield Row("frames", channels, verdict, text, figures)
 
 
-def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
+def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     """Hold what pushes the vehicle, by accelerometer and attitude, against how its velocity
     changes.
 
@@ -299,37 +303,41 @@ def _forces(log: FlightLog, quat: str, path: str) -> list[Row]:
     together."""
     sensed = "acc_b" in log
     if path not in log:
-        return []
+        return
     motion = log[path].samples()
     attitude = log[quat].samples()
     if min(len(motion.time), len(attitude.time)) < 50:
-        return []
+        return
     time, acc = accelerations(*motion, log[path].unit)
     if len(time) < 50 or float(np.sqrt(np.sum(np.var(acc, axis=0)))) < _PUSHED:
-        return []
+        return
     turn = relations.attitude_at(*attitude, time)
     if not sensed:
         hangs, relative = _carried(log, quat, time, acc)
         if np.sum(hangs) < 50:
-            return []
+            return
         turn = turn[hangs]
         acc = _together(acc[hangs], relative[hangs], turn)
-        return _leaning(time[hangs], acc, turn, f"d({path})/dt, {quat} thrust along z")
+        yield from _leaning(time[hangs], acc, turn, f"d({path})/dt, {quat} thrust along z")
+        return
     force_b = log["acc_b"].samples()
     if len(force_b.time) < 50 or sparse(force_b.time) or sparse(motion.time):
-        return []
+        return
     gravity = np.array([0.0, 0.0, GRAVITY])
     pushed = rotate(relations.attitude_at(*attitude, force_b.time), force_b.values) - gravity
     pushed = relations.mean_over(force_b.time, pushed, time, _SPAN)
     relation = relations.relate(Samples(time, acc), Samples(time, pushed))
     if relation is None:
-        return []
+        return
     channels = f"d({path})/dt, {quat} acc_b"
     wrong = _exchanged(relation, channels)
     if wrong is None:
         expected_b = Samples(time, rotate_back(turn, acc + gravity))
         wrong = _exchanged_body(expected_b, force_b, channels)
-    return [wrong] if wrong is not None else _pushed(relation, acc, pushed, channels, True)
+    if wrong is None:
+        yield from _pushed(relation, acc, pushed, channels, True)
+    else:
+        yield wrong
 
 
 def _carried(
@@ -365,16 +373,19 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     return acc + share * relative
 
 
-def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> list[Row]:
+def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> Iterator[Row]:
     """Hold the level push of a thrust along body z against accelerations [m/s^2]."""
     level = np.array([1.0, 1.0, 0.0])
     up = matrix_of_quat(turn)[:, :, 2]
     pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * level
     relation = relations.relate(Samples(time, acc * level), Samples(time, pushed))
     if relation is None:
-        return []
+        return
     wrong = _exchanged(relation, channels)
-    return [wrong] if wrong is not None else _pushed(relation, acc * level, pushed, channels, False)
+    if wrong is None:
+        yield from _pushed(relation, acc * level, pushed, channels, False)
+    else:
+        yield wrong
 
 
 def sparse(time: np.ndarray) -> bool:
@@ -413,7 +424,7 @@ def accelerations(time: np.ndarray, path: np.ndarray, unit: str, span: float = _
 
 def _pushed(
     relation: relations.Relation, acc: np.ndarray, pushed: np.ndarray, channels: str, sensed: bool
-) -> list[Row]:
+) -> Iterator[Row]:
     """Rows about a push that has the axes of the change of velocity."""
     off = np.mean(pushed - acc, axis=0)
     figures = {
@@ -423,7 +434,7 @@ def _pushed(
         "offset_m_s2": off.tolist(),
     }
     if relation.correlation < FIRMLY and not sensed:
-        return []  # a payload or a draught pushes as well
+        return  # a payload or a draught pushes as well
     if relation.correlation < FIRMLY:
         if relation.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0:
             verdict = "bad"
@@ -433,24 +444,24 @@ def _pushed(
             f"hardly go together (correlation {relation.correlation:.2f}):"
             " attitude or accelerometer of another flight, or noise"
         )
-        return [Row("frames", channels, verdict, text, figures)]
+        yield Row("frames", channels, verdict, text, figures)
+        return
     together = f"go together as they are, correlation {relation.correlation:.2f}"
-    rows = [Row("frames", channels, "ok", together, figures)]
+    yield Row("frames", channels, "ok", together, figures)
     if not 0.5 < relation.scale < 2.0:
         hint = relations.unit_hint(relation.scale)
         text = (
             f"the second is {relation.scale:.4g} times the first: {hint or 'no unit explains it'}"
         )
-        rows.append(Row("units", channels, "bad", text, figures))
+        yield Row("units", channels, "bad", text, figures)
     if sensed:
-        rows.append(_late(relation, channels, figures, False))
+        yield _late(relation, channels, figures, False)
         if np.linalg.norm(off) > _OFFSET:
             text = (
                 f"the second is off by ({', '.join(f'{x:+.2f}' for x in off)}) m/s^2 in the mean:"
                 " bias, or a tilted mount"
             )
-            rows.append(Row("frames", channels, "warn", text, figures))
-    return rows
+            yield Row("frames", channels, "warn", text, figures)
 
 
 def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
@@ -463,23 +474,24 @@ def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
     return Row("frames", channels, "bad", text, figures)
 
 
-def _still_gravity(log: FlightLog) -> list[Row]:
+def _still_gravity(log: FlightLog) -> Iterator[Row]:
     """Without an attitude: the size of the force, in its median."""
     if "acc_b" not in log or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
-        return []
+        return
     _, acc = log["acc_b"].samples()
     if len(acc) < 20:
-        return []
+        return
     size = float(np.median(np.linalg.norm(acc, axis=1)))
     figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(acc, axis=0).tolist()}
     if not 0.7 < size / GRAVITY < 1.4:
         hint = relations.unit_hint(size / GRAVITY) or "gravity is missing or the unit is wrong"
         text = f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}"
-        return [Row("units", "acc_b", "bad", text, figures)]
-    return [Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)]
+        yield Row("units", "acc_b", "bad", text, figures)
+    else:
+        yield Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)
 
 
-def _commands(log: FlightLog) -> list[Row]:
+def _commands(log: FlightLog) -> Iterator[Row]:
     """Whether the measured rates, or those of the measured attitude, follow what was commanded."""
     if "rate_b" in log:
         turning = "rate_b"
@@ -488,10 +500,9 @@ def _commands(log: FlightLog) -> list[Row]:
         turning = "rate of quat_wb"
         rates = relations.rates_of(*log["quat_wb"].samples())
     else:
-        return []
-    rows: list[Row] = []
+        return
     if not usable(rates, MOVES):
-        return rows
+        return
     spread = float(np.max(np.std(rates.values, axis=0)))
     for name in ("command", "rate_setpoint_b"):
         if name not in log:
@@ -502,46 +513,45 @@ def _commands(log: FlightLog) -> list[Row]:
         if relation is not None:
             channels = f"{name}, {turning}"
             early = _early(relation, set_points, rates, channels)
-            rows += early or _followed(relation, channels, spread)
-    return rows
+            yield early or _followed(relation, channels, spread)
 
 
 def _early(
     relation: relations.Relation, set_points: Samples, rates: Samples, channels: str
-) -> list[Row]:
+) -> Row | None:
     """Report rates that go before their commands: if no delay that a controller has fits them as
     well, the clock of the commands is late. A swing that a controller opposes fits both.
     """
     if relation.axes_delay > -_DELAY_BAD or relation.axes_correlation < FIRMLY:
-        return []
+        return None
     time = set_points.time
     moved = set_points._replace(time=time + _RESPONSE)
     later = relations.relate(moved, rates, reach=_RESPONSE)
     if later is None:
-        return []
+        return None
     before = min(relation.axes_correlation, 0.999)
     after = min(max(later.axes_correlation, relation.correlation * (relation.delay > 0.0)), 0.999)
     independent = float(np.ptp(time)) / relations.INDEPENDENT
     nats = 0.5 * independent * np.log((1.0 - after**2) / (1.0 - before**2))
     if nats < _NATS or before < after + CLEARLY:
-        return []
+        return None
     early = -1e3 * relation.axes_delay
     text = f"the rates go {early:.0f} ms or more before their commands, correlation {before:.2f}"
     text += f" (behind them {after:.2f}, {nats:.0f} nats): the commands' clock is late"
     figures = {"delay_s": relation.axes_delay, "nats": float(nats)}
-    return [Row("delay", channels, "bad", text, figures)]
+    return Row("delay", channels, "bad", text, figures)
 
 
-def _followed(relation: relations.Relation, channels: str, spread: float) -> list[Row]:
+def _followed(relation: relations.Relation, channels: str, spread: float) -> Row:
     figures = _figures(relation)
     if _disagrees(relation):
         text = (
             "the rates do not follow the commands"
             f" (best correlation {relation.axes_correlation:.2f}): not the same flight?"
         )
-        return [Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)]
+        return Row("frames", channels, "bad" if spread > _LIVELY else "warn", text, figures)
     if _turned(relation):
-        return [_in_other_axes(relation, channels, "the rates follow the commands")]
+        return _in_other_axes(relation, channels, "the rates follow the commands")
     is_measured = relation.delay_sd < _UNTOLD
     late = is_measured and relation.delay < -0.005
     hint = relations.unit_hint(relation.scale)
@@ -561,16 +571,16 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> lis
         text += f": {hint}"
     elif weak:
         text += ": weakly"
-    return [Row("delay", channels, verdict, text, figures)]
+    return Row("delay", channels, verdict, text, figures)
 
 
-def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
+def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if "pos_w" not in log or "payload_pos_w" not in log:
-        return []
+        return
     place = log["pos_w"].samples()
     time, pos = log["payload_pos_w"].samples()
     if len(place.time) < 20 or len(time) < 20:
-        return []
+        return
     overlap = (time > place.time[0]) & (time < place.time[-1])
     if "attached" in log:
         overlap &= log["attached"].hold(time).astype(bool)
@@ -580,7 +590,8 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     channels = "pos_w, payload_pos_w"
     if len(length) < 20:
         text = "vehicle and payload were never measured at one time"
-        return [Row("frames", channels, "bad", text)]
+        yield Row("frames", channels, "bad", text)
+        return
     middle = float(np.median(length))
     spread = float(np.percentile(length, 90) - np.percentile(length, 10))
     above = float(np.mean(gap[:, 2] > 0.5 * middle))
@@ -588,59 +599,62 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
     if above > 0.5:
         text += ", the payload above: bodies exchanged, or z down"
-        return [Row("frames", channels, "bad", text, figures)]
+        yield Row("frames", channels, "bad", text, figures)
+        return
     if not 0.02 < middle < 20.0:
         text += ": no cable; millimetres taken for metres, or metres for millimetres?"
-        return [Row("units", channels, "bad", text, figures)]
-    rows = [Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)]
-    rows += _length(middle, vehicle.cable_length, channels) if vehicle.cable_length else []
-    rows += _left_early(log, payload.time, gap)
-    return rows + _payload_late(place, payload, channels)
+        yield Row("units", channels, "bad", text, figures)
+        return
+    yield Row("frames", channels, "warn" if spread > 0.1 * middle else "ok", text, figures)
+    if vehicle.cable_length:
+        yield _length(middle, vehicle.cable_length, channels)
+    yield from _left_early(log, payload.time, gap)
+    yield from _payload_late(place, payload, channels)
 
 
-def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> list[Row]:
+def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:
     """Report a payload that leaves its cable before its release is commanded."""
     if "release_command" not in log:
-        return []
+        return
     stamps, pressed = log["release_command"].samples()
     commanded = np.flatnonzero(pressed.ravel() > 0.0)
     if not len(commanded):
-        return []
+        return
     length = np.linalg.norm(gap, axis=1)
     hangs = (gap[:, 2] < -0.5 * length) & (
         time < stamps[commanded[0]]
     )  # not beside it on the floor
     if not np.any(hangs):
-        return []
+        return
     taut = np.flatnonzero(length < (1.0 + _TAUT) * np.median(length[hangs]))
     if taut[-1] == len(time) - 1:
-        return []
+        return
     since = stamps[max(commanded[0] - 1, 0)]  # the command came after this sample
     early = float(since - time[taut[-1] + 1])
     if early < _DELAY_BAD:
-        return []
+        return
     text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "
     text += "the commands' clock is late, or it fell off"
     channels = "release_command, payload_pos_w"
-    return [Row("delay", channels, "bad", text, {"delay_s": -early})]
+    yield Row("delay", channels, "bad", text, {"delay_s": -early})
 
 
-def _length(middle: float, expected: float, channels: str) -> list[Row]:
+def _length(middle: float, expected: float, channels: str) -> Row:
     """Compare the measured cable with the model's."""
     off = middle / expected - 1.0
     figures = {"median_m": middle, "model_m": expected}
     text = f"apart by {100 * off:+.1f} % of the model's cable of {expected:g} m"
     verdict = "bad" if abs(off) > _OTHER_CABLE else "warn" if abs(off) > _LONGER else "ok"
     text += ": another cable, or another body" if verdict == "bad" else ""
-    return [Row("cable", channels, verdict, text, figures)]
+    return Row("cable", channels, verdict, text, figures)
 
 
-def _payload_late(place: Samples, payload: Samples, channels: str) -> list[Row]:
+def _payload_late(place: Samples, payload: Samples, channels: str) -> Iterator[Row]:
     """Measure the delay of the payload's stream: a cable keeps its length, at the right delay."""
     delays = np.arange(-0.2, 0.2001, 0.01)
     overlap = (payload.time > place.time[0] + 0.2) & (payload.time < place.time[-1] - 0.2)
     if np.sum(overlap) < 50:
-        return []
+        return
     time, pos = (array[overlap] for array in payload)
     gaps = pos - relations.on_grid(*place, time - delays[:, None])
     spread = np.std(np.linalg.norm(gaps, axis=2), axis=1)
@@ -651,20 +665,20 @@ def _payload_late(place: Samples, payload: Samples, channels: str) -> list[Row]:
     plain, least = np.maximum(spread[[len(delays) // 2, best]], floor)
     nats = independent * float(np.log(plain / least))
     if nats < _NATS or best in (0, len(delays) - 1) or abs(delay) < _DELAY_WARN:
-        return []
+        return
     text = (
         f"the payload is {1e3 * delay:+.0f} ms behind the vehicle: the cable's length then"
         f" varies by {1e3 * least:.1f} mm, not {1e3 * plain:.1f} ({nats:.0f} nats)"
     )
     verdict = "bad" if abs(delay) > _DELAY_BAD else "warn"
-    return [Row("delay", channels, verdict, text, {"delay_s": delay, "nats": nats})]
+    yield Row("delay", channels, verdict, text, {"delay_s": delay, "nats": nats})
 
 
-def _same(log: FlightLog) -> list[Row]:
+def _same(log: FlightLog) -> Iterator[Row]:
     """Two measurements of one quantity on different clocks: the delay between them, and whether it
     holds.
     """
-    rows: list[Row] = []
+    bad = False
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
         if first not in log or second not in log:
             continue
@@ -672,10 +686,11 @@ def _same(log: FlightLog) -> list[Row]:
         b = log[second].samples()
         if not (usable(a, MOVES) and usable(b, MOVES)):
             continue
-        rows += _compared(a, b, f"{first}, {second}")
-        if "bad" not in {row.verdict for row in rows}:
-            rows += _drift(a, b, f"{first}, {second}")
-    return rows
+        rows = list(_compared(a, b, f"{first}, {second}"))
+        yield from rows
+        bad = bad or "bad" in {row.verdict for row in rows}
+        if not bad:
+            yield from _drift(a, b, f"{first}, {second}")
 
 
 def _within(samples: Samples, start: float, end: float) -> Samples:
@@ -683,7 +698,7 @@ def _within(samples: Samples, start: float, end: float) -> Samples:
     return Samples(samples.time[rows], samples.values[rows])
 
 
-def _drift(first: Samples, second: Samples, channels: str) -> list[Row]:
+def _drift(first: Samples, second: Samples, channels: str) -> Iterator[Row]:
     """Whether the delay is the same from piece to piece of 5 s."""
     delays = []
     piece = 5.0
@@ -696,7 +711,7 @@ def _drift(first: Samples, second: Samples, channels: str) -> list[Row]:
         if relation is not None and relation.correlation > 0.8 and relation.delay_sd < DELAY_KNOWN:
             delays.append((start, relation.delay))
     if len(delays) < 3:
-        return []
+        return
     late = np.array([delay for _, delay in delays])
     spread = float(np.ptp(late))
     figures = {"delays_s": late.tolist(), "from_s": [float(start) for start, _ in delays]}
@@ -704,4 +719,4 @@ def _drift(first: Samples, second: Samples, channels: str) -> list[Row]:
         f"the delay runs from {1e3 * np.min(late):+.1f} to {1e3 * np.max(late):+.1f} ms over"
         f" {len(late)} pieces of {piece:.0f} s"
     )
-    return [Row("delay", channels, "warn" if spread > 0.01 else "ok", text, figures)]
+    yield Row("delay", channels, "warn" if spread > 0.01 else "ok", text, figures)

@@ -85,14 +85,15 @@ def label(log: FlightLog, number: int) -> str:
     return f"{source}:{part}" if part else source
 
 
-def _look(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
+def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if not log.channels:
-        return [Row("clock", "", "bad", "no channel at all")]
+        yield Row("clock", "", "bad", "no channel at all")
+        return
     log = _until_landing(log)
-    rows = _reader(log)
+    yield from _reader(log)
     for name, channel in log.channels.items():
-        rows += signals.look(name, channel, signals.notes_of(log, name))
-    rows += _clocks(log)
+        yield from signals.look(name, channel, signals.notes_of(log, name))
+    yield from _clocks(log)
     full = {
         name: channel
         for name, channel in log.channels.items()
@@ -100,19 +101,17 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
     }
     for name in [name for name in full if name.endswith("quat_wb")]:
         if not np.all(np.any(full[name].samples()[1], axis=1)):
-            rows.append(Row("values", name, "bad", "holds quaternions of length 0"))
+            yield Row("values", name, "bad", "holds quaternions of length 0")
             del full[name]
     usable = FlightLog(full, log.meta)
     kind = str(log.meta.get("vehicle", ""))
     if kind and not Vehicle(kind).rotors_alone:
         text = f"of a {kind}: only its channels are looked at; expected a vehicle of rotors"
-        return [*rows, Row("vehicle", "", "bad", text)]
-    return (
-        rows
-        + physics.look(usable, vehicle)
-        + thrust_checks.look(usable, vehicle)
-        + excitation.look(usable)
-    )
+        yield Row("vehicle", "", "bad", text)
+        return
+    yield from physics.look(usable, vehicle)
+    yield from thrust_checks.look(usable, vehicle)
+    yield from excitation.look(usable)
 
 
 def _until_landing(log: FlightLog) -> FlightLog:
@@ -125,19 +124,19 @@ def _until_landing(log: FlightLog) -> FlightLog:
     return FlightLog(channels, log.meta)
 
 
-def _reader(log: FlightLog) -> list[Row]:
-    """Return the notes of a binary log's reader."""
-    rows = []
+def _reader(log: FlightLog) -> Iterator[Row]:
+    """Yield the notes of a binary log's reader."""
     corrupt = log.meta.get("corrupt", 0)
     dropped = log.meta.get("dropped", 0)
     if corrupt or dropped:
         text = f"{corrupt} damaged stretches, {dropped} frames lost with them"
-        rows.append(Row("gaps", "", "warn", text, {"corrupt": corrupt, "dropped": dropped}))
+        yield Row("gaps", "", "warn", text, {"corrupt": corrupt, "dropped": dropped})
     if log.meta.get("complete") is False:
-        rows.append(Row("gaps", "", "warn", "ends without its end marker: cut short", {}))
+        yield Row("gaps", "", "warn", "ends without its end marker: cut short", {})
     if log.meta.get("damaged"):
-        rows.append(Row("gaps", "", "warn", "damaged stretches in the file", {}))
-    rows += [Row("gaps", "", "warn", f"left out: {part}") for part in log.meta.get("left_out", ())]
+        yield Row("gaps", "", "warn", "damaged stretches in the file", {})
+    for part in log.meta.get("left_out", ()):
+        yield Row("gaps", "", "warn", f"left out: {part}")
     for name in log.channels:
         notes = signals.notes_of(log, name)
         if flagged := notes.get("invalid by the source"):
@@ -145,28 +144,25 @@ def _reader(log: FlightLog) -> list[Row]:
                 f"{100 * flagged / len(log[name].time):.0f} % of the samples are not valid by the"
                 f" autopilot's own word ({notes['flagged']})"
             )
-            rows.append(Row("values", name, "warn", text, {"flagged": flagged}))
+            yield Row("values", name, "warn", text, {"flagged": flagged})
         if resets := notes.get("resets"):
             text = f"the estimate was reset {resets} times: it jumps there"
-            rows.append(Row("values", name, "warn", text, {"resets": resets}))
-    return rows
+            yield Row("values", name, "warn", text, {"resets": resets})
 
 
-def _clocks(log: FlightLog) -> list[Row]:
+def _clocks(log: FlightLog) -> Iterator[Row]:
     clocks: dict[str, list[str]] = {}
     for name in log.channels:
         clocks.setdefault(str(signals.notes_of(log, name).get("clock", "main")), []).append(name)
     spans = [(c.time[0], c.time[-1]) for c in log.channels.values() if len(c.time) > 1]
-    rows = []
     if len(clocks) > 1:
         text = f"{len(clocks)} clocks: " + "; ".join(
             f"{name}: {', '.join(channels)}" for name, channels in clocks.items()
         )
-        rows.append(Row("clock", "", "ok", text, {"clocks": len(clocks)}))
+        yield Row("clock", "", "ok", text, {"clocks": len(clocks)})
     if spans and max(start for start, _ in spans) > min(end for _, end in spans):
         text = "channels that never overlap in time: different clocks, or different flights"
-        rows.append(Row("clock", "", "bad", text))
-    return rows
+        yield Row("clock", "", "bad", text)
 
 
 def _copies(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:

@@ -2,6 +2,8 @@
 noise of its sensor.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from visthrow.common.rotations import continuous
@@ -94,8 +96,8 @@ def _resolution(values: np.ndarray) -> np.ndarray:
     return steps
 
 
-def look(name: str, channel: Channel, notes: dict) -> list[Row]:
-    """All checks of one channel; ``notes``: what the reader left out; see
+def look(name: str, channel: Channel, notes: dict) -> Iterator[Row]:
+    """Yield the findings of all checks of one channel; ``notes``: what the reader left out; see
     :func:`visthrow.logs.readers.table.make_channel`.
     """
     count = len(channel.time)
@@ -103,19 +105,19 @@ def look(name: str, channel: Channel, notes: dict) -> list[Row]:
     figures = {"samples": count, "seconds": span}
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:
         text = f"{count} settled values over {span:.0f} s"
-        return [Row("clock", name, "ok", text, figures)]
+        yield Row("clock", name, "ok", text, figures)
+        return
     if count < FEW_SAMPLES or span < SHORT:
         text = (
             f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
         )
         event = name in _SWITCHES + ("separation", "landing", "goal_w")
-        return [Row("clock", name, "ok" if event else "bad", text, figures)]
-    return [
-        _clock(name, channel, notes),
-        *_gaps(name, channel),
-        *_values(name, channel),
-        *_noise(name, channel),
-    ]
+        yield Row("clock", name, "ok" if event else "bad", text, figures)
+        return
+    yield _clock(name, channel, notes)
+    yield from _gaps(name, channel)
+    yield from _values(name, channel)
+    yield from _noise(name, channel)
 
 
 def _clock(name: str, channel: Channel, notes: dict) -> Row:
@@ -154,7 +156,7 @@ def _clock(name: str, channel: Channel, notes: dict) -> Row:
     return Row("clock", name, verdict, text, figures)
 
 
-def _gaps(name: str, channel: Channel) -> list[Row]:
+def _gaps(name: str, channel: Channel) -> Iterator[Row]:
     steps = np.diff(channel.time)
     period = float(np.median(steps))
     wide = steps > _GAP_PERIODS * period
@@ -168,7 +170,7 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
         "invalid_share": invalid,
     }
     if not np.any(wide) and invalid == 0.0:
-        return []
+        return
     if invalid + share > 0.5:
         verdict = "bad"
     elif invalid + share > 0.02 or np.max(steps) > 0.5:
@@ -179,27 +181,26 @@ def _gaps(name: str, channel: Channel) -> list[Row]:
         f"{figures['gaps']} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
         f" time, {100 * invalid:.1f} % of the samples not valid"
     )
-    return [Row("gaps", name, verdict, text, figures)]
+    yield Row("gaps", name, verdict, text, figures)
 
 
-def _values(name: str, channel: Channel) -> list[Row]:
+def _values(name: str, channel: Channel) -> Iterator[Row]:
     time, values = channel.samples()
     if len(values) < FEW_SAMPLES:
-        return [Row("values", name, "bad", f"{len(values)} valid samples")]
-    rows = []
+        yield Row("values", name, "bad", f"{len(values)} valid samples")
+        return
     if any(word in name for word in _NEVER_STUCK) and "setpoint" not in name:
-        rows += _stuck(name, values, time)
+        yield from _stuck(name, values, time)
     if any(word in name for word in _RAILED) and "setpoint" not in name and name not in _SWITCHES:
-        rows += _railed(name, values)
+        yield from _railed(name, values)
     if channel.unit in _FASTEST and not any(word in name for word in _COMMANDED):
-        rows += _jumps(name, values, time, channel.unit)
-    return rows
+        yield from _jumps(name, values, time, channel.unit)
 
 
-def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
+def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
     same = np.all(np.diff(values, axis=0) == 0.0, axis=1)
     if not np.any(same):
-        return []
+        return
     changes = np.flatnonzero(~same)
     firsts = np.append(0, changes + 1)
     lengths = time[np.append(changes, len(same))] - time[firsts]
@@ -209,21 +210,20 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> list[Row]:
     share = float(np.mean(same))
     figures = {"longest_s": longest, "at_s": start, "stuck_s": total, "repeated_share": share}
     if np.all(same):
-        return [Row("values", name, "bad", "one value from beginning to end", figures)]
-    if longest > _STUCK_TIME:
+        yield Row("values", name, "bad", "one value from beginning to end", figures)
+    elif longest > _STUCK_TIME:
         verdict = "bad" if total > 0.3 * float(np.ptp(time)) else "warn"
         text = f"stands still to the last digit for {longest:.2f} s at {start:.2f} s"
-        return [Row("values", name, verdict, text, figures)]
-    if share > 0.2:
+        yield Row("values", name, verdict, text, figures)
+    elif share > 0.2:
         text = (
             f"{100 * share:.0f} % of the samples repeat the one before: measured more slowly than"
             " logged, or rounded"
         )
-        return [Row("values", name, "warn", text, figures)]
-    return []
+        yield Row("values", name, "warn", text, figures)
 
 
-def _railed(name: str, values: np.ndarray) -> list[Row]:
+def _railed(name: str, values: np.ndarray) -> Iterator[Row]:
     rails = [(0.0, "")]
     stops = any(word in name for word in _STOPS_AT_ZERO)  # switched off is no rail
     for column in values.T:
@@ -233,12 +233,12 @@ def _railed(name: str, values: np.ndarray) -> list[Row]:
                 rails.append((share, f"its {words} value {rail:.6g}"))
     worst, where = max(rails)
     if worst <= _RAIL_SHARE:
-        return []
+        return
     text = f"{100 * worst:.1f} % of the samples at {where}: saturated"
-    return [Row("values", name, "warn", text, {"share": worst})]
+    yield Row("values", name, "warn", text, {"share": worst})
 
 
-def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[Row]:
+def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> Iterator[Row]:
     """Report steps that no motion makes, from sample to sample and across gaps."""
     if "quat" in name:
         values = continuous(values)
@@ -248,20 +248,20 @@ def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> list[R
     adjacent = steps < 5 * np.median(steps)
     jumped = (size > 5.0 * usual) & (size / steps > _FASTEST[unit]) & adjacent
     unit_word = "" if unit == "1" else f" {unit}"
-    rows = []
     if np.any(jumped):
         index = int(np.argmax(np.where(jumped, size, 0.0)))
         count = int(np.sum(jumped))
         largest = f"{size[index]:.3g}{unit_word} at {time[index]:.2f} s"
         verdict = "warn" if np.mean(jumped) < 0.02 else "bad"
         text = f"{count} jumps, the largest {largest}"
-        rows.append(Row("values", name, verdict, text, {"jumps": count}))
+        yield Row("values", name, verdict, text, {"jumps": count})
     if unit == "m":
-        return rows + _jumps_across(name, values, time, np.flatnonzero(~adjacent))
-    return rows
+        yield from _jumps_across(name, values, time, np.flatnonzero(~adjacent))
 
 
-def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray) -> list[Row]:
+def _jumps_across(
+    name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndarray
+) -> Iterator[Row]:
     """Positions that do not go on behind a gap where they went before it: another origin, or
     another body.
     """
@@ -278,27 +278,25 @@ def _jumps_across(name: str, values: np.ndarray, time: np.ndarray, gaps: np.ndar
         if distance > 0.05 + 0.25 * _HARDEST * width**2:
             off.append((distance, float(time[i]), width))
     if not off:
-        return []
+        return
     distance, instant, width = max(off)
     text = (
         f"{len(off)} jumps across gaps, the largest {distance:.3g} m over the {width:.2f} s from"
         f" {instant:.2f} s: another origin or body?"
     )
-    return [
-        Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": distance})
-    ]
+    yield Row("values", name, "warn", text, {"jumps_across_gaps": len(off), "largest_m": distance})
 
 
-def _noise(name: str, channel: Channel) -> list[Row]:
+def _noise(name: str, channel: Channel) -> Iterator[Row]:
     sigma = noise(channel)
     if (
         channel.values.dtype.kind == "b"
         or not np.all(np.isfinite(sigma))
         or not np.any(sigma > 0.0)
     ):
-        return []
+        return
     text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
-    return [Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})]
+    yield Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})
 
 
 def notes_of(log: FlightLog, name: str) -> dict:

@@ -51,9 +51,11 @@ IDLE_SHARE = 0.12  # likewise, of the full command
 _UNEVEN = 0.4
 
 
-def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> list[Row]:
-    """Return the findings about thrust and rotors in one flight."""
-    return [*_force(log, vehicle), *_rotors(log), *_turning(log)]
+def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
+    """Yield the findings about thrust and rotors in one flight."""
+    yield from _force(log, vehicle)
+    yield from _rotors(log)
+    yield from _turning(log)
 
 
 def thrust_of(
@@ -111,27 +113,30 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     return mass if mass > 0.0 else None
 
 
-def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
+def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     """Hold the thrust against the force along body z, by the accelerometer and by the path:
     vibration spoils the one, a draught none.
     """
     driver = vehicle.thrust_input
     if driver and driver not in log:
         text = f"the model reads it, and the log lacks it; {suggest(driver, log.channels)}"
-        return [Row("thrust", driver, "warn", text)]
+        yield Row("thrust", driver, "warn", text)
+        return
     thrust = thrust_of(log, vehicle)
     if thrust is None or np.median(thrust[2]) <= 0.0:
-        return []
+        return
     name, time, command = thrust
     mass = mass_of(log, vehicle)
-    rows = [_weight(mass, vehicle, f"{name}, acc_b")] if mass is not None else []
+    if mass is not None:
+        yield _weight(mass, vehicle, f"{name}, acc_b")
     if sparse(time):
         period = 1e3 * float(np.median(np.diff(time)))
         text = f"comes every {period:.0f} ms: too seldom to be held against the force"
-        return [*rows, Row("thrust", name, "warn", text)]
+        yield Row("thrust", name, "warn", text)
+        return
     correlations = list(_correlations(log, time, command))
     if not correlations:
-        return rows
+        return
     felt, curve, against = max(correlations, key=lambda correlation: np.max(correlation[1]))
     peak = float(np.max(curve[_OF_MOTORS]))
     best = float(np.max(curve))
@@ -163,7 +168,7 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> list[Row]:
         text += "thrust of another flight, another channel" + (
             "" if verdict == "bad" else ", or noise"
         )
-    return [*rows, Row(topic, f"{name}, {felt}", verdict, text, figures)]
+    yield Row(topic, f"{name}, {felt}", verdict, text, figures)
 
 
 def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
@@ -264,9 +269,8 @@ def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
     return Row("thrust", channels, verdict, text, {"mass_kg": mass, "model_kg": vehicle.mass})
 
 
-def _rotors(log: FlightLog) -> list[Row]:
+def _rotors(log: FlightLog) -> Iterator[Row]:
     """Each rotor against the others: a vehicle that hovers turns all of them alike."""
-    rows = []
     for name in ROTORS:
         if name not in log or log[name].values.shape[1:] != (4,):
             continue
@@ -291,32 +295,29 @@ def _rotors(log: FlightLog) -> list[Row]:
                     if abs(np.log(ratio / factor)) < 0.15:
                         text += f"{word}: "
                 text += "no trim explains it; a sensor (pole pairs, a lost wire), or the rotor"
-            rows.append(Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio}))
-    return rows
+            yield Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio})
 
 
-def _turning(log: FlightLog) -> list[Row]:
+def _turning(log: FlightLog) -> Iterator[Row]:
     """Which way the vehicle turns when motors differ: order of the motors, and sign."""
     name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), None)
     if name is None or "rate_b" not in log or log[name].values.shape[1:] != (4,):
-        return []
+        return
     time_m, motors = log[name].samples()
     rate = log["rate_b"].samples()
     if not usable(rate, MOVES) or len(time_m) < 50:
-        return []
+        return
     time_d, turning = relations.derivative(*rate, 0.03)
     front_left, front_right, rear_left, rear_right = motors.T
     roll = front_left + rear_left - front_right - rear_right
     pitch = rear_left + rear_right - front_left - front_right
     if len(time_d) < 50 or max(np.std(roll), np.std(pitch)) <= 0.0:
-        return []
-    rows = []
+        return
     for axis, (word, torque) in enumerate((("roll", roll), ("pitch", pitch))):
         driven = Samples(time_m, torque[:, None])
         relation = relations.relate(driven, Samples(time_d, turning[:, axis : axis + 1]), 0.2)
         if relation is not None and relation.axes_correlation >= 0.2:
-            rows.append(_turned_by(word, relation, f"{name}, rate_b"))
-    return rows
+            yield _turned_by(word, relation, f"{name}, rate_b")
 
 
 def _turned_by(word: str, relation: relations.Relation, channels: str) -> Row:
