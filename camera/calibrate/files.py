@@ -14,6 +14,7 @@ left out, the angle that the farthest corner of the image sees."""
 import math
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import chain, zip_longest
 from pathlib import Path
@@ -184,7 +185,7 @@ def _tree_of_xml(text: str) -> Any:
 
 def _cameras_of(path: str | Path) -> list[Entry]:
     """Cameras of a file, each by a name of its own or its number."""
-    cameras = _cameras(_tree(path))
+    cameras = list(_cameras(_tree(path)))
     names = [name for *_, name in cameras]
     named = []
     for i, (box, node, name) in enumerate(cameras):
@@ -193,22 +194,20 @@ def _cameras_of(path: str | Path) -> list[Entry]:
     return named
 
 
-def _cameras(tree: Any, name: str = "") -> list[Entry]:
-    """Each camera in a tree: its box, its node and what it is called there."""
+def _cameras(tree: Any, name: str = "") -> Iterator[Entry]:
+    """Yield each camera in a tree: its box, its node and what it is called there."""
     if isinstance(tree, list):
-        named = [(str(i), entry) for i, entry in enumerate(tree)]
+        named: dict[Any, Any] = dict(enumerate(tree))
     elif isinstance(tree, dict):
-        tree = _uniform(tree)
+        named = tree = _uniform(tree)
         for box, tool in BOXES.items():
             if all(_has(tree, names) for names in tool["has"]):
-                return [(box, tree, str(tree.get("label", name) or name))]
-        named = [(str(key), entry) for key, entry in tree.items()]
+                yield box, tree, str(tree.get("label", name) or name)
+                return
     else:
-        return []
-    cameras = []
-    for key, entry in named:
-        cameras += _cameras(entry, name if key in ("camera", "value0", "cameras") else key)
-    return cameras
+        return
+    for key, entry in named.items():
+        yield from _cameras(entry, name if key in ("camera", "value0", "cameras") else str(key))
 
 
 def _uniform(tree: Node) -> Node:

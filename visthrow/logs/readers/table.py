@@ -12,7 +12,6 @@ import zlib
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -55,9 +54,9 @@ class Columns(dict[str, np.ndarray]):
         settings: Settings above the numbers, such as a motion capture's.
     """
 
-    def __init__(self, columns: Mapping[str, np.ndarray] = MappingProxyType({})) -> None:
-        """Hold columns."""
-        super().__init__(columns)
+    def __init__(self, *columns: Mapping[str, np.ndarray]) -> None:
+        """Hold columns, or none yet."""
+        super().__init__(*columns)
         self.left_out: list[str] = []
         self.settings: dict[str, str] = {}
 

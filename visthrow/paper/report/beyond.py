@@ -4,6 +4,7 @@ figures come from.
 
 import json
 from collections import defaultdict
+from collections.abc import Iterator
 
 import numpy as np
 from numpy import ndarray
@@ -62,18 +63,14 @@ def _is_beyond(result: Result) -> bool:
     )
 
 
-def _rows(results: list[Result]) -> list[dict[str, str]]:
+def _rows(results: list[Result]) -> Iterator[dict[str, str]]:
     def question(result: Result) -> str:
         return json.dumps([result.unit[key] for key in ("policy", "plant", "departures", "target")])
 
-    rows = []
     for result in sorted(results, key=question):
         variant = result.unit["variant"]
         changes = _changes(result.unit["departures"])
-        rows.append(
-            {**cells(result), "training": TITLES.get(variant, variant), "flown with": changes}
-        )
-    return rows
+        yield {**cells(result), "training": TITLES.get(variant, variant), "flown with": changes}
 
 
 def _changes(departures: dict) -> str:

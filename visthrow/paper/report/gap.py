@@ -2,6 +2,7 @@
 other sight.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -95,16 +96,14 @@ def curve(thrown: ResultSet, sweep: GapSweep, policy: str) -> Points:
     return sorted(points.items())
 
 
-def _rows(sweep: GapSweep, points: Points) -> list[dict[str, str]]:
+def _rows(sweep: GapSweep, points: Points) -> Iterator[dict[str, str]]:
     nominal = dict(points).get(sweep.own)
-    rows = []
     for value, r in points:
         added = "its own" if r is nominal else "-"
         if nominal is not None and r is not nominal:
             added = st.difference(errors([r]), errors([nominal])).text(sign=True)
         row = cells(r) | {"value": f"{value:.3g}", "added to its own [m]": added}
-        rows.append(row | {"imperfection": f"{sweep.title}, {sweep.xlabel}"})
-    return rows
+        yield row | {"imperfection": f"{sweep.title}, {sweep.xlabel}"}
 
 
 def _trained(thrown: ResultSet, missing: list[str]) -> list:

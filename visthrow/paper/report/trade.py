@@ -2,7 +2,7 @@
 accuracy with the policies on it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -310,12 +310,11 @@ def _verdicts(
     selected: Sequence[Result],
     policies: Sequence[tuple[str, Result]],
     policies_on: str,
-) -> list[str]:
+) -> Iterator[str]:
     """Whether the paper's claim holds: no setting as accurate and as fast, and at each setting's
     accuracy the policy faster.
     """
     points = points_of(selected)
-    sentences = []
     for name, result in policies:
         point = np.array(_point(result))
         head = (
@@ -323,7 +322,7 @@ def _verdicts(
             f" ({point[0]:.3f} s, {point[1]:.3f} m): "
         )
         if not len(points):
-            sentences.append(head + f"none of {_count(selected)} landed all its throws.")
+            yield head + f"none of {_count(selected)} landed all its throws."
             continue
         beating = points[np.all(points <= point, axis=1)]
         faster, nearer = (points[points[:, i] < point[i]] for i in range(2))
@@ -339,8 +338,7 @@ def _verdicts(
         if len(nearer):
             slower = nearer[:, 0].min() / point[0]
             accuracy += f", the fastest of which takes {slower:.2f} times as long"
-        sentences.append(f"{head}{claim}; {speed}; {accuracy}.")
-    return sentences
+        yield f"{head}{claim}; {speed}; {accuracy}."
 
 
 def _count(points: Sequence) -> str:

@@ -133,11 +133,9 @@ def train(
             "seconds": round(time.perf_counter() - start, 2),
             "status": status,
             "commit": provenance.commit(),
+            "processors": provenance.processors(),
         }
-        write_json(
-            folder / PIECES / f"{time.time_ns()}.json",
-            {**piece, "processors": provenance.processors()},
-        )
+        write_json(folder / PIECES / f"{time.time_ns()}.json", piece)
     return status
 
 
