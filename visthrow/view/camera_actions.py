@@ -3,6 +3,7 @@
 import argparse
 import dataclasses
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -183,12 +184,10 @@ def verdict(camera: CameraParams, report: BoardReport, best: BoardReport) -> tup
     )
 
 
-def _by_picture(paths: list[Path], report: BoardReport) -> list[str]:
-    lines = []
+def _by_picture(paths: list[Path], report: BoardReport) -> Iterator[str]:
     for i, (path, rms) in enumerate(zip(paths, report.image_rms_px, strict=True)):
         missing = f"left out: {report.left_out[i]}" if i in report.left_out else "no board found"
-        lines.append(f"{path.name:24s} " + (missing if math.isnan(rms) else f"{rms:.3f} px"))
-    return lines
+        yield f"{path.name:24s} " + (missing if math.isnan(rms) else f"{rms:.3f} px")
 
 
 def sentence(lens: FisheyeParams) -> str:

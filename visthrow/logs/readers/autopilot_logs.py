@@ -6,6 +6,7 @@ All of them are north-east-down and forward-right-down; ours become x north, y w
 forward, left, up."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -332,9 +333,8 @@ def _moving(
     return next(iter([*moving, *candidates]), None)
 
 
-def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
-    """Messages of which every row is of a kind that no tap takes."""
-    notes = []
+def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> Iterator[str]:
+    """Yield messages of which every row is of a kind that no tap takes."""
     limited = [tap for tap in taps if tap.only is not None]
     for message in dict.fromkeys(tap.message for tap in limited):
         ranges = sorted({tuple(tap.only) for tap in limited if tap.message == message})
@@ -345,8 +345,7 @@ def _of_other_kinds(log: Messages, taps: tuple[Tap, ...]) -> list[str]:
         if not any(np.any(in_range(fields[name], *bounds)) for _, *bounds in ranges):
             received = ", ".join(f"{value:g}" for value in np.unique(fields[name]))
             accepted = ", ".join(f"{lowest:g}" for _, lowest, _ in ranges)
-            notes.append(f"{message}: its {name} is {received}; those that are read: {accepted}")
-    return notes
+            yield f"{message}: its {name} is {received}; those that are read: {accepted}"
 
 
 def _moving_motors(fields: Fields, pattern: str) -> int:

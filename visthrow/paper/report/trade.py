@@ -115,21 +115,19 @@ def _row(result: Result) -> dict[str, str]:
     return row
 
 
-def _steps() -> list[Grid | Text | None]:
-    """Step times of the controller, from the records of ``python -m bench.mpc``."""
+def _steps() -> Iterator[Grid | Text | None]:
+    """Yield step times of the controller, from the records of ``python -m bench.mpc``."""
     records = [measurements.load(path) for path in sorted(measurements.FOLDER.glob("mpc*.json"))]
     if not records:
         command = "`python -m bench.mpc --record mpc-cpu`"
-        return [Text(f"No step times of the controller: {command}.", "missing")]
-    grids = []
+        yield Text(f"No step times of the controller: {command}.", "missing")
     for record in records:
         cpu = record["provenance"]["processors"]["cpu"]
         (table,) = record["tables"]
         title = f"Step of the controller, one core of an {cpu}"
         note = f"{measurements.made_by(record)}. {record['notes'][0]}"
         header = " | ".join(table["header"])
-        grids.append(Grid.from_rows(title, header, map(tuple, table["rows"]), note, heads=2))
-    return grids
+        yield Grid.from_rows(title, header, map(tuple, table["rows"]), note, heads=2)
 
 
 def _bar(thrown: ResultSet) -> str:
