@@ -191,11 +191,10 @@ def _climbed(
     def tried(place: tuple[int, int, int]) -> float:
         nonlocal levels
         if place not in scores:
-            stamps_of = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
-            value, levels = _likelihood(
-                windows, channels, {**correlations_of, channel: stamps_of}, levels
-            )
-            scores[place] = value, replace(stamps_of, scale=stamps_of.scale * levels.scale[channel])
+            guess = Correlation(PERIODS[place[0]] * period, SHARES[place[1]], place[2], scale)
+            tried_of = {**correlations_of, channel: guess}
+            value, levels = _likelihood(windows, channels, tried_of, levels)
+            scores[place] = value, replace(guess, scale=scale * levels.scale[channel])
         return scores[place][0]
 
     best = max(
@@ -208,16 +207,12 @@ def _climbed(
             best = better
     if best[0] == times - 1:  # it would last for still longer
         return scores[best][1], 0.0
-    white = max(
-        _likelihood(
-            [replace(w, sigma=w.sigma * np.where(w.channel == channel, s, 1.0)) for w in windows],
-            channels,
-            correlations_of,
-        )[0]
-        for s in (1.0, scale)
-    )
-    value, stamps_of = scores[best]
-    return stamps_of, value - white
+    value, likeliest = scores[best]
+    white = []
+    for deviation in (1.0, scale):
+        none = Correlation(period, 0.0, 1, deviation)
+        white.append(_likelihood(windows, channels, {**correlations_of, channel: none})[0])
+    return likeliest, value - max(white)
 
 
 def _neighbours(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:

@@ -10,6 +10,7 @@ deviations; a named one has N(0, prior^2) within its bounds (the slab):
 All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K)
 for n draws at once."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -65,9 +66,7 @@ class Priors:
     visible: np.ndarray  # bool: all its channels are there
 
     @staticmethod
-    def of(
-        effects: list[Effect] | tuple[Effect, ...], channels: list[str] | tuple[str, ...]
-    ) -> "Priors":
+    def of(effects: Sequence[Effect], channels: Sequence[str]) -> "Priors":
         """Read them off the catalogue.
 
         Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0.
@@ -78,12 +77,10 @@ class Priors:
                     f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds"
                     f" {e.bounds}; expected both above 0, and bounds about 0"
                 )
-        names = [e.name for e in effects]
-        if len(set(names)) < len(names):
-            raise DiagnoseError(
-                "two effects share a name:"
-                f" {', '.join(sorted({n for n in names if names.count(n) > 1}))}"
-            )
+        counts = Counter(e.name for e in effects)
+        twice = sorted(name for name, count in counts.items() if count > 1)
+        if twice:
+            raise DiagnoseError(f"two effects share a name: {', '.join(twice)}")
         floor = np.array([e.floor for e in effects], dtype=float)
         bounds = np.array([e.bounds for e in effects], dtype=float).reshape(-1, 2)
         switch = np.array([bool(e.switch) for e in effects], dtype=bool)
@@ -93,7 +90,7 @@ class Priors:
         visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
         return Priors(floor, np.maximum(slab, 1.5), bounds[:, 0], bounds[:, 1], visible)
 
-    def deviation(self, active: list[int] | tuple[int, ...]) -> np.ndarray:
+    def deviation(self, active: Sequence[int]) -> np.ndarray:
         """Prior deviations with these effects named, shape (K,)."""
         spread = np.full(len(self.floor), SPIKE)
         spread[list(active)] = self.slab[list(active)]
@@ -136,7 +133,7 @@ def _factor(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
 
 
 def log_evidence(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
 ) -> float:
     """log Z of one set of named effects."""
     deviation = priors.deviation(active)
@@ -146,22 +143,17 @@ def log_evidence(
     value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
     if len(active):
         columns = list(active)
-        spread = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0][
-            columns
-        ].diagonal()
-        mean = mean[columns] * deviation[columns]
-        spread = np.sqrt(spread) * deviation[columns]
-        low = priors.low[columns]
-        high = priors.high[columns]
-        value += (
-            _log_mass(mean, spread, low, high)
-            - _log_mass(np.zeros(len(columns)), deviation[columns], low, high)
-        ).sum()
+        slab = deviation[columns]
+        inverse = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0]
+        spread = slab * np.sqrt(inverse[columns].diagonal())
+        bounds = priors.low[columns], priors.high[columns]
+        within = _log_mass(slab * mean[columns], spread, *bounds)
+        value += (within - _log_mass(0.0 * slab, slab, *bounds)).sum()
     return float(value)
 
 
 def additions(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
 ) -> np.ndarray:
     """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not
     visible.
@@ -173,7 +165,7 @@ def additions(
 
 
 def pair_additions(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
 ) -> np.ndarray:
     """Return the gain of log Z by naming each pair of effects: two that cancel show no gain alone.
 
@@ -192,7 +184,7 @@ def _naming(
     information: np.ndarray,
     score: np.ndarray,
     priors: Priors,
-    active: list[int] | tuple[int, ...],
+    active: Sequence[int],
     sets: np.ndarray,
 ) -> np.ndarray:
     """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their numbers,
@@ -209,24 +201,20 @@ def _naming(
     # that is there already; it is left out below.
     wide = np.maximum(variance - variance @ taken @ variance, variance)
     wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
-    gain = (
-        -np.log(priors.slab / SPIKE)[sets].sum(1)
-        - 0.5 * np.linalg.slogdet(unit + change[..., None] * variance)[1]
-    )
-    gain = gain - 0.5 * np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
-    low = priors.low[sets]
-    high = priors.high[sets]
     slab = priors.slab[sets]
-    gain = gain + (
-        _log_mass(wide_mean, wide_sd, low, high) - _log_mass(np.zeros_like(low), slab, low, high)
-    ).sum(-1)
+    bounds = priors.low[sets], priors.high[sets]
+    explained = np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
+    log_det = np.linalg.slogdet(unit + change[..., None] * variance)[1]
+    gain = -0.5 * (explained + log_det) - np.log(slab / SPIKE).sum(1)
+    within = _log_mass(wide_mean, wide_sd, *bounds) - _log_mass(0.0 * slab, slab, *bounds)
+    gain = gain + within.sum(-1)
     out = ~priors.visible
     out[list(active)] = True
     return np.where(out[sets].any(1), -np.inf, gain)
 
 
 def estimate(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
 ) -> np.ndarray:
     """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
     shape (K,).
@@ -284,7 +272,7 @@ def mean_sizes(
 
 
 def certainty(
-    information: np.ndarray, theta: np.ndarray, priors: Priors, active: list[int] | tuple[int, ...]
+    information: np.ndarray, theta: np.ndarray, priors: Priors, active: Sequence[int]
 ) -> np.ndarray:
     """Sizes of named effects in the half widths of 95 % intervals to which half a floor is added,
     in the order of ``active``.

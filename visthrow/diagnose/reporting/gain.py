@@ -84,7 +84,7 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     box = _blackbox(
         work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng
     )
-    gains = channel_gains(work, cross, box)
+    gains = channel_gains(work, cross.groups, cross.trained, box)
     sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
     trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
     landing = landing_gain(work, diagnosis.theta, trained, seed)

@@ -12,6 +12,7 @@ import numpy as np
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.likelihood.forms import unit_of
+from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
@@ -34,19 +35,20 @@ def levels(problem: Problem, before: Point, after: Point, threshold: float) -> t
     many, one is higher by chance."""
     noise = after.noise
     threshold = threshold + np.log(max(len(noise.latent_sd), 1))
-    phases = {phase: _Phase(after, phase) for _, phase in noise.latent_sd}
-    limits = {key: phases[key[1]].upper_limit(key[0]) for key in noise.latent_sd}
+    stacks = {phase: _stack_of(after, phase) for _, phase in noise.latent_sd}
+    limits = {key: _upper_limit(stacks[key[1]], noise, key) for key in noise.latent_sd}
     floors = floors_of(problem, after)
     listed = []
-    for block, phase in sorted(limits, key=lambda key: key[0]):
-        level = noise.latent_sd[block, phase]
+    for key in sorted(limits, key=lambda key: key[0]):
+        block, phase = key
+        level = noise.latent_sd[key]
         quiet = min(limit for (b, _), limit in limits.items() if b == block)
-        most = max(UNKNOWN_RATIO * quiet, floors.get((block, phase), 0.0))
+        most = max(UNKNOWN_RATIO * quiet, floors.get(key, 0.0))
         nats = 0.0
         if level > most:
-            likelihood = phases[phase].likelihood
-            nats = likelihood(block, level) - likelihood(block, most)
-        earlier = before.noise.latent_sd.get((block, phase), float("nan"))
+            stack = stacks[phase]
+            nats = _likelihood(stack, noise, key, level) - _likelihood(stack, noise, key, most)
+        earlier = before.noise.latent_sd.get(key, float("nan"))
         name, excessive = LATENT_BLOCKS[block], bool(nats > threshold)
         listed.append(Level(name, phase, earlier, level, quiet, float(nats), excessive))
     return tuple(listed)
@@ -80,29 +82,26 @@ def positions_of(problem: Problem) -> list[int]:
     return [c for c, name in enumerate(problem.model.channels) if unit_of(name) == "m"]
 
 
-class _Phase:
-    """The windows of a phase under any level of a block's latent forces there."""
+def _stack_of(point: Point, phase: str) -> Stack:
+    """Return the windows of a phase side by side."""
+    windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
+    return Stack([point.grams[w] for w in windows], point.device, windows)
 
-    def __init__(self, point: Point, phase: str):
-        """Put them side by side."""
-        windows = [w for w, gram in enumerate(point.grams) if gram.phase == phase]
-        self.noise = point.noise
-        self.phase = phase
-        self.stack = Stack([point.grams[w] for w in windows], point.device, windows)
 
-    def likelihood(self, block: int, level: float) -> float:
-        """Return the log likelihood of the phase's residuals."""
-        noise = replace(self.noise, latent_sd={**self.noise.latent_sd, (block, self.phase): level})
-        return float(self.stack.values(noise).sum())
+def _likelihood(stack: Stack, noise: Noise, key: tuple[int, str], level: float) -> float:
+    """Return the log likelihood of a phase's residuals under a level of a block and phase."""
+    tried = replace(noise, latent_sd={**noise.latent_sd, key: level})
+    return float(stack.values(tried).sum())
 
-    def upper_limit(self, block: int) -> float:
-        """Largest level of a block that the residuals allow, one-sided 97.5 %."""
-        best = self.noise.latent_sd[block, self.phase]
-        top = self.likelihood(block, best)
-        for step in range(1, MOST_STEPS):
-            if self.likelihood(block, best * STEP**step) < top - 0.5 * NORMAL_95**2:
-                break
-        return float(best * STEP**step)
+
+def _upper_limit(stack: Stack, noise: Noise, key: tuple[int, str]) -> float:
+    """Return the largest level of a block that a phase's residuals allow, one-sided 97.5 %."""
+    best = noise.latent_sd[key]
+    least = _likelihood(stack, noise, key, best) - 0.5 * NORMAL_95**2
+    for step in range(1, MOST_STEPS):
+        if _likelihood(stack, noise, key, best * STEP**step) < least:
+            break
+    return float(best * STEP**step)
 
 
 def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int] = ()) -> list[str]:

@@ -163,20 +163,20 @@ def borne_out(
 
 
 def channel_gains(
-    work: Work, cross: Crossed, box: np.ndarray | None = None
+    work: Work, groups: Sequence[int], trained: np.ndarray, box: np.ndarray | None = None
 ) -> tuple[ChannelGain, ...]:
     """Prediction errors on held-out flights of every measured channel.
 
-    ``cross``: searches that leave flights out; ``box``: squared errors of a black box, shape (F, C,
-    H)."""
+    ``groups``: what is left out together, of each window; ``trained``: sizes in floors that the
+    others gave, shape (F, K); ``box``: squared errors of a black box, shape (F, C, H)."""
     before, after = work.before, work.after
     names = work.problem.model.channels
-    row = np.unique(cross.groups, return_inverse=True)[1]
-    change = (after.theta - cross.trained)[row] * work.problem.priors.floor
+    row = np.unique(groups, return_inverse=True)[1]
+    change = (after.theta - trained)[row] * work.problem.priors.floor
     named = [w.residual + w.effects @ shift for w, shift in zip(after.windows, change)]
     plain = [w.residual for w in before.windows]
-    left = errors(after.windows, cross.groups, after.noise, named, len(names))
-    earlier = errors(before.windows, cross.groups, after.noise, plain, len(names)).square
+    left = errors(after.windows, groups, after.noise, named, len(names))
+    earlier = errors(before.windows, groups, after.noise, plain, len(names)).square
     # squares before, after, of noise alone, and of the black box, shape (F, C, H) each
     squares = [earlier, left.square, left.floor]
     squares += [] if box is None else [box]
@@ -244,7 +244,7 @@ def measure(diagnosis: Diagnosis) -> HeldOut:
     floors = work.problem.priors.floor
     sizes = np.array([diagnosis.theta.get(e.name, 0.0) for e in work.problem.effects])
     share = borne_out(cross.statistics, cross.trained, sizes / floors)
-    gains = channel_gains(work, cross)
+    gains = channel_gains(work, cross.groups, cross.trained)
     return HeldOut(*share, gains, cross.named, len(cross.folds), cross.left_out)
 
 
@@ -356,13 +356,12 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     Asked where no calm phase tells what gusts are; there the latent forces are compared with those.
     """
     work = diagnosis.work
-    point = diagnosis.work.after
+    point = work.after
     if compares_phases(point):
         return diagnosis
-    groups, left_out = groups_of(point)
+    groups, _ = groups_of(point)
     none = np.zeros((len(set(groups)), len(point.theta)))
-    gains = channel_gains(work, Crossed(groups, left_out, point.statistics, [], none, {}))
-    unexplained = _unexplained(gains)
+    unexplained = _unexplained(channel_gains(work, groups, none))
     if not unexplained:
         return diagnosis
     floors = floors_of(work.problem, point)

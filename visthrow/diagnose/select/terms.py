@@ -27,7 +27,6 @@ from visthrow.diagnose.models.law_terms import (
     JOINT,
     SCALARS,
     SYMBOLS,
-    VECTORS,
     KnotValues,
     Term,
     carries,
@@ -174,27 +173,27 @@ def _proportional(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
     return table(terms, values)[..., None]
 
 
-def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> np.ndarray:
-    """Return where the curve of each term's scalar may bend, evenly over what was flown, shape
-    (T, m).
-    """
+def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, np.ndarray]:
+    """Return where a curve of each scalar may bend, evenly over what was flown, shape (m,) each."""
     places = {}
     for name in {term.factors[0] for term in terms}:
         flown = np.concatenate([SCALARS[name].read(v) for v in values])
         low, high = np.percentile(flown, OUTER)
         places[name] = np.linspace(low, max(high, low + LEAST_REACH), PIECES)
-    return np.array([places[term.factors[0]] for term in terms])
+    return places
 
 
-def _hats(terms: Sequence[Term], places: np.ndarray, values: KnotValues) -> np.ndarray:
+def _hats(
+    terms: Sequence[Term], places: Mapping[str, np.ndarray], values: KnotValues
+) -> np.ndarray:
     """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m)."""
+    number = np.arange(PIECES)
     columns = []
-    for term, bends in zip(terms, places):
-        scalar = SCALARS[term.factors[0]].read(values)
-        place = np.interp(scalar, bends, np.arange(len(bends)))
-        hats = np.maximum(1.0 - np.abs(place[:, None] - np.arange(len(bends))), 0.0)
-        vector = VECTORS[term.block][term.vector].read(values)
-        columns.append(vector[:, :, None] * hats[:, None, :])
+    for term in terms:
+        scalar, vector = (factor.read(values) for factor in term.parts)
+        place = np.interp(scalar, places[term.factors[0]], number)
+        hats = np.maximum(1.0 - np.abs(place[:, None] - number), 0.0)
+        columns.append(vector[:, :, None] * hats[:, None])
     return np.stack(columns, axis=2)
 
 
