@@ -17,7 +17,7 @@ from sim.cores import cores
 from visthrow.common.compute_device import resolve
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.reporting import explain_cli
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 
 VERDICT_S = {"cpu": 90.0, "cuda": 5.0}
 """Bars for ten throws and a minute of flight with the whole catalogue: two quiet CPU cores, an
@@ -34,7 +34,9 @@ def measure(args: argparse.Namespace) -> dict[str, float]:
     model = source.model
     logs = source.logs
     opened = time.perf_counter()
-    diagnosis = search.explain(model, seed=args.seed, without=opening.numbers(args.without, logs))
+    diagnosis = diagnose_flights.explain(
+        model, seed=args.seed, without=opening.numbers(args.without, logs)
+    )
     explained = time.perf_counter()
     found = {
         "open": opened - begun,

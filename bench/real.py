@@ -32,7 +32,7 @@ from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.search import diagnose
+from visthrow.diagnose.select.diagnose_flights import diagnose
 from visthrow.logs.check.run import check
 from visthrow.logs.flightlog import Channel, FlightLog
 

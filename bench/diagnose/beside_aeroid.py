@@ -20,7 +20,7 @@ from scipy.integrate import solve_ivp
 from bench.worlds.world import sensor_noise
 from visthrow.diagnose.inputs import fit as fitting
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.logs.flightlog import Channel, FlightLog
 
 NAMES = ("ball_drag", "wind_x", "wind_y")
@@ -131,7 +131,7 @@ def compared(seed: int, colour: str) -> dict:
         }
         line[f"{who}_s"] = time.perf_counter() - begin
     begin = time.perf_counter()
-    verdict = search.explain(model_of(stamps, seen), laws=False)
+    verdict = diagnose_flights.explain(model_of(stamps, seen), laws=False)
     line |= {
         "explain_s": time.perf_counter() - begin,
         "overall": verdict.overall,

@@ -227,13 +227,13 @@ def scramble(recipe: Recipe, folder: Path) -> dict:
 def flip(recipe: Recipe, _: Path) -> dict:
     """Residuals of every other flight turned around: what is common to all flights is gone."""
     from visthrow.diagnose.reporting import diagnosis_report as report
-    from visthrow.diagnose.select import search
+    from visthrow.diagnose.select import diagnose_flights
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import load_experiment, plant_of
 
     experiment = load_experiment("state", model_of(recipe))
     model = ThrowModel(logs_of(recipe), plant_of(experiment))
-    verdict = report.to_json(search.explain(altered.Flipped(model, recipe.seed)))
+    verdict = report.to_json(diagnose_flights.explain(altered.Flipped(model, recipe.seed)))
     return {"passed": not names(verdict), "said": verdict}
 
 

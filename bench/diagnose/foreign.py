@@ -28,7 +28,7 @@ from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.80665  # [m/s^2]
@@ -299,7 +299,7 @@ def asked(seed: int) -> dict:
     begin = time.process_time()
     try:
         logs = [flown(world, np.random.default_rng([seed, i])) for i in range(FLIGHTS)]
-        said = search.explain(FlyerModel(logs, known(name)), seed=seed)
+        said = diagnose_flights.explain(FlyerModel(logs, known(name)), seed=seed)
     except (VisthrowError, ValueError, FloatingPointError) as error:
         return line | {"verdict": "failed", "why": str(error)[:200]}
     groups = [{f.name, *f.partners} for f in said.findings if f.name in said.theta]

@@ -19,7 +19,7 @@ from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.logs.flightlog import Channel, FlightLog
 
 G = 9.80665  # [m/s^2]
@@ -147,7 +147,7 @@ def asked(kind: str, law: str, seed: int) -> dict:
     """A world, and what the tool says of it."""
     line = {"kind": kind, "law": law, "seed": seed}
     try:
-        said = search.explain(model_of(kind, logs_of(kind, law, seed)), seed=seed)
+        said = diagnose_flights.explain(model_of(kind, logs_of(kind, law, seed)), seed=seed)
     except (VisthrowError, ValueError, FloatingPointError) as error:
         return line | {"verdict": "failed", "why": str(error)[:200]}
     return line | {

@@ -39,12 +39,15 @@ from pathlib import Path
 from bench.diagnose import foreign
 from visthrow.diagnose.inputs.setup import MODELS
 from visthrow.diagnose.reporting.diagnosis_report import to_json
-from visthrow.diagnose.select import search
 from visthrow.logs.flightlog import FlightLog
+try:
+    from visthrow.diagnose.select.diagnose_flights import explain
+except ImportError:  # of an older checkout
+    from visthrow.diagnose.select.search import explain
 vehicle, seed = sys.argv[1:]
 logs = [FlightLog.load(path) for path in sorted(Path().glob("flight_*.npz"))]
 model = MODELS["flyer"](logs, foreign.known(vehicle))
-answer = search.explain(model, seed=int(seed))
+answer = explain(model, seed=int(seed))
 Path("verdict.json").write_text(json.dumps(to_json(answer)))
 """
 TIMEOUT = 300.0  # [s]

@@ -5,7 +5,7 @@ nothing is.
 import numpy as np
 from pytest import fixture, mark
 
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.diagnose.throw.throw_model import ThrowModel
 from visthrow.task import plant_of
 from visthrow.throws.loading import load_policy
@@ -23,10 +23,12 @@ def flown():
     return loaded, [fly(loaded, np.array([2.0, 0.0, 0.0]), seed=seed) for seed in SEEDS]
 
 
-def told(loaded, logs) -> search.Diagnosis:
+def told(loaded, logs) -> diagnose_flights.Diagnosis:
     """What ``explain`` says of logs."""
     experiment = loaded.experiment
-    return search.explain(ThrowModel(logs, plant_of(experiment), sensing=experiment.sensing))
+    return diagnose_flights.explain(
+        ThrowModel(logs, plant_of(experiment), sensing=experiment.sensing)
+    )
 
 
 def test_flights_of_fly_hide_nothing(flown):

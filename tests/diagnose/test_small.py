@@ -24,7 +24,7 @@ from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import TorqueParams
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.logs.flightlog import Channel, FlightLog
 
 TURNING = replace(
@@ -104,7 +104,7 @@ def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
 
 @mark.parametrize("kind", list(small.WORLDS))
 def test_nothing_hidden_is_no_effect(kind):
-    diagnosis = search.explain(small.model_of(kind, small.logs_of(kind, "", 1)))
+    diagnosis = diagnose_flights.explain(small.model_of(kind, small.logs_of(kind, "", 1)))
     assert diagnosis.overall == "NO EFFECT"
     assert not diagnosis.laws
 

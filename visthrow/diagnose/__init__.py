@@ -8,7 +8,7 @@ from typing import Any
 def __getattr__(name: str) -> Any:
     """Import :func:`diagnose` when it is asked for: it needs the algebra's libraries."""
     if name == "diagnose":
-        from visthrow.diagnose.select.search import diagnose
+        from visthrow.diagnose.select.diagnose_flights import diagnose
 
         return diagnose
     raise AttributeError(f"module 'visthrow.diagnose' has no attribute '{name}'")

@@ -10,7 +10,7 @@ from pytest import approx, mark
 
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.diagnose.select.point import Problem, linearise, untracked_windows
 
 NAME, SIZE = "effect_03", 10.0  # in floors
@@ -40,7 +40,7 @@ class Whipping(SyntheticModel):
 
 
 def explained(size: float):
-    return search.explain(Whipping(truth={NAME: size}, seed=5), laws=False)
+    return diagnose_flights.explain(Whipping(truth={NAME: size}, seed=5), laws=False)
 
 
 def test_a_candidate_that_promises_more_than_it_keeps_is_looked_at_where_it_leads():
@@ -78,7 +78,7 @@ def test_sizes_and_intervals_hold_whatever_else_is_below_its_floor():
     off = []
     for seed in range(5):
         truth = {NAME: 2.0 * SIZE, EFFECTS[Levered.by].name: 0.9}
-        diagnosis = search.explain(Levered(truth=truth, seed=seed, throws=8), laws=False)
+        diagnosis = diagnose_flights.explain(Levered(truth=truth, seed=seed, throws=8), laws=False)
         assert diagnosis.named == (NAME,)
         size, own = 2.0 * SIZE * EFFECTS[3].floor, diagnosis[NAME]
         off.append((own.estimate - size) / own.sd)
@@ -109,7 +109,7 @@ class Sideways(SyntheticModel):
 def test_of_causes_of_which_only_one_is_there_that_one_is_named():
     """The simulated set holds a cause near 0; without it the other has hardly been listed."""
     model = Sideways(effects=catalogue(20), truth={"effect_01": 40.0}, throws=6, free=2)
-    assert search.explain(model, laws=False).named == ("effect_01",)
+    assert diagnose_flights.explain(model, laws=False).named == ("effect_01",)
 
 
 BAD = 10
@@ -160,7 +160,7 @@ def test_a_window_that_is_lost_where_the_cause_is_is_left_out_and_the_search_goe
     said = []
     model = Spoiled(truth={"effect_00": 15.0}, throws=8, seed=4)
     model.rough, model.beyond = 4.0, 5.0
-    diagnosis = search.explain(model, laws=False, progress=said.append)
+    diagnosis = diagnose_flights.explain(model, laws=False, progress=said.append)
     assert sum("are left out, which the simulation does not follow" in line for line in said) == 1
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_00",)

@@ -19,7 +19,7 @@ from visthrow.diagnose.likelihood.correlation import (
     with_correlations,
 )
 from visthrow.diagnose.likelihood.evidence import Priors
-from visthrow.diagnose.select import point, result, search
+from visthrow.diagnose.select import diagnose_flights, point, result
 
 RATE, TIME = 200, 0.03
 SOME = 16  # effects
@@ -101,6 +101,6 @@ def test_time_order_and_size_are_those_planted(colour, order):
 
 def test_noise_that_is_correlated_is_no_cause(monkeypatch):
     """Taken for white, it is told as names or as something unknown."""
-    assert search.explain(flown(7, "first")).overall == result.NO_EFFECT
+    assert diagnose_flights.explain(flown(7, "first")).overall == result.NO_EFFECT
     monkeypatch.setattr(point, "correlations", lambda *_: {})
-    assert search.explain(flown(7, "first")).overall != result.NO_EFFECT
+    assert diagnose_flights.explain(flown(7, "first")).overall != result.NO_EFFECT

@@ -15,7 +15,7 @@ from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.imu import ImuModel
 from visthrow.diagnose.planning import design, fly_manoeuvres, plan
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre, catalogue
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.task import plant_of
 
 BASES = {m.name: m for m in catalogue()}
@@ -35,7 +35,7 @@ def hovered(params):
     model = FlyerModel(
         [hover.setup_log(params, {params.position: 3e-4, "payload_pos_w": 3e-4})], params
     )
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     return diagnosis, *fly_manoeuvres.simulator_of(
         model, diagnosis, lambda logs: FlyerModel(logs, params)
     )

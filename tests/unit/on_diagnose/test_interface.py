@@ -14,7 +14,7 @@ from sim.params import GRAVITY
 from tests.flightlogs import log_at, with_channels
 from tests.flown import fly, setting_with
 from tests.plants import paper_plant
-from visthrow.diagnose.select.search import correct_interface_mistakes
+from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
 from visthrow.diagnose.throw import command_mistakes as interface
 from visthrow.diagnose.throw.command_mistakes import suspected
 from visthrow.diagnose.throw.throw_model import ThrowModel

@@ -32,7 +32,7 @@ from visthrow.diagnose.models.quadrotor.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
 from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.reporting.gain import on_others
-from visthrow.diagnose.select import result, search
+from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
@@ -116,7 +116,7 @@ class TestBall:
         """
         truth, stamps, paths = beside_aeroid.world(240000100)
         seen = paths + default_rng(1).normal(0.0, 5e-4, paths.shape)
-        diagnosis = search.explain(beside_aeroid.model_of(stamps, seen), laws=False)
+        diagnosis = diagnose_flights.explain(beside_aeroid.model_of(stamps, seen), laws=False)
         assert diagnosis.overall == "KNOWN"
         assert set(diagnosis.theta) == set(truth)
         assert all(
@@ -285,19 +285,21 @@ class TestFlyer:
 
     def test_a_push_that_another_vehicle_drives_is_a_law_of_its_measured_position(self):
         logs = [fly(6.0, downwash=0.03, seed=i) for i in range(3)]
-        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        diagnosis = diagnose_flights.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
         assert diagnosis.overall == "UNKNOWN"
         assert diagnosis.laws[0].formula == "F = c 1/d d_z/d z"
         law = diagnosis.laws[0]
         assert law.coefficient == approx(0.03, rel=0.02)
         for log in logs:
             del log.channels["neighbour_pos_w"]
-        unaware = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
+        unaware = diagnose_flights.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)))
         assert all("/d" not in law.formula for law in unaware.laws)
 
     def test_what_neither_name_nor_law_explains_is_told(self):
         logs = [fly(6.0, beat=0.01, seed=i) for i in range(3)]
-        diagnosis = search.explain(FlyerModel(logs, replace(FLYER, command_delay=LATE)), laws=False)
+        diagnosis = diagnose_flights.explain(
+            FlyerModel(logs, replace(FLYER, command_delay=LATE)), laws=False
+        )
         assert diagnosis.overall in ("UNKNOWN", "EXPLAINED IN PART")
         assert any("noise alone" in reason for reason in diagnosis.reasons)
 
@@ -315,7 +317,7 @@ class TestFlyer:
             ["wind_x", "wind_y", "frame_tilt_y", "marker_rot_y", "thrust_gain", "cmd_delay"]
         )
         model.effects = measures.narrowed(model.effects, measures.parsed(stated))
-        found = search.explain(model, laws=False)
+        found = diagnose_flights.explain(model, laws=False)
         named = {f.name for f in found.findings if f.verdict in result.NAMED}
         assert stated or not named & {"frame_tilt_y", "marker_rot_y"}
         assert ("wind_x" in named) != bool(stated)
@@ -438,7 +440,7 @@ class TestImu:
         model = ImuModel(logs, replace(IMU, thrust_map=strong))
         assert model.channels == ("acc_b",)
         assert "with a correlation of 0." in model.notes[0]
-        diagnosis = search.diagnose(logs, model, laws=False)
+        diagnosis = diagnose_flights.diagnose(logs, model, laws=False)
         assert set(diagnosis.named) == {"thrust_gain", "motor_tau"}
         assert diagnosis.theta["thrust_gain"] == approx(1.0 / 1.8 - 1.0, abs=0.03)
         assert diagnosis["inertia_xy"].missing == ("rate_b",)

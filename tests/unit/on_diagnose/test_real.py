@@ -15,6 +15,7 @@ from pytest import approx, mark
 from tests.commands import run_command
 from tests.places import DATA
 from visthrow.diagnose.inputs import setup as setups
+from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.result import (
     CANDIDATE,
     FOUND,
@@ -24,7 +25,6 @@ from visthrow.diagnose.select.result import (
     NO_EFFECT,
     UNKNOWN,
 )
-from visthrow.diagnose.select.search import explain
 from visthrow.logs import read_all
 from visthrow.logs.check.run import check, contradictions
 

@@ -15,7 +15,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.apply import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import result, search, verdicts
+from visthrow.diagnose.select import diagnose_flights, result, verdicts
 from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.scatter import (
@@ -217,7 +217,7 @@ def test_what_flights_have_of_their_own_is_integrated_out():
 @mark.parametrize(("seed", "deviation"), [(1, 4.0), (2, 9.0)])
 def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation):
     sizes = 14.0 + deviation * default_rng(seed).permutation(np.linspace(-1.7, 1.7, 16))
-    diagnosis = search.explain(drawn(sizes, seed=seed), laws=False)
+    diagnosis = diagnose_flights.explain(drawn(sizes, seed=seed), laws=False)
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("cmd_delay",)
     found, varies = diagnosis["cmd_delay"], delay_jitter(diagnosis)
@@ -231,7 +231,7 @@ def test_an_effect_that_varies_about_a_mean_is_named_and_varies(seed, deviation)
 
 def test_an_effect_that_varies_about_nothing_is_not_named():
     sizes = 6.0 * default_rng(5).permutation(np.linspace(-1.7, 1.7, 12))
-    diagnosis = search.explain(drawn(sizes, seed=5), laws=False)
+    diagnosis = diagnose_flights.explain(drawn(sizes, seed=5), laws=False)
     assert not diagnosis.theta
     assert delay_jitter(diagnosis).found
     mean = delay_jitter(diagnosis).mean["cmd_delay"]

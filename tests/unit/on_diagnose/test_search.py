@@ -13,7 +13,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import evidence
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
-from visthrow.diagnose.select import held_out, result, search
+from visthrow.diagnose.select import diagnose_flights, held_out, result
 from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.point import Problem, linearise
@@ -50,7 +50,7 @@ def pushed(model, window, size: float):
 
 
 def test_nothing_is_found_where_nothing_is():
-    diagnosis = search.explain(world())
+    diagnosis = diagnose_flights.explain(world())
     assert diagnosis.overall == result.NO_EFFECT
     assert not diagnosis.theta
     assert not diagnosis.events
@@ -61,7 +61,7 @@ def test_nothing_is_found_where_nothing_is():
 @mark.parametrize("sign", [1.0, -1.0])
 def test_one_effect_is_named_with_its_size_and_interval(sign):
     model = world(truth={"effect_03": 10.0 * sign}, curvature=0.2, seed=4)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis.overall == result.KNOWN
     found = diagnosis["effect_03"]
     assert found.verdict == result.FOUND
@@ -79,7 +79,7 @@ TRIPLE = {"effect_03": 12.0, "effect_04": -9.0, "effect_02": 15.0}
 def test_three_effects_are_named_also_where_bends_would_fake_one(curvature):
     """A bend of 2 at 30 floors is taken for more than a third of each size."""
     model = world(truth=TRIPLE, seed=1, curvature=curvature)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert set(diagnosis.named) == set(TRIPLE)
     for name, size in sizes(model, diagnosis).items():
         assert abs(size - TRIPLE[name]) < 1.5
@@ -104,7 +104,7 @@ def hiding(own: float, **options) -> SyntheticModel:
 @mark.parametrize("beside", [{}, {"effect_04": 10.0}])
 def test_two_effects_that_hide_each_other_are_named_together(beside):
     """Neither brings a single nat alone, nor does what looks like both."""
-    diagnosis = search.explain(hiding(0.15, truth=beside), laws=False)
+    diagnosis = diagnose_flights.explain(hiding(0.15, truth=beside), laws=False)
     assert set(diagnosis.named) == {"effect_03", "effect_07", *beside}
     for name in ("effect_03", "effect_07"):
         assert diagnosis[name].low < 14.0 * diagnosis[name].floor < diagnosis[name].high
@@ -115,7 +115,7 @@ def test_two_effects_that_hide_each_other_are_named_together(beside):
 
 def test_effects_that_do_the_same_are_a_class_with_their_known_combination():
     model = world(truth={"effect_03": 12.0}, same={"effect_07": ("effect_03", 0.5)}, seed=2)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     group = [f for f in diagnosis.findings if f.verdict == result.CLASS]
     assert {f.name for f in group} == {"effect_03", "effect_07"}
     assert all(set(f.partners) == {"effect_03", "effect_07"} - {f.name} for f in group)
@@ -131,7 +131,7 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
     model.effects = tuple(
         replace(e, channels=("battery_voltage",)) if e.name == "effect_05" else e for e in EFFECTS
     )
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis["effect_05"].verdict == result.UNOBSERVABLE
     assert diagnosis["effect_05"].missing == ("battery_voltage",)
     assert diagnosis.named == ("effect_03",)
@@ -139,7 +139,7 @@ def test_a_missing_channel_makes_effects_unobservable_and_names_it():
 
 def test_what_happened_in_one_flight_is_an_event_and_no_cause():
     model = altered(lambda m, w: pushed(m, w, 40.0) if w.flight == 4 else w, throws=9)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert not diagnosis.theta
     assert diagnosis.events == (4,)
     assert [set(names) for names, _ in diagnosis.sets] == [{"effect_03 in flight 4"}]
@@ -147,7 +147,7 @@ def test_what_happened_in_one_flight_is_an_event_and_no_cause():
 
 def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert not diagnosis.theta
     assert [(s.name, s.of) for s in diagnosis.scatter if s.found] == [
         ("effect_03_by_flight", ("effect_03",))
@@ -189,14 +189,14 @@ def test_what_flights_share_and_what_each_has_for_itself_are_weighed_alike(sizes
 
 def test_commands_of_other_flights_are_inconsistent_data():
     """Poses that have nothing to do with the commands leave forces of the order of the thrust."""
-    diagnosis = search.explain(world(gust=80.0))
+    diagnosis = diagnose_flights.explain(world(gust=80.0))
     assert diagnosis.overall == result.INCONSISTENT
     assert not diagnosis.theta
 
 
 def test_a_simulation_that_fails_is_out_of_domain():
     failing = altered(lambda m, w: replace(w, residual=np.full_like(w.residual, np.nan)))
-    diagnosis = search.explain(failing)
+    diagnosis = diagnose_flights.explain(failing)
     assert diagnosis.overall == result.OUT_OF_DOMAIN
     assert not diagnosis.theta
     assert len(diagnosis.findings) == 12
@@ -207,7 +207,7 @@ def test_a_few_windows_that_fail_are_left_out_and_counted():
         lambda m, w: replace(w, residual=w.residual * np.nan) if w.flight == 5 else w,
         truth={"effect_03": 10.0},
     )
-    diagnosis = search.explain(some, laws=False)
+    diagnosis = diagnose_flights.explain(some, laws=False)
     assert diagnosis.named == ("effect_03",)
     windows = some.windows({})
     failed = sum(w.flight == 5 for w in windows)
@@ -220,7 +220,7 @@ def test_an_estimate_stays_within_its_physical_bounds():
     model.effects = tuple(
         replace(e, bounds=(-5 * floor, 8 * floor)) if e.name == "effect_03" else e for e in EFFECTS
     )
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert all(
         f.low >= -5 * floor - 1e-12 and f.high <= 8 * floor + 1e-12
         for f in diagnosis.findings
@@ -237,7 +237,7 @@ def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():
     model.effects = tuple(
         replace(e, bounds=(-0.0, 1.0), unit="1") if e.name == "effect_03" else e for e in EFFECTS
     )
-    found = search.explain(model, laws=False)["effect_03"]
+    found = diagnose_flights.explain(model, laws=False)["effect_03"]
     assert found.verdict == result.BOUNDED
     assert (found.low, found.high) == (0.0, 0.0)
     assert (
@@ -250,7 +250,7 @@ def test_no_window_is_an_error_that_says_so():
     empty = world()
     empty._windows = []
     with raises(DiagnoseError, match="no stretch of flight"):
-        search.explain(empty)
+        diagnose_flights.explain(empty)
 
 
 def test_catalogues_that_contradict_themselves_are_refused():
@@ -354,7 +354,7 @@ def test_a_window_that_no_force_explains_is_left_out():
         )
 
     model = altered(spoil, truth={"effect_03": 10.0}, seed=4)
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis.windows == len(model.windows({})) - 1
     assert tuple(diagnosis.theta) == ("effect_03",)
 
@@ -387,6 +387,6 @@ def test_what_gusts_held_goes_over_to_the_sizes(monkeypatch):
     for w in model._windows:
         w.effects[:, 1] = w.latent @ model._law(w.knots) if w.phase == "throw" else 0.0
         w.residual[:] += 0.02 * w.effects[:, 1]
-    diagnosis = search.explain(model, laws=False)
+    diagnosis = diagnose_flights.explain(model, laws=False)
     assert diagnosis.named == ("effect_01",)
     assert diagnosis["effect_01"].estimate == approx(0.02, abs=1e-3)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from tests.synthetic_diagnosis import SyntheticModel, catalogue
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.diagnose.select.point import Problem, fitted, linearise
 
 EFFECTS = tuple(replace(e, switch=i == 3) for i, e in enumerate(catalogue(6)))
@@ -41,7 +41,9 @@ def test_another_kind_of_block_must_explain_the_flights_itself():
     """
     floor = EFFECTS[3].floor
     truth = {"effect_03": 1.0 / floor}
-    assert search.explain(
+    assert diagnose_flights.explain(
         SyntheticModel(effects=EFFECTS, truth=truth, seed=4), laws=False
     ).named == ("effect_03",)
-    assert not search.explain(Promising(effects=EFFECTS, truth=truth, seed=4), laws=False).named
+    assert not diagnose_flights.explain(
+        Promising(effects=EFFECTS, truth=truth, seed=4), laws=False
+    ).named

@@ -24,10 +24,10 @@ from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
+from visthrow.diagnose.select import diagnose_flights
 from visthrow.diagnose.select import lost_commands as dropped
-from visthrow.diagnose.select import search
+from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
-from visthrow.diagnose.select.search import explain
 from visthrow.diagnose.throw import cutting, landing
 from visthrow.diagnose.throw.initial_states import hover_state
 from visthrow.diagnose.throw.recorded_flight import record_of
@@ -470,7 +470,7 @@ def told(diagnosis):
 
 
 def test_lost_commands_are_found_beside_a_cause():
-    diagnosis = search.explain(model_of(SHARE, com_x=0.003))
+    diagnosis = diagnose_flights.explain(model_of(SHARE, com_x=0.003))
     assert (diagnosis.overall, diagnosis.named, [s.name for s in told(diagnosis)]) == (
         "KNOWN",
         ("com_x",),

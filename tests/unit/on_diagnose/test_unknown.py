@@ -18,7 +18,7 @@ from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
-from visthrow.diagnose.select import result, search, terms, verdicts
+from visthrow.diagnose.select import diagnose_flights, result, terms, verdicts
 from visthrow.diagnose.select.candidates import ALL
 from visthrow.diagnose.select.excess import acts_on
 from visthrow.diagnose.select.point import Problem, candidate, linearise
@@ -135,7 +135,7 @@ def test_units_and_formulas(term, unit, formula):
 
 def test_a_law_beside_a_known_cause_leaves_the_cause_its_name():
     model = SyntheticModel(law="swirl", law_size=0.01, truth={"effect_03": 12.0}, seed=3)
-    diagnosis = search.explain(model)
+    diagnosis = diagnose_flights.explain(model)
     assert diagnosis.overall == result.UNKNOWN
     assert diagnosis.block == "payload force"
     assert diagnosis.named == ("effect_03",)
@@ -162,7 +162,7 @@ class PassedBy(SyntheticModel):
 
 
 def test_a_law_that_other_flights_do_not_repeat_is_not_told():
-    diagnosis = search.explain(PassedBy(law="passing", law_size=0.4, seed=3))
+    diagnosis = diagnose_flights.explain(PassedBy(law="passing", law_size=0.4, seed=3))
     assert diagnosis.overall == result.UNKNOWN
     assert "left out do not repeat it" in " ".join(diagnosis.reasons)
     assert not any(" = c " in reason for reason in diagnosis.reasons)
@@ -189,14 +189,14 @@ def test_a_law_takes_no_name_away_that_says_the_same():
     """The name is far larger than usual and close to its bound, which costs it nats that the
     nameless term does not pay.
     """
-    diagnosis = search.explain(with_a_name_for_the_law(0.0198))
+    diagnosis = diagnose_flights.explain(with_a_name_for_the_law(0.0198))
     assert diagnosis.overall == result.KNOWN
     assert diagnosis.named == ("effect_01",)
     assert diagnosis["effect_01"].estimate == approx(0.02, abs=1e-3)
 
 
 def test_a_name_that_would_have_to_exceed_its_bound_stays_none():
-    diagnosis = search.explain(with_a_name_for_the_law(0.01))
+    diagnosis = diagnose_flights.explain(with_a_name_for_the_law(0.01))
     assert diagnosis.overall == result.UNKNOWN
     assert not diagnosis.named
 
@@ -227,7 +227,7 @@ def test_a_name_of_another_form_than_the_truth_is_withdrawn(kind, size):
     model.effects = (EFFECTS[0], replace(EFFECTS[1], prior_sd=0.05), *EFFECTS[2:])
     for w, moved in zip(model._windows, drag):
         w.effects[:, 1] = moved
-    diagnosis = search.explain(model)
+    diagnosis = diagnose_flights.explain(model)
     if kind is LinearDrag:
         assert diagnosis.overall == result.KNOWN
         assert diagnosis.named == ("effect_01",)
@@ -329,7 +329,7 @@ def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
 def test_the_table_takes_up_what_no_name_explains():
     """Weights from some flights predict the hidden drag in a flight that they have not seen."""
     model = SyntheticModel(law="speed", law_size=0.02, seed=3, throws=12)
-    point = search.explain(model, laws=False).work.before
+    point = diagnose_flights.explain(model, laws=False).work.before
     table = table_of(point, default_rng(0))
     flights = [w.flight for w in point.windows]
     trained = train(point, table, flights)

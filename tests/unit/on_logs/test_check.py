@@ -16,7 +16,7 @@ from tests.commands import run_command
 from tests.flightlogs import DELAY, UNITS, G, flight, log_at, log_of, with_channels
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
-from visthrow.diagnose.select.search import diagnose, refused_of
+from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
 from visthrow.logs.check import physics, thrust_checks
 from visthrow.logs.check.excitation import QUESTIONS, excitation
 from visthrow.logs.check.relations import derivative, relate

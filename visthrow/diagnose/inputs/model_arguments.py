@@ -91,7 +91,7 @@ class Opened:
 
     def diagnose(self, laws: bool = True, say: Callable[[str], None] | None = None) -> Diagnosis:
         """Diagnose the flights, as the arguments say."""
-        from visthrow.diagnose.select.search import diagnose
+        from visthrow.diagnose.select.diagnose_flights import diagnose
 
         without = numbers(self._args.without, self.logs)
         if self._args.overrule:
@@ -140,7 +140,7 @@ def throw_model(
     """
     from visthrow.common.compute_device import resolve
     from visthrow.diagnose.likelihood import threads
-    from visthrow.diagnose.select.search import correct_interface_mistakes
+    from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
     from visthrow.diagnose.throw.throw_model import ThrowModel
     from visthrow.task import load_experiment, plant_of
 

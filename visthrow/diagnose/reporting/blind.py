@@ -49,8 +49,8 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     """Hide each effect at rising sizes in the flights' own noise and see whether the statistics
     name it.
 
-    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; what it named is taken out
-    first; ``draws``: worlds for each effect, size and sign."""
+    ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; what it named is
+    taken out first; ``draws``: worlds for each effect, size and sign."""
     work = diagnosis.work
     rng = np.random.default_rng(seed)
     priors = work.problem.priors

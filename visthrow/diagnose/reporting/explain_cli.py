@@ -59,7 +59,7 @@ def _tested(
     from visthrow.diagnose.likelihood.forms import READABLE, unit_of
     from visthrow.diagnose.models.law_terms import term_of
     from visthrow.diagnose.reporting.gain import on_others
-    from visthrow.diagnose.select.search import refused_of
+    from visthrow.diagnose.select.diagnose_flights import refused_of
     from visthrow.logs.check.run import check, contradictions
 
     checked = check(test_flights.logs, test_flights.known)

@@ -76,8 +76,8 @@ class Gain:
 def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     """Measure the gain of a diagnosis on held-out flights.
 
-    ``diagnosis``: of :func:`visthrow.diagnose.select.search.explain`; ``seed``: of the black box's
-    basis."""
+    ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; ``seed``: of the
+    black box's basis."""
     work = diagnosis.work
     rng = np.random.default_rng(seed)
     cross = crossed(diagnosis)

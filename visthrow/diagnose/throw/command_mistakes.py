@@ -3,10 +3,10 @@ the commands.
 
 Here they are suspected, from how measured rates follow commanded ones and from the weight that
 commands carry. They are candidates of the selection like any other:
-:func:`visthrow.diagnose.select.search.correct_interface_mistakes` simulates the flights with and
-without each, and keeps what raises the evidence by more than it costs. (Commands that bear the time
-of their arrival are no gross mistake: they show as the effect ``cmd_delay`` on its bound, the
-link's delay less.)
+:func:`visthrow.diagnose.select.diagnose_flights.correct_interface_mistakes` simulates the
+flights with and without each, and keeps what raises the evidence by more than it costs. (Commands
+that bear the time of their arrival are no gross mistake: they show as the effect ``cmd_delay`` on
+its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
