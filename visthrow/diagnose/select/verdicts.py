@@ -90,9 +90,6 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     total = shared_point.information, shared_point.score
     sizes = mean_sizes(*total, problem.priors, sized, [(sized, 0.0)])
     means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
-    varied = []
-    for s in scatter:
-        varied.append(replace(s, mean={name: means[name] for name in s.of if name in means}))
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
     reading = Reading(problem, shared_point, active, withdrawn, sets, unlike)
@@ -115,7 +112,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         laws=_different(explanations),
         events=_events(selection, point),
         sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
-        scatter=tuple(varied),
+        scatter=tuple(_with_means(s, means) for s in scatter),
         mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
         flights=len(point.plain.flights),
@@ -123,6 +120,11 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         samples=int(point.statistics.samples.sum()),
         work=Work(problem, nominal, point if active else nominal, tuple(active)),
     )
+
+
+def _with_means(scatter: Scatter, means: Mapping[str, float]) -> Scatter:
+    """Return a verdict on what varies with the means of its effects in these flights."""
+    return replace(scatter, mean={name: means[name] for name in scatter.of if name in means})
 
 
 def _covariance(
