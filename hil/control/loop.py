@@ -17,6 +17,7 @@ from hil.control.tick.runner import Runner
 from hil.links.backends.base import Backend, DryRun
 from hil.links.clock import Clock, Ticker
 from hil.links.team_link import TeamLink
+from hil.poses.pose import Pose
 from hil.poses.sources.images import Eyes
 from hil.poses.sources.pose_source import Source
 
@@ -31,7 +32,7 @@ REHEARSAL = 5e-3
 """Time kept for the first rehearsal [s]. Later ones keep the longest that recent ones took."""
 
 FORGETTING = 0.98  # by which the time that is kept shrinks from rehearsal to rehearsal
-MARGIN = 2e-4  # left between the rehearsal's end and the tick [s]
+MARGIN = 5e-4  # left between the rehearsal and the tick for poses that came meanwhile [s]
 
 GOLDEN = 0.5 * (math.sqrt(5.0) - 1.0)
 
@@ -130,10 +131,10 @@ class Loop:
         if runner.policy_flies:
             lead += self._rehearsal
         _wait(clock, ticker.due() - lead, backend, source)
-        early = source.poll(clock.now())
-        runner.take_poses(early)
+        early = self._take_poses()
         if runner.policy_flies:
             self._rehearse()
+            early += self._take_poses()
         _wait(clock, ticker.due(), backend, source)
         due = ticker.due()
         missed = ticker.missed
@@ -176,6 +177,12 @@ class Loop:
         self.count += 1
         gc.collect(1 if self.count % COLLECT_ALL == 0 else 0)
         self._ended = clock.now()
+
+    def _take_poses(self) -> list[Pose]:
+        """Take in the poses that have come before their tick."""
+        poses = self.source.poll(self.clock.now())
+        self.runner.take_poses(poses)
+        return poses
 
     def _rehearse(self) -> None:
         """Rehearse the next tick just before it is due, if there is time for it.

@@ -1,6 +1,6 @@
 """From the policy's output to a command: collective thrust, body rates, release.
 
-Onboard-safe (torch only).
+Onboard-safe; on tensors, and on arrays of one vehicle.
 
 The policy puts out five numbers; the first four are clipped to [-1, 1]. Thrust is quadratic in the
 first, ``c = max_thrust ((1 + a) / 2)^2``: the number is a throttle proportional to the motors'
@@ -11,16 +11,18 @@ open."""
 import torch
 from torch import Tensor
 
+from camera.arrays import Array, library
+
 COMMANDS = 4
 ACTIONS = 5
 
 
-def clip_action(action: Tensor) -> Tensor:
+def clip_action(action: Array) -> Array:
     """Normalised action within [-1, 1], shape (E, 5): what is remembered as the previous action."""
-    return action.clamp(-1.0, 1.0)
+    return action.clip(-1.0, 1.0)
 
 
-def command_from_action(action: Tensor, max_thrust: float | Tensor, max_rate: Tensor) -> Tensor:
+def command_from_action(action: Array, max_thrust: float | Tensor, max_rate: Array) -> Array:
     """Command of a clipped action.
 
     Args:
@@ -32,9 +34,10 @@ def command_from_action(action: Tensor, max_thrust: float | Tensor, max_rate: Te
     Returns:
         Collective thrust [N] and body rates [rad/s], shape (E, 4).
     """
-    bounded = action[:, :COMMANDS].clamp(-1.0, 1.0)
+    bounded = action[:, :COMMANDS].clip(-1.0, 1.0)
     throttle = 0.5 * (bounded[:, :1] + 1.0)
-    return torch.cat([max_thrust * throttle * throttle, bounded[:, 1:] * max_rate], dim=-1)
+    parts = [max_thrust * throttle * throttle, bounded[:, 1:] * max_rate]
+    return library(action).concatenate(parts, -1)
 
 
 def action_from_command(command: Tensor, max_thrust: float, max_rate: Tensor) -> Tensor:
@@ -45,7 +48,7 @@ def action_from_command(command: Tensor, max_thrust: float, max_rate: Tensor) ->
     return torch.cat([2.0 * throttle - 1.0, (command[:, 1:] / max_rate).clamp(-1.0, 1.0)], dim=-1)
 
 
-def release_asked(action: Tensor, threshold: float) -> Tensor:
+def release_asked(action: Array, threshold: float) -> Array:
     """Whether the latch trips: the fifth output above the threshold, bool, shape (E,)."""
     return action[:, COMMANDS] > threshold
 

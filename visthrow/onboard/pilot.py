@@ -1,10 +1,10 @@
 """The policy in flight: from poses of vehicle, payload and goal to a command. Onboard-safe.
 
 The same functions of :mod:`visthrow.onboard.observations` and :mod:`visthrow.onboard.actions` that
-the training environment calls, with a batch of one on board; only the noise is missing."""
+the training environment calls, with a batch of one on board; only the noise is missing. For one
+vehicle all is computed on NumPy arrays, for more on tensors."""
 
 import time
-import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy import ndarray
-from torch import Tensor
 
 from camera.arrays import Array, push
 from camera.keypoints import KeypointCamera
@@ -27,6 +26,7 @@ from visthrow.onboard import goal_motion
 from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy
 from visthrow.onboard.row_keypoints import row_keypoints
+from visthrow.onboard.row_policy import RowPolicy
 
 VIEWS = {
     "pos_w": 3,
@@ -126,7 +126,7 @@ class Pilot:
         try:
             self.layout = ob.layout_of(SimpleNamespace(**contract["observation"]))
             self._max_thrust = float(contract["action"]["max_thrust"])
-            self._max_rate = torch.tensor(contract["action"]["max_rate"], dtype=torch.float32)
+            max_rate = np.array(contract["action"]["max_rate"], dtype=np.float32)
             self._threshold = float(contract["release"]["threshold"])
             self.lag = float(contract["release"]["lag"])
             self.period = float(contract["control_period"])
@@ -148,12 +148,13 @@ class Pilot:
             policy.require({"camera": camera_conditions(camera_params)}, {"camera"}, allow)
         self.policy = policy
         self.count = count
+        self._network = RowPolicy(policy) if count == 1 else policy
+        self._max_rate = self._native(max_rate)
         self.camera = self._camera = None
         if camera_params is not None:
             self.camera = self._camera = KeypointCamera(camera_params)
             if count == 1:
                 self._camera = self.camera.on_arrays()
-        self._decide = self._traced()
         self.spent = (0.0, 0.0)
         first = act.hover_action(GRAVITY * mass, self._max_thrust)
         self._first = np.array([first], dtype=np.float32)
@@ -167,7 +168,7 @@ class Pilot:
         self._history = self._zeros(count, 1 + layout.history, layout.payload)
         self._answers = self._zeros(count, 1 + layout.response, ob.RESPONSE)
         self._goal_fit = self._zeros(count, goal_motion.SUMS)
-        self._memory = self.policy.begin(count)
+        self._memory = self._native(self.policy.begin(count))
         self._shown: tuple[Any, ...] = ()  # to the last call
         self._fresh = self._zeros(count) == 0.0
         self._steps = 0
@@ -223,18 +224,20 @@ class Pilot:
         self._answers = seen.answers
         self._goal_fit = seen.goal_fit
         decided = time.perf_counter()
-        observation = torch.as_tensor(seen.observation)
-        action, command, release, self._memory = self._decide(observation, self._memory)
+        raw, self._memory = self._network.step(seen.observation, self._memory)
+        action = act.clip_action(raw)
+        command = act.command_from_action(action, self._max_thrust, self._max_rate)
+        release = act.release_asked(raw, self._threshold)
         self._unasked = self._previous[:, 4]
-        self._previous = action.numpy()
+        self._previous = np.asarray(action)
         self._fresh = self._zeros(self.count) > 0.0
         self._steps += 1
         self.spent = (decided - begin, time.perf_counter() - decided)
         return PilotOutput(
             self._previous,
-            command.numpy(),
-            release.numpy(),
-            observation.numpy(),
+            np.asarray(command),
+            np.asarray(release),
+            np.asarray(seen.observation),
             None if seen.points is None else np.asarray(seen.points),
             None if seen.points is None else np.asarray(seen.valid),
         )
@@ -245,8 +248,7 @@ class Pilot:
         code in the processor's caches.
         """
         if self._shown:
-            observation = self._see(*self._shown).observation
-            self._decide(torch.as_tensor(observation), self._memory)
+            self._network.step(self._see(*self._shown).observation, self._memory)
 
     def not_released(self) -> None:
         """Say that the release which the last call asked for was not done: the next call is told of
@@ -350,23 +352,6 @@ class Pilot:
         further = velocity, places, earlier
         observation, history = ob.observe(layout, frame, filled, *carried, *further)
         return Seen(observation, history, answers, goal_fit, points, valid)
-
-    def _traced(self) -> Any:
-        """Return a program that runs without Python code: from observation and memory to the
-        clipped action, command, whether a release is asked for, and the new memory.
-        """
-        policy = self.policy.for_one_row() if self.count == 1 else self.policy
-        examples = torch.zeros(self.count, policy.obs_dim), policy.begin(self.count)
-
-        def decision(observation: Tensor, memory: Tensor) -> tuple[Tensor, ...]:
-            raw, memory = policy.step(observation, memory)
-            action = act.clip_action(raw)
-            command = act.command_from_action(action, self._max_thrust, self._max_rate)
-            return action, command, act.release_asked(raw, self._threshold), memory
-
-        with warnings.catch_warnings(), torch.no_grad():
-            warnings.simplefilter("ignore")  # of branches that depend on shapes alone
-            return torch.jit.trace(decision, examples, check_trace=False)
 
     @torch.inference_mode()
     def see(

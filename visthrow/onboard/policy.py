@@ -175,24 +175,16 @@ class Policy:
 
     def to(self, device: str | torch.device) -> "Policy":
         """Return the policy with its tensors on another device."""
-        return self._with_tensors(lambda tensor: tensor.to(device))
-
-    def for_one_row(self) -> "Policy":
-        """Return the policy with its weights column by column in memory: on a single row, where
-        reading them is what takes the time, they are then read once and in order.
-        """
-        return self._with_tensors(lambda tensor: tensor.t().contiguous().t())
-
-    def _with_tensors(self, change: Callable[[Tensor], Tensor]) -> "Policy":
         changed: dict[str, Any] = {
-            "weights": tuple(map(change, self.weights)),
-            "biases": tuple(map(change, self.biases)),
+            "weights": tuple(weight.to(device) for weight in self.weights),
+            "biases": tuple(bias.to(device) for bias in self.biases),
         }
         if self.mean is not None and self.std is not None:
-            changed |= {"mean": change(self.mean), "std": change(self.std)}
+            changed |= {"mean": self.mean.to(device), "std": self.std.to(device)}
         if self.estimator is not None:
             parts = self.estimator.parts()
-            changed["estimator"] = Estimator.of_parts({n: change(p) for n, p in parts.items()})
+            moved = {name: part.to(device) for name, part in parts.items()}
+            changed["estimator"] = Estimator.of_parts(moved)
         return replace(self, **changed)
 
     def require(
