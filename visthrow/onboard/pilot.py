@@ -168,7 +168,7 @@ class Pilot:
         self._history = self._zeros(count, 1 + layout.history, layout.payload)
         self._answers = self._zeros(count, 1 + layout.response, ob.RESPONSE)
         self._goal_fit = self._zeros(count, goal_motion.SUMS)
-        self._memory = self._native(self.policy.begin(count))
+        self._memory = self._native(self.policy.begin(count).numpy())
         self._shown: tuple[Any, ...] = ()  # to the last call
         self._fresh = self._zeros(count) == 0.0
         self._steps = 0
