@@ -334,10 +334,10 @@ def test_a_charge_that_nobody_logged_is_that_of_the_throttles_calibration(plante
         plant.vehicle.controller, kind="motor_mixing", calibration_voltage=16.5, mix_thrust=weight
     )
     calibrated = replace(plant, vehicle=replace(plant.vehicle, controller=mixing))
-    told = hover_state(flight, calibrated, 1)
+    told = hover_state(flight, calibrated)
     assert told["voltage"][0] == approx(16.5, abs=0.02)
-    assert hover_state(climbing, calibrated, 1)["charge_used"][0] == told["charge_used"][0]
-    assert hover_state(flight, plant, 1)["charge_used"][0] == 0.2
+    assert hover_state(climbing, calibrated)["charge_used"][0] == told["charge_used"][0]
+    assert hover_state(flight, plant)["charge_used"][0] == 0.2
 
 
 def test_a_full_pack_that_nobody_logged_is_no_other_thrust_or_air():

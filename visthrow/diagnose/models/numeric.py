@@ -455,12 +455,15 @@ def halves(steps: int) -> np.ndarray:
 
 
 def integrate(
-    slope: Callable[[int, np.ndarray], np.ndarray], state: np.ndarray, steps: int, step: np.ndarray
+    slope: Callable[[int, np.ndarray], np.ndarray],
+    state: np.ndarray,
+    steps: int,
+    step: np.ndarray | float,
 ) -> np.ndarray:
     """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
     ``slope``: of the half step counted from the start, and the state; ``state``: at the start,
-    shape (B, S); ``step``: [s], shape (B, 1)."""
+    shape (B, S); ``step``: [s], of all lanes or of each, shape (B, 1)."""
     path = np.empty((len(state), steps + 1, state.shape[1]))
     half = 0.5 * step
     path[:, 0] = state

@@ -10,7 +10,7 @@ its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -58,9 +58,7 @@ class Mistake:
             return log
         c = log["command"]
         values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
-        return FlightLog(
-            {**log.channels, "command": Channel(c.time, values, c.unit, c.frame, c.valid)}, log.meta
-        )
+        return replace(log, channels={**log.channels, "command": replace(c, values=values)})
 
 
 def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
@@ -90,7 +88,7 @@ def commanded(
     Around hover the thrust of a vehicle is ``T = W (1 + s (u / h - 1))``: weight W [N] at the share
     h of full throttle. The slope s is fitted where an accelerometer tells the force and the
     throttle varies enough, else it is 1."""
-    weight = GRAVITY * (plant.vehicle.body.mass + plant.rope.payload_mass + plant.rope.rope_mass)
+    weight = GRAVITY * plant.total_mass
     corrected = list(logs)
     shares = []
     for i, log in enumerate(logs):
@@ -106,10 +104,8 @@ def commanded(
         values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
         command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
         channels = {**log.channels, "command": command}
-        corrected[i] = FlightLog(
-            {name: c.only((c.time >= start) & (c.time <= end)) for name, c in channels.items()},
-            log.meta,
-        )
+        flown = {n: c.only((c.time >= start) & (c.time <= end)) for n, c in channels.items()}
+        corrected[i] = replace(log, channels=flown)
         shares.append((hover, slope))
     if not shares:
         return corrected, ()
@@ -123,9 +119,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     """Throttle in hover, slope of the thrust about it, first and last time in flight [s]; None
     where nothing flies.
     """
-    channel = log["throttle"]
-    time = channel.time[channel.valid]
-    share = channel.values[channel.valid].astype(float)
+    time, values = log["throttle"].samples()
+    share = values[:, 0]
     flies = (
         share > 0.5 * np.percentile(share, 75)
         if np.any(share > 0.0)
@@ -133,7 +128,7 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     )
     place = measured(log, "pos_w")
     if place is not None:
-        height = np.interp(time, place.time[place.valid], place.values[place.valid][:, 2])
+        height = relations.on_grid(*place.samples(), time)[:, 2]
         flies &= height > np.min(height) + min(LIFTED, 0.5 * np.ptp(height))
     if np.count_nonzero(flies) < 50:
         return None
@@ -143,16 +138,11 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     hover = float(np.median(share[rows]))
     if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
         return hover, 1.0, start, end
-    acc = log["acc_b"]
+    acc = log["acc_b"].samples()
     grid = time[rows][(time[rows] > acc.time[0] + 0.2) & (time[rows] < acc.time[-1] - 0.2)]
-    felt = (
-        relations.mean_over(
-            acc.time[acc.valid], acc.values[acc.valid].astype(float)[:, 2:3], grid + LATE, 0.1
-        )[:, 0]
-        / GRAVITY
-    )
-    commanded = relations.mean_over(time, share[:, None], grid, 0.1)[:, 0] / hover
-    slope, level = np.polyfit(commanded, felt, 1)
+    force = relations.mean_over(*acc, grid + LATE, 0.1)[:, 2] / GRAVITY
+    commanded = relations.mean_over(time, values, grid, 0.1)[:, 0] / hover
+    slope, level = np.polyfit(commanded, force, 1)
     if not (SLOPES[0] < slope < SLOPES[1] and level + slope > 0.5):
         return hover, 1.0, start, end
     return hover * float(1.0 + (1.0 - level - slope) / slope), float(slope), start, end
@@ -230,11 +220,8 @@ def _thrust_unit(
     """Another unit of the commanded thrust: that in which its median comes nearest to the weight
     that it carries [N].
     """
-    medians = [
-        float(np.median(c.values[c.valid, 0]))
-        for log in logs
-        if "command" in log and np.any((c := log["command"]).valid)
-    ]
+    commands = [c for log in logs if (c := measured(log, "command")) is not None]
+    medians = [float(np.median(c.values[c.valid, 0])) for c in commands]
     ratio = float(np.median(medians)) / weight if medians else 0.0
     if not 0.0 < ratio < np.inf:
         return None

@@ -18,7 +18,7 @@ from sim.effects.setting import Setting
 from sim.params import SensingParams
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.throw.cutting import Cut
-from visthrow.diagnose.throw.initial_states import smoothed
+from visthrow.diagnose.throw.initial_states import smoothed, without_frame, without_marker
 from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight, measured
 from visthrow.logs.check.signals import highpass_sigma
 from visthrow.logs.flightlog import FlightLog
@@ -135,11 +135,6 @@ def _longer(columns: np.ndarray, rows: int) -> np.ndarray:
     return np.vstack((columns, np.zeros((rows, columns.shape[1]))))
 
 
-def _origin(x: SensingParams, points: np.ndarray) -> np.ndarray:
-    """Measured points in the world's frame [m], shape (N, 3)."""
-    return Rotation.from_rotvec(x.frame_tilt).inv().apply(points) / (1.0 + x.scale)
-
-
 class LandingHeight:
     """Height at which the payload's centre was when it came down [m]: one sample of a throw."""
 
@@ -161,13 +156,9 @@ class LandingHeight:
     def predicted(self, window: int, setting: Setting) -> np.ndarray:
         """See :class:`DirectMeasurement`."""
         x = setting.sensing
-        point = self.windows[window][1]
-        payload = _origin(x, point[None])[0] - np.array(x.payload_offset)
-        payload[2] = setting.plant.release.landing_height
-        measured = Rotation.from_rotvec(x.frame_tilt).apply(
-            payload + np.array(x.payload_offset)
-        ) * (1.0 + x.scale)
-        return measured[2:]
+        point = without_frame(x, self.windows[window][1])
+        point[2] = setting.plant.release.landing_height + x.payload_offset[2]
+        return (1.0 + x.scale) * Rotation.from_rotvec(x.frame_tilt).apply(point)[2:]
 
 
 class CameraView:
@@ -246,9 +237,8 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         return None
     valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
     stamps = channel.time[during]
-    indices = np.flatnonzero(during)
     index = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
-    points = np.asarray(channel.values, dtype=float)
+    points = np.asarray(channel.values[during], dtype=float)
     goal = (
         np.asarray(log["goal_w"].values, dtype=float)[0]
         if "goal_w" in log
@@ -279,10 +269,10 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         return None
     return view | {
         "time": stamps,
-        "points": points[indices],
+        "points": points,
         "valid": visible,
         "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
-        "sigma": max(_noise(points[indices], visible), LEAST_KEYPOINT_SIGMA),
+        "sigma": max(_noise(points, visible), LEAST_KEYPOINT_SIGMA),
     }
 
 
@@ -308,15 +298,13 @@ def _visible_keypoints(
     x = setting.sensing
     camera = setting.camera
     vehicle = time + (x.vehicle_delay - nominal.sensing.vehicle_delay)
-    frame = Rotation.from_rotvec(x.frame_tilt)
-    marker = Rotation.from_rotvec(x.marker_rotation)
-    turned = frame.inv() * view["attitude"](vehicle) * marker.inv()
+    turned = without_marker(x, view["attitude"](vehicle))
     # The mount is stated from the centre of mass as it was believed: where the weight really lies
     # moves no lens.
     off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
-    pos = _origin(x, view["vehicle"](vehicle)) - turned.apply(off)
+    pos = without_frame(x, view["vehicle"](vehicle)) - turned.apply(off)
     payload = time + (x.payload_delay - nominal.sensing.payload_delay)
-    ball = _origin(x, view["payload"](payload)) - np.array(x.payload_offset)
+    ball = without_frame(x, view["payload"](payload)) - np.array(x.payload_offset)
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
-from sim.params import GRAVITY, PlantParams, VehicleParams
+from sim.params import GRAVITY, PlantParams, SensingParams, VehicleParams
 from visthrow.common.rotations import cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
@@ -209,6 +209,17 @@ def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.
     return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
 
 
+def without_frame(x: SensingParams, vectors: np.ndarray) -> np.ndarray:
+    """Return measured points [m] or velocities [m/s], shape (..., 3), in the world's frame."""
+    return Rotation.from_rotvec(x.frame_tilt).inv().apply(vectors) / (1.0 + x.scale)
+
+
+def without_marker(x: SensingParams, measured: Rotation) -> Rotation:
+    """Return the vehicle's attitude in the world's frame from that measured of its marker body."""
+    frame = Rotation.from_rotvec(x.frame_tilt)
+    return frame.inv() * measured * Rotation.from_rotvec(x.marker_rotation).inv()
+
+
 def measured_state(
     flight: RecordedFlight, time: float, setting: Setting, payload: int, inner: States
 ) -> States:
@@ -220,38 +231,29 @@ def measured_state(
     out = {name: value.copy() for name, value in inner.items()}
     x = setting.sensing
     plant = setting.plant
-    level = Rotation.from_rotvec(x.frame_tilt).inv()
-    marker = Rotation.from_rotvec(x.marker_rotation)
-    pos, vel = smoothed(flight.vehicle, time + x.vehicle_delay) or (
-        flight.vehicle.values[0],
-        np.zeros(3),
+    (pos, vel), (quat, rate) = (
+        smoothed(samples, time + x.vehicle_delay) or (samples.values[0], np.zeros(3))
+        for samples in (flight.vehicle, flight.attitude)
     )
-    quat, rate = smoothed(flight.attitude, time + x.vehicle_delay) or (
-        flight.attitude.values[0],
-        np.zeros(3),
-    )
-    attitude = level * Rotation.from_quat(quat) * marker.inv()
-    rate = marker.apply(rate)
-    if (
-        flight.gyro is not None
-        and (turn_rate := smoothed(flight.gyro, time + x.gyro_delay)) is not None
-    ):
-        rate = turn_rate[0] - np.array(x.gyro_bias)
+    attitude = without_marker(x, Rotation.from_quat(quat))
+    rate = Rotation.from_rotvec(x.marker_rotation).apply(rate)
+    gyro = flight.gyro and smoothed(flight.gyro, time + x.gyro_delay)
+    if gyro:
+        rate = gyro[0] - np.array(x.gyro_bias)
     off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
-    pos, vel = level.apply([pos, vel]) / (1.0 + x.scale)
+    pos, vel = without_frame(x, np.array([pos, vel]))
     out["pos_w"][0] = pos - attitude.apply(off)
     out["quat_wb"][0] = attitude.as_quat()
     out["vel_w"][0] = vel - attitude.apply(cross(rate, off))
     out["rate_b"][0] = rate
-    if payload in (ATTACHED, LOOSE) and flight.payload is not None:
-        turn_rate = smoothed(flight.payload, time + x.payload_delay)
-        if turn_rate is not None:
-            point, speed = level.apply(turn_rate) / (1.0 + x.scale)
-            point = point - np.array(x.payload_offset)
-            out["payload_pos_w"][0] = point
-            out["payload_vel_w"][0] = speed
-            if payload == ATTACHED:
-                _hang(out, plant, attitude, point, speed)
+    track = flight.payload and smoothed(flight.payload, time + x.payload_delay)
+    if track and payload in (ATTACHED, LOOSE):
+        point, speed = without_frame(x, np.array(track))
+        point = point - np.array(x.payload_offset)
+        out["payload_pos_w"][0] = point
+        out["payload_vel_w"][0] = speed
+        if payload == ATTACHED:
+            _hang(out, plant, attitude, point, speed)
     return out
 
 
@@ -272,10 +274,7 @@ def _hang(
     link[-1] += plant.rope.payload_offset
     chord = np.sum(link * n, axis=0)
     chord /= np.linalg.norm(chord)
-    axis = cross(chord, reach / distance)
-    sine = float(np.linalg.norm(axis))
-    cosine = float(chord @ reach / distance)
-    turn = Rotation.from_rotvec(axis * (np.arctan2(sine, cosine) / sine if sine > 1e-12 else 0.0))
+    turn, _ = Rotation.align_vectors(reach, chord)
     n = turn.apply(n)
     u = turn.apply(u)
     lacking = speed - mount_vel - np.sum(link * u, axis=0)
@@ -284,7 +283,7 @@ def _hang(
     state["cable_vel_w"][0] = u + np.cross(spin, n)
 
 
-def hover_state(flight: RecordedFlight, plant: PlantParams, payload: int) -> States:
+def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
     """A state in hover at the flight's start: what the first window's measurements do not tell."""
     v = plant.vehicle
     rope = plant.rope
@@ -298,17 +297,13 @@ def hover_state(flight: RecordedFlight, plant: PlantParams, payload: int) -> Sta
         open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0))
     )
     down = np.array([0.0, 0.0, -1.0])
-    state = {
-        name: np.zeros((1, L, 3) if kind.endswith("[]") else (1, 3))
-        for name, kind in STATE_FIELDS.items()
-    }
-    state |= {"slack_first": np.zeros(1), "slack_last": np.zeros(1)}
+    shapes = {"real": (1,), "vec3[]": (1, L, 3)}
+    state = {name: np.zeros(shapes.get(kind, (1, 3))) for name, kind in STATE_FIELDS.items()}
     below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
     state |= {
         "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]),
         "motor_speed": np.full((1, 4), speed),
         "setpoint": flight.command[:1, 1:].copy(),
-        "gyro": np.zeros((1, 3)),
         "charge_used": np.array([used]),
         "voltage": np.array([sagged if v.battery.kind == "sag" else v.battery.reference_voltage]),
         "cable_dir_w": np.tile(down, (1, L, 1)),

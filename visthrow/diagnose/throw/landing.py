@@ -22,7 +22,7 @@ from visthrow.diagnose.throw.cutting import (
     payload_down,
 )
 from visthrow.diagnose.throw.recorded_flight import NEVER, ChannelSamples, RecordedFlight
-from visthrow.diagnose.throw.replay import Lane, ReplayedFlights
+from visthrow.diagnose.throw.replay import Lane
 
 LEAD = 1.0  # before the separation, at which the open loop begins [s]
 HEAD = 0.4  # of it, over which the initial state is fitted [s]
@@ -156,19 +156,17 @@ def _fly(
     cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
     setting, states = model.begun(theta, cuts)
     release = setting.plant.release
-    x = model.setting.sensing
     retained = [w for w, c in enumerate(cuts) if c.retained]
     flown = [replace(cuts[w], end=ends[cuts[w].flight]) for w in retained]
     looked = [_with_path(f, ends.get(n)) for n, f in enumerate(model.flights.flights)]
-    onward = ReplayedFlights(looked, flown, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
+    onward = model.cut_into(looked, flown)
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     measured = onward.fly(model.simulation(setting), states, lanes).seen
     out = np.full((len(flown), 3), np.nan)
     for i, c in enumerate(flown):
         first = 2 * int(onward.windows["vehicle_count"][i])
-        count = int(onward.windows["payload_count"][i])
         time = onward.samples[i][2].time
-        path = measured[first : first + count, i]
+        path = measured[first : first + len(time), i]
         out[i] = _crossing(
             path[time > looked[c.flight].latch + release.lag], release.landing_height
         )

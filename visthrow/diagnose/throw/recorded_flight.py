@@ -204,26 +204,22 @@ def _paired(
     common, at_pos, at_quat = np.intersect1d(
         np.round(pos.time, 7), np.round(quat.time, 7), return_indices=True
     )
-    if len(common) >= 0.2 * min(len(pos.time), len(quat.time)) and len(common) >= 5:
-        time = pos.time[at_pos]
-        return ChannelSamples(time, pos.values[at_pos], pos.sigma), ChannelSamples(
-            time, quat.values[at_quat], quat.sigma
-        )
-    index = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
-    close = (
-        (quat.time[index] - quat.time[index - 1] < BETWEEN)
-        & (pos.time >= quat.time[0])
-        & (pos.time <= quat.time[-1])
-    )
-    if np.count_nonzero(close) < 5:
+    if len(common) >= max(5, 0.2 * min(len(pos.time), len(quat.time))):
+        rows = at_pos
+        attitudes = quat.values[at_quat]
+    else:
+        index = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
+        close = quat.time[index] - quat.time[index - 1] < BETWEEN
+        rows = np.flatnonzero(close & (pos.time >= quat.time[0]) & (pos.time <= quat.time[-1]))
+        attitudes = attitude_at(quat.time, quat.values, pos.time[rows])
+    if len(rows) < 5:
         raise DiagnoseError(
             f"flight {number}: positions and attitudes of the vehicle were never measured at one"
             " time"
         )
-    time = pos.time[close]
-    return ChannelSamples(time, pos.values[close], pos.sigma), ChannelSamples(
-        time, attitude_at(quat.time, quat.values, time), quat.sigma
-    )
+    time = pos.time[rows]
+    vehicle = ChannelSamples(time, pos.values[rows], pos.sigma)
+    return vehicle, ChannelSamples(time, attitudes, quat.sigma)
 
 
 def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
@@ -242,26 +238,26 @@ def carriers(flights: Sequence[RecordedFlight]) -> list[bool]:
 
 
 def _hanging(log: FlightLog) -> bool | None:
-    if "attached" not in log or not np.any(log["attached"].valid):
-        return None
-    return bool(log["attached"].values[log["attached"].valid][0])
+    channel = measured(log, "attached")
+    return None if channel is None else bool(channel.samples().values[0, 0])
 
 
 def _latch(log: FlightLog) -> float:
     """Return when the release was commanded."""
-    if "release_command" not in log:
+    channel = measured(log, "release_command")
+    if channel is None:
         return NEVER
-    channel = log["release_command"]
-    requested = np.flatnonzero(channel.valid & (channel.values > 0.5))
-    return float(channel.time[requested[0]]) if len(requested) else NEVER
+    time, values = channel.samples()
+    return float(min(time[values[:, 0] > 0.5], default=NEVER))
 
 
 def _landing(log: FlightLog) -> tuple[float, np.ndarray | None]:
     """Time and point of the payload's landing."""
-    if "landing" in log and np.any(log["landing"].valid):
-        time, points = log["landing"].samples()
-        return float(time[0]), points[0]
-    return NEVER, None
+    channel = measured(log, "landing")
+    if channel is None:
+        return NEVER, None
+    time, points = channel.samples()
+    return float(time[0]), points[0]
 
 
 def _voltage(log: FlightLog) -> float | None:
@@ -279,9 +275,5 @@ def _payload(log: FlightLog, landing: float) -> ChannelSamples | None:
     samples = _samples(log, "payload_pos_w")
     if samples is None:
         return None
-    keep = samples.time < landing - 1e-3
-    return (
-        ChannelSamples(samples.time[keep], samples.values[keep], samples.sigma)
-        if np.count_nonzero(keep) >= 5
-        else None
-    )
+    flown = samples.during(-np.inf, landing - 1e-3)
+    return flown if len(flown.time) >= 5 else None

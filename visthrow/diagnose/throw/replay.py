@@ -4,6 +4,7 @@ of a batch share.
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import groupby, zip_longest
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,9 +66,9 @@ def grouped(windows: Sequence[int], lanes: Sequence[int], room: int) -> list[lis
     return groups
 
 
-def rough_step(setting: Setting, substep: float) -> float:
-    """Length of a rough lane's steps [s]: twice the nominal one, as far as the vehicle's shortest
-    lag allows.
+def step_lengths(setting: Setting, substep: float) -> tuple[float, float]:
+    """Return the lengths of the nominal steps and of a rough lane's [s]: twice as long, as far as
+    the vehicle's shortest lag allows.
     """
     controller = setting.plant.vehicle.controller
     motor = setting.plant.vehicle.motor
@@ -80,7 +81,7 @@ def rough_step(setting: Setting, substep: float) -> float:
     lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
     nominal = substep * np.sqrt(max(setting.step_square, FINEST))
     longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
-    return max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
+    return nominal, max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
 
 
 class Simulation:
@@ -105,12 +106,7 @@ class Simulation:
         self.replay = Replay(
             [s.plant for s in settings], [s.sensing for s in settings], device, download=download
         )
-        self.steps = np.array(
-            [
-                (substep * np.sqrt(max(s.step_square, FINEST)), rough_step(s, substep))
-                for s in settings
-            ]
-        )
+        self.steps = np.array([step_lengths(s, substep) for s in settings])
 
 
 class Lane(NamedTuple):
@@ -314,28 +310,22 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
     Returns the states, and those at the windows' ends that they lead to.
     """
     (setting,) = simulation.settings
-    by_flight: dict[int, list[int]] = {}
-    for w, c in enumerate(flights.cuts):
-        by_flight.setdefault(c.flight, []).append(w)
+    by_flight = groupby(range(len(flights.cuts)), key=lambda w: flights.cuts[w].flight)
     states: list[States | None] = [None] * len(flights.cuts)
     ends: list[States | None] = [None] * len(flights.cuts)
-    for k in range(max(map(len, by_flight.values()))):
-        windows = [ws[k] for ws in by_flight.values() if k < len(ws)]
+    for k, side_by_side in enumerate(zip_longest(*[list(group) for _, group in by_flight])):
+        windows = [w for w in side_by_side if w is not None]
         for w in windows:
             c = flights.cuts[w]
             flight = flights.flights[c.flight]
-            before = by_flight[c.flight][k - 1] if k else None
-            gap = (
-                before is None or c.start > flights.cuts[before].end + 1e-6
-            )  # in which the inner states have gone
-            inner = hover_state(flight, setting.plant, c.payload) if gap else ends[before]
+            # in a gap the inner states have gone
+            gap = k == 0 or c.start > flights.cuts[w - 1].end + 1e-6
+            inner = hover_state(flight, setting.plant) if gap else ends[w - 1]
             states[w] = measured_state(flight, c.start, setting, c.payload, inner)
             if gap:
                 states[w]["gyro"] = states[w]["rate_b"].copy()
         lanes = [Lane(w, 0, row, keep=0) for row, w in enumerate(windows)]
         flown = flights.fly(simulation, stacked([states[w] for w in windows]), lanes)
         for row, w in enumerate(windows):
-            ends[w] = {
-                name: value.copy() for name, value in rows_of(flown.ends, np.array([row])).items()
-            }
+            ends[w] = rows_of(flown.ends, np.array([row]))
     return stacked(states), stacked(ends)

@@ -145,7 +145,7 @@ class ThrowModel(Model):
             self.notes = (f"{count} are looked at: all throws, and where commands vary most",)
         return chosen
 
-    def _cut(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
+    def cut_into(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]) -> ReplayedFlights:
         """Return these windows of flights, in the time of their sensors."""
         x = self.setting.sensing
         return ReplayedFlights(flights, cuts, (x.vehicle_delay, x.payload_delay, x.gyro_delay))
@@ -154,11 +154,11 @@ class ThrowModel(Model):
         self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]
     ) -> States:
         """Take the windows without the time in which ropes were slack; returns initial states."""
-        self.flights = self._cut(flights, cuts)
+        self.flights = self.cut_into(flights, cuts)
         states, ends = self._settled_throughout(self.setting, self.flights)
         without_slack = self._without_slack(ends)
         if without_slack != cuts:
-            self.flights = self._cut(flights, without_slack)
+            self.flights = self.cut_into(flights, without_slack)
             states, _ = self._settled_throughout(self.setting, self.flights)
         return states
 
@@ -384,7 +384,7 @@ class ThrowModel(Model):
         setting = self.at(theta)
         if cuts is None:
             return setting, self._settled(setting)
-        flights = self._cut(self.flights.flights, cuts)
+        flights = self.cut_into(self.flights.flights, cuts)
         start, _ = self._settled_throughout(setting, flights)
         return setting, self._initial_fit(setting, flights).fit(start)
 

@@ -166,17 +166,14 @@ class FlyerModel(NumericModel):
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
         thrust = self._thrusts(lanes)
-        rot = self._rotations(lanes)
-        mount = self._mount(rot)
-        slope, _ = self._dynamics(lanes, thrust, rot, mount)
-        step = np.full((len(lanes.owner), 1), self.params.step)
-        path = integrate(slope, self._begin(lanes, mount), self.steps, step)
+        mount = self._mount(lanes)
+        slope, _ = self._dynamics(lanes, thrust, mount)
+        path = integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
         return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
     def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
         """See the base class."""
-        rot = self._rotations(lanes)
-        _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
+        _, quantities = self._dynamics(lanes, self._thrusts(lanes), self._mount(lanes))
         moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
         names = moments[0].keys() - {"slope"}  # which follows from the thrusts at the knots
         grid = self.params.step * np.arange(len(moments))
@@ -196,10 +193,8 @@ class FlyerModel(NumericModel):
             volts = self.of_windows(lanes, "volts") - p.reference_voltage
         sag = p.voltage_coefficient + self.size_of(lanes, "battery_sag")
         scale = (1.0 + self.size_of(lanes, "thrust_gain")) * (1.0 + sag * volts)
-        if p.torque is None:
-            return scale[:, None]
         scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
-        return scale[:, None] * (1.0 + scales)
+        return scale[:, None] * (1.0 + scales[:, : self.motors])
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
         """See the base class."""
@@ -259,20 +254,18 @@ class FlyerModel(NumericModel):
         seen = self.measure(stretch, model.simulate(lanes), lanes)
         return (seen[1:] - seen[:1]).T
 
-    def _mount(self, rot: np.ndarray) -> np.ndarray:
+    def _mount(self, lanes: Lanes) -> Sequence[np.ndarray]:
         """Return where the cable is attached, from the centre of mass, the velocity and the
-        acceleration of that point at the half steps, world frame, shape (3, half steps, B or 1, 3).
+        acceleration of that point at the half steps, world frame, each of shape (half steps, B, 3).
         """
         cable = self.params.cable
-        if cable is None or not any(cable.mount):
-            return np.zeros((3, len(rot), 1, 3))
-        arm = rot @ np.array(cable.mount)
+        if cable is None:
+            return ()
+        arm = self._rotations(lanes) @ np.array(cable.mount)
         rate = np.gradient(arm, 0.5 * self.params.step, axis=0, edge_order=2)
-        return np.array(
-            [arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)]
-        )
+        return arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)
 
-    def _begin(self, lanes: Lanes, mount: np.ndarray) -> np.ndarray:
+    def _begin(self, lanes: Lanes, mount: Sequence[np.ndarray]) -> np.ndarray:
         """States from the unknowns at the window's start."""
         unknown = lanes.nuisance
         if self.params.cable is None:
@@ -285,12 +278,12 @@ class FlyerModel(NumericModel):
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         swing = np.pad(unknown[:, 8:10], level)
         swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
-        gap = length * direction + mount[0, 0]
-        rate = length * swing + mount[1, 0]
+        gap = length * direction + mount[0][0]
+        rate = length * swing + mount[1][0]
         return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
 
     def _dynamics(
-        self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: np.ndarray
+        self, lanes: Lanes, thrust: np.ndarray, mount: Sequence[np.ndarray]
     ) -> tuple[Slope, Quantities]:
         """Return what gives the derivative of states, and what gives the quantities of laws there,
         by the half step.
@@ -304,8 +297,8 @@ class FlyerModel(NumericModel):
         pushes = self.pushes_at(lanes, halves(self.steps))
         names = [LATENT_BLOCKS[block] for block, _ in self.pushes[::3]]
         latent = dict(zip(names, np.split(pushes, len(names), axis=2)))
-        force_of = self._force(lanes, thrust, rot)
-        pulled = self._pulled(lanes, mass, gravity, mount) if p.cable is not None else None
+        force_of = self._force(lanes, thrust)
+        pulled = self._pulled(lanes, mass, gravity, wind, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
 
         def loads_at(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
@@ -314,9 +307,7 @@ class FlyerModel(NumericModel):
             return loads
 
         def hung_at(half: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            loads = loads_at(half, state)
-            _, _, direction, pull = pulled(half, state, state[:, 3:6] - wind, loads)
-            return direction, pull
+            return pulled(half, state, loads_at(half, state))[2:]
 
         quantities = self._quantities(lanes, thrust.sum(2), hung_at)
 
@@ -327,7 +318,7 @@ class FlyerModel(NumericModel):
                 for block, load in exerted(self.laws, quantities(half, state)).items():
                     loads[block] = loads.get(block, 0.0) + load
             if pulled is not None:
-                acc, acc_payload, *_ = pulled(half, state, vel - wind, loads)
+                acc, acc_payload, *_ = pulled(half, state, loads)
                 parts = [vel, acc, state[:, 9:12], acc_payload - acc]
             else:
                 parts = [vel, loads["vehicle force"] / mass + gravity]
@@ -384,9 +375,10 @@ class FlyerModel(NumericModel):
         share = (position - index)[..., None, None]
         return before + share * (measured[lane, index + 1] - before)
 
-    def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
+    def _force(self, lanes: Lanes, thrust: np.ndarray) -> Slope:
         """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
         p = self.params
+        rot = self._rotations(lanes)
         total = thrust.sum(2, keepdims=True)
         added = self.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
         drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
@@ -411,27 +403,31 @@ class FlyerModel(NumericModel):
         return force
 
     def _pulled(
-        self, lanes: Lanes, mass: np.ndarray, gravity: np.ndarray, mount: np.ndarray
+        self,
+        lanes: Lanes,
+        mass: np.ndarray,
+        gravity: np.ndarray,
+        wind: np.ndarray,
+        mount: Sequence[np.ndarray],
     ) -> Callable:
         """Return what gives accelerations of vehicle and payload, the cable's direction, and what
-        it pulls with [N], by the half step, states, velocity in the air and loads; it never pushes.
+        it pulls with [N], by the half step, states and loads; it never pushes.
         """
         payload = (self.params.cable.mass + self.size_of(lanes, "mass_payload"))[:, None]
         payload_drag = self.size_of(lanes, "payload_drag")[:, None]
         reduced = 1.0 / (1.0 / payload + 1.0 / mass)
 
-        def pulled(
-            half: int, state: np.ndarray, air: np.ndarray, loads: Mapping
-        ) -> tuple[np.ndarray, ...]:
-            gap = state[:, 6:9] - mount[0, half]
-            gap_rate = state[:, 9:12] - mount[1, half]
-            vel = air + state[:, 9:12]
+        def pulled(half: int, state: np.ndarray, loads: Mapping) -> tuple[np.ndarray, ...]:
+            arm, rate, acc = (part[half] for part in mount)
+            gap = state[:, 6:9] - arm
+            gap_rate = state[:, 9:12] - rate
+            vel = state[:, 3:6] + state[:, 9:12] - wind
             drag = -payload_drag * np.sqrt(_products(vel, vel)) * vel
             free = loads["vehicle force"] / mass + gravity
             free_payload = (drag + loads["payload force"]) / payload + gravity
             length = np.sqrt(_products(gap, gap))
             direction = gap / length
-            separation = _products(direction, free_payload - free - mount[2, half])
+            separation = _products(direction, free_payload - free - acc)
             relative = separation + _products(gap_rate, gap_rate) / length
             pull = np.maximum(relative * reduced, 0.0)
             pull_w = pull * direction

@@ -2,16 +2,15 @@
 state.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
-from scipy.spatial.transform import Rotation
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import matrix_of_quat
+from visthrow.common.rotations import matrix_of_quat, vectors_between
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -20,7 +19,10 @@ from visthrow.logs.flightlog import Channel, FlightLog
 # entries of the commands' table in a step of the integration: between them, commands switch at
 # their own times
 FINE = 16
-LEAST_SIGMA = {"rate_b": 2e-3}  # noise below which none is believed; of other channels 1e-4
+# noise below which none is believed; of other channels 1e-4
+LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
+Table = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Stamps [s], shape (n,), values, shape (n, C), and their noise, shape (C,)."""
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
@@ -45,11 +47,12 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
 
 
 def cut_flying(
-    log: FlightLog, params: QuadrotorParams, driving: Sequence[str]
-) -> Iterator[tuple[float, np.ndarray]]:
-    """Yield start [s] and held inputs of each window in which the vehicle flies and no channel of
-    ``driving`` has a large gap.
+    log: FlightLog, params: QuadrotorParams, channels: Sequence[str], driving: Sequence[str]
+) -> Iterator[tuple[float, list[Table], dict[str, Any]]]:
+    """Yield start [s], samples of ``channels``, and what the motors need, of each window in which
+    the vehicle flies and no channel of ``driving`` has a large gap.
     """
+    sigma = [sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels]
     driven = [log[name] for name in driving]
     first = max(c.time[0] for c in driven)
     last = min(c.time[-1] for c in driven)
@@ -60,39 +63,34 @@ def cut_flying(
         if all(covered(c, start, start + params.window) for c in driven):
             inputs = held_inputs(log[params.input], params, start)
             if flies(inputs, params):
-                yield start, inputs
-
-
-def read_common(
-    log: FlightLog, params: QuadrotorParams, start: float, inputs: np.ndarray
-) -> dict[str, Any]:
-    """Return what the motors of a window need."""
-    middle = np.array([start + 0.5 * params.window])
-    volts = log["battery_voltage"].hold(middle)[0] if "battery_voltage" in log else 0.0
-    since = start - float(log[params.input].time[0])
-    return {"start": start, "input": inputs, "volts": float(volts), "since": since}
+                rows = [take_samples(log[name], params, start) for name in channels]
+                tables = [(*row, sd) for row, sd in zip(rows, sigma)]
+                middle = np.array([start + 0.5 * params.window])
+                volts = log["battery_voltage"].hold(middle)[0] if "battery_voltage" in log else 0.0
+                since = start - float(log[params.input].time[0])
+                common = {"start": start, "input": inputs, "volts": float(volts), "since": since}
+                yield start, tables, common
 
 
 def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch]:
     """Cut a log, the flight of a number, into windows of a model that fly."""
     params = model.params
-    channels = model.channels
-    sigma = [sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels]
     driving = [params.position, params.attitude, params.input]
     if NEIGHBOUR in log:
         driving.append(NEIGHBOUR)
     margin = spare(params.step)
     halves = np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
     stretches = []
-    for start, inputs in cut_flying(log, params, driving):
-        rows = [take_samples(log[name], params, start) for name in channels]
-        if len(rows[0][0]) < 5 or np.min(rows[0][1][:, 2]) < params.lowest:
+    for start, tables, common in cut_flying(log, params, model.channels, driving):
+        stamps, positions, _ = tables[0]
+        if len(stamps) < 5 or np.min(positions[:, 2]) < params.lowest:
             continue
         times = start + 0.5 * params.step * halves
         quat = attitude_at(*log[params.attitude].samples(), times)
         rot = matrix_of_quat(quat)
-        guess, spread, direction = _guess(rows, channels, params, rot[margin : margin + 2])
-        data = read_common(log, params, start, inputs) | {
+        by_name = dict(zip(model.channels, tables))
+        guess, spread, direction = _guess(by_name, params, rot[margin : margin + 2])
+        data = common | {
             "rot": rot,
             "quat": quat,
             "rate": _rates(quat, params.step),
@@ -102,7 +100,6 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
         }
         if NEIGHBOUR in log:
             data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
-        tables = [(*row, sd) for row, sd in zip(rows, sigma)]
         span = start, start + params.window
         stretches.append(model.lay_out(number, "flight", tables, span, data, guess, spread))
     return stretches
@@ -172,8 +169,7 @@ def _rates(quat: np.ndarray, step: float) -> np.ndarray:
     """Return body rates at half steps by the attitudes about them [rad/s], shape (half steps,
     3).
     """
-    rot = Rotation.from_quat(quat)
-    turn = (rot[:-2].inv() * rot[2:]).as_rotvec()
+    turn = vectors_between(quat[:-2], quat[2:])
     return np.pad(turn / step, ((1, 1), (0, 0)), mode="edge")
 
 
@@ -211,22 +207,24 @@ def _offset(log: FlightLog, attitude: str) -> np.ndarray:
     return np.median(mean_over(*log["rate_b"].samples(), time, 0.06) - rate, axis=0)
 
 
-def _line(time: np.ndarray, values: np.ndarray, start: float) -> tuple[np.ndarray, np.ndarray]:
+def _line(table: Table, start: float) -> np.ndarray:
+    """Return value and slope at the start of a straight line through what follows."""
+    time, values, _ = table
     early = time <= max(start + _GUESS, time[min(3, len(time) - 1)])
-    slope, value = np.polynomial.polynomial.polyfit(time[early] - start, values[early], 1)[::-1]
-    return value, slope
+    return np.polynomial.polynomial.polyfit(time[early] - start, values[early], 1)
 
 
 def _guess(
-    rows, channels, params: FlyerParams, rot: np.ndarray
+    tables: Mapping[str, Table], params: FlyerParams, rot: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Unknowns at the start, their spread, and the cable's direction there.
 
-    ``rot``: attitudes at the start and half a step later, shape (2, 3, 3).
+    ``tables``: samples of each channel; ``rot``: attitudes at the start and half a step later,
+    shape (2, 3, 3).
     """
-    tables = dict(zip(channels, rows))
-    start = float(rows[0][0][0])
-    pos, vel = _line(*rows[0], start)
+    measured = tables[params.position]
+    start = float(measured[0][0])
+    pos, vel = _line(measured, start)
     guess = [*pos, *vel]
     spread = [0.1] * 3 + [1.0] * 3
     direction = np.array([0.0, 0.0, -1.0])
@@ -234,7 +232,7 @@ def _guess(
     if params.cable is not None:
         table = tables["payload_pos_w"]
         if len(table[0]) >= 4:
-            pos_p, vel_p = _line(*table, start)
+            pos_p, vel_p = _line(table, start)
             arm, next_arm = rot @ np.array(params.cable.mount)
             gap = pos_p - pos - arm
             direction = gap / np.linalg.norm(gap)
@@ -244,7 +242,7 @@ def _guess(
         guess += [0.0, 0.0, *swing[:2]]
         spread += [0.1, 0.1, 1.0, 1.0]
     if params.torque is not None:
-        _, rate = tables["rate_b"]
+        _, rate, _ = tables["rate_b"]
         guess += list(rate[0]) if len(rate) else [0.0] * 3
         spread += [1.0] * 3
     return np.array(guess), np.array(spread), direction

@@ -15,14 +15,11 @@ from visthrow.diagnose.models.numeric import (
     Stretch,
     halves,
     integrate,
-    sigma_of,
-    take_samples,
 )
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, in_all
 from visthrow.diagnose.models.quadrotor.flyer_params import QuadrotorParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
     cut_flying,
-    read_common,
 )
 from visthrow.logs.check.relations import Relation, derivative, relate
 from visthrow.logs.flightlog import FlightLog, Samples
@@ -30,7 +27,6 @@ from visthrow.logs.flightlog import FlightLog, Samples
 CHANNELS = ("acc_b", "rate_b")
 UNREAD = frozenset({"pos_w", "quat_wb", "payload_pos_w"})
 OFFSET = 0.5  # deviation of what an accelerometer in flight is off by [m/s^2]
-QUIETEST = (1e-2, 2e-3)  # noise of accelerometer and gyro below which none is believed
 # correlation of angular acceleration with the commands' torques, from which inertia is told: 0.99
 # in simulated flights, 0.2 to 0.5 in fast flights of a Crazyflie, which the air turns as well
 FOLLOWS = 0.8
@@ -71,15 +67,12 @@ class ImuModel(FlyerModel):
     def windows_of(self, log: FlightLog, number: int) -> list[Stretch]:
         """See the base class."""
         p = self.params
-        sigma = [sigma_of(log[name], floor) for name, floor in zip(CHANNELS, QUIETEST)]
         stretches = []
-        for start, inputs in cut_flying(log, p, self.needed):
-            (time, acc), (gyro_time, rate) = (take_samples(log[n], p, start) for n in CHANNELS)
-            tables = [(time, acc[:, 2:], sigma[0][2:]), (gyro_time, rate, sigma[1])]
-            data = read_common(log, p, start, inputs)
-            begin = [*rate[0], 0.0], [1.0, 1.0, 1.0, OFFSET]
+        for start, (force, gyro), data in cut_flying(log, p, CHANNELS, self.needed):
+            time, acc, noise = force
+            tables = [(time, acc[:, 2:], noise[2:]), gyro][: len(self.channels)]
+            begin = [*gyro[1][0], 0.0], [1.0, 1.0, 1.0, OFFSET]
             span = start, start + p.window
-            tables = tables[: len(self.channels)]
             stretches.append(self.lay_out(number, "flight", tables, span, data, *begin))
         return stretches
 
@@ -98,10 +91,9 @@ class ImuModel(FlyerModel):
         def slope(half: int, rate: np.ndarray) -> np.ndarray:
             return turning(half, rate, pushes[half, :, -3:])
 
-        step = np.full((len(lanes.owner), 1), self.params.step)
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
         if "rate_b" in self.channels:
-            rates = integrate(slope, lanes.nuisance[:, :3], self.steps, step)
+            rates = integrate(slope, lanes.nuisance[:, :3], self.steps, self.params.step)
         gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
