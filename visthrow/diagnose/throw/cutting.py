@@ -50,7 +50,7 @@ def _split(first: float, last: float) -> list[tuple[float, float]]:
 
 
 def _phase(flight: RecordedFlight, first: float, last: float) -> str:
-    pos = flight.vehicle.values[flight.vehicle.between(first, last)]
+    pos = flight.vehicle.during(first, last).values
     if len(pos) < 2:
         return "flight"
     reach = np.ptp(pos, axis=0) / (last - first)
@@ -91,13 +91,10 @@ def cut(
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
     cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
-    until = [
-        cuts[max(i - 1, 0)].phase for i in range(len(cuts))
-    ]  # the first window's own: nothing is known of before
     return [
-        replace(c, at_rest=phase == "hover")
-        for c, phase in zip(cuts, until)
-        if _is_visible(flight, c)
+        replace(c, at_rest=before.phase == "hover")
+        for before, c in pairwise([*cuts[:1], *cuts])  # of before the first nothing is known
+        if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST
     ]
 
 
@@ -144,8 +141,3 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
         for p in pieces
         if p.end - p.start > 1e-6
     ]
-
-
-def _is_visible(flight: RecordedFlight, c: Cut) -> bool:
-    span = flight.vehicle.between(c.start, c.end)
-    return span.stop - span.start >= POSES_LEAST

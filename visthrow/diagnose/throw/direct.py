@@ -110,6 +110,7 @@ def with_direct(
         time, values, sigma = kind.samples(number)
         plain = kind.predicted(number, settings[0])
         columns = np.zeros((len(time), len(steps)))
+        behind = (0, len(time)), (0, 0)
         for k in np.flatnonzero(steps):
             perturbed = settings[1 + k]
             if (
@@ -125,14 +126,10 @@ def with_direct(
             channel=np.append(window.channel, np.full(len(time), channels.index(kind.channel))),
             sigma=np.append(window.sigma, np.full(len(time), sigma)),
             effects=np.vstack((window.effects, columns)),
-            nuisance=_longer(window.nuisance, len(time)),
-            latent=_longer(window.latent, len(time)),
+            nuisance=np.pad(window.nuisance, behind),
+            latent=np.pad(window.latent, behind),
         )
     return window
-
-
-def _longer(columns: np.ndarray, rows: int) -> np.ndarray:
-    return np.vstack((columns, np.zeros((rows, columns.shape[1]))))
 
 
 class LandingHeight:

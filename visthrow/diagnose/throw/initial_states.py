@@ -190,10 +190,10 @@ def _smoothed(
     samples: ChannelSamples, instant: float, before: float, after: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
-        span = samples.between(instant - reach * before, instant + reach * after)
-        if span.stop - span.start >= LEAST_SAMPLES:
-            time = samples.time[span] - instant
-            values = samples.values[span]
+        near = samples.during(instant - reach * before, instant + reach * after)
+        if len(near.time) >= LEAST_SAMPLES:
+            time = near.time - instant
+            values = near.values
             if values.shape[1] == 4:
                 return _smoothed_turn(time, values)
             fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)

@@ -39,13 +39,9 @@ class ChannelSamples:
         default_factory=dict, repr=False, compare=False
     )  # what they say about times that were asked for before
 
-    def between(self, first: float, last: float) -> slice:
-        """Samples with first <= time < last."""
-        return slice(*np.searchsorted(self.time, (first, last)))
-
     def during(self, first: float, last: float) -> "ChannelSamples":
-        """Samples with first <= time < last, by themselves."""
-        span = self.between(first, last)
+        """Return the samples with first <= time < last."""
+        span = slice(*np.searchsorted(self.time, (first, last)))
         return ChannelSamples(self.time[span], self.values[span], self.sigma)
 
 
