@@ -162,15 +162,14 @@ def _fly(
     onward = model.cut_into(looked, flown)
     lanes = [Lane(i, 0, w) for i, w in enumerate(retained)]
     measured = onward.fly(model.simulation(setting), states, lanes).seen
-    out = np.full((len(flown), 3), np.nan)
+    points = []
     for i, c in enumerate(flown):
         first = 2 * int(onward.windows["vehicle_count"][i])
         time = onward.samples[i][2].time
         path = measured[first : first + len(time), i]
-        out[i] = _crossing(
-            path[time > looked[c.flight].latch + release.lag], release.landing_height
-        )
-    return out
+        free = time > looked[c.flight].latch + release.lag
+        points.append(_crossing(path[free], release.landing_height))
+    return np.array(points)
 
 
 def _approach(model: Any, number: int, begin: float, end: float) -> list[Cut]:
