@@ -5,7 +5,7 @@ worth on flights that it never saw.
 cases whose names hold it. Three tables:
 
 - sets: each through `explain`. No KNOWN may stand where an interval of the held-out gain includes
-  0. With test flights, what the setup that `apply` writes wins back there, of what is above the
+  0. With test flights, what the sizes that `apply` writes win back there, of what is above the
   noise.
 - traps: flights that somebody spoilt. What is said must name what was done, or refuse with that
   reason.
@@ -25,10 +25,14 @@ from pathlib import Path
 
 import numpy as np
 
+from examples.gimbal.gimbal_model import SLUNG_LOAD, GimbalModel
+from examples.pendulum.swing_model import ENCODER, PendulumModel
+from examples.trim.trim_model import E8, E9, UNTRIMMED, TrimModel
 from visthrow.common import provenance, workers
 from visthrow.common.storage import write_json
 from visthrow.diagnose.apply import patch
 from visthrow.diagnose.inputs import setup as setups
+from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.reporting import diagnosis_report as report
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import result
@@ -67,11 +71,14 @@ mass = 0.010
 """
 """One of two vehicles on one load, as if it carried it alone."""
 
-UNTRIMMED = """base = "crazypad.toml"
-[trim]
-motor_scale = [1.0, 1.0, 1.0, 1.0]
-"""
-"""The published thrust of four motors alike, as before anybody fitted this drone."""
+EXAMPLES: dict[str, tuple[str, Callable[[Logs], NumericModel]]] = {
+    "pendulum": ("pendulum_encoder", lambda logs: PendulumModel(logs, ENCODER)),
+    "gimbal": ("slungload_camera", lambda logs: GimbalModel(logs, SLUNG_LOAD)),
+    "trim of E8": ("crazypad", lambda logs: TrimModel(logs, E8)),
+    "trim of E9": ("crazypad", lambda logs: TrimModel(logs, E9)),
+    "untrimmed": ("crazypad", lambda logs: TrimModel(logs, UNTRIMMED)),
+}
+"""Models of examples, each with the setup that maps its columns."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,7 @@ class Case:
     """One question."""
 
     name: str
-    setup: str  # of configs/diagnose, or the text of one
+    setup: str  # of configs/diagnose, the text of one, or one of EXAMPLES
     files: tuple[str, ...]  # below the folder of the data
     change: Callable[[Logs], Logs] = list
     test: tuple[str, ...] = ()  # flights that nothing is estimated from
@@ -248,8 +255,8 @@ def _without(files: Sequence[str], setup: str, name: str) -> list[Case]:
 SETS = (
     *_without(NANO, "nanobench_cf21", "nanobench"),
     *_without(CF, "cf_payload", "payload_cf_single"),
-    Case("set slungload, bag 17 unseen", "slungload_camera", SLUNG[:1], test=SLUNG[1:]),
-    Case("set slungload, bag 16 unseen", "slungload_camera", SLUNG[1:], test=SLUNG[:1]),
+    Case("set slungload, bag 17 unseen", "gimbal", SLUNG[:1], test=SLUNG[1:]),
+    Case("set slungload, bag 16 unseen", "gimbal", SLUNG[1:], test=SLUNG[:1]),
     Case("set jugglebot, session 3 unseen", "jugglebot", BALLS[:1], test=BALLS[1:]),
     Case("set jugglebot, session 7 unseen", "jugglebot", BALLS[1:], test=BALLS[:1]),
     *(
@@ -264,10 +271,10 @@ SETS = (
         for n, file in zip((7, 3), BALLS)
         for k in range(3)
     ),
-    Case("set pendulum", "pendulum_encoder", SWING),
+    Case("set pendulum", "pendulum", SWING),
     Case(
         "set pendulum, last third unseen",
-        "pendulum_encoder",
+        "pendulum",
         SWING,
         cut(0.0, 0.667),
         test=(f"{SWING[0]}@0.667",),
@@ -275,7 +282,7 @@ SETS = (
     *(
         Case(
             f"set crazypad {drone}, log03 unseen",
-            UNTRIMMED,
+            "untrimmed",
             (f"{PAD}normal_flight__{drone}_log00.csv.gz",),
             test=(f"{PAD}normal_flight__{drone}_log03.csv.gz",),
         )
@@ -291,7 +298,7 @@ SETS = (
     *(
         Case(
             f"set crazypad {n.split('__')[0]}",
-            "crazypad_e9" if "E9" in n else "crazypad",
+            "trim of E9" if "E9" in n else "trim of E8",
             (f"{PAD}{n}.csv.gz",),
         )
         for n in (
@@ -385,7 +392,7 @@ PARTS = (
     *(
         Case(
             f"part slungload {Path(f).name[7:9]} {k + 1} of 3",
-            "slungload_camera",
+            "gimbal",
             (f,),
             cut(k / 3, (k + 1) / 3),
             of="slungload",
@@ -416,7 +423,7 @@ PARTS = (
     *(
         Case(
             f"part pendulum {k + 1} of 3",
-            "pendulum_encoder",
+            "pendulum",
             SWING,
             cut(k / 3, (k + 1) / 3),
             of="pendulum",
@@ -426,7 +433,7 @@ PARTS = (
     *(
         Case(
             f"part crazypad E8 log0{k}",
-            UNTRIMMED,
+            "untrimmed",
             (f"{PAD}normal_flight__E8_log0{k}.csv.gz",),
             of="crazypad E8",
         )
@@ -435,15 +442,17 @@ PARTS = (
 )
 
 
-def _setup_file(text: str, folder: Path) -> str:
-    """Name or path of a case's setup."""
-    if "\n" not in text:
-        return text
-    path = folder / "setup.toml"
-    path.write_text(
-        re.sub(r'base = "(\w+)\.toml"', lambda m: f'base = "diagnose/{m[1]}.toml"', text)
-    )
-    return str(path)
+def _opened(text: str, folder: Path) -> tuple[str, Callable[[Logs], NumericModel]]:
+    """Return the setup that reads a case's logs, and what makes its model of them."""
+    if text in EXAMPLES:
+        return EXAMPLES[text]
+    name = text
+    if "\n" in text:
+        name = str(folder / "setup.toml")
+        base = re.sub(r'base = "(\w+)\.toml"', r'base = "diagnose/\1.toml"', text)
+        Path(name).write_text(base)
+    setup = setups.load(name)
+    return name, lambda logs: setups.model_of(setup, logs)
 
 
 def _read(files: Sequence[str], data: Path, setup: str) -> Logs:
@@ -461,12 +470,11 @@ def run(task: tuple[Case, Path]) -> dict:
     case, data = task
     begun = resource.getrusage(resource.RUSAGE_SELF).ru_utime
     with tempfile.TemporaryDirectory() as folder:
-        name = _setup_file(case.setup, Path(folder))
-        setup = setups.load(name)
+        name, model_of = _opened(case.setup, Path(folder))
         known = setups.known(name)
         logs = case.change(_read(case.files, data, name))
         try:
-            diagnosis = diagnose(logs, setups.model_of(setup, logs), vehicle=known)
+            diagnosis = diagnose(logs, model_of(logs), vehicle=known)
             said = report.summary(diagnosis)
         except Exception as error:  # what a user would be told
             said = f"error: {error}\n" + "\n".join(
@@ -500,22 +508,22 @@ def run(task: tuple[Case, Path]) -> dict:
         if case.expect:
             row["ok"] = bool(re.search(case.expect, said))
         if case.test and diagnosis.theta:
-            row["unseen"] = _unseen(
-                diagnosis, name, setup, case.of_test(_read(case.test, data, name)), Path(folder)
-            )
+            unseen = case.of_test(_read(case.test, data, name))
+            row["unseen"] = _unseen(diagnosis, model_of(unseen), model_of(unseen))
         return row | {"cpu_s": resource.getrusage(resource.RUSAGE_SELF).ru_utime - begun}
 
 
-def _unseen(diagnosis, name: str, setup, logs: Logs, folder: Path) -> dict[str, list[float]]:
-    """Errors of the plain setup and of the one that apply writes on other flights, and of noise
-    alone.
+def _unseen(
+    diagnosis: result.Diagnosis, plain: NumericModel, extended: NumericModel
+) -> dict[str, list[float]]:
+    """Return errors on other flights of the plain model and of one with the sizes that `apply`
+    writes, and of noise alone.
     """
-    whole = report.to_json(diagnosis, extra={"model": setup.model})
-    base = str(Path(name).resolve()) if Path(name).is_file() else f"diagnose/{name}.toml"
-    (folder / "extended.toml").write_text(patch.of_setup(base, setup, whole, name, ()))
-    extended = setups.model_of(setups.load(folder / "extended.toml"), logs)
-    found = on_others(setups.model_of(setup, logs), extended, {}, diagnosis).errors
-    return {channel: list(errors) for channel, errors in found.items()}
+    written = report.to_json(diagnosis)
+    sizes, _ = patch.with_scatter(*patch.read(written, "the diagnosis"), written)
+    extended.extend(sizes)
+    measured = on_others(plain, extended, {}, diagnosis).errors
+    return {channel: list(errors) for channel, errors in measured.items()}
 
 
 def won_back(errors: Sequence[float]) -> float:

@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from examples.pendulum.swing_model import PendulumModel, PendulumParams
+from examples.trim.trim_model import TrimModel, TrimParams
 from visthrow.common.errors import VisthrowError
 from visthrow.diagnose.models.numeric import NumericModel
-from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
-from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.select import diagnose_flights
 from visthrow.logs.flightlog import Channel, FlightLog
 

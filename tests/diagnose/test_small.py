@@ -132,7 +132,7 @@ def test_an_unknown_of_a_model_without_laws_says_so(tmp_path, monkeypatch, print
     assert f"no law outside the catalogue is looked for: {setups.MODELS['stand'].lawless}" in said
 
 
-@mark.parametrize("kind", ["gimbal", "stand"])
+@mark.parametrize("kind", ["imu", "stand"])
 def test_models_without_laws_say_why(kind, tmp_path, capsys):
     law = {
         "formula": "F = c z",
@@ -144,7 +144,7 @@ def test_models_without_laws_say_why(kind, tmp_path, capsys):
     }
     given = {
         "model": kind,
-        "config": "slungload_camera",
+        "config": "motor_stand",
         "theta": {},
         "covariance": [],
         "findings": [],

@@ -18,6 +18,9 @@ from visthrow.task import rewards
 from visthrow.training import trainer
 
 BALLS = ROOT / "tests" / "data" / "real" / "jugglebot_throws" / "session7.csv.gz"
+SWING = ROOT / "tests" / "data" / "real" / "pendulum_single" / "single_pendulum_id.csv.gz"
+FAULTS = ROOT / "tests" / "data" / "real" / "crazypad_faults"
+VIEWS = ROOT / "tests" / "data" / "slungload_camera"
 LONGEST = 60
 """Lines of a program."""
 
@@ -30,13 +33,24 @@ RUNS = {
     "add_source": ("--seconds 0.5", "the policy's command is"),
     "fly_keypoints": ("", "thrust [N]"),
     "step_simulator": ("--count 2 --seconds 0.1", "the first ball at"),
+    "pendulum/diagnose_swing": (f"{SWING}", "FOUND  dry friction"),
+    "gimbal/diagnose_gimbal": (
+        f"{VIEWS}/rosbag_16.csv.gz {VIEWS}/rosbag_17.csv.gz --test {VIEWS}/rosbag_17.csv.gz",
+        "tested, marker_pos_c",
+    ),
+    "trim/diagnose_trim": (
+        f"{FAULTS}/cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz --fit",
+        "motor_rl: thrust times 0.6",
+    ),
 }
 """Program -> its arguments, and what it prints."""
 
 
 def run(name: str, words: str, monkeypatch) -> None:
+    program = ROOT / "examples" / f"{name}.py"
     monkeypatch.setattr(sys, "argv", [name, *words.split()])
-    runpy.run_path(str(ROOT / "examples" / f"{name}.py"), run_name="__main__")
+    monkeypatch.syspath_prepend(program.parent)  # as Python does for a program that is a file
+    runpy.run_path(str(program), run_name="__main__")
 
 
 @mark.parametrize("name", RUNS)
@@ -105,7 +119,10 @@ def test_a_detector_finds_what_its_network_says(monkeypatch):
 
 
 def test_every_example_is_short_and_run():
-    programs = {path.stem: path for path in (ROOT / "examples").glob("*.py")}
+    """A model may stand beside its program, in a folder of the two."""
+    examples = ROOT / "examples"
+    paths = [p for p in examples.rglob("*.py") if not p.stem.endswith("_model")]
+    programs = {path.relative_to(examples).with_suffix("").as_posix(): path for path in paths}
     assert set(programs) == {
         *RUNS,
         "calibrate_camera",
@@ -114,5 +131,8 @@ def test_every_example_is_short_and_run():
         "add_detector",
         "add_reward",
     }
-    for path in programs.values():
-        assert len(path.read_text().splitlines()) <= LONGEST, path.name
+    for name, path in programs.items():
+        assert len(path.read_text().splitlines()) <= LONGEST, name
+    for model in examples.rglob("*_model.py"):
+        assert any(program.parent == model.parent for program in programs.values())
+        assert model.parent != examples

@@ -268,8 +268,8 @@ def test_other_models_have_extended_setups(diagnosis, tmp_path):
 def test_what_does_not_belong_to_a_setup_is_refused(diagnosis, tmp_path, refused):
     out = tmp_path / "x.toml"
     refused(
-        f"diagnose apply {diagnosis(**BALL)} --config pendulum_encoder --out {out}",
-        said="of the model 'ball'; the model of diagnose/pendulum_encoder.toml is pendulum",
+        f"diagnose apply {diagnosis(**BALL)} --config motor_stand --out {out}",
+        said="of the model 'ball'; the model of diagnose/motor_stand.toml is stand",
     )
     out.write_text('base = "diagnose/jugglebot.toml"\n[effects]\nball_drag = 0.4\n')
     for theta, unit, name, message in (

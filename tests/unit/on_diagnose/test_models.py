@@ -10,13 +10,13 @@ import numpy as np
 from numpy.linalg import norm
 from numpy.random import default_rng
 from pytest import approx, mark, raises
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from bench.diagnose import beside_aeroid, flown
 from bench.diagnose.flown import LATE, G, ball_log, fly
 from tests.commands import run_command
 from tests.flightlogs import log_at, with_channels
+from tests.places import DATA
 from tests.plants import paper_plant
 from visthrow import config
 from visthrow.common.errors import ConfigError, DiagnoseError, LogError
@@ -24,20 +24,16 @@ from visthrow.diagnose.inputs import fit as fitting
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
-from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
-from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.logs.export import export
 from visthrow.logs.flightlog import Channel, FlightLog
 
 BALL = BallParams(G, 0.0, 0.02, 0.3, 1)
-SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
 STAND = StandParams(1.5e-6, 2e-8, 0.0, 0.1, 11.0, 0.02, 0.01, 0.05, 0.02, 100.0)
 QUADROTOR = {
     "input": "motor_command",
@@ -63,21 +59,6 @@ FLYER = FlyerParams(
 )
 TORQUE = TorqueParams((1.6e-5, 1.6e-5, 3e-5), 0.03, 0.03, 0.006, (1.0, -1.0, -1.0, 1.0))
 IMU = ImuParams(**QUADROTOR, step=0.01, torque=TORQUE)
-
-
-def swing_log(
-    length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0
-) -> FlightLog:
-    def slope(_, state):
-        angle, rate = state
-        friction = viscous * rate + coulomb * np.tanh(rate / 0.02) + quadratic * abs(rate) * rate
-        return [rate, -G / length * np.sin(angle) - friction]
-
-    time = np.arange(0.0, seconds, 0.005)
-    angle = solve_ivp(
-        slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10
-    ).y[0]
-    return log_at(time, angle=angle + offset + default_rng(1).normal(0, noise, len(time)))
 
 
 def found(model, names) -> dict[str, tuple[float, float]]:
@@ -140,32 +121,6 @@ class TestBall:
         still = log_at(time, payload_pos_w=np.zeros((len(time), 3)))
         with raises(LogError, match="no stretch"):
             BallModel([still], BALL)
-
-
-class TestPendulum:
-    def test_small_swings_have_the_period_of_theory(self):
-        model = PendulumModel([swing_log(noise=1e-9)], SWING)
-        assert max(np.max(np.abs(r)) for r in model.residuals({})) < 1e-5
-
-    def test_frictions_are_told_apart(self):
-        log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
-        names = [
-            "pendulum_length",
-            "viscous_friction",
-            "coulomb_friction",
-            "quadratic_drag",
-            "encoder_offset",
-        ]
-        estimates = found(PendulumModel([log], SWING), names)
-        truth = {
-            "pendulum_length": 0.01,
-            "viscous_friction": 0.05,
-            "coulomb_friction": 0.1,
-            "quadratic_drag": 0.02,
-            "encoder_offset": 0.01,
-        }
-        assert all(near(estimates, name, truth[name]) for name in names), estimates
-        assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
 
 
 class TestStand:
@@ -350,28 +305,6 @@ class TestFlyer:
             replace(FLYER, input="thrust_command", torque=TORQUE)
 
 
-TRIM = TrimParams(
-    "motor_command",
-    "pos_w",
-    "vel_w",
-    0.03,
-    G,
-    (0.0, 0.15, 0.0),
-    3.8,
-    0.0,
-    (1.0, 1.0, 1.0, 1.0),
-    0.03,
-    0.006,
-    (1.0, -1.0, -1.0, 1.0),
-    0.2,
-    0.5,
-    0.5,
-    0.003,
-    0.01,
-    5e-4,
-)
-
-
 class TestImu:
     """Motors' commands, accelerometer and gyro, and nothing else."""
 
@@ -447,87 +380,26 @@ class TestImu:
         assert any("no torque or inertia" in reason for reason in diagnosis.reasons)
 
 
-def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
-    """Hover in which each motor is told its share of the weight's quarter."""
-    rng = default_rng(seed)
-    time = np.arange(0, 8, 0.01)
-    command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
-    pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
-    vel = rng.normal(0, 0.01, (len(time), 3))
-    return log_at(time, pos_w=pos, vel_w=vel, motor_command=command)
-
-
-class TestTrim:
-    def test_one_weak_motor(self):
-        estimates = found(
-            TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM),
-            ["motor_fl", "motor_fr", "motor_rl", "motor_rr"],
-        )
-        assert estimates["motor_rl"][0] == approx(-0.2, abs=0.02)
-        assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
-
-
-class TestGimbal:
-    PARAMS = GimbalParams(
-        (0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0
-    )
-
-    def logs(self, tilt=(0.0, 0.0, 0.0), focal=1.0, delay=0.0) -> list[FlightLog]:
-        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
-        of scipy's.
-        """
-        rng = default_rng(2)
-        time = np.arange(0, 20, 1 / 30)
-
-        def seen(t):
-            turn = Rotation.from_euler(
-                "ZYX",
-                np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
-            )
-            gap = np.column_stack(
-                [0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)]
-            )
-            gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
-            local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
-            return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
-
-        turn, gap, _ = seen(time)
-        point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
-        gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
-        log = log_at(
-            time,
-            pos_w=np.tile([0, 0, 4.0], (len(time), 1)),
-            quat_wb=turn.as_quat(),
-            payload_pos_w=gap + [0, 0, 4],
-            marker_pos_c=point + rng.normal(0, 0.005, point.shape),
-            gimbal=gimbal,
-        )
-        return [log]
-
-    def test_tilt_delay_and_focal_length_are_found(self):
-        model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)
-        estimates = found(
-            model,
-            ["camera_tilt_x", "camera_tilt_y", "camera_tilt_z", "camera_delay", "focal_scale"],
-        )
-        truth = {
-            "camera_tilt_x": 0.02,
-            "camera_tilt_y": -0.015,
-            "camera_tilt_z": 0.01,
-            "camera_delay": 0.06,
-            "focal_scale": -0.03,
-        }
-        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), (
-            estimates
-        )
-
-
 class TestSetups:
     def test_one_model_a_setup(self):
         with raises(ConfigError, match="ball and stand: a setup has only one model"):
             setups.Setup("", ball=BALL, stand=STAND)
         with raises(ConfigError, match="has no model"):
             setups.model_of(setups.Setup("bare"), [])
+
+    @mark.parametrize("table", setups.EXAMPLES)
+    def test_a_model_that_moved_says_where_it_is(self, table, tmp_path):
+        (tmp_path / "mine.toml").write_text(f'about = "mine"\n[{table}]\nwindow = 1.0\n')
+        with raises(ConfigError, match=rf"mine.toml: the model \[{table}\] .* examples/{table} "):
+            setups.load(tmp_path / "mine.toml")
+
+    def test_a_mapping_without_a_model_names_its_program(self, refused):
+        swing = DATA / "real" / "pendulum_single" / "single_pendulum_id.csv.gz"
+        for command in ("explain", "fit"):
+            refused(
+                f"diagnose {command} {swing} --config pendulum_encoder",
+                said="its model is a program of the repository: examples/pendulum",
+            )
 
     def test_a_simulated_vehicle_gets_what_a_flight_showed(self):
         sizes = {"motor_tau": 0.007, "mass_quad": 0.01, "rotor_drag_xy": 0.02}

@@ -6,21 +6,16 @@ With the environment variable VISTHROW_REAL_DATA naming a folder of the full dat
 files are looked at."""
 
 import os
-import re
 from pathlib import Path
 
 import numpy as np
 from pytest import approx, mark
 
-from tests.commands import run_command
 from tests.places import DATA
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.result import (
     CANDIDATE,
-    FOUND,
-    IN_PART,
-    KNOWN,
     NAMED,
     NO_EFFECT,
     UNKNOWN,
@@ -91,46 +86,6 @@ def test_two_drones_run_on_two_clocks():
 
 
 @mark.slow
-def test_pendulum_has_three_frictions():
-    diagnosis, named, rms = explained(
-        "pendulum_encoder", REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
-    )
-    assert diagnosis.overall == IN_PART  # what is left is a hundred times the encoder's noise
-    assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named
-    assert diagnosis["pendulum_length"].estimate == approx(-0.0167, abs=3e-4)
-    assert diagnosis["encoder_scale"].verdict != FOUND  # a spring at the joint does the same
-    assert rms(diagnosis.theta) < 0.1 * rms({})
-
-
-def test_a_cut_propeller_is_found_and_tape_is_not():
-    folder = REAL / "crazypad_faults"
-    diagnosis, named, _ = explained(
-        "crazypad", folder / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
-    )
-    assert diagnosis.overall == KNOWN
-    assert "motor_rl" in named
-    assert diagnosis["motor_rl"].estimate == approx(-0.15, abs=0.04)
-    assert set(diagnosis.theta) <= {"motor_rl", "added_rl"}
-    diagnosis, named, _ = explained("crazypad", folder / "tape_on_propeller_M3__E8_log00.csv.gz")
-    assert diagnosis.overall == NO_EFFECT
-    assert not named
-
-
-@mark.slow
-def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
-    """Windows of one sample without a state at their start: the motor that is named predicts the
-    parts that were left out.
-    """
-    flight = REAL / "crazypad_faults" / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
-    code = run_command(f"diagnose explain {flight} --config crazypad --no-blind --out {tmp_path}")
-    assert code == 0
-    said = capsys.readouterr().out
-    assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", said)
-    assert "nan" not in said
-    assert (tmp_path / "report.html").is_file()
-
-
-@mark.slow
 def test_cable_is_ten_millimetres_longer_and_thrust_stronger():
     flights = [REAL / "payload_cf_single" / f"log{number}.csv.gz" for number in (204, 205, 206)]
     diagnosis, named, rms = explained("cf_payload", *flights)
@@ -166,16 +121,3 @@ def test_a_motor_idles_and_a_hundred_motors_are_not_one():
     diagnosis, named, _ = explained("motor_stand", table)
     assert diagnosis.overall != NO_EFFECT
     assert "thrust_voltage" not in named
-
-
-def test_the_camera_sees_the_load_nearer_the_axis():
-    diagnosis, named, rms = explained(
-        "slungload_camera", *sorted((DATA / "slungload_camera").glob("*.gz"))
-    )
-    assert "focal_scale" in named
-    assert diagnosis["focal_scale"].estimate == approx(
-        -0.12, abs=0.025
-    )  # -0.11 in these pieces, -0.13 in the whole bags
-    assert named & {"camera_tilt_x", "marker_rot_y"}
-    assert named & {"camera_tilt_y", "marker_rot_x"}
-    assert rms(diagnosis.theta) < 0.6 * rms({})

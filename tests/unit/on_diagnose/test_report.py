@@ -25,6 +25,7 @@ from visthrow.diagnose.throw.landing import PredictedLandings
 from visthrow.view import page
 
 SWING = str(DATA / "real" / "pendulum_single" / "single_pendulum_id.csv.gz")
+STAND = str(DATA / "real" / "motor_prop_stand" / "all_tests.csv.gz")
 TRUTH = {"effect_03": 12.0, "effect_04": -9.0}
 
 
@@ -303,9 +304,9 @@ def test_the_recording_is_written(tmp_path, found):
         ("plan nothing.npz --hall nan,5,3", "--hall nan,5,3: expected lengths above 0"),
         ("plan nothing.npz --hall 5,5,0.5", "a height above 0.8 m"),
         ("plan nothing.npz --manoeuvres hoover", "did you mean 'hover'"),
-        (f"explain {SWING} --config pendulum_encoder --only=", "no effect ''"),
+        (f"explain {STAND} --config motor_stand --only=", "no effect ''"),
         (
-            f"explain {SWING} --config pendulum_encoder --test other.csv --no-report",
+            f"explain {STAND} --config motor_stand --test other.csv --no-report",
             "other.csv: no such file",
         ),
         (f"explain nothing.npz --out {SWING}", "single_pendulum_id.csv.gz is no folder"),

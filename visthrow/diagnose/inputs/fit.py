@@ -18,7 +18,7 @@ from sim.params import VehicleParams, changed
 from visthrow import config
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.setup import Setup
-from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.models.model_interface import Model, Window
 from visthrow.logs.flightlog import FlightLog
 
 DEFAULT_FREE = {
@@ -33,7 +33,6 @@ DEFAULT_FREE = {
     ),
     "imu": ("thrust_gain", "thrust_curve", "motor_tau", "cmd_delay", "inertia_xy", "inertia_z"),
     "stand": ("thrust_gain", "thrust_linear", "load_cell_zero", "power_gain", "idle_power"),
-    "trim": ("motor_fl", "motor_fr", "motor_rl", "motor_rr"),
 }
 """Model -> effects that are fitted where none are named; what cannot be told from the logs keeps
 its prior.
@@ -94,25 +93,31 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     after = model.residuals(problem.sizes(point.theta))
     units = tuple(model.effects[i].unit for i in columns)
     covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    channel = np.concatenate([w.channel for w in before])
-    measured = ([w.residual for w in before], after)
-    rms = [
-        {
-            name: float(np.sqrt(np.mean(value[channel == i] ** 2)))
-            for i, name in enumerate(model.channels)
-            if np.any(channel == i)
-        }
-        for value in map(np.concatenate, measured)
-    ]
+    rms_before = _rms(model, before, [w.residual for w in before])
+    rms_after = _rms(model, before, after)
     return FitResult(
         tuple(free),
         units,
         sizes,
         covariance,
         identified,
-        *rms,
-        middle_speed=model.middle_speed,
+        rms_before,
+        rms_after,
+        model.middle_speed,
     )
+
+
+def _rms(
+    model: Model, windows: Sequence[Window], residuals: Sequence[np.ndarray]
+) -> dict[str, float]:
+    """Return the residual of each channel that the windows hold, in its unit."""
+    channel = np.concatenate([w.channel for w in windows])
+    squares = np.concatenate(residuals) ** 2
+    return {
+        name: float(np.sqrt(np.mean(squares[channel == i])))
+        for i, name in enumerate(model.channels)
+        if np.any(channel == i)
+    }
 
 
 def vehicle_of(setup: Setup, result: FitResult, base: VehicleParams) -> VehicleParams:

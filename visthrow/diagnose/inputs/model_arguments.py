@@ -61,7 +61,7 @@ class Opened:
         args = self._args
         logs = self.logs
         chosen = setup.load(args.config) if args.config else None
-        if chosen is None or not chosen.model:
+        if chosen is None or not (chosen.model or chosen.example):
             model, self.logs = throw_model(args, logs)
         elif args.overrides:
             raise ConfigError(

@@ -5,35 +5,34 @@ parameters.
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.gimbal import GimbalModel, GimbalParams
 from visthrow.diagnose.models.law_terms import term_of
-from visthrow.diagnose.models.model_interface import Model
-from visthrow.diagnose.models.pendulum import PendulumModel, PendulumParams
-from visthrow.diagnose.models.quadrotor.flyer import FlyerModel, FlyerParams
+from visthrow.diagnose.models.numeric import NumericModel
+from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
+from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
 from visthrow.diagnose.models.quadrotor.imu import UNREAD, ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
-from visthrow.diagnose.models.trim import TrimModel, TrimParams
 from visthrow.logs import read_all, takes_mapping
 from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap
 
 VELOCITIES = frozenset({"vel_w", "vel_b", "payload_vel_w"})  # which no model of a vehicle reads
-MODELS = {
+MODELS: dict[str, Any] = {
     "ball": BallModel,
-    "pendulum": PendulumModel,
     "stand": StandModel,
-    "gimbal": GimbalModel,
     "flyer": FlyerModel,
     "imu": ImuModel,
-    "trim": TrimModel,
 }
 """Table of a setup -> the model that it parametrises."""
+
+EXAMPLES = ("gimbal", "pendulum", "trim")
+"""Tables of earlier versions, whose models are programs under ``examples`` now."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +43,14 @@ class Setup:
     """
 
     about: str  # whose logs these are
+    example: str = ""  # folder of the program that holds the model, where no table does
     table: TableMap | None = (
         None  # of tables' columns; None: the logs say themselves what they hold
     )
     ball: BallParams | None = None
-    pendulum: PendulumParams | None = None
     stand: StandParams | None = None
-    gimbal: GimbalParams | None = None
     flyer: FlyerParams | None = None
     imu: ImuParams | None = None
-    trim: TrimParams | None = None
     effects: dict[str, float] = field(
         default_factory=dict
     )  # sizes that a diagnosis found, written by apply
@@ -72,17 +69,22 @@ class Setup:
         return next((name for name in MODELS if getattr(self, name) is not None), "")
 
 
-def model_of(setup: Setup, logs: Sequence[FlightLog]) -> Model:
+def model_of(setup: Setup, logs: Sequence[FlightLog]) -> NumericModel:
     """Make the model that a setup holds logs against.
 
     Raises ConfigError: it has none; LogError: logs hold nothing to hold the model against, or an
     effect or law is none of the model's."""
+    if not setup.model and setup.example:
+        raise ConfigError(
+            f"the setup '{setup.about}' only reads the columns; its model is a program of the"
+            f" repository: {setup.example}"
+        )
     if not setup.model:
         raise ConfigError(
             f"the setup '{setup.about}' has no model; expected a table of one of:"
             f" {', '.join(MODELS)}"
         )
-    model = MODELS[setup.model](logs, getattr(setup, setup.model))
+    model: NumericModel = MODELS[setup.model](logs, getattr(setup, setup.model))
     model.extend(setup.effects, setup.laws)
     return model
 
@@ -92,7 +94,16 @@ def load(name: str | Path) -> Setup:
 
     Raises ConfigError: there is none, or it does not fill the schema.
     """
-    return config.load(Setup, config.find("diagnose", str(name)))
+    try:
+        return config.load(Setup, config.find("diagnose", str(name)))
+    except ConfigError as error:
+        for table in EXAMPLES:
+            if f" {table}: unknown key" in str(error):
+                raise ConfigError(
+                    f"{name}: the model [{table}] is a program of the repository now; copy"
+                    f" examples/{table} and change its numbers"
+                ) from None
+        raise
 
 
 def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:

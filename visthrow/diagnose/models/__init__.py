@@ -1,3 +1,3 @@
-"""Small models beside the whole throw: a ball, a pendulum, a motor stand, a camera, a quadrotor
-alone, one with a payload.
+"""Small models beside the whole throw: a ball, a motor stand, a quadrotor alone, one with a
+payload; and what a model of your own is made of.
 """

@@ -1,5 +1,5 @@
-"""Catalogues of the setups' models: the files of ``configs/model_effects``, in the numbers that a
-setup gives.
+"""Catalogues of models: the files of ``configs/model_effects``, and those of others, in the numbers
+that a model's parameters give.
 """
 
 from dataclasses import dataclass, field, replace

@@ -74,7 +74,7 @@ class NumericModel(Model, ABC):
     # latent block and axis of each latent force, and the number of its knots over a window
     pushes: Sequence[tuple[int, int]]
     knot_count: int
-    table: str  # file of the catalogue
+    table: str  # effects: a file of configs/model_effects by its name, or another by its path
     needed: Sequence[str] = ()  # channels without which a log holds no window
     inputs: Sequence[str] = ()  # channels that are there and drive the simulation
 
@@ -97,7 +97,7 @@ class NumericModel(Model, ABC):
         )
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
-        self._slopes: list[np.ndarray] | None = None
+        self._slopes: list[np.ndarray] = []  # by the unknowns at the start
         self._base = np.zeros(
             len(self.effects)
         )  # sizes that the model has before anything is found
@@ -171,7 +171,8 @@ class NumericModel(Model, ABC):
         """Return latent forces of lanes at shares of a window's span, shape (T, B, pushes)."""
         weights = triangles(shares, np.linspace(0.0, 1.0, self.knot_count))
         latent = lanes.latent.reshape(len(lanes.latent), -1, self.knot_count)
-        return np.einsum("bpk,tk->tbp", latent, weights)
+        forces: np.ndarray = np.einsum("bpk,tk->tbp", latent, weights)
+        return forces
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
         """Give the model what a diagnosis found: sizes are counted, and bounded, from there; laws
@@ -263,13 +264,16 @@ class NumericModel(Model, ABC):
         Raises LogError for an effect that it does not know.
         """
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
-        return self._base + np.array([float(theta.get(name, 0.0)) for name in self.numbers])
+        sizes = np.array([float(theta.get(name, 0.0)) for name in self.numbers])
+        total: np.ndarray = self._base + sizes
+        return total
 
     def of_windows(self, lanes: Lanes, name: str) -> np.ndarray:
         """Return an entry of the windows' data, of one shape in all windows, a row for each
         lane.
         """
-        return np.array([s.data[name] for s in self.stretches])[lanes.owner]
+        values = np.array([s.data[name] for s in self.stretches])
+        return np.take(values, lanes.owner, axis=0)
 
     def size_of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
@@ -286,7 +290,7 @@ class NumericModel(Model, ABC):
     def windows(self, theta: Mapping[str, float]) -> list[Window]:
         """See :class:`visthrow.diagnose.models.model_interface.Model`."""
         size = self.size(theta)
-        self._slopes = None
+        self._slopes = []
         residuals = self._settle(size)
         self._slopes = self._slopes_by_start(size)
         residuals = self._from_prior(residuals)
@@ -349,7 +353,7 @@ class NumericModel(Model, ABC):
         residuals = self._off(size, self._start)
         if not self._start.shape[1]:
             return residuals
-        if self._slopes is None:
+        if not self._slopes:
             self._slopes = self._slopes_by_start(size)
         aims = self._aims(residuals, self._start)
         for _ in range(SETTLE_STEPS):
@@ -426,7 +430,8 @@ class NumericModel(Model, ABC):
 
 def _costs(aims: list[np.ndarray]) -> np.ndarray:
     """Return the sum of squares of each window; infinite where a simulation ran away."""
-    return np.nan_to_num([aim @ aim for aim in aims], nan=np.inf, posinf=np.inf)
+    squares = np.array([aim @ aim for aim in aims])
+    return np.where(np.isnan(squares), np.inf, squares)
 
 
 def _holds(log: FlightLog, name: str) -> bool:

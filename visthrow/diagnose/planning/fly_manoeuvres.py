@@ -19,7 +19,7 @@ from visthrow.common.rotations import matrix_of_quat
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
-from visthrow.diagnose.models.trim import command_of
+from visthrow.diagnose.models.thrust_map import command_of
 from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for

@@ -1,8 +1,9 @@
-"""A pendulum on an encoder: natural frequency, friction of three kinds, and errors of
-the encoder.
+"""A model of a pendulum on an encoder: natural frequency, friction of three kinds, and errors of
+the encoder. Its effects stand in ``effects.toml``.
 """
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.interpolate import CubicHermiteSpline
@@ -53,13 +54,27 @@ class PendulumParams(Bounded):
         return self.gravity / self.length
 
 
+ENCODER = PendulumParams(
+    gravity=9.81,  # at sea level in the middle latitudes
+    length=0.17,  # the plain model's, from the period of the last swings
+    hanging=3.141592653589793,  # the data's SOURCE.md
+    viscous=0.0,  # the plain model has no friction
+    coulomb=0.0,  # as above
+    quadratic=0.0,  # as above
+    window=2.0,  # about two swings
+    step=0.01,  # a hundredth of a swing
+    every=5,  # 100 Hz
+)
+"""The pendulum of dynamicslab (MultiArm-Pendulum)."""
+
+
 class PendulumModel(NumericModel):
     """Free swings, cut into windows.
 
     Convention: the pendulum swings in the plane of world x and z; forces are those on a bob of 1 kg
     at the pendulum's length."""
 
-    table = "pendulum"
+    table = str(Path(__file__).with_name("effects.toml"))
     pushes = ((2, 0), (2, 2))
     knot_count = 11
     channels = needed = (CHANNEL,)

@@ -1,10 +1,13 @@
-"""A camera that sees a marker on the payload, against motion capture of vehicle and payload.
+"""A model of a camera that sees a marker on the payload, against motion capture of both bodies.
+
+Its effects stand in ``effects.toml``.
 
 Convention: a gimbal under the vehicle turns about its x axis, then about its own y axis; the camera
 stands off along the gimbal's x axis; its optical axis is that x axis, its image's x to the right, y
 down."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -41,12 +44,27 @@ class GimbalParams(Bounded):
     largest: Positive  # detections further than this from the prediction are of something else [m]
 
 
+SLUNG_LOAD = GimbalParams(
+    base_b=(0.0, 0.0, -0.107),  # the authors' geometry (the data's SOURCE.md)
+    camera_offset=0.025,  # as above
+    camera_axes_deg=(-90.0, 0.0, -90.0),  # as above: about x, then about z
+    marker_z=0.0,  # the plain model: the marker is at the tracked centre of the load
+    sigma_across=0.02,  # scatter of detections from frame to frame
+    sigma_along=0.05,  # the size of a marker tells its distance less well
+    stabilised=False,  # with angles against the horizon the residual is four times as large
+    window=10.0,  # three swings
+    every=3,  # neighbouring detections err alike
+    largest=1.0,  # a marker at twice the distance is another one
+)
+"""A 1.8 kg multirotor with 0.46 kg on a cable of about 3 m."""
+
+
 class GimbalModel(NumericModel):
     """Windows of the marker's positions in the camera's frame."""
 
     lawless = "it is geometry, in which no force moves anything"
 
-    table = "gimbal"
+    table = str(Path(__file__).with_name("effects.toml"))
     pushes = ((2, 0), (2, 1), (2, 2))
     knot_count = 11
     channels = (CHANNEL,)

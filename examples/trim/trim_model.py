@@ -1,17 +1,19 @@
-"""Mean commands of the four motors in slow flight: what feedback had to do so that forces and
-torques balance.
+"""A model of the mean commands of the four motors in slow flight: what feedback had to do so that
+forces and torques balance. Its effects stand in ``effects.toml``.
 
 Where neither attitude nor rates are logged, the balance still tells: thrusts must carry the weight
 and turn nothing."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
+from visthrow.diagnose.models.thrust_map import command_of
 from visthrow.logs.check.relations import derivative
 from visthrow.logs.flightlog import FlightLog
 
@@ -40,10 +42,38 @@ class TrimParams(Bounded):
     com_spread: Positive  # of its centre of mass: the pack is not where it was [m]
 
 
+E8 = TrimParams(
+    command="motor_wanted",
+    position="est_pos_w",
+    velocity="est_vel_w",
+    mass=0.033,  # 27 g and Lighthouse deck 2.7 g, card deck 1.6 g, holder (Bitcraze's weights)
+    gravity=9.81,  # at sea level in the middle latitudes
+    # 60 gf of four motors at full: the firmware's own compensation (Bitcraze)
+    thrust_map=(0.0, 0.1471, 0.0),
+    reference_voltage=3.5,  # middle of these flights
+    voltage_coefficient=0.0,  # the value is compensated for the battery
+    # `diagnose_trim.py --fit` of normal_flight log00 and log03
+    motor_scale=(0.980, 0.815, 0.791, 1.017),
+    arm=0.0325,  # 92 mm from motor to motor across (Bitcraze)
+    torque_ratio=0.006,  # Foerster 2015
+    spin=(1.0, -1.0, -1.0, 1.0),  # neighbours turn against each other
+    lowest=0.25,  # above the ground effect
+    slowest_window=0.5,  # a gait of control
+    fastest=0.6,  # their plan flies at 0.3 m/s
+    spread=0.01,  # of a window's mean, by draught and control
+    motor_spread=0.015,  # E8's third unharmed flight differs by 1 % in the right motors
+    com_spread=0.0012,  # and by 7 % in both left ones: a pack that sits 1.2 mm further
+)
+"""CrazyPAD's Crazyflie 2.1 of this name."""
+E9 = replace(E8, motor_scale=(0.975, 0.842, 0.784, 0.902))  # likewise fitted
+UNTRIMMED = replace(E8, motor_scale=(1.0, 1.0, 1.0, 1.0))
+"""The published thrust of four motors alike, as before anybody fitted a drone."""
+
+
 class TrimModel(NumericModel):
     """Means over windows of slow level flight."""
 
-    table = "trim"
+    table = str(Path(__file__).with_name("effects.toml"))
     pushes = ((0, 2), (1, 0), (1, 1), (1, 2))  # a push along the vertical, then three torques
     knot_count = 2
 
@@ -136,11 +166,3 @@ class TrimModel(NumericModel):
             "vel_w": np.tile(data["vel"], (2, 1)),
             "thrust": np.full(2, self.params.mass * self.params.gravity * data["lift"]),
         }
-
-
-def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
-    """Command at which the map gives a thrust."""
-    c0, c1, c2 = thrust_map
-    if c2 == 0.0:
-        return (thrust - c0) / c1
-    return (-c1 + np.sqrt(np.maximum(c1 * c1 - 4.0 * c2 * (c0 - thrust), 0.0))) / (2.0 * c2)

@@ -1,0 +1,259 @@
+"""The models of examples against physics of another hand: scipy's integrator, closed forms, planted
+parameters found again; and on recorded data of others.
+"""
+
+import re
+
+import numpy as np
+from numpy.random import default_rng
+from pytest import approx, mark, raises
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from examples.gimbal.gimbal_model import SLUNG_LOAD, GimbalModel, GimbalParams
+from examples.pendulum.swing_model import ENCODER, PendulumModel, PendulumParams
+from examples.trim.trim_model import E8, TrimModel, TrimParams
+from tests.flightlogs import log_at
+from tests.places import DATA
+from tests.unit.on_diagnose.test_models import found, near
+from visthrow.common.errors import LogError
+from visthrow.diagnose.inputs import setup as setups
+from visthrow.diagnose.reporting.explain_cli import write_report
+from visthrow.diagnose.select.result import FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT
+from visthrow.diagnose.select.search import explain
+from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.readers import table
+
+G = 9.81
+REAL = DATA / "real"
+SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
+TRIM = TrimParams(
+    "motor_command",
+    "pos_w",
+    "vel_w",
+    0.03,
+    G,
+    (0.0, 0.15, 0.0),
+    3.8,
+    0.0,
+    (1.0, 1.0, 1.0, 1.0),
+    0.03,
+    0.006,
+    (1.0, -1.0, -1.0, 1.0),
+    0.2,
+    0.5,
+    0.5,
+    0.003,
+    0.01,
+    5e-4,
+)
+
+
+def swing_log(
+    length=0.2, viscous=0.0, coulomb=0.0, quadratic=0.0, offset=0.0, noise=2e-4, seconds=12.0
+) -> FlightLog:
+    def slope(_, state):
+        angle, rate = state
+        friction = viscous * rate + coulomb * np.tanh(rate / 0.02) + quadratic * abs(rate) * rate
+        return [rate, -G / length * np.sin(angle) - friction]
+
+    time = np.arange(0.0, seconds, 0.005)
+    angle = solve_ivp(
+        slope, (0, seconds), [1.2, 0.0], t_eval=time, max_step=0.005, rtol=1e-9, atol=1e-10
+    ).y[0]
+    return log_at(time, angle=angle + offset + default_rng(1).normal(0, noise, len(time)))
+
+
+class TestPendulum:
+    def test_small_swings_have_the_period_of_theory(self):
+        model = PendulumModel([swing_log(noise=1e-9)], SWING)
+        assert max(np.max(np.abs(r)) for r in model.residuals({})) < 1e-5
+
+    def test_frictions_are_told_apart(self):
+        log = swing_log(0.21, viscous=0.05, coulomb=0.1, quadratic=0.02, offset=0.01)
+        names = [
+            "pendulum_length",
+            "viscous_friction",
+            "coulomb_friction",
+            "quadratic_drag",
+            "encoder_offset",
+        ]
+        estimates = found(PendulumModel([log], SWING), names)
+        truth = {
+            "pendulum_length": 0.01,
+            "viscous_friction": 0.05,
+            "coulomb_friction": 0.1,
+            "quadratic_drag": 0.02,
+            "encoder_offset": 0.01,
+        }
+        assert all(near(estimates, name, truth[name]) for name in names), estimates
+        assert estimates["pendulum_length"][0] == approx(0.01, rel=0.02)
+
+
+def hover_log(shares=(1.0, 1.0, 1.0, 1.0), seed=0) -> FlightLog:
+    """Hover in which each motor is told its share of the weight's quarter."""
+    rng = default_rng(seed)
+    time = np.arange(0, 8, 0.01)
+    command = 0.03 * G / 4 / 0.15 * np.array(shares) + rng.normal(0, 0.004, (len(time), 4))
+    pos = np.tile([0, 0, 0.6], (len(time), 1)) + rng.normal(0, 1e-3, (len(time), 3))
+    vel = rng.normal(0, 0.01, (len(time), 3))
+    return log_at(time, pos_w=pos, vel_w=vel, motor_command=command)
+
+
+class TestTrim:
+    def test_one_weak_motor(self):
+        estimates = found(
+            TrimModel([hover_log((1.0, 1.0, 1.25, 1.0))], TRIM),
+            ["motor_fl", "motor_fr", "motor_rl", "motor_rr"],
+        )
+        assert estimates["motor_rl"][0] == approx(-0.2, abs=0.02)
+        assert all(near(estimates, f"motor_{name}", 0.0) for name in ("fl", "fr", "rr"))
+
+
+class TestGimbal:
+    PARAMS = GimbalParams(
+        (0.0, 0.0, -0.1), 0.02, (-90.0, 0.0, -90.0), 0.0, 0.01, 0.02, False, 4.0, 1, 1.0
+    )
+
+    def logs(self, tilt=(0.0, 0.0, 0.0), focal=1.0, delay=0.0) -> list[FlightLog]:
+        """A payload that swings below a vehicle that looks down; the marker by a chain of rotations
+        of scipy's.
+        """
+        rng = default_rng(2)
+        time = np.arange(0, 20, 1 / 30)
+
+        def seen(t):
+            turn = Rotation.from_euler(
+                "ZYX",
+                np.column_stack([0.3 * np.sin(0.4 * t), 0.1 * np.sin(t), 0.12 * np.cos(1.3 * t)]),
+            )
+            gap = np.column_stack(
+                [0.5 * np.sin(1.8 * t), 0.4 * np.cos(1.7 * t), -3.0 + 0.1 * np.sin(t)]
+            )
+            gimbal = Rotation.from_euler("XY", [0.05, np.pi / 2])
+            local = gimbal.inv().apply(turn.inv().apply(gap) - [0, 0, -0.1]) - [0.02, 0, 0]
+            return turn, gap, np.column_stack([-local[:, 1], -local[:, 2], local[:, 0]])
+
+        turn, gap, _ = seen(time)
+        point = Rotation.from_rotvec(tilt).apply(seen(time - delay)[2]) * [focal, focal, 1.0]
+        gimbal = np.tile([0.05, np.pi / 2], (len(time), 1))
+        log = log_at(
+            time,
+            pos_w=np.tile([0, 0, 4.0], (len(time), 1)),
+            quat_wb=turn.as_quat(),
+            payload_pos_w=gap + [0, 0, 4],
+            marker_pos_c=point + rng.normal(0, 0.005, point.shape),
+            gimbal=gimbal,
+        )
+        return [log]
+
+    def test_tilt_delay_and_focal_length_are_found(self):
+        model = GimbalModel(self.logs((0.02, -0.015, 0.01), 0.97, 0.06), self.PARAMS)
+        estimates = found(
+            model,
+            ["camera_tilt_x", "camera_tilt_y", "camera_tilt_z", "camera_delay", "focal_scale"],
+        )
+        truth = {
+            "camera_tilt_x": 0.02,
+            "camera_tilt_y": -0.015,
+            "camera_tilt_z": 0.01,
+            "camera_delay": 0.06,
+            "focal_scale": -0.03,
+        }
+        assert all(abs(estimates[name][0] - value) < 0.003 for name, value in truth.items()), (
+            estimates
+        )
+
+
+SWUNG = REAL / "pendulum_single" / "single_pendulum_id.csv.gz"
+CUT = REAL / "crazypad_faults" / "cut_propeller_M3_2.5mm_2.5mm_42mm__E8_log00.csv.gz"
+TAPED = REAL / "crazypad_faults" / "tape_on_propeller_M3__E8_log00.csv.gz"
+SEEN = DATA / "slungload_camera" / "rosbag_16.csv.gz"
+
+
+def named_in(diagnosis) -> set[str]:
+    return {f.name for f in diagnosis.findings if f.verdict in NAMED}
+
+
+def error_of(model, theta) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(model.residuals(theta)) ** 2)))
+
+
+@mark.slow
+def test_pendulum_has_three_frictions():
+    model = PendulumModel(setups.read_logs([SWUNG], "pendulum_encoder"), ENCODER)
+    diagnosis = explain(model)
+    assert diagnosis.overall == IN_PART  # what is left is a hundred times the encoder's noise
+    assert {"pendulum_length", "coulomb_friction", "quadratic_drag"} <= named_in(diagnosis)
+    assert diagnosis["pendulum_length"].estimate == approx(-0.0167, abs=3e-4)
+    assert diagnosis["encoder_scale"].verdict != FOUND  # a spring at the joint does the same
+    assert error_of(model, diagnosis.theta) < 0.1 * error_of(model, {})
+
+
+def test_a_cut_propeller_is_found_and_tape_is_not():
+    diagnosis = explain(TrimModel(setups.read_logs([CUT], "crazypad"), E8))
+    assert diagnosis.overall == KNOWN
+    assert "motor_rl" in named_in(diagnosis)
+    assert diagnosis["motor_rl"].estimate == approx(-0.15, abs=0.04)
+    assert set(diagnosis.theta) <= {"motor_rl", "added_rl"}
+    diagnosis = explain(TrimModel(setups.read_logs([TAPED], "crazypad"), E8))
+    assert diagnosis.overall == NO_EFFECT
+    assert not named_in(diagnosis)
+
+
+@mark.slow
+def test_means_are_held_out_and_have_a_page(tmp_path, capsys):
+    """Windows of one sample without a state at their start: the motor that is named predicts the
+    parts that were left out.
+    """
+    logs = setups.read_logs([CUT], "crazypad")
+    model = TrimModel(logs, E8)
+    write_report(tmp_path, explain(model), model, logs, seed=0, limits=False)
+    said = capsys.readouterr().out
+    assert re.search(r"held-out error of motor_wanted: 0.066\d? -> 0.02\d+, [56]\d % less", said)
+    assert "nan" not in said
+    assert (tmp_path / "report.html").is_file()
+
+
+def test_the_camera_sees_the_load_nearer_the_axis():
+    paths = sorted((DATA / "slungload_camera").glob("*.gz"))
+    model = GimbalModel(setups.read_logs(paths, "slungload_camera"), SLUNG_LOAD)
+    diagnosis = explain(model)
+    named = named_in(diagnosis)
+    assert "focal_scale" in named
+    # -0.11 in these pieces, -0.13 in the whole bags
+    assert diagnosis["focal_scale"].estimate == approx(-0.12, abs=0.025)
+    assert named & {"camera_tilt_x", "marker_rot_y"}
+    assert named & {"camera_tilt_y", "marker_rot_x"}
+    assert error_of(model, diagnosis.theta) < 0.6 * error_of(model, {})
+
+
+def swung(columns: dict) -> PendulumModel:
+    mapping = setups.load("pendulum_encoder").table
+    return PendulumModel(table.logs_of(columns, mapping, "a table"), ENCODER)
+
+
+def filmed(columns: dict) -> GimbalModel:
+    mapping = setups.load("slungload_camera").table
+    return GimbalModel(table.logs_of(columns, mapping, "a table"), SLUNG_LOAD)
+
+
+@mark.parametrize(
+    ("model", "path", "change", "words"),
+    [
+        (swung, SWUNG, lambda t: {"theta_rad": np.nan * t["theta_rad"]}, "missing .* angle"),
+        (swung, SWUNG, lambda t: {"theta_rad": np.degrees(t["theta_rad"])}, "degrees, or another"),
+        (filmed, SEEN, lambda t: {"l_px": np.nan * t["l_px"]}, "missing everywhere: payload_pos_w"),
+        (
+            filmed,
+            SEEN,
+            lambda t: {"d_px": t["d_py"], "d_py": t["d_px"]},
+            "other axes, another unit, or another marker",
+        ),
+    ],
+)
+def test_spoiled_channels_are_refused(model, path, change, words):
+    columns = table.read_table(path)
+    assert model(columns).stretches  # as it is, it can be looked at
+    with raises(LogError, match=words):
+        model(columns | change(columns))
