@@ -2,6 +2,7 @@
 that a model's parameters give.
 """
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cache
 from operator import attrgetter
@@ -29,17 +30,20 @@ class ModelEffect(Effect):
     def for_params(self, params: Any) -> "ModelEffect":
         """Return the effect in the parameters' numbers."""
 
-        def scaled(name: str, value: float) -> float:
-            for factor in filter(None, self.times.get(name, "").split(" * ")):
-                value *= attrgetter(factor)(params)
-            return value
+        def scale(field_name: str) -> float:
+            """Return what a field is a multiple of."""
+            factors = filter(None, self.times.get(field_name, "").split(" * "))
+            product: float = math.prod(attrgetter(factor)(params) for factor in factors)
+            return product
 
-        low, high = (scaled("bounds", bound) for bound in self.bounds)
+        low, high = (bound * scale("bounds") for bound in self.bounds)
+        if self.lowest:
+            low = -attrgetter(self.lowest)(params)
         return replace(
             self,
-            bounds=(-attrgetter(self.lowest)(params) if self.lowest else low, high),
-            prior_sd=scaled("prior_sd", self.prior_sd),
-            floor=scaled("floor", self.floor),
+            bounds=(low, high),
+            prior_sd=self.prior_sd * scale("prior_sd"),
+            floor=self.floor * scale("floor"),
             channels=tuple(name.format_map(vars(params)) for name in self.channels),
         )
 

@@ -16,7 +16,7 @@ import numpy as np
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
-from visthrow.diagnose.models.law_terms import carries, exerted, term_of
+from visthrow.diagnose.models.law_terms import Term, carries, exerted, term_of
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.logs.check.signals import noise
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -91,10 +91,11 @@ class NumericModel(Model, ABC):
                 " model explains"
             )
         driving = set(self.inputs) - set(self.channels)
-        self.effects = tuple(
-            replace(e, channels=tuple(c for c in e.channels if c not in driving))
-            for e in self.catalogue()
-        )
+        effects = []
+        for effect in self.catalogue():
+            shown_by = tuple(c for c in effect.channels if c not in driving)
+            effects.append(replace(effect, channels=shown_by))
+        self.effects = tuple(effects)
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
         self._slopes: list[np.ndarray] = []  # by the unknowns at the start
@@ -184,22 +185,26 @@ class NumericModel(Model, ABC):
         for effect, size in zip(self.effects, base):
             if beyond := beyond_bounds(effect, size):
                 raise LogError(f"{beyond} in this model")
-        first = self.stretches[0]
-        lanes = self._lanes(base)
-        known = self.knots(lanes, self.simulate(lanes))[0] if laws else {}
-        for term in map(term_of, laws):
-            lacking = sorted(term.needs - known.keys())
-            if not lacking and not carries(first.latent_block, term.block):
-                lacking = [term.block]
-            if lacking:
-                reason = self.lawless or f"this model has no {', '.join(lacking)}"
-                raise LogError(f"the law {term.formula} cannot act here: {reason}")
+        if laws:
+            lanes = self._lanes(base)
+            known = self.knots(lanes, self.simulate(lanes))[0]
+            for law in laws:
+                self._expect_law(term_of(law), known)
         self._base = base
         self.laws = (*self.laws, *laws)
-        self.effects = tuple(
-            replace(e, bounds=(e.bounds[0] - b, e.bounds[1] - b))
-            for e, b in zip(self.effects, base.tolist())
-        )
+        shifted = []
+        for effect, size in zip(self.effects, base.tolist()):
+            low, high = effect.bounds
+            shifted.append(replace(effect, bounds=(low - size, high - size)))
+        self.effects = tuple(shifted)
+
+    def _expect_law(self, term: Term, known: Mapping[str, np.ndarray]) -> None:
+        lacking = sorted(term.needs - known.keys())
+        if not lacking and not carries(self.stretches[0].latent_block, term.block):
+            lacking = [term.block]
+        if lacking:
+            reason = self.lawless or f"this model has no {', '.join(lacking)}"
+            raise LogError(f"the law {term.formula} cannot act here: {reason}")
 
     def choose(self, names: Sequence[str]) -> None:
         """Keep these effects alone. Raises DiagnoseError for one that it does not know."""
@@ -277,11 +282,9 @@ class NumericModel(Model, ABC):
 
     def size_of(self, lanes: Lanes, name: str) -> np.ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
-        return (
-            lanes.theta[:, self.numbers[name]]
-            if name in self.numbers
-            else np.zeros(len(lanes.owner))
-        )
+        if name not in self.numbers:
+            return np.zeros(len(lanes.owner))
+        return lanes.theta[:, self.numbers[name]]
 
     def stack(self, lanes: Lanes, *names: str) -> np.ndarray:
         """Sizes of several effects, shape (B, N); zeros for an empty name."""
@@ -358,22 +361,20 @@ class NumericModel(Model, ABC):
         aims = self._aims(residuals, self._start)
         for _ in range(SETTLE_STEPS):
             steps = np.array([self._newton(i, aim) for i, aim in enumerate(aims)])
-            before = costs = _costs(aims)
+            before = _costs(aims)
             for shrink in (1.0, 0.3):
                 if not np.any(steps):
                     break
                 trial = self._start + shrink * steps
-                residuals_after = self._off(size, trial)
-                aims_after = self._aims(residuals_after, trial)
-                costs_after = _costs(aims_after)
-                for i in np.flatnonzero(costs_after < costs):
-                    residuals[i] = residuals_after[i]
-                    aims[i] = aims_after[i]
-                better = (costs_after < costs)[:, None]
-                self._start = np.where(better, trial, self._start)
-                steps = np.where(better, 0.0, steps)
-                costs = np.minimum(costs, costs_after)
-            if np.max(before - costs) < 2 * SETTLED:
+                trial_residuals = self._off(size, trial)
+                trial_aims = self._aims(trial_residuals, trial)
+                better = _costs(trial_aims) < _costs(aims)
+                for i in np.flatnonzero(better):
+                    residuals[i] = trial_residuals[i]
+                    aims[i] = trial_aims[i]
+                self._start = np.where(better[:, None], trial, self._start)
+                steps[better] = 0.0
+            if np.max(before - _costs(aims)) < 2 * SETTLED:
                 break
         return residuals
 
