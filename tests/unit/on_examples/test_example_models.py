@@ -20,7 +20,7 @@ from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting.explain_cli import write_report
 from visthrow.diagnose.select.result import FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT
-from visthrow.diagnose.select.search import explain
+from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers import table
 
