@@ -19,8 +19,8 @@ from tests.unit.on_diagnose.test_models import found, near
 from visthrow.common.errors import LogError
 from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.reporting.explain_cli import write_report
-from visthrow.diagnose.select.result import FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT
 from visthrow.diagnose.select.diagnose_flights import explain
+from visthrow.diagnose.select.result import FOUND, IN_PART, KNOWN, NAMED, NO_EFFECT
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.readers import table
 
