@@ -10,7 +10,7 @@ its bound, the link's delay less.)
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -40,8 +40,9 @@ class Mistake:
     nats: float  # by which it beats the log as it stands
     logs: int  # that can tell
     ways: int = 1  # that commands may be wrong in so: their logarithm is the price
-    # of the command (thrust and rates), shape (4, 4); none where it was made anew
-    change: np.ndarray | None = field(default=None, compare=False)
+    change: tuple[
+        tuple[float, ...], ...
+    ] = ()  # of the command (thrust and rates), shape (4, 4); none where it was made anew
 
     @property
     def sentence(self) -> str:
@@ -56,7 +57,7 @@ class Mistake:
         if "command" not in log:
             return log
         c = log["command"]
-        values = np.asarray(c.values, dtype=float) @ self.change.T
+        values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
         return replace(log, channels={**log.channels, "command": replace(c, values=values)})
 
 
@@ -185,7 +186,7 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
         nats,
         len(clear),
         len(EXCHANGES),
-        change,
+        _rows(change),
     )
 
 
@@ -209,7 +210,7 @@ def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
         0.0,
         len(relation),
         len(words),
-        change,
+        _rows(change),
     )
 
 
@@ -236,5 +237,9 @@ def _thrust_unit(
         0.0,
         len(medians),
         len(units),
-        change,
+        _rows(change),
     )
+
+
+def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+    return tuple(map(tuple, matrix.tolist()))
