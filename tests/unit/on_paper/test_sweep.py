@@ -4,9 +4,11 @@ it.
 
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 from pytest import approx, fixture, importorskip, mark, raises
@@ -222,6 +224,26 @@ def test_a_failure_stops_nothing_else_and_is_told(path, tmp_path):
     again, outcome = run(path, tmp_path)
     assert {name.split("-")[0] for name, _ in again.started} == {"state_rigid_cable"}
     assert not outcome.failed
+
+
+def test_ctrl_c_stops_what_runs_and_fails_nothing(path, tmp_path, monkeypatch):
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pool.time, "sleep", interrupt)
+    starter, outcome = run(path, tmp_path)
+    assert outcome == pool.Outcome(stopped=True, interrupted=True)
+    assert len(starter.alive) > 1
+    assert all(task.stopped for task in starter.alive)
+
+
+def test_a_unit_stops_where_the_process_that_started_it_is_gone(path, monkeypatch):
+    """Stopped as by Ctrl-C, so that it writes its checkpoint."""
+    monkeypatch.setattr("visthrow.paper.sweep.work.work", lambda *_: time.sleep(30.0))
+    begin = time.monotonic()
+    another = os.getpid()  # no process is its own parent
+    assert run_command(f"sweep work {path} --units state --parent {another}") == 130
+    assert time.monotonic() - begin < 20.0
 
 
 def test_what_another_process_has_is_tried_again(path, tmp_path):
