@@ -45,6 +45,13 @@ def with_channels(log: FlightLog, **channels: Channel) -> FlightLog:
     return FlightLog(log.channels | channels, log.meta)
 
 
+def upright(up: np.ndarray, heading: np.ndarray) -> Rotation:
+    """Attitudes whose third axis points along ``up`` and whose first one is nearest to ``heading``."""
+    side = np.cross(up, heading)
+    side /= norm(side, axis=1, keepdims=True)
+    return Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+
+
 def flight(
     seconds: float = 12.0, rate: float = 100.0, seed: int = 0, scale: float = 1.0
 ) -> dict[str, np.ndarray]:
@@ -68,9 +75,7 @@ def flight(
     up = force / norm(force, axis=1, keepdims=True)
     yaw = np.sin(rng.uniform(0.5, 0.9) * time + rng.uniform(0, 6))
     heading = np.column_stack([np.cos(yaw), np.sin(yaw), 0 * yaw])
-    side = np.cross(up, heading)
-    side /= norm(side, axis=1, keepdims=True)
-    turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+    turn = upright(up, heading)
     rates = np.zeros((len(time), 3))
     rates[1:-1] = (turn[:-2].inv() * turn[2:]).as_rotvec() * rate / 2.0
     rates[0], rates[-1] = rates[1], rates[-2]

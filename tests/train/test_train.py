@@ -51,6 +51,11 @@ def weights(folder):
     return [w.numpy() for w in Policy.load(folder / "policy.npz").weights]
 
 
+def require_same_weights(one, other):
+    for a, b in zip(weights(one), weights(other), strict=True):
+        assert_array_equal(a, b)
+
+
 @fixture(scope="module")
 def whole(tmp_path_factory):
     """A run of four iterations without interruption."""
@@ -136,8 +141,7 @@ def test_a_signal_leaves_checkpoint_and_policy_and_the_printed_command_goes_on(
     assert iterations_of(folder) == [1, 2, 3, 4]
     assert (folder / "summary.json").exists()
     assert not (folder / "evaluation.json").exists()
-    for a, b in zip(weights(whole), weights(folder), strict=True):
-        assert_array_equal(a, b)
+    require_same_weights(whole, folder)
 
 
 def test_minutes_leave_a_policy(tmp_path, capsys):
@@ -207,8 +211,7 @@ def test_a_killed_training_goes_on_bit_for_bit(whole, killed, tmp_path):
     assert iterations_of(folder) == [1, 2, 3]
     assert train(folder, "--resume") == 0
     assert iterations_of(folder) == [1, 2, 3, 4]
-    for a, b in zip(weights(whole), weights(folder), strict=True):
-        assert_array_equal(a, b)
+    require_same_weights(whole, folder)
 
 
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsys):
@@ -229,8 +232,7 @@ def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch, capsy
     assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
     monkeypatch.setattr(storage.os, "fsync", fsync)
     assert train(folder, "--resume") == 0
-    for a, b in zip(weights(whole), weights(folder), strict=True):
-        assert_array_equal(a, b)
+    require_same_weights(whole, folder)
 
 
 @mark.parametrize(

@@ -9,11 +9,10 @@ import numpy as np
 from numpy.linalg import norm
 from numpy.random import default_rng
 from pytest import approx, mark
-from scipy.spatial.transform import Rotation
 
 from bench import delays
 from tests.commands import run_command
-from tests.flightlogs import DELAY, UNITS, G, flight, log_at, log_of, with_channels
+from tests.flightlogs import DELAY, UNITS, G, flight, log_at, log_of, upright, with_channels
 from visthrow import cli
 from visthrow.diagnose.inputs.setup import VELOCITIES, known
 from visthrow.diagnose.select.diagnose_flights import diagnose, refused_of
@@ -240,9 +239,7 @@ def carrying(share: float = 0.2, length: float = 0.5) -> dict[str, np.ndarray]:
     above = below + length * hung / norm(hung, axis=1, keepdims=True)
     thrust = (1.0 - share) * pull(above) + share * hung
     up = thrust / norm(thrust, axis=1, keepdims=True)
-    side = np.cross(up, [1.0, 0.0, 0.0])
-    side /= norm(side, axis=1, keepdims=True)
-    turn = Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
+    turn = upright(up, [1.0, 0.0, 0.0])
     rng = default_rng(3)
     columns = {"time": time, "pos_w": above, "payload_pos_w": below}
     noisy = {n: v + rng.normal(0, 3e-4, v.shape) for n, v in columns.items() if n != "time"}
