@@ -46,7 +46,7 @@ def with_channels(log: FlightLog, **channels: Channel) -> FlightLog:
 
 
 def upright(up: np.ndarray, heading: np.ndarray) -> Rotation:
-    """Attitudes whose third axis points along ``up`` and whose first one is nearest to ``heading``."""
+    """Attitudes with the third axis along ``up`` and the first one nearest to ``heading``."""
     side = np.cross(up, heading)
     side /= norm(side, axis=1, keepdims=True)
     return Rotation.from_matrix(np.stack([np.cross(side, up), side, up], axis=2))
