@@ -14,7 +14,8 @@ more:
 
 The blocks of a page run in order in a folder of the page's own that looks like the root of a clone.
 What another page has run already, with the same arguments and files, is not run again: what it
-wrote is copied. A training is evaluated with 4 throws for 200."""
+wrote is copied. A training is evaluated with 4 throws for 200, a plan of the baseline begins at one
+duration for five."""
 
 import contextlib
 import hashlib
@@ -183,7 +184,9 @@ class Runner:
         spoken = " ".join(block.text for block in blocks if block.language in ("sh", "python"))
         files = " ".join(block.text for block in blocks if block.title)
         names: dict[str, object] = {}
-        with contextlib.chdir(folder), mock.patch.object(trainer, "EVALUATED", 4):
+        evaluated = mock.patch.object(trainer, "EVALUATED", 4)
+        starts = mock.patch("visthrow.paper.baseline.spline.LONGEST", (1.4,))
+        with contextlib.chdir(folder), evaluated, starts:
             for block in blocks:
                 if block.title:
                     assert block.title in spoken + files, (

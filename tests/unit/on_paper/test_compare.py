@@ -6,14 +6,12 @@ from pytest import importorskip
 
 from tests.commands import run_command
 from visthrow.cli import compare
-from visthrow.paper.baseline import spline, thrower
+from visthrow.paper.baseline import thrower
 
 importorskip("piqp")
 
 
-def test_compare_shows_the_baseline_under_each_condition(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.paper.baseline.thrower.cores", lambda: 1)
+def test_compare_shows_the_baseline_under_each_condition(tmp_path, capsys, one_start):
     out = tmp_path / "rows.json"
     command = "compare state baseline --throws 2 --targets 1.5 --device cpu"
     assert run_command(f"{command} --out {tmp_path} --json {out}") == 0

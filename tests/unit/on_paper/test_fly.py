@@ -10,7 +10,7 @@ from pytest import approx, fixture, importorskip, mark
 from tests.commands import run_command
 from tests.configs import load_experiment
 from visthrow.common.statistics import pareto
-from visthrow.paper.baseline import front, spline
+from visthrow.paper.baseline import front
 from visthrow.paper.baseline import pendulum_model as pm
 from visthrow.paper.baseline.fly_plan import (
     Delays,
@@ -45,7 +45,7 @@ def experiment() -> Experiment:
 
 
 @fixture(scope="module")
-def plan(experiment):
+def plan(experiment, one_start):
     return plan_throw(
         pm.pendulum_of(plant_of(experiment)),
         2.0,
@@ -129,9 +129,7 @@ def test_front_and_hypervolume_by_hand():
     assert front.hypervolume(np.empty((0, 2))) == 0.0
 
 
-def test_the_command_writes_tables_and_picture(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(spline, "LONGEST", (1.4,))  # one start of the optimisation instead of five
-    monkeypatch.setattr("visthrow.paper.baseline.thrower.cores", lambda: 1)
+def test_the_command_writes_tables_and_picture(tmp_path, capsys, one_start):
     packed = tmp_path / "all.json"
     command = f"baseline --quick --targets 1.5 --policies state --out {tmp_path} --json {packed}"
     assert run_command(command) == 0
