@@ -25,7 +25,7 @@ BINARY = {
 MACHINE_PATHS = re.compile(
     r"(?<![\w.:/-])/(?:home|root|Users|workspace|work|opt|mnt|scratch)/\w+"  # absolute folders
     r"|file://|\bindex-url\b|\bfind-links\b"
-    r"|\b[\w-]+\.(?:pypi|pythonhosted)\.org\b|\bpypi\.org\b",
+    r"|\b(?:pypi|pythonhosted)\.org\b",
     re.IGNORECASE,
 )
 EXEMPT = {"tests/contract/test_text.py", "tests/unit/on_visthrow/test_provenance.py"}

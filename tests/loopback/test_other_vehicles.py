@@ -113,7 +113,6 @@ THRUST = ("times the weight", "thrust: the vehicle")
 OTHERS = {
     "half the weight": ({"times": 0.5}, THRUST),
     "twice the weight": ({"times": 2.0}, THRUST),
-    "four times the weight": ({"times": 4.0}, THRUST),
     "less thrust": ({"spoil": bend(0.8)}, THRUST),
     "more thrust": ({"spoil": bend(1.2)}, THRUST),
     "no yaw": ({"yaw_lag": 1e6}, ("handed back: yaw: the vehicle does not turn as commanded",)),

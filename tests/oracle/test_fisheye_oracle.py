@@ -5,23 +5,11 @@ import math
 import cv2
 import numpy as np
 import torch
-from pytest import mark
 
 from camera.fisheye import Fisheye
-from camera.params import FisheyeParams
+from tests.lenses import LENSES
 
 PIXEL_TOLERANCE = 1e-9  # px; the bar: 1e4 times the rounding of float64 at 1,000 px
-LENSES = mark.parametrize(
-    "params",
-    [
-        FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5),
-        FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0),
-        FisheyeParams(
-            512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0
-        ),
-    ],
-    ids=["equidistant", "bent", "narrow"],
-)
 
 
 def points_before_the_lens(number: int = 5000) -> np.ndarray:

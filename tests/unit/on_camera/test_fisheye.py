@@ -10,17 +10,9 @@ from pytest import mark, raises
 
 from camera.fisheye import Fisheye
 from camera.params import FisheyeParams
+from tests.lenses import BENT, EQUIDISTANT, LENSES
 
 f64 = partial(torch.tensor, dtype=torch.float64)
-
-EQUIDISTANT = FisheyeParams(640, 640, 166.6786, 166.6786, 319.5, 319.5)
-BENT = FisheyeParams(640, 480, 160.0, 150.0, 310.0, 245.0, 0.02, -0.01, 0.002, -0.0002, 200.0)
-NARROW = FisheyeParams(
-    512, 512, 190.97, 190.99, 254.9, 256.9, 0.0035, 0.0007, -0.0021, 0.0002, 195.0
-)  # a TUM-VI-like lens
-LENSES = mark.parametrize(
-    "params", [EQUIDISTANT, BENT, NARROW], ids=["equidistant", "bent", "narrow"]
-)
 
 ANGLE_TOLERANCE = 1e-9  # rad; the bar of the model, 1e6 times the rounding of float64
 EDGE_TOLERANCE = 1e-12  # rounding of a dozen float64 operations on values near 1
