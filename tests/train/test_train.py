@@ -323,7 +323,7 @@ def test_another_solver_keeps_its_rope_and_steps(name):
 
 
 def test_the_recorded_seeds_are_those_of_the_record():
-    record = measurements.load(measurements.FOLDER / "time-to-error-state-h100.json")
+    record = measurements.load(measurements.FOLDER / "time-to-error-state-h200.json")
     errors = [run["final"][1] for run in record["figures"]["runs"]]
     recorded = tables_beside(session.__file__, "recorded.toml")
     assert recorded == {"state_fast": approx(errors, abs=5.1e-5)}  # four digits are kept
