@@ -92,6 +92,7 @@ class Selector:
         self._linear: dict[int, tuple[Point, Linear]] = {}
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
         self._visited = {NOTHING}
+        self._settled_sets = {NOTHING}  # at which derivatives were taken, or still held
         self._simulated: dict[Names, float] = {}  # nats of each set ahead of the best
         self._proposed: set[Names] = set()
         self._followed: set[Names] = set()
@@ -145,7 +146,7 @@ class Selector:
         """Select, beginning with a set."""
         for start in self._tried(self.nominal, [begin] if begin else []):
             self._go(start)
-        while self._moved() or self._propose() or self._widen():
+        while self._moved() or self._relinearised() or self._propose() or self._widen():
             pass
         return self
 
@@ -333,12 +334,27 @@ class Selector:
         self.origin = origin
         return [replace(trials[chosen], lead=lead)]
 
-    def _go(self, trial: Trial) -> None:
-        """Take a set as the best, and derivatives where it is."""
+    def _relinearised(self) -> bool:
+        """Take derivatives where the best set is, once no other is better by the last ones; False
+        where these still hold. Sets that were judged by derivatives from elsewhere may be tried
+        again.
+        """
+        origin, chosen = self.origin, self.best.chosen
+        if chosen in self._settled_sets:
+            return False
+        self._settled_sets.add(chosen)
+        self._go(replace(self.best, lead=0.0), last=True)
+        if self.origin is origin:
+            return False
+        self._visited = set(self._settled_sets)
+        return True
+
+    def _go(self, trial: Trial, last: bool = False) -> None:
+        """Take a set as the best; ``last``: whether no other is better by the derivatives."""
         self._simulated = {s: nats - trial.lead for s, nats in self._simulated.items()}
         if trial.point.about is self.nominal.about:
             self.origin = self.nominal
-        point = self._settled(trial.point, trial.columns)
+        point = self._settled(trial.point, trial.columns, last)
         if point is not trial.point or trial.shares:
             shares, occam = self.linear(point).shares(trial.chosen)
             if shares:
@@ -349,16 +365,18 @@ class Selector:
         self._visited.add(trial.chosen)
         self._linear = {id(self.nominal): (self.nominal, self.linear(self.nominal))}
 
-    def _settled(self, point: Point, active: list[int]) -> Point:
-        """Linearise where a set is, unless the last derivatives still hold, and step on where that
-        moved the optimum.
+    def _settled(self, point: Point, active: list[int], last: bool) -> Point:
+        """Linearise where a set is, unless the last derivatives still hold or may lead on to other
+        sets, and step on where that moved the optimum.
         """
         kinds = self.problem.switches
         unchanged = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
         silent = self.problem.priors.visible & (np.diag(self.origin.information) <= 0.0)
-        anew = self.problem.model.cheap and np.any(silent)
-        if unchanged and not anew and curvature(self.problem, self.origin, point) < SPIKE:
-            return point
+        cheap = self.problem.model.cheap
+        if unchanged and not (cheap and np.any(silent)):
+            lead_on = not (cheap or last)
+            if lead_on or curvature(self.problem, self.origin, point) < SPIKE:
+                return point
         for _ in range(ROUNDS):
             try:
                 self.origin = self._linearised(point.theta, point)
