@@ -11,6 +11,7 @@ from typing import Any
 
 import warp as wp
 
+from camera.warp_start import FLAGS
 from sim.kernels import state as st
 from sim.kernels.laws import build_laws
 from sim.kernels.quadrotor.rigid_body import build_flow
@@ -20,7 +21,7 @@ from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
 from sim.kernels.rope.release import lag
-from sim.kernels.runtime import Ints, unique_kernel
+from sim.kernels.runtime import Ints
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
@@ -46,6 +47,11 @@ STATE_FIELDS = {
 # share of the payload's weight below which the rope counts as slack: its shape is then anyone's
 # guess
 SLACK = 0.15
+
+INLINED = " -ffp-contract=fast -mllvm=-inline-threshold=4000"
+"""Of the compiler for CPUs: fused multiplications, as on a GPU, and functions inlined into the loop.
+A step takes 16 % less, and the kernel a fifth longer to compile.
+"""
 
 TINY = 1.0e-9  # times [s] nearer than this are one
 
@@ -301,7 +307,11 @@ def build_replay(
         knots.payload_vel_w[row] = m.pay_vel
         knots.tension[row] = pull
 
-    @unique_kernel
+    @wp.kernel(
+        module="unique",
+        enable_backward=False,
+        module_options={"cpu_compiler_flags": FLAGS + INLINED},
+    )
     def replay_kernel(
         # Params:
         plants: t.Plants,

@@ -178,31 +178,35 @@ class Linear:
             return []
         information, score = self.total(subset)
         theta = covariance(information, self.priors.deviation(columns_of(subset))) @ score
-        promise = {}
-        for group, members in self._by_group.items():
+        close = {}
+        for group, (members, deviation) in self._by_group.items():
             flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
             precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
             misfit = (flights.absolute - flights.information @ theta) ** 2 / precision
             sizes = np.ones(1) if group == EVENT else REACH[::COARSE]
-            deviation = np.zeros(precision.shape[1])
-            for c in members:
-                deviation[list(c.columns)] = c.deviations
             part = precision * (sizes[:, None, None] * deviation) ** 2
             gain = 0.5 * (misfit * part / (1.0 + part) - np.log1p(part))
-            row = {flight: f for f, flight in enumerate(flights.flights.tolist())}
-            whole = gain.sum(1)
-            for c in members:
-                j = list(c.columns)
-                nats = gain[0, row[c.flight], j] if group == EVENT else whole[:, j].sum(1)
-                promise[c] = float(nats.max()) - c.penalty
-        close = [c for c, n in promise.items() if n > self._step - STRONG and c not in subset]
-        return sorted(close, key=promise.get, reverse=True)[:RANDOM_TRIED]
+            if group == EVENT:
+                row = {flight: f for f, flight in enumerate(flights.flights.tolist())}
+                rows = [row[c.flight] for c in members]
+                nats = gain[0, rows, [c.columns[0] for c in members]]
+            else:
+                whole = gain.sum(1)
+                nats = np.array([whole[:, list(c.columns)].sum(1).max() for c in members])
+            promise = nats - [c.penalty for c in members]
+            for i in np.flatnonzero(promise > self._step - STRONG).tolist():
+                if members[i] not in subset:
+                    close[members[i]] = promise[i]
+        return sorted(close, key=close.get, reverse=True)[:RANDOM_TRIED]
 
     @cached_property
-    def _by_group(self) -> dict[str, list[Candidate]]:
-        groups: dict[str, list[Candidate]] = {}
+    def _by_group(self) -> dict[str, tuple[list[Candidate], np.ndarray]]:
+        """Random shares of each group, with the deviation of each effect, shape (K,)."""
+        groups: dict[str, tuple[list[Candidate], np.ndarray]] = {}
         for c in self.random:
-            groups.setdefault(c.group, []).append(c)
+            members, deviation = groups.setdefault(c.group, ([], np.zeros(len(self.priors.floor))))
+            members.append(c)
+            deviation[list(c.columns)] = c.deviations
         return groups
 
     def neighbours(self, chosen: Names, centre: Names) -> dict[Names, float]:
