@@ -227,10 +227,14 @@ def test_a_failure_stops_nothing_else_and_is_told(path, tmp_path):
 
 
 def test_ctrl_c_stops_what_runs_and_fails_nothing(path, tmp_path, monkeypatch):
+    signals = [KeyboardInterrupt]
+
     def interrupt(_):
-        raise KeyboardInterrupt
+        if signals:
+            raise signals.pop()
 
     monkeypatch.setattr(pool.time, "sleep", interrupt)
+    monkeypatch.setattr(pool, "GRACE", 0.1)
     starter, outcome = run(path, tmp_path)
     assert outcome == pool.Outcome(stopped=True, interrupted=True)
     assert len(starter.alive) > 1
