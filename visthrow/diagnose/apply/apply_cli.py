@@ -18,6 +18,7 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from visthrow.common.storage import atomic_write
+    from visthrow.config.effects import catalogue
     from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.inputs.model_arguments import THROW
@@ -39,7 +40,7 @@ def run(args: argparse.Namespace) -> int:
         )
     laws = patch.laws_of(report, args.diagnosis, args.laws)
     if of_throw:
-        patch.refuse_strange(report, args.diagnosis, theta)
+        patch.refuse_strange(report, args.diagnosis, theta, catalogue(), THROW)
     theta, covariance = patch.with_scatter(theta, covariance, report)
     account = origin(report, args.diagnosis)
     if of_throw:

@@ -298,8 +298,8 @@ def refuse_strange(
     report: Mapping[str, Any],
     path: str,
     theta: Mapping[str, float],
-    effects: Mapping[str, Effect] | None = None,
-    model_name: str = "throw",
+    effects: Mapping[str, Effect],
+    model_name: str,
 ) -> None:
     """Refuse effects that are none of a model's, though they may bear the same name, and sizes that
     it cannot have.
@@ -310,10 +310,9 @@ def refuse_strange(
     Args:
         report: of the diagnosis. path: of its file.
         theta: sizes that the model would have.
-        effects: its effects; None: the throw's.
+        effects: its effects.
         model_name: its name.
     """
-    effects = catalogue() if effects is None else effects
     strange = [name for name in theta if name not in effects]
     if strange:
         raise DiagnoseError(

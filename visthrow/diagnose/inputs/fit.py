@@ -238,7 +238,7 @@ def _digest(log: FlightLog) -> str:
     digest = hashlib.sha256()
     for name in sorted(log.channels):
         channel = log[name]
-        digest.update(
-            name.encode() + channel.time.tobytes() + np.ascontiguousarray(channel.values).tobytes()
-        )
+        digest.update(name.encode())
+        digest.update(channel.time.tobytes())
+        digest.update(np.ascontiguousarray(channel.values).tobytes())
     return digest.hexdigest()[:16]

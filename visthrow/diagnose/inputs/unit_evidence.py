@@ -100,15 +100,11 @@ def readings(
     for way, (_, _, nats) in zip(attitudes, leans):
         kind = way.kind if way is not None else None
         together[kind] = max(together.get(kind, 0.0), nats)
-    nearest = min(
-        (
-            abs(np.log10(UNITS[unit][1] * times))
-            for (_, times, _), unit in product(leans, units)
-            if times > 0.0
-        ),
-        default=np.inf,
-    )
-    leaning = nearest < _DECADES and max(size for size, *_ in leans) > _LEANS
+    decades = []  # of what a lean makes, by which a unit is off
+    for (_, times, _), unit in product(leans, units):
+        if times > 0.0:
+            decades.append(abs(np.log10(UNITS[unit][1] * times)))
+    leaning = min(decades, default=np.inf) < _DECADES and max(size for size, *_ in leans) > _LEANS
     listed = []
     for attitude, (_, times, _) in zip(attitudes, leans):
         nats = together[attitude.kind if attitude is not None else None] if leaning else 0.0

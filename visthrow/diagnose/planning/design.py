@@ -74,10 +74,8 @@ class Limits:
     thrust: float = 0.4  # added to the thrust, as a share of it
 
     def __post_init__(self) -> None:
-        if not (
-            min(*self.half, self.speed, self.acceleration, self.rate, self.thrust) > 0.0
-            and self.highest > self.lowest > 0.0
-        ):
+        smallest = min(*self.half, self.speed, self.acceleration, self.rate, self.thrust)
+        if not (smallest > 0.0 and self.highest > self.lowest > 0.0):
             raise DiagnoseError(f"{self}: expected limits above 0, and a highest above the lowest")
 
     def hold(self, path: np.ndarray) -> bool:
@@ -168,15 +166,13 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     seconds = base.seconds - 2.0 * SETTLE
     limits = limits.around(base.reference().pos_w)
     middle = np.array([0.0, 0.0, base.path(np.zeros(1))[0, 2]])
-    most = {
-        "x": (limits.half[0], limits.speed, limits.acceleration),
-        "y": (limits.half[1], limits.speed, limits.acceleration),
-        "z": (0.5 * (limits.highest - limits.lowest), limits.speed, limits.acceleration),
-        "yaw": (np.pi, YAW_RATE, np.inf),
-    }
+    half_height = 0.5 * (limits.highest - limits.lowest)
+    reaches = dict(zip("xyz", (*limits.half, half_height)))
 
     def swept(axis: str, t: np.ndarray) -> np.ndarray:
-        reach, speed, acceleration = most[axis]
+        reach, speed, acceleration = np.pi, YAW_RATE, np.inf
+        if axis in reaches:
+            reach, speed, acceleration = reaches[axis], limits.speed, limits.acceleration
         low, high = (_between(PATH, x[f"{end}_{axis}"]) for end in ("from", "to"))
 
         def farthest(frequency: np.ndarray) -> np.ndarray:
@@ -301,18 +297,16 @@ def optimise(
     )
 
 
+@dataclass
 class _Search:
     """The cost of designs, and the best that can be flown."""
 
-    def __init__(
-        self, aim: PlanningGoal, base: Manoeuvre, simulate: Simulate, limits: Limits
-    ) -> None:
-        self.aim = aim
-        self.base = base
-        self.simulate = simulate
-        self.limits = limits
-        self.best: tuple[float, np.ndarray, np.ndarray] | None = None
-        self.flights = 0
+    aim: PlanningGoal
+    base: Manoeuvre
+    simulate: Simulate
+    limits: Limits
+    best: tuple[float, np.ndarray, np.ndarray] | None = None  # rate, numbers, information
+    flights: int = 0
 
     def costs(self, columns: np.ndarray) -> np.ndarray:
         """Less for more expected nats a second; of what would be aborted, more than of all others
