@@ -6,6 +6,7 @@ from pathlib import Path
 from visthrow import config
 from visthrow.common.arguments import declared
 from visthrow.common.errors import DiagnoseError
+from visthrow.config.effects import catalogue
 
 HARM = 0.02  # share by which a channel may get worse on held-out flights
 
@@ -18,7 +19,6 @@ def run(args: argparse.Namespace) -> int:
     import json
 
     from visthrow.common.storage import atomic_write
-    from visthrow.config.effects import catalogue
     from visthrow.diagnose.apply import patch
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.inputs.model_arguments import THROW
