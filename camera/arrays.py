@@ -20,7 +20,7 @@ Array = Any
 """A tensor or an array; what a function returns is of the kind of its arguments."""
 
 
-def _by_torch(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
+def by_torch(function: Callable[..., Tensor]) -> Callable[..., np.ndarray]:
     """Return a function of tensors as one of arrays."""
     return lambda *arrays: function(*map(torch.from_numpy, arrays)).numpy()
 
@@ -40,11 +40,11 @@ class ArrayFunctions:
     stack = np.stack
     where = np.where
     zeros_like = np.zeros_like
-    atan = _by_torch(torch.atan)
-    cos = _by_torch(torch.cos)
-    sin = _by_torch(torch.sin)
+    atan = by_torch(torch.atan)
+    cos = by_torch(torch.cos)
+    sin = by_torch(torch.sin)
     sqrt = np.sqrt
-    linalg = SimpleNamespace(cross=_by_torch(torch.linalg.cross))
+    linalg = SimpleNamespace(cross=by_torch(torch.linalg.cross))
 
 
 def library(array: Tensor | np.ndarray) -> Any:

@@ -206,8 +206,7 @@ def fit_fisheye(
     the image sees.
 
     fx, fy and k1 to k4 are fitted, and the principal point where the foreign lens is not symmetric
-    about its own. Raises ValueError: the model is unknown, its image shows too little, or the fit
-    describes no camera.
+    about its own. Raises ValueError: the image shows too little, or the fit describes no camera.
 
     Args:
         model: A core of `DENOMINATORS`, a hyphen and one of `DISTORTIONS`; or one of `ANGULAR`.

@@ -9,7 +9,14 @@ import numpy as np
 from numpy import ndarray
 
 from camera.fisheye import AXIS_EPSILON, Fisheye
-from camera.keypoints import DIRECTION_EPSILON, MAX_SINE, KeypointCamera, box_midpoints, by_rule
+from camera.keypoints import (
+    DIRECTION_EPSILON,
+    GOAL_KEYPOINTS,
+    MAX_SINE,
+    KeypointCamera,
+    box_midpoints,
+    by_rule,
+)
 
 Vector = tuple[float, float, float]
 
@@ -34,7 +41,7 @@ def row_keypoints(
     valid = np.array([[seen for _, _, seen in marks]])
     if not lens.circle_inside_image:
         valid &= lens.on_sensor(lens.denormalize(points))
-    points[:, 4:] = box_midpoints(points[:, 4:])
+    points[:, GOAL_KEYPOINTS:] = box_midpoints(points[:, GOAL_KEYPOINTS:])
     return by_rule(camera, points.astype(np.float32), valid)
 
 

@@ -7,11 +7,11 @@ with a row reads them."""
 from collections.abc import Callable
 
 import numpy as np
-import torch
 import torch.nn.functional as F
 from numpy import ndarray
 from torch import Tensor
 
+from camera.arrays import by_torch
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import ACTIVATIONS, Policy
 
@@ -41,8 +41,7 @@ def _activation(name: str) -> Callable[[ndarray], ndarray]:
     """Return an activation by rsl_rl's name."""
     if name == "elu":
         return _elu
-    function = getattr(F, ACTIVATIONS[name]["torch"])
-    return lambda x: function(torch.from_numpy(x)).numpy()
+    return by_torch(getattr(F, ACTIVATIONS[name]["torch"]))
 
 
 class RowPolicy:

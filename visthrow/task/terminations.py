@@ -1,9 +1,8 @@
-"""Ends of a throw (the paper, Sec.
-
-III-C), for an episode of training and for a flight on any plant.
+"""Ends of a throw, for an episode of training and for a flight on any plant.
 
 The functions take and return tensors or NumPy arrays over the batch, shape (E,) or (E, 3).
-"""
+
+Source: the paper, Section III-C."""
 
 import math
 from functools import reduce

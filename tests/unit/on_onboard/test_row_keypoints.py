@@ -17,7 +17,7 @@ SINGLE = 2e-6
 
 LENSES = {
     "equidistant": {},
-    "bent": {"k1": 0.01, "k2": -0.02, "k3": 0.003},
+    "bent": {"k1": 0.01, "k2": -0.02, "k3": 0.003, "k4": 0.001},
     "larger than the sensor": {"width": 500, "cx": 230.0},
 }
 

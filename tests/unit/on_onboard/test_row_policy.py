@@ -11,7 +11,7 @@ from pytest import mark
 from visthrow.onboard.estimator import Estimator
 from visthrow.onboard.policy import ACTIVATIONS, Policy
 from visthrow.onboard.row_policy import RowPolicy
-from visthrow.throws.loading import load_policy
+from visthrow.onboard.shipped import SHIPPED
 
 ROUNDING = 2e-6
 """Of outputs near 1: sums of float32 in another order."""
@@ -79,5 +79,6 @@ def test_a_normaliser_and_a_memory(scale, tolerance):
     assert_same(replace(policy, mean=None, std=None, eps=0.0), scale, tolerance)
 
 
-def test_the_shipped_policy():
-    assert_same(load_policy("vision").policy, tolerance=WIDE)
+@mark.parametrize("path", sorted(SHIPPED.glob("*.npz")), ids=lambda path: path.stem)
+def test_shipped_policies(path):
+    assert_same(Policy.load(path), tolerance=WIDE)
