@@ -18,8 +18,8 @@ from visthrow.common.errors import VisthrowError
 STILL = ("--plant", "tests.level:make")
 """A vehicle without a simulator: it takes no time from the runner."""
 
-P50 = 1.0
-P99 = 3.0
+P50 = 1.2
+P99 = 2.2
 """Bars of the whole way from the look for messages to the command's bytes [ms]."""
 
 WARM = 0.2
