@@ -1,7 +1,7 @@
 """Answer the worlds of banks with two checkouts of the project, and compare the answers.
 
     python -m bench.diagnose.two_checkouts answer --trees OLD NEW --jobs 40 --ledger two.jsonl \\
-        --banks bench/diagnose/bank-charge-2.txt --foreign bench/diagnose/bank-foreign-charge-2.txt
+        --banks bench/diagnose/bank-open.txt --foreign bench/diagnose/bank-foreign-open.txt
     python -m bench.diagnose.two_checkouts compare two.jsonl
 
 With one tree it is answered alone, as the new one.

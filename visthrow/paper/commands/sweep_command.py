@@ -94,6 +94,8 @@ def _work(args: argparse.Namespace, work: Any, out: Path) -> int:
 
     if not args.units:
         raise ConfigError("sweep work: no --units; expected ids as `visthrow sweep run` gives them")
+    # a shell that starts a sweep in the background has SIGINT ignored, which processes inherit
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if args.parent:
         threading.Thread(target=_follow, args=(args.parent,), daemon=True).start()
     return do(work, out, args.units.split(","), args.device, args.minutes)
