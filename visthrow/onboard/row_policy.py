@@ -1,5 +1,5 @@
-"""A policy for one vehicle on NumPy arrays: on a single row it takes two thirds of torch's time and
-decides the same to rounding. Onboard-safe.
+"""A policy for one vehicle on NumPy arrays, which decides the same as in torch to rounding.
+Onboard-safe.
 
 Reading the weights is what takes the time. They lie in memory in the order in which the product
 with a row reads them."""
