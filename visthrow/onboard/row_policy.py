@@ -33,7 +33,7 @@ def _elu(x: ndarray) -> ndarray:
 
 
 def _sigmoid(x: ndarray) -> ndarray:
-    """Return the logistic function, which by its exponential would overflow."""
+    """Return the logistic function, by a form that never overflows."""
     return 0.5 + 0.5 * np.tanh(0.5 * x)
 
 

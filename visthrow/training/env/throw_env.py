@@ -398,10 +398,11 @@ class ThrowEnv(VecEnv):
             quantities["goal_velocity"] = self.goals.velocity[:, :2]
         if self._cargo is not None:
             quantities["cargo"] = self._cargo
-        mount = self.view.buffers
-        quantities["mount"] = torch.cat(
-            [mount["extrinsic_rotation"], mount["extrinsic_offset"]], dim=-1
-        )
+        if "mount" in named:
+            mount = self.view.buffers
+            quantities["mount"] = torch.cat(
+                [mount["extrinsic_rotation"], mount["extrinsic_offset"]], dim=-1
+            )
         quantities["pose_age"] = self.delay.age[:, None]
         if self._fleet:
             quantities["vehicle"] = self._fleet.exact
