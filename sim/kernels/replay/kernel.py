@@ -21,7 +21,7 @@ from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.loose import build_loose
 from sim.kernels.rope.release import lag
-from sim.kernels.runtime import Ints
+from sim.kernels.runtime import Ints, unique_kernel
 from sim.kernels.structs import EXTENSIONS, QUAD_STATE, Types
 from sim.params import LawParams, SensingParams, VehicleParams
 
@@ -49,8 +49,8 @@ STATE_FIELDS = {
 SLACK = 0.15
 
 INLINED = " -mllvm=-inline-threshold=4000"
-"""Of the compiler for CPUs: functions inlined into the loop. The bits stay; a step takes 12 % less,
-and the kernel a fifth longer to compile.
+"""Option of the compiler for CPUs that inlines functions into the loop. The bits stay; a step takes
+12 % less, and the kernel a fifth longer to compile.
 """
 
 TINY = 1.0e-9  # times [s] nearer than this are one
@@ -307,11 +307,7 @@ def build_replay(
         knots.payload_vel_w[row] = m.pay_vel
         knots.tension[row] = pull
 
-    @wp.kernel(
-        module="unique",
-        enable_backward=False,
-        module_options={"cpu_compiler_flags": FLAGS + INLINED},
-    )
+    @unique_kernel(module_options={"cpu_compiler_flags": FLAGS + INLINED})
     def replay_kernel(
         # Params:
         plants: t.Plants,

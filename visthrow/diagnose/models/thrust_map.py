@@ -1,4 +1,4 @@
-"""The map from a motor's command to its thrust, backwards."""
+"""The command that gives a motor's thrust: its thrust map inverted."""
 
 from collections.abc import Sequence
 

@@ -59,12 +59,12 @@ name in that of one of any size.
 SAME = 1e-9  # share of a term's information from which what a cause leaves of it is rounding
 
 PIECES = 7
-"""Places between which a curve is linear: a step is told from a line, and of 5 or 9 places the
+"""Places between which a curve is linear: enough to distinguish a step from a line. With 5 or 9 the
 evidence is the same within a few nats.
 """
 
 OUTER = 1.0, 99.0  # percentiles of what was flown, between which the places lie
-LEAST_REACH = 1e-6  # of a scalar that never changes, whose curve is a constant
+LEAST_REACH = 1e-6  # span of the places of a scalar that never changes: its curve is a constant
 
 # terms that become effects to be weighed: as many as other sets that are simulated in their place
 WEIGHED = 6
@@ -79,7 +79,7 @@ def _terms(block: str, quantities: tuple[str, ...]) -> tuple[Term, ...]:
 class Screen:
     """Information of all terms, or curves, about one point, summed over windows.
 
-    A term is one column of latent forces; a curve is ``m`` of them, see :func:`best_curve`."""
+    A term is one column of latent forces; a curve is ``m`` of them, see :func:`best_curves`."""
 
     terms: tuple[Term, ...]
     size: np.ndarray  # root mean square over the knots, shape (T,)
@@ -225,26 +225,32 @@ def _conditional(
     return information, screened.score - screened.cross @ (sigma @ point.score)
 
 
-def best_curve(
-    problem: Problem, point: Point, active: Sequence[int], block: str, reach: float
-) -> tuple[float, str]:
-    """Return the nats that the best curve of a block brings beside a set of names, less the log of
-    how many were tried, and its formula; 0 and "" where none can be told.
+def best_curves(
+    problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float]
+) -> dict[str, tuple[float, str]]:
+    """Return the nats that the best curve of each block brings beside a set of names, less the log
+    of how many were tried, and its formula; none of a block that the windows carry no knots for.
 
     A curve is a force f(q) v along a vector v, with any function f of one scalar q: pieces that
     are linear between ``PIECES`` places. It tells whether names have the right form. No name is
     given up for a law that is a little better: a curve that holds no more than the names say
-    brings nothing. ``reach``: prior deviation of f v at each place."""
+    brings nothing. ``strongest``: latent force of each block where the model stood alone [N or
+    N m]; the prior deviation of f v is ``UNKNOWN_RATIO`` of it at each place."""
+    if not strongest:
+        return {}
     calm, parts = with_capped_gusts(point)
     values = [KnotValues(window.knots) for window in point.windows]
-    screened = screen(calm, parts, block, values, curves=True)
-    if screened is None:
-        return 0.0, ""
-    gain, _ = gains(calm, problem.priors, active, screened, reach)
-    best = int(np.argmax(gain))
-    scalar, vector = screened.terms[best].parts
-    formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
-    return float(gain[best] - np.log(len(gain))), formula
+    curves = {}
+    for block, force in strongest.items():
+        screened = screen(calm, parts, block, values, curves=True)
+        if screened is None:
+            continue
+        gain, _ = gains(calm, problem.priors, active, screened, UNKNOWN_RATIO * force)
+        best = int(np.argmax(gain))
+        scalar, vector = screened.terms[best].parts
+        formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
+        curves[block] = float(gain[best] - np.log(len(gain))), formula
+    return curves
 
 
 def unsaid(

@@ -37,7 +37,6 @@ from visthrow.diagnose.select.held_out import Work, repeated_share, share_text
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
-    UNKNOWN_RATIO,
     Point,
     Problem,
     moved,
@@ -425,19 +424,17 @@ def _misshapen(selection: Selector) -> dict[str, str]:
     """Return the blocks in which some function of one quantity explains what the names there leave,
     and the reason: their form is another.
     """
+    problem, best, by_block = selection.problem, selection.best, _by_block(selection)
     strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
+    in_blocks = {block: strongest[block] for block in by_block if block in strongest}
+    curves = terms.best_curves(problem, best.point, best.columns, in_blocks)
     reasons = {}
-    for block, members in _by_block(selection).items():
-        if block not in strongest:
-            continue
-        reach = UNKNOWN_RATIO * strongest[block]
-        problem, best = selection.problem, selection.best
-        nats, formula = terms.best_curve(problem, best.point, best.columns, block, reach)
+    for block, (nats, formula) in curves.items():
         if nats > selection.threshold:
-            names = ", ".join(problem.effects[j].name for j in members)
+            names = ", ".join(problem.effects[j].name for j in by_block[block])
             reasons[block] = (
-                f"a force {formula}, with any function f, explains {nats:.0f} nats that are left"
-                f" beside {names}; the form is another"
+                f"{formula}, with any function f, explains {nats:.0f} nats that are left beside"
+                f" {names}; the form is another"
             )
     return reasons
 

@@ -166,14 +166,16 @@ class FlyerModel(NumericModel):
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
         that one's rate, with torques the body rates; behind it, the thrust of each motor."""
         thrust = self._thrusts(lanes)
-        mount = self._mount(lanes)
-        slope, _ = self._dynamics(lanes, thrust, mount)
+        rot = self._rotations(lanes)
+        mount = self._mount(rot)
+        slope, _ = self._dynamics(lanes, thrust, rot, mount)
         path = integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
         return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
     def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
         """See the base class."""
-        _, quantities = self._dynamics(lanes, self._thrusts(lanes), self._mount(lanes))
+        rot = self._rotations(lanes)
+        _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
         moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
         names = moments[0].keys() - {"slope"}  # which follows from the thrusts at the knots
         grid = self.params.step * np.arange(len(moments))
@@ -254,14 +256,14 @@ class FlyerModel(NumericModel):
         seen = self.measure(stretch, model.simulate(lanes), lanes)
         return (seen[1:] - seen[:1]).T
 
-    def _mount(self, lanes: Lanes) -> Sequence[np.ndarray]:
+    def _mount(self, rot: np.ndarray) -> Sequence[np.ndarray]:
         """Return where the cable is attached, from the centre of mass, the velocity and the
         acceleration of that point at the half steps, world frame, each of shape (half steps, B, 3).
         """
         cable = self.params.cable
         if cable is None:
             return ()
-        arm = self._rotations(lanes) @ np.array(cable.mount)
+        arm = rot @ np.array(cable.mount)
         rate = np.gradient(arm, 0.5 * self.params.step, axis=0, edge_order=2)
         return arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)
 
@@ -283,12 +285,12 @@ class FlyerModel(NumericModel):
         return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
 
     def _dynamics(
-        self, lanes: Lanes, thrust: np.ndarray, mount: Sequence[np.ndarray]
+        self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: Sequence[np.ndarray]
     ) -> tuple[Slope, Quantities]:
         """Return what gives the derivative of states, and what gives the quantities of laws there,
         by the half step.
 
-        ``thrust``: [N], shape (half steps, B, motors)."""
+        ``thrust``: [N], shape (half steps, B, motors); ``rot``: attitudes at the half steps."""
         p = self.params
         mass = (p.mass + self.size_of(lanes, "mass_quad"))[:, None]
         tilt = self.stack(lanes, "frame_tilt_y", "frame_tilt_x", "") * [1.0, -1.0, 1.0]
@@ -297,7 +299,7 @@ class FlyerModel(NumericModel):
         pushes = self.pushes_at(lanes, halves(self.steps))
         names = [LATENT_BLOCKS[block] for block, _ in self.pushes[::3]]
         latent = dict(zip(names, np.split(pushes, len(names), axis=2)))
-        force_of = self._force(lanes, thrust)
+        force_of = self._force(lanes, thrust, rot)
         pulled = self._pulled(lanes, mass, gravity, wind, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
 
@@ -375,10 +377,9 @@ class FlyerModel(NumericModel):
         share = (position - index)[..., None, None]
         return before + share * (measured[lane, index + 1] - before)
 
-    def _force(self, lanes: Lanes, thrust: np.ndarray) -> Slope:
+    def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
         """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
         p = self.params
-        rot = self._rotations(lanes)
         total = thrust.sum(2, keepdims=True)
         added = self.stack(lanes, "rotor_drag_xy", "rotor_drag_xy", "rotor_drag_z")
         drag = np.array([p.drag_xy, p.drag_xy, p.drag_z]) + added
