@@ -23,11 +23,9 @@ from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "angle"
 FEWEST = 20  # samples of a window
-FARTHEST = (
-    2.0 * np.pi
-    # median distance from where the pendulum hangs [rad]: no free swing goes round and round most
-    # of the time
-)
+# median distance from where the pendulum hangs [rad]: no free swing goes round and round most of
+# the time
+FARTHEST = 2.0 * np.pi
 # dry friction changes its sign over this rate [rad/s]: narrower than any swing, wide enough for the
 # integrator
 SMOOTH = 0.02

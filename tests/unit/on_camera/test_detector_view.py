@@ -4,20 +4,11 @@ from dataclasses import replace
 
 import torch
 from numpy.testing import assert_allclose, assert_array_equal
-from pytest import approx, fixture
+from pytest import approx
 
 from camera.keypoint_noise import DetectorView
 from tests.configs import load_experiment
-
-COUNT = 4096
-FRESH = torch.ones(COUNT, dtype=torch.bool)
-OLD = ~FRESH
-LIKE = torch.zeros(COUNT)
-
-
-@fixture(autouse=True)
-def seeded():
-    torch.manual_seed(3)
+from tests.episodes import COUNT, FRESH, LIKE, OLD
 
 
 def view_of(mount: dict | None = None, **noise) -> DetectorView:
@@ -31,6 +22,7 @@ def view_of(mount: dict | None = None, **noise) -> DetectorView:
         noise=replace(camera.noise, **exact | noise),
         mount=replace(camera.mount, **errors),
     )
+    torch.manual_seed(3)
     view = DetectorView(camera, LIKE)
     view.begin(FRESH)
     return view

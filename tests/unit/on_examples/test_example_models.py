@@ -3,6 +3,7 @@ parameters found again; and on recorded data of others.
 """
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from numpy.random import default_rng
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from examples.gimbal.gimbal_model import SLUNG_LOAD, GimbalModel, GimbalParams
 from examples.pendulum.swing_model import ENCODER, PendulumModel, PendulumParams
-from examples.trim.trim_model import E8, TrimModel, TrimParams
+from examples.trim.trim_model import E8, UNTRIMMED, TrimModel
 from tests.flightlogs import log_at
 from tests.places import DATA
 from tests.unit.on_diagnose.test_models import found, near
@@ -27,25 +28,17 @@ from visthrow.logs.readers import table
 G = 9.81
 REAL = DATA / "real"
 SWING = PendulumParams(G, 0.2, 0.0, 0.0, 0.0, 0.0, 2.0, 0.01, 2)
-TRIM = TrimParams(
-    "motor_command",
-    "pos_w",
-    "vel_w",
-    0.03,
-    G,
-    (0.0, 0.15, 0.0),
-    3.8,
-    0.0,
-    (1.0, 1.0, 1.0, 1.0),
-    0.03,
-    0.006,
-    (1.0, -1.0, -1.0, 1.0),
-    0.2,
-    0.5,
-    0.5,
-    0.003,
-    0.01,
-    5e-4,
+TRIM = replace(
+    UNTRIMMED,
+    command="motor_command",
+    position="pos_w",
+    velocity="vel_w",
+    mass=0.03,
+    thrust_map=(0.0, 0.15, 0.0),
+    arm=0.03,
+    spread=0.003,
+    motor_spread=0.01,
+    com_spread=5e-4,
 )
 
 

@@ -242,11 +242,17 @@ def test_ctrl_c_stops_what_runs_and_fails_nothing(path, tmp_path, monkeypatch):
 
 
 def test_a_unit_stops_where_the_process_that_started_it_is_gone(path, monkeypatch):
-    """Stopped as by Ctrl-C, so that it writes its checkpoint."""
+    """Stopped as by Ctrl-C, so that it writes its checkpoint, also where a shell started the sweep
+    in the background, which ignores SIGINT.
+    """
     monkeypatch.setattr("visthrow.paper.sweep.work.work", lambda *_: time.sleep(30.0))
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     begin = time.monotonic()
     another = os.getpid()  # no process is its own parent
-    assert run_command(f"sweep work {path} --units state --parent {another}") == 130
+    try:
+        assert run_command(f"sweep work {path} --units state --parent {another}") == 130
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert time.monotonic() - begin < 20.0
 
 

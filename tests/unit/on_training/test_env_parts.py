@@ -7,24 +7,17 @@ from dataclasses import replace
 
 import torch
 from numpy.testing import assert_allclose
-from pytest import approx, fixture
+from pytest import approx
 
 from tests.configs import load_experiment
+from tests.episodes import COUNT, FRESH, LIKE, OLD
 from visthrow.training.env.options import POSE, MovingGoals, PoseDelay
 
-COUNT = 4096
 PERIOD = 0.02
-FRESH = torch.ones(COUNT, dtype=torch.bool)
-OLD = ~FRESH
-LIKE = torch.zeros(COUNT)
-
-
-@fixture(autouse=True)
-def seeded():
-    torch.manual_seed(3)
 
 
 def delay_of(**changes) -> PoseDelay:
+    torch.manual_seed(3)
     params = load_experiment("state").task.observation
     return PoseDelay(replace(params, **changes), PERIOD, LIKE, None)
 
@@ -52,6 +45,7 @@ def test_an_exact_pose_of_the_recent_past_lies_between_two_steps():
 
 
 def test_goals_move_in_every_direction_at_the_configured_speeds():
+    torch.manual_seed(3)
     goals = MovingGoals((0.2, 0.6), LIKE)
     goals.begin(FRESH)
     speed = goals.velocity.norm(dim=-1)
