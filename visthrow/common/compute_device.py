@@ -18,16 +18,14 @@ def resolve(name: str = "auto") -> str:
     exists = ["cpu", *(f"cuda:{i}" for i in range(count))]
     device = {"auto": exists[1] if count else "cpu", "cuda": "cuda:0"}.get(name, name)
     if device not in exists:
-        raise DeviceError(
-            f"device '{name}' is not there; expected auto or one of {', '.join(exists)}"
-        )
+        raise DeviceError(f"no device '{name}'; expected auto or one of {', '.join(exists)}")
     return device
 
 
 @contextmanager
 def rounded_products(allowed: bool) -> Iterator[None]:
-    """Whether float32 products on a GPU may have TF32's ten bits while this lasts, which networks
-    bear and rays of keypoints do not.
+    """Allow or forbid TF32's ten bits in float32 products on a GPU while the context lasts:
+    networks tolerate them, rays of keypoints do not.
 
     A CUDA graph keeps what held when it was captured.
     """

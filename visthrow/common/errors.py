@@ -52,7 +52,7 @@ class BusyError(VisthrowError):
 
 
 class DeviceError(VisthrowError):
-    """The compute device asked for is not there."""
+    """The requested compute device does not exist."""
 
 
 class StorageError(VisthrowError):

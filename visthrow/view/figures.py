@@ -242,9 +242,8 @@ def _stars(axis: Any, stars: Sequence[tuple]) -> dict[str, object]:
         bar = {"color": colour, **LOOKS["bar"]}
         axis.plot([duration.value] * 2, [error.low, error.high], "-", **bar)
         axis.plot([duration.low, duration.high], [error.value] * 2, "-", **bar)
-        labels[label] = axis.plot(duration.value, error.value, "*", color=colour, **LOOKS["star"])[
-            0
-        ]
+        star = {"color": colour, **LOOKS["star"]}
+        (labels[label],) = axis.plot(duration.value, error.value, "*", **star)
     return labels
 
 

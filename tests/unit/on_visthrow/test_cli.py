@@ -228,10 +228,10 @@ def test_a_file_of_windows_notepad_is_read(tmp_path):
     assert config.load(VehicleParams, path).body.mass == 0.21
 
 
-def test_devices_that_are_not_there_are_refused():
+def test_devices_that_do_not_exist_are_refused():
     assert compute_device.resolve("cpu") == "cpu"
     assert compute_device.resolve("auto") in ("cpu", "cuda:0")
-    with raises(DeviceError, match=r"'cuda:99' is not there; expected auto or one of cpu"):
+    with raises(DeviceError, match=r"no device 'cuda:99'; expected auto or one of cpu"):
         compute_device.resolve("cuda:99")
 
 
