@@ -33,6 +33,7 @@ from visthrow.onboard.policy import Policy, find_policy
 POLICY = "policy.npz"
 CONFIG = "config.toml"
 TICKS = "ticks.jsonl"
+BASE = "hil/dry_run.toml"  # under the config of a run that is read again
 FORMER_POSES = "poses.jsonl"  # of runs that were recorded with the poses apart
 SUMMARY = "summary.json"
 PROVENANCE = "provenance.json"
@@ -165,7 +166,7 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
 
 def _replayable(path: Path) -> str:
     """Return config of a run without what only reads the recording's source: its poses are here,
-    and its form has changed before.
+    and its form has changed before. Keys that are newer than the run have their shipped values.
     """
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -179,7 +180,7 @@ def _replayable(path: Path) -> str:
         for key, value in tree.get("source", {}).items()
         if key not in ("columns", "time")
     }
-    return dumps(tree)
+    return dumps(tree | {"base": BASE})
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:

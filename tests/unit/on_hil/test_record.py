@@ -75,8 +75,12 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
         load_run(tmp_path)
 
 
-def test_a_run_that_was_recorded_with_its_poses_apart_replays(run_folder, tmp_path, printed):
+def test_a_run_with_its_poses_apart_and_without_a_later_key_replays(run_folder, tmp_path, printed):
     shutil.copytree(run_folder, tmp_path / "before")
+    config = tmp_path / "before" / "config.toml"
+    text = config.read_text()
+    assert "probe = 0.8\n" in text
+    config.write_text(text.replace("probe = 0.8\n", ""))
     ticks = list(lines(run_folder / "ticks.jsonl"))
     poses = [[line["n"], *row] for line in ticks for row in line["poses"]]
     former = [line | {"poses": len(line["poses"])} for line in ticks]
