@@ -76,6 +76,12 @@ def vectors_between(first: ndarray, last: ndarray) -> ndarray:
     return turn[:, :3] * angle / np.maximum(sine, 1e-300)
 
 
+def tilt_deg(vector: ndarray) -> ndarray:
+    """Return the angles of vectors from up [deg]; shape (..., 3) to (...)."""
+    level = np.linalg.norm(vector[..., :2], axis=-1)
+    return np.degrees(np.arctan2(level, vector[..., 2]))
+
+
 def rotate(quat: ndarray, vector: ndarray) -> ndarray:
     """Turn vectors, shape (..., 3), by unit quaternions, shape (..., 4):
 

@@ -1,5 +1,9 @@
 """Units at the edge of the house: what each is worth in ours."""
 
+from collections.abc import Mapping
+
+import numpy as np
+
 from visthrow.common.errors import ConfigError
 from visthrow.common.toml_text import tables_beside
 
@@ -10,6 +14,15 @@ UNITS: dict[str, tuple[str, float]] = {
     name: (ours, size) for ours, sizes in _TABLES.items() for name, size in sizes.items()
 }
 """Name -> (ours, size in ours)."""
+
+
+def nearest(number: float, sizes: Mapping[str, float]) -> tuple[str, float]:
+    """Return the name of the size that brings a number nearest to 1, and by how much of the
+    logarithm it misses.
+    """
+    misses = {name: abs(float(np.log(number * size))) for name, size in sizes.items()}
+    best = min(misses, key=misses.__getitem__)
+    return best, misses[best]
 
 
 def to_si(unit: str, where: str) -> tuple[str, float]:

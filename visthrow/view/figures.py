@@ -18,17 +18,7 @@ from visthrow.view.parts import png_of
 WIDTH = 9.2  # width of a picture over the whole page [inch]
 
 
-def _looks() -> dict[str, dict[str, Any]]:
-    looks = tables_beside(__file__, "data/looks.toml")
-    for look in looks.values():
-        for key in look.keys() & {"color", "mec"}:
-            look[key] = getattr(style, look[key], look[key])
-        if isinstance(look.get("ls"), list):
-            look["ls"] = (0, tuple(look["ls"]))
-    return looks
-
-
-LOOKS = _looks()
+LOOKS = style.looks_of(tables_beside(__file__, "data/looks.toml"))
 """Part of a picture -> matplotlib's keywords."""
 
 CIRCLES = (0.1, 0.2, 0.4)  # about the target, in scatter panels [m]

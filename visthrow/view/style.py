@@ -3,7 +3,9 @@
 Source: Okabe and Ito, Color Universal Design, 2008, for the eight colours.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 """Colours of compared things, in order."""
@@ -19,6 +21,23 @@ PAYLOAD = "#D55E00"
 GOAL = "#009E73"
 FRONT = COLOURS[0]  # rotors
 REAR = "#9AA5B1"
+BEFORE = COLOURS[1]  # a model as it stands
+AFTER = COLOURS[0]  # the model with what a diagnosis named
+
+
+def looks_of(tables: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Return parts of pictures -> matplotlib's keywords, of tables whose colours may be names of
+    this module and whose ``ls`` may be a list of dash and gap.
+    """
+    looks = {}
+    for part, table in tables.items():
+        look = dict(table)
+        for key in look.keys() & {"color", "mec"}:
+            look[key] = globals().get(look[key], look[key])
+        if isinstance(look.get("ls"), list):
+            look["ls"] = (0, tuple(look["ls"]))
+        looks[part] = look
+    return looks
 
 
 def use() -> None:

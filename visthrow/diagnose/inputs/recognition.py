@@ -68,7 +68,7 @@ def moves(values: np.ndarray) -> bool:
 def rises(cells: np.ndarray) -> bool:
     """Tell whether a column rises as a clock does."""
     steps = np.diff(cells[np.isfinite(cells)])
-    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and float(np.mean(steps > 0.0)) > 0.3
+    return len(steps) > 10 and bool(np.all(steps >= 0.0)) and np.mean(steps > 0.0) > 0.3
 
 
 class Recognition:
@@ -166,7 +166,7 @@ class Recognition:
             vector = group.matches("rotvec") and not group.matches("not_vehicle")
             if not vector and not (group.hints_at("euler") and self._smooth(group)):
                 continue
-            largest = float(np.nanpercentile(np.abs(group.values), 99))
+            largest = np.nanpercentile(np.abs(group.values), 99)
             unit = _angle_unit(group)
             kind = "rotvec" if vector else "euler"
             why = f"{'three angles' if vector else 'roll, pitch, yaw'} up to {largest:.3g} {unit}"
@@ -196,7 +196,7 @@ class Recognition:
             if not np.any(channel.valid):
                 continue
             doubt = _UNUSUAL * ((order != entry.order) + (bool(axes) != motive))
-            doubt += _TILTED * (physics.median_tilt(channel) > physics.STEEPEST)
+            doubt += _TILTED * (physics.median_tilt(channel.samples().values) > physics.STEEPEST)
             doubt += 0.5 * _TILTED * (-down if axes == NED else down)
             words = [unit] * open_unit + [f"order {order}"] * open_order
             words.append(f"axes {axes or 'x,y,z'}")
@@ -210,7 +210,7 @@ class Recognition:
         for group in self._hinting("acc_b"):
             middle = np.nanmedian(group.values, axis=0)
             if abs(middle[2]) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
-                return -float(np.sign(middle[2]))
+                return -np.sign(middle[2])
         return 0.0
 
     def _positions(self) -> None:
@@ -239,7 +239,7 @@ class Recognition:
             group = path.group
             usual = "mocap_pos_w" if group.matches("capture") else "pos_w"
             usual = "est_pos_w" if group.matches("estimate") else usual
-            wide = float(np.nanmax(np.nanstd(group.values, axis=0)))
+            wide = np.nanmax(np.nanstd(group.values, axis=0))
             smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd){path.why}"
             first = path is paths[0]
             if not first or not self._take("pos_w", group, path.unit, smoothly, axes=self._up()):
@@ -278,7 +278,7 @@ class Recognition:
             best, *others = listed
             rivals = [r.words for r in others if r.doubt < best.doubt + SURE]
             if rivals:
-                reach = float(np.nanmax(np.abs(group.values)))
+                reach = np.nanmax(np.abs(group.values))
                 self.questions.append(
                     f"{group.listed} reach {reach:.3g} from the origin: {best.words} is a guess;"
                     f" {' and '.join(rivals)} would do as well"
@@ -415,7 +415,7 @@ class Recognition:
         if best is None:
             return False
         relation, group = best
-        independent = 0.5 * float(np.ptp(time)) / _REACH
+        independent = 0.5 * np.ptp(time) / _REACH
         unlike = max(1.0 - relation.correlation**2, 1e-6)
         nats = independent * np.log((1.0 - in_world**2) / unlike)
         if nats < SURE or relation.correlation < _FIRMLY:
@@ -437,7 +437,7 @@ class Recognition:
         if not ranked:
             return
         score, group, size = max(ranked, key=lambda candidate: candidate[0])
-        largest = float(np.nanpercentile(np.abs(group.values), 99))
+        largest = np.nanpercentile(np.abs(group.values), 99)
         why = f"99 % within {largest:.3g}"
         unit = NAMES["usual_units"].get(group.columns[0], "deg/s" if largest > 30.0 else "rad/s")
         unit = group.unit if group.unit.endswith("/s") else unit
@@ -454,7 +454,7 @@ class Recognition:
 
     def _forces(self) -> None:
         for group in self._hinting("acc_b"):
-            size = float(np.nanmedian(np.linalg.norm(group.values, axis=1)))
+            size = np.nanmedian(np.linalg.norm(group.values, axis=1))
             for unit in ("m/s^2", "g", "mg"):
                 if 0.8 < size * UNITS[unit][1] / physics.GRAVITY < 1.25:
                     why = f"a middle size of {size:.3g}: gravity in {unit}"
@@ -462,7 +462,7 @@ class Recognition:
 
     def _motors(self) -> None:
         for group in [g for g in self._open(4) if g.stem == "motor"]:
-            high = float(np.nanpercentile(group.values, 99))
+            high = np.nanpercentile(group.values, 99)
             words = " ".join(group.columns)
             if group.unit in ("rpm", "rad/s") or PATTERNS["speed"].search(words):
                 unit = group.unit or ("rpm" if "rpm" in words.lower() else "rad/s")
@@ -484,7 +484,7 @@ class Recognition:
 
     def _single_columns(self) -> None:
         for group in self._open(1):
-            middle = float(np.nanmedian(group.values))
+            middle = np.nanmedian(group.values)
             if group.matches("battery"):
                 units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
                 for unit in units:
@@ -510,7 +510,7 @@ class Recognition:
         ]
         groups.sort(key=lambda group: (len(group.stem) == 1, not group.matches("target")))
         for group in groups:
-            middle = float(np.nanmedian(group.values))
+            middle = np.nanmedian(group.values)
             if middle <= _LARGEST_THRUST and not rises(group.values[:, 0]):
                 unit = group.unit if group.unit in THRUSTS else "N"
                 self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
@@ -556,7 +556,7 @@ def _lettered(group: Group) -> bool:
 def _normalised(values: np.ndarray) -> np.ndarray:
     """Return numbers about their column's mean as one vector of length 1, zeros where none move."""
     centred = (values - np.mean(values, axis=0)).ravel()
-    return centred / max(float(np.linalg.norm(centred)), 1e-300)
+    return centred / max(np.linalg.norm(centred), 1e-300)
 
 
 def _on_grid(samples: Samples, grid: np.ndarray) -> np.ndarray:
@@ -568,4 +568,4 @@ def _on_grid(samples: Samples, grid: np.ndarray) -> np.ndarray:
 
 def _size(samples: Samples) -> float:
     """Root mean square about the means of the columns."""
-    return float(np.sqrt(np.mean(np.var(samples.values, axis=0))))
+    return np.sqrt(np.mean(np.var(samples.values, axis=0)))

@@ -92,7 +92,7 @@ def readings(
         units: Units of length that are tried.
         attitudes: Readings of the vehicle's attitude; None where there is no attitude.
     """
-    reach = float(np.nanmax(np.abs(path)))
+    reach = np.nanmax(np.abs(path))
     fall = by_fall(time, path)
     attitudes = list(attitudes)
     leans = [(0.0,) * 3 if way is None else _by_lean(time, path, way) for way in attitudes]
@@ -140,13 +140,13 @@ def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> tuple[fl
     lean = relations.mean_over(stamps, GRAVITY * up[:, :2], stamps, _SPAN)
     lean = lean - np.mean(lean, axis=0)
     acc = acc[:, :2] - np.mean(acc[:, :2], axis=0)
-    size, moves = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in (lean, acc))
+    size, moves = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (lean, acc))
     if size <= 0.0 or moves <= 0.0:
         return 0.0, 0.0, 0.0
-    correlation = float(np.mean(np.sum(lean * acc, axis=1))) / (size * moves)
-    independent = float(np.ptp(stamps)) / _SPAN
+    correlation = np.mean(np.sum(lean * acc, axis=1)) / (size * moves)
+    independent = np.ptp(stamps) / _SPAN
     correlation = min(max(correlation, 0.0), 0.999)
-    return size, moves / size, -0.5 * independent * float(np.log(1.0 - correlation**2))
+    return size, moves / size, -0.5 * independent * np.log(1.0 - correlation**2)
 
 
 def _huber(deviations: float) -> float:
@@ -171,7 +171,7 @@ def by_fall(time: np.ndarray, path: np.ndarray) -> str:
     shares = {}
     for unit in LENGTHS:
         off = np.linalg.norm(acc[:, None] * UNITS[unit][1] - down, axis=2)
-        shares[unit] = float(np.max(np.mean(off < _FALLS * GRAVITY, axis=0)))
+        shares[unit] = np.max(np.mean(off < _FALLS * GRAVITY, axis=0))
     best = max(shares, key=shares.__getitem__)
     return best if shares[best] > _SHARE else ""
 
@@ -188,7 +188,7 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
     Returns:
         The unit, "" where none does.
     """
-    off = {unit: abs(float(np.log(weighed / (carried * UNITS[unit][1])))) for unit in units}
+    off = {unit: abs(np.log(weighed / (carried * UNITS[unit][1]))) for unit in units}
     best = min(off, key=off.__getitem__)
     return best if off[best] < MASS_BAD else ""
 

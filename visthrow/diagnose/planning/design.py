@@ -163,6 +163,7 @@ START = np.array([1.0, *(0.0, 0.3, 0.7) * 4, 0.0, 0.0, 0.0, 0.0, 0.7])  # the ma
 def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     """Lay the sweeps of a vector of :data:`NUMBERS` over a manoeuvre."""
     x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0).tolist()))
+    kept = x["kept"]
     seconds = base.seconds - 2.0 * SETTLE
     limits = limits.around(base.reference().pos_w)
     middle = np.array([0.0, 0.0, base.path(np.zeros(1))[0, 2]])
@@ -170,20 +171,19 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     reaches = dict(zip("xyz", (*limits.half, half_height)))
 
     def swept(axis: str, t: np.ndarray) -> np.ndarray:
-        reach, speed, acceleration = np.pi, YAW_RATE, np.inf
-        if axis in reaches:
-            reach, speed, acceleration = reaches[axis], limits.speed, limits.acceleration
-        low, high = (_between(PATH, x[f"{end}_{axis}"]) for end in ("from", "to"))
-
         def farthest(frequency: np.ndarray) -> np.ndarray:
             turned = 2.0 * np.pi * frequency
-            within = np.minimum(reach, speed / turned)
-            return np.minimum(within, acceleration / turned**2)
+            if axis == "yaw":
+                return np.minimum(np.pi, YAW_RATE / turned)
+            within = np.minimum(reaches[axis], limits.speed / turned)
+            return np.minimum(within, limits.acceleration / turned**2)
 
+        low = _between(PATH, x[f"from_{axis}"])
+        high = _between(PATH, x[f"to_{axis}"])
         return x[f"share_{axis}"] * sweep(t, seconds, low, high, farthest)
 
     def ramped(t: np.ndarray) -> np.ndarray:
-        return middle + x["kept"] * (base.path(t) - middle)
+        return middle + kept * (base.path(t) - middle)
 
     def moved(t: np.ndarray) -> np.ndarray:
         return np.column_stack([swept(axis, t) for axis in "xyz"])
@@ -198,11 +198,11 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         for i, axis in enumerate("xyz"):
             added = sweep(t, seconds, slow, fast, phase=2.0 * np.pi * i / 3.0)
             sweeps.append(x[f"rate_{axis}"] * added)
-        return x["kept"] * base.rates(t) + limits.rate * np.column_stack(sweeps)
+        return kept * base.rates(t) + limits.rate * np.column_stack(sweeps)
 
     def thrust(t: np.ndarray) -> np.ndarray:
-        kept = 1.0 + x["kept"] * (base.thrust(t) - 1.0)
-        return kept + limits.thrust * x["thrust"] * sweep(t, seconds, fast, slow)
+        added = limits.thrust * x["thrust"] * sweep(t, seconds, fast, slow)
+        return 1.0 + kept * (base.thrust(t) - 1.0) + added
 
     return replace(
         base,
@@ -210,7 +210,7 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         purpose="the most nats a second within the limits",
         rates=rates,
         path=lambda t: ramped(t) + fitting * moved(t),
-        yaw=lambda t: x["kept"] * base.yaw(t) + swept("yaw", t),
+        yaw=lambda t: kept * base.yaw(t) + swept("yaw", t),
         thrust=thrust,
     )
 
@@ -260,9 +260,10 @@ def optimise(
     ``steps``: generations of the search, of as many flights as the first look.
     """
     count = len(NUMBERS)
-    scattered = START + SCATTER_SHARE * (qmc.Sobol(count, seed=seed).random(SCATTERED) - START)
+    points = qmc.Sobol(count, seed=seed).random(SCATTERED)
+    scattered = START + SCATTER_SHARE * (points - START)
     search = _Search(aim, base, simulate, limits)
-    start = search.costs(START[:, None])[0]
+    start = -float(search.costs(START[:, None])[0])
 
     def generation(columns: np.ndarray) -> np.ndarray:
         costs = search.costs(columns)
@@ -286,15 +287,8 @@ def optimise(
     if search.best is None:
         return None
     rate, numbers, information = search.best
-    return Design(
-        base,
-        designed(base, limits, numbers),
-        numbers,
-        information,
-        -float(start),
-        rate,
-        search.flights,
-    )
+    manoeuvre = designed(base, limits, numbers)
+    return Design(base, manoeuvre, numbers, information, start, rate, search.flights)
 
 
 @dataclass

@@ -15,7 +15,7 @@ from sim.scaling.units import Units, in_units
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import matrix_of_quat
+from visthrow.common.rotations import rotate_back, tilt_deg
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
@@ -47,9 +47,22 @@ LOST = 10.0  # the same of a vehicle that flies off
 # mass of a setup's cable, in that of its payload: the setup's model has it without mass
 THREAD = 1e-3
 
-ROWS = ("pos_w", "vel_w", "acc_w", "yaw", "rates_b", "thrust_factor", "release")
-"""What is flown of a reference."""
+STEPS = round(PERIOD / SAMPLE_PERIOD)  # samples in a row of a reference
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
+LOGGED = {
+    "pos_w": ("m", "world"),
+    "quat_wb": ("1", "world"),
+    "payload_pos_w": ("m", "world"),
+    "rate_b": ("rad/s", "body"),
+    "acc_b": ("m/s^2", "body"),
+    "battery_voltage": ("V",),
+    "command": ("N, rad/s", "body"),
+    "release_command": ("1",),
+    "thrust_command": ("N",),
+    "motor_command": ("1",),
+    "motor_speed": ("rad/s",),
+}
+"""Channel of a simulated log -> unit and frame."""
 
 
 @dataclass(frozen=True)
@@ -83,12 +96,9 @@ def simulator_of(
     """
     if isinstance(model, ThrowModel):
         plant = apply(model.entries, model.setting, diagnosis.theta).plant
-        model_of = partial(_throw_model, model)
         adapted = copy
     elif isinstance(model, FlyerModel) and isinstance(model.params, FlyerParams):
-        known = plant_of(load_experiment("state"))
-        plant = vehicle_of(model.params, known)
-        model_of = partial(_setup_model, model, build)
+        plant = vehicle_of(model.params, plant_of(load_experiment("state")))
         adapted = partial(carried, params=model.params)
     else:
         raise DiagnoseError(
@@ -97,21 +107,16 @@ def simulator_of(
         )
     noise = _sensor_noise(diagnosis)
 
+    def model_of(flight: SimulatedFlight) -> Model:
+        if isinstance(model, ThrowModel):
+            return _throw_model(model, noise, flight)
+        return build([flight.setup_log(model.params, noise, model.has_voltage)])
+
     def simulate(manoeuvres: Sequence[Manoeuvre]) -> list[Simulated]:
         flights = fly(plant, manoeuvres, seed, model.device)
-        return [flight.simulated(partial(model_of, noise)) for flight in flights]
+        return [flight.simulated(model_of) for flight in flights]
 
     return simulate, adapted
-
-
-def _setup_model(
-    model: FlyerModel,
-    build: Callable[[Sequence[FlightLog]], Model],
-    noise: Mapping[str, float],
-    flight: "SimulatedFlight",
-) -> Model:
-    """Return a setup's model of a simulated flight; ``build``: gives it by the flight's log."""
-    return build([flight.setup_log(model.params, noise, model.has_voltage)])
 
 
 def _throw_model(
@@ -150,10 +155,10 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     """
     ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
-    v = in_units(plant.vehicle, alike)
+    vehicle = in_units(plant.vehicle, alike)
     rope = in_units(plant.rope, alike)
-    no_drag = {f"aero.{f.name}": 0.0 for f in fields(v.aero) if f.name != "kind"}
-    values = no_drag | {
+    values = {f"aero.{f.name}": 0.0 for f in fields(vehicle.aero) if f.name != "kind"}
+    values |= {
         "aero.drag_x": params.drag_xy,
         "aero.drag_y": params.drag_xy,
         "aero.drag_z": params.drag_z,
@@ -163,15 +168,14 @@ def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
         "thrust.voltage_coefficient": 0.0,
         "controller.voltage_compensation": 1.0,
     }
-    if params.cable is not None:
+    cable = params.cable
+    if cable is not None:
+        length = cable.length - rope.payload_offset
+        mass = THREAD * cable.mass
         rope = replace(
-            rope,
-            length=params.cable.length - rope.payload_offset,
-            payload_mass=params.cable.mass,
-            mount=params.cable.mount,
-            rope_mass=THREAD * params.cable.mass,
+            rope, length=length, payload_mass=cable.mass, mount=cable.mount, rope_mass=mass
         )
-    return replace(plant, vehicle=changed(v, values), rope=rope)
+    return replace(plant, vehicle=changed(vehicle, values), rope=rope)
 
 
 def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
@@ -179,7 +183,7 @@ def _sensor_noise(diagnosis: Diagnosis) -> dict[str, float]:
     point = diagnosis.work.after
     noise = {}
     for c, name in enumerate(diagnosis.work.problem.model.channels):
-        sigma = point.sigma(c) * float(point.noise.scale[c])
+        sigma = point.sigma(c) * point.noise.scale[c]
         if np.isfinite(sigma):
             noise[name] = sigma
     return noise
@@ -205,12 +209,12 @@ class SimulatedFlight:
         """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
         it if it was not.
         """
-        off = self.truth["pos_w"][:: round(PERIOD / SAMPLE_PERIOD)] - self.reference.pos_w
+        off = self.truth["pos_w"][::STEPS] - self.reference.pos_w
         height = self.reference.pos_w[:, 2] - self.reference.lowest
-        sunk = -off[:, 2] / height
-        astray = np.linalg.norm(off, axis=1) / ASTRAY
-        used = float(np.max([self.swing / HIGHEST, astray.max(), sunk.max()]))  # NaN counts
-        used = min(used, LOST) if np.isfinite(used) else LOST
+        sunk = np.max(-off[:, 2] / height)
+        astray = np.max(np.linalg.norm(off, axis=1)) / ASTRAY
+        used = np.max([self.swing / HIGHEST, astray, sunk])  # NaN counts
+        used = min(float(used), LOST) if np.isfinite(used) else LOST
         try:
             return Simulated(model_of(self) if used < 1.0 else None, used)
         except (DiagnoseError, LogError):
@@ -225,28 +229,20 @@ class SimulatedFlight:
             return 0.0
         released = self.reference.time[self.reference.release]
         hanging = self.time < np.min(released, initial=np.inf)
-        hangs = (self.truth["payload_pos_w"] - self.truth["pos_w"])[hanging]
-        axes = -matrix_of_quat(self.truth["quat_wb"][hanging])[:, :, 2]
-        cosine = np.einsum("ni,ni->n", hangs, axes) / np.linalg.norm(hangs, axis=1)
-        return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).max())
+        rope_w = (self.truth["pos_w"] - self.truth["payload_pos_w"])[hanging]
+        rope_b = rotate_back(self.truth["quat_wb"][hanging], rope_w)
+        return tilt_deg(rope_b).max()
 
     def log(self, noise: Mapping[str, float], voltage: bool = True) -> FlightLog:
         """Return a flight log like the throw's: poses from motion capture, commands as sent, and
         the battery's ``voltage`` if the vehicle logs it.
         """
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
-        measured = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
-        sent = self.reference.time
-        channels = {
-            "pos_w": Channel(self.time, measured["pos_w"], "m", "world"),
-            "quat_wb": Channel(self.time, measured["quat_wb"], "1", "world"),
-            "payload_pos_w": Channel(self.time, measured["payload_pos_w"], "m", "world"),
-            "command": Channel(sent, self.commands, "N, rad/s", "body"),
-            "release_command": Channel(sent, self.reference.release.astype(float), "1"),
-        }
+        values = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         if voltage:
-            channels["battery_voltage"] = Channel(self.time, self.truth["voltage"], "V")
-        return self._log(channels)
+            values["battery_voltage"] = self.truth["voltage"]
+        sent = {"command": self.commands, "release_command": self.reference.release.astype(float)}
+        return self._log(_channels(self.time, values) | _channels(self.reference.time, sent))
 
     def setup_log(
         self, params: FlyerParams, noise: Mapping[str, float], voltage: bool = False
@@ -255,28 +251,20 @@ class SimulatedFlight:
         thrust, and what an IMU on board measures.
         """
         truth = self.truth
-        turns = matrix_of_quat(truth["quat_wb"])
+        names = {"pos_w": params.position, "quat_wb": params.attitude}
+        values = {}
+        for name in ("pos_w", "payload_pos_w", "rate_b"):
+            sd = noise.get(names.get(name, name), 0.0)
+            values[name] = truth[name] + sd * self.rng.standard_normal(truth[name].shape)
         force_w = np.gradient(truth["vel_w"], SAMPLE_PERIOD, axis=0) + [0.0, 0.0, GRAVITY]
-        battery = self.plant.vehicle.battery.reference_voltage
-        measured = {
-            params.position: (truth["pos_w"], "m", "world"),
-            "payload_pos_w": (truth["payload_pos_w"], "m", "world"),
-            "rate_b": (truth["rate_b"], "rad/s", "body"),
-        }
-        channels = {}
-        for name, (values, unit, frame) in measured.items():
-            values = values + noise.get(name, 0.0) * self.rng.standard_normal(values.shape)
-            channels[name] = Channel(self.time, values, unit, frame)
-        force_b = np.einsum("nji,nj->ni", turns, force_w)
-        channels |= {
-            params.attitude: Channel(self.time, truth["quat_wb"], "1", "world"),
-            params.input: self._input(params),
-            "acc_b": Channel(self.time, force_b, "m/s^2", "body"),
-        }
+        values["quat_wb"] = truth["quat_wb"]
+        values["acc_b"] = rotate_back(truth["quat_wb"], force_w)
         if voltage:
-            volts = params.reference_voltage * truth["voltage"] / battery
-            channels["battery_voltage"] = Channel(self.time, volts, "V")
-        return self._log(channels)
+            battery = self.plant.vehicle.battery.reference_voltage
+            values["battery_voltage"] = params.reference_voltage * truth["voltage"] / battery
+        measured = _channels(self.time, values)
+        channels = {names.get(name, name): channel for name, channel in measured.items()}
+        return self._log(channels | self._input(params))
 
     def _log(self, channels: dict[str, Channel]) -> FlightLog:
         """Return a log of channels, without those of a payload that is not carried."""
@@ -284,19 +272,24 @@ class SimulatedFlight:
         kept = {name: channel for name, channel in channels.items() if name not in absent}
         return FlightLog(kept, {"period": PERIOD})
 
-    def _input(self, params: FlyerParams) -> Channel:
+    def _input(self, params: FlyerParams) -> dict[str, Channel]:
         """Return the input of a setup's log: the map of thrust, the lag and the delay inverted."""
         if params.input in ("command", "thrust_command"):
-            thrust = command_of(params.thrust_map, self.commands[:, :1])
-            whole = params.input == "command"
-            values = np.hstack((thrust, self.commands[:, 1:])) if whole else thrust
-            return Channel(self.reference.time, values, "N, rad/s" if whole else "N")
+            values = command_of(params.thrust_map, self.commands[:, :1])
+            if params.input == "command":
+                values = np.hstack((values, self.commands[:, 1:]))
+            return _channels(self.reference.time, {params.input: values})
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
         lag = self.plant.vehicle.motor.time_constant
         lagged = thrust + lag * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
         # samples that are held stand for what lies about them
         stamps = self.time - params.command_delay - 0.5 * SAMPLE_PERIOD
-        return Channel(stamps, command_of(params.thrust_map, lagged), "1")
+        return _channels(stamps, {params.input: command_of(params.thrust_map, lagged)})
+
+
+def _channels(time: np.ndarray, values: Mapping[str, np.ndarray]) -> dict[str, Channel]:
+    """Return channels of names in :data:`LOGGED` that share their stamps [s]."""
+    return {name: Channel(time, array, *LOGGED[name]) for name, array in values.items()}
 
 
 def fly(
@@ -309,47 +302,53 @@ def fly(
 
     references = [m.reference() for m in manoeuvres]
     count = len(references)
-    rows = max(len(r.time) for r in references)
-    plan = {name: np.stack([_held(getattr(r, name), rows) for r in references], 1) for name in ROWS}
+    plan = _stacked(references)
     plant = replace(plant, sim=replace(plant.sim, control_period=SAMPLE_PERIOD))
     motors = plant.vehicle.controller
     thrusts = {"min_thrust": 4.0 * motors.min_thrust, "max_thrust": 4.0 * motors.max_thrust}
-    controller = HoverController(replace(TRACKING, **thrusts), PERIOD, count)
-    gains = controller.params
+    gains = replace(TRACKING, **thrusts)
+    controller = HoverController(gains, PERIOD, count)
+    # a controller that follows velocities and accelerations by a goal that is ahead
+    push = plan.vel_w + plan.acc_w / gains.velocity_gain
+    goals = plan.pos_w + push / gains.position_gain
     sim = HybridSim(plant, count, device)
-    sim.place(plan["pos_w"][0])
+    sim.place(plan.pos_w[0])
     dropped = ~np.array([m.payload for m in manoeuvres])
-    sent = []
-    sampled: dict[str, list[np.ndarray]] = {name: [] for name in SAMPLED}
-    for row in range(-round(APPROACH_SECONDS / PERIOD), rows):
-        wanted = {name: values[max(row, 0)] for name, values in plan.items()}
-        push = wanted["vel_w"] + wanted["acc_w"] / gains.velocity_gain
-        goal = wanted["pos_w"] + push / gains.position_gain
+    commands = []
+    samples = []
+    for row in range(-round(APPROACH_SECONDS / PERIOD), len(goals)):
+        flown = row >= 0
+        i = max(row, 0)
         state = [sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")]
         mass = np.where(dropped, plant.vehicle.body.mass, plant.total_mass)
-        command = controller.step(*state, goal, mass, wanted["yaw"])
-        if row >= 0:
-            command[:, 1:] += wanted["rates_b"]
-            command[:, 0] *= wanted["thrust_factor"]
-            dropped = dropped | wanted["release"]
-            sent.append(command)
+        command = controller.step(*state, goals[i], mass, plan.yaw[i])
+        if flown:
+            command[:, 1:] += plan.rates_b[i]
+            command[:, 0] *= plan.thrust_factor[i]
+            dropped = dropped | plan.release[i]
+            commands.append(command)
         sim.set_command(command, dropped)
-        for _ in range(round(PERIOD / SAMPLE_PERIOD)):
-            for name in SAMPLED if row >= 0 else ():
-                sampled[name].append(sim.get(name).astype(float))
+        for _ in range(STEPS):
+            if flown:
+                samples.append([sim.get(name).astype(float) for name in SAMPLED])
             sim.step()
-    truth = {name: np.array(values) for name, values in sampled.items()}
-    commands = np.array(sent)
+    truth = {name: np.array(values) for name, values in zip(SAMPLED, zip(*samples))}
+    sent = np.array(commands)
     flights = []
-    for e, (r, m) in enumerate(zip(references, manoeuvres)):
-        rows = len(r.time)
-        steps = rows * round(PERIOD / SAMPLE_PERIOD)
-        states = {name: values[:steps, e] for name, values in truth.items()}
+    for e, (reference, manoeuvre) in enumerate(zip(references, manoeuvres)):
+        rows = len(reference.time)
+        states = {name: values[: rows * STEPS, e] for name, values in truth.items()}
         rng = np.random.default_rng([seed, e])
-        flights.append(SimulatedFlight(m, r, plant, states, commands[:rows, e], rng))
+        flights.append(SimulatedFlight(manoeuvre, reference, plant, states, sent[:rows, e], rng))
     return flights
 
 
-def _held(values: np.ndarray, rows: int) -> np.ndarray:
-    """Return rows of a reference, and its last one from there on."""
-    return values[np.minimum(np.arange(rows), len(values) - 1)]
+def _stacked(references: Sequence[Reference]) -> Reference:
+    """Return references side by side, each at its last row from its end on."""
+    rows = max(len(r.time) for r in references)
+    columns = []
+    for f in fields(Reference):
+        values = [getattr(r, f.name) for r in references]
+        held = [v[np.minimum(np.arange(rows), len(v) - 1)] for v in values]
+        columns.append(np.stack(held, 1))
+    return Reference(*columns)

@@ -5,7 +5,7 @@ Each manoeuvre is simulated with the model as found; its expected information is
 hand. For two members of a class the promise is the expected gap of their evidence with either as
 the truth, the smaller of both."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -61,26 +61,23 @@ class PlanningGoal:
         ``names``: names of the effects to plan for; empty for all. Raises DiagnoseError: an effect
         that the diagnosis does not know."""
         work = diagnosis.work
+        effects = work.problem.model.effects
         self.diagnosis = diagnosis
         self.base = work.after
         self.priors = work.problem.priors
-        self.names = [e.name for e in work.problem.model.effects]
+        self.names = [e.name for e in effects]
         expect_known(names, self.names, "no effect '{}' in this diagnosis", DiagnoseError)
         number = self.names.index
         self.pairs = []
-        unclear = []
         for f in diagnosis.findings:
-            if f.verdict == result.NOT_IDENTIFIABLE:
-                unclear.append(f.name)
-            if f.verdict != result.CLASS or f.name not in diagnosis.theta:
-                continue
-            for partner in f.partners:
-                if not names or {f.name, partner} & set(names):
+            for partner in f.partners if f.verdict == result.CLASS else ():
+                asked = not names or f.name in names or partner in names
+                if asked and f.name in diagnosis.theta:
                     self.pairs.append((number(f.name), number(partner)))
-        graded = []
-        for effect, visible in zip(work.problem.model.effects, self.priors.visible):
-            if visible and not effect.switch:
-                graded.append(effect.name)
+        unclear = [f.name for f in diagnosis.findings if f.verdict == result.NOT_IDENTIFIABLE]
+        graded = [
+            e.name for e, visible in zip(effects, self.priors.visible) if visible and not e.switch
+        ]
         self.vague = [] if self.pairs else [number(name) for name in names or unclear or graded]
 
     def information(self, model: Model) -> np.ndarray:
@@ -95,29 +92,35 @@ class PlanningGoal:
         """
         if self.pairs:
             return min(self._gap(pair, new) for pair in self.pairs)
-        return float(np.mean(np.log(self._deviations(0.0 * new) / self._deviations(new))))
+        return np.mean(np.log(self._deviations(0.0 * new) / self._deviations(new)))
 
     def settled(self, new: np.ndarray) -> tuple[list[tuple[int, ...]], int]:
         """Pairs apart, or effects that can be named, after the fewest flights that settle the most;
         and the number of these.
         """
+        most: list[tuple[int, ...]] = []
+        repeats = 0
+        for count in range(1, MOST_REPEATS + 1):
+            settled = self._apart(new, count) if self.pairs else self._named(new, count)
+            if len(settled) > len(most):
+                most = settled
+                repeats = count
+        return most, repeats
 
-        def apart(count: int) -> list[tuple[int, ...]]:
-            return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
+    def _apart(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
+        """Return the pairs that so many flights separate."""
+        return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
 
-        if self.pairs:
-            return _fewest_flights(apart, len(self.pairs))
+    def _named(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
+        """Return the effects that so many flights tell well enough to be named."""
         able = self.priors.slab[self.vague] * NAMEABLE
-        unknown = able < self._deviations(0.0 * new)
+        shows = self._deviations(count * new) < able
+        shows &= self._deviations(0.0 * new) > able  # unknown yet
         # a name is confirmed by so many flights that tell of it
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
         telling = np.sum(at_hand > TELLING * new[self.vague, self.vague], axis=0)
-
-        def shown(count: int) -> list[tuple[int, ...]]:
-            shows = unknown & (self._deviations(count * new) < able) & (telling + count >= PARTS)
-            return [(j,) for j in np.compress(shows, self.vague).tolist()]
-
-        return _fewest_flights(shown, len(self.vague))
+        shows &= telling + count >= PARTS
+        return [(j,) for j in np.compress(shows, self.vague).tolist()]
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
         """Expected nats between two members after the new flight, with either as the truth; the
@@ -142,7 +145,7 @@ class PlanningGoal:
             right = log_evidence(total, after, priors, [*remaining, truth])
             wrong = log_evidence(total, after, priors, [*remaining, rival])
             gaps.append(right - wrong)
-        return float(min(gaps))
+        return min(gaps)
 
     def _deviations(self, new: np.ndarray) -> np.ndarray:
         """Posterior deviation of each effect that is planned for, if it were named, with more
@@ -205,7 +208,6 @@ def _worth(p: FlightProposal) -> tuple[float, float]:
 def _measured(aim: PlanningGoal) -> list[FlightProposal]:
     """Measurements on the ground that settle members of classes."""
     names = aim.names
-    findings = {f.name: f for f in aim.diagnosis.findings}
     proposals = []
     for m in MEASUREMENTS:
         pairs = [(a, b) for a, b in aim.pairs if m.effect in (names[a], names[b])]
@@ -213,17 +215,14 @@ def _measured(aim: PlanningGoal) -> list[FlightProposal]:
             continue
         j = names.index(m.effect)
         # if it is the cause, the measurement shows it
-        shown = 0.5 * (findings[m.effect].estimate / m.sd) ** 2
+        shown = 0.5 * (aim.diagnosis[m.effect].estimate / m.sd) ** 2
         gaps = [min(shown, _denied(aim.diagnosis, j, a + b - j, m)) for a, b in pairs]
-        separated = []
-        for (a, b), gap in zip(pairs, gaps):
-            if gap > DECISIVE:
-                separated.append((names[a], names[b]))
-        repeats = int(bool(separated))
+        apart = [pair for pair, gap in zip(pairs, gaps) if gap > DECISIVE]
+        separates = tuple((names[a], names[b]) for a, b in apart)
         why = f"settles {m.effect}"
-        proposals.append(
-            FlightProposal(m.name, why, m.seconds, min(gaps), tuple(separated), repeats, "")
-        )
+        repeats = 1 if apart else 0
+        nats = min(gaps)
+        proposals.append(FlightProposal(m.name, why, m.seconds, nats, separates, repeats, ""))
     return proposals
 
 
@@ -251,16 +250,19 @@ def expected_information(
     floors = np.array([e.floor for e in model.effects])
     grams = grams_of(windows, floors, len(model.channels))
     grams = correlated_of(grams, windows, noise.correlation_time)
-    loudest: dict[int, float] = {}
-    for (block, _), level in noise.latent_sd.items():
-        loudest[block] = max(level, loudest.get(block, 0.0))
-    levels = {}
-    for block, phase in product(range(len(LATENT_BLOCKS)), {w.phase for w in windows}):
-        # of a payload that has not been flown: as strongly as the vehicle [N]
-        level = loudest.get(block, loudest.get(0, 1.0))
-        levels[block, phase] = noise.latent_sd.get((block, phase), level)
-    alike = np.ones((len(windows), len(LATENT_BLOCKS)))
-    expected = replace(noise, scale=np.ones(len(model.channels)), latent_sd=levels, share=alike)
+    blocks = range(len(LATENT_BLOCKS))
+    phases = {w.phase for w in windows}
+    rising = sorted(noise.latent_sd.items(), key=lambda item: item[1])
+    loudest = {block: level for (block, _), level in rising}
+    # of a payload that has not been flown: as strongly as the vehicle [N]
+    usual = {block: loudest.get(block, loudest.get(0, 1.0)) for block in blocks}
+    levels = {(block, phase): usual[block] for block, phase in product(blocks, phases)}
+    expected = replace(
+        noise,
+        scale=np.ones(len(model.channels)),
+        latent_sd=levels | {key: noise.latent_sd[key] for key in levels.keys() & noise.latent_sd},
+        share=np.ones((len(windows), len(LATENT_BLOCKS))),
+    )
     parts = integrals(grams, expected).shares(grams, expected)
     information = np.sum([part.information for part in parts], axis=0)
     # both catalogues name the same effects, each in floors of its own
@@ -270,15 +272,3 @@ def expected_information(
             j = flown[name]
             places[i, j] = priors.floor[i] / floors[j]
     return places @ information @ places.T
-
-
-def _fewest_flights(settled: Callable[[int], list], all_of_them: int) -> tuple[list, int]:
-    """Return the most that the fewest flights settle, and their number."""
-    best: tuple[list, int] = [], 0
-    for count in range(1, MOST_REPEATS + 1):
-        settled_now = settled(count)
-        if len(settled_now) > len(best[0]):
-            best = settled_now, count
-        if len(best[0]) == all_of_them:
-            break
-    return best

@@ -96,7 +96,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
         if parametric
         else "the flights' own residuals, with random signs a flight"
     )
-    return Blind(tuple(curves), float(alarms.mean()), 10 * draws, source)
+    return Blind(tuple(curves), alarms.mean(), 10 * draws, source)
 
 
 def _limit(size: np.ndarray, share: np.ndarray) -> float:
@@ -105,9 +105,9 @@ def _limit(size: np.ndarray, share: np.ndarray) -> float:
     """
     below = np.flatnonzero(share < NAMED)
     if not len(below):
-        return float(size[0])
+        return size[0]
     last = below[-1]
     if last == len(size) - 1:
         return float("nan")
     part = (NAMED - share[last]) / (share[last + 1] - share[last])
-    return float(np.exp(np.log(size[last]) + part * np.log(size[last + 1] / size[last])))
+    return np.exp(np.log(size[last]) + part * np.log(size[last + 1] / size[last]))

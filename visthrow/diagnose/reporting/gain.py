@@ -120,18 +120,18 @@ def landing_gain(
         remaining = {effect: size for effect, size in theta.items() if effect != name}
         without = model.landings(remaining, flown) if remaining else plain
         level = (named.predicted - without.predicted)[good, :2]
-        moved[name] = float(np.nanmean(np.linalg.norm(level, axis=1)))
+        moved[name] = np.nanmean(np.linalg.norm(level, axis=1))
     after = mean(held_landings.errors[good], seed=seed)
     released = []
     off = []
     for prediction in (plain, held_landings):
-        released.append(float(np.nanmean(prediction.released_errors[good])))
+        released.append(np.nanmean(prediction.released_errors[good]))
         level = (prediction.predicted - prediction.measured)[good, :2]
         off.append(tuple(map(tuple, level.tolist())))
     return LandingGain(
         int(good.sum()),
         bool(trained),
-        float(plain.errors[good].mean()),
+        plain.errors[good].mean(),
         after.value,
         after.low,
         after.high,
@@ -236,4 +236,4 @@ def _nats(before: Point, after: Point, cross: Crossed) -> float:
     change = cross.trained - after.theta
     quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
     square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic
-    return float(0.5 * (plain.square.sum() - square.sum()) / named.samples.sum())
+    return 0.5 * (plain.square.sum() - square.sum()) / named.samples.sum()

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.likelihood.evidence import covariance
 from visthrow.diagnose.likelihood.forms import READABLE, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
@@ -16,13 +17,13 @@ from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.held_out import Work
-from visthrow.diagnose.select.result import Diagnosis
+from visthrow.diagnose.select.result import Diagnosis, SelectionStep
 from visthrow.view import style
 from visthrow.view.parts import png_of
 
 WIDTH = 9.2  # [inch]
-BEFORE = style.COLOURS[1]
-AFTER = style.COLOURS[0]
+LOOKS = style.looks_of(tables_beside(__file__))
+"""Part of a picture -> matplotlib's keywords."""
 REFERENCE = ("x [m]", "y [m]", "z [m]", "heading [deg]", "thrust [%]")
 REFERENCE += tuple(f"rate {axis} [rad/s]" for axis in "xyz")
 """What is drawn of a reference, in the order of its columns."""
@@ -37,9 +38,15 @@ def _figure(rows: int, columns: int, height: float, **options):
     import matplotlib.pyplot as plt
 
     style.use()
-    return plt.subplots(
-        rows, columns, figsize=(WIDTH, height), constrained_layout=True, squeeze=False, **options
-    )
+    size = (WIDTH, height)
+    how = {"layout": "constrained", "squeeze": False, **options}
+    return plt.subplots(rows, columns, figsize=size, **how)
+
+
+def _single(height: float):
+    """Return a figure with one axes, and these."""
+    figure, axes = _figure(1, 1, height)
+    return figure, axes[0, 0]
 
 
 def _with_legend(figure) -> bytes:
@@ -83,7 +90,7 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
     ``rates``: expected nats a second of manoeuvres by their name.
     """
     figure, axes = _figure(3, 3, 6.2)
-    for manoeuvre, colour in ((base, BEFORE), (designed, AFTER)):
+    for manoeuvre, colour in ((base, style.BEFORE), (designed, style.AFTER)):
         r = manoeuvre.reference()
         percent = 100.0 * (r.thrust_factor - 1.0)
         columns = np.column_stack((r.pos_w, np.degrees(r.yaw), percent, r.rates_b)).T
@@ -91,13 +98,11 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
             axis.plot(r.time, values, color=colour, lw=1.0, label=manoeuvre.name)
             axis.set(ylabel=label, xlabel="time [s]")
     best = sorted(rates, key=rates.get)[-6:]
-    axes[2, 2].barh(
-        best,
-        [rates[name] for name in best],
-        color=[AFTER if name == designed.name else BEFORE for name in best],
-    )
-    axes[2, 2].tick_params(axis="y", labelsize=6)
-    axes[2, 2].set(xlabel="expected nats a second")
+    colours = [style.AFTER if name == designed.name else style.BEFORE for name in best]
+    bars = axes[2, 2]
+    bars.barh(best, [rates[name] for name in best], color=colours)
+    bars.tick_params(axis="y", labelsize=6)
+    bars.set(xlabel="expected nats a second")
     return _with_legend(figure)
 
 
@@ -120,9 +125,9 @@ def residuals(work: Work, channel: int) -> bytes:
     for axis, (_, before, rows, old, new) in zip(axes[0], chosen):
         time = before.time[rows]
         noise = factor * 2.0 * np.median(before.sigma[rows] * work.after.noise.scale[channel])
-        axis.axhspan(-noise, noise, color=style.FAINT, lw=0, label="noise, 2 sigma")
-        axis.plot(time, factor * old, ".", ms=2.2, color=BEFORE, label="model as it stands")
-        axis.plot(time, factor * new, ".", ms=2.2, color=AFTER, label="with what was named")
+        axis.axhspan(-noise, noise, **LOOKS["noise"])
+        axis.plot(time, factor * old, **LOOKS["residual"], **LOOKS["before"])
+        axis.plot(time, factor * new, **LOOKS["residual"], **LOOKS["after"])
         axis.set(title=f"flight {before.flight}, {before.phase}", xlabel="time [s]")
     axes[0, 0].set_ylabel(f"measured - simulated [{unit}]" if unit else "measured - simulated")
     return _with_legend(figure)
@@ -140,48 +145,48 @@ def ladder(diagnosis: Diagnosis) -> bytes:
     for axis in axes.flat[len(steps) :]:
         axis.set_visible(False)
     for number, (axis, step) in enumerate(zip(axes.flat, steps), start=1):
-        names = list(step.screened)[::-1]
-        screened = [max(step.screened[n], 0.0) for n in names]
-        labels = [textwrap.fill(name, NAMES_ACROSS) for name in names]
-        axis.barh(labels, screened, height=0.62, color=style.FAINT)
-        for name in step.refitted.keys() & set(names):
-            marker, colour = ("o", AFTER) if name == step.named else ("^", style.QUIET)
-            height = names.index(name)
-            axis.plot(max(step.refitted[name], 0.0), height, marker=marker, ms=6, color=colour)
-        axis.axvline(step.least, color=BEFORE, lw=1)
+        _step(axis, step)
         several = f"{step.named.count(', ') + 1} causes"
-        axis.set(
-            xscale="symlog",
-            xlabel="nats",
-            title=f"step {number}: {several if ', ' in step.named else step.named}",
-        )
-        axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
-        _plain(axis.xaxis)
-        axis.tick_params(axis="y", labelsize=8)
+        axis.set_title(f"step {number}: {several if ', ' in step.named else step.named}")
     return png_of(figure)
+
+
+def _step(axis, step: SelectionStep) -> None:
+    """Draw the candidates of one step."""
+    names = list(step.screened)[::-1]
+    screened = [max(step.screened[n], 0.0) for n in names]
+    labels = [textwrap.fill(name, NAMES_ACROSS) for name in names]
+    axis.barh(labels, screened, **LOOKS["screened"])
+    for name in step.refitted.keys() & set(names):
+        look = LOOKS["taken" if name == step.named else "beaten"]
+        axis.plot(max(step.refitted[name], 0.0), names.index(name), **look)
+    axis.axvline(step.least, **LOOKS["threshold"])
+    axis.set(xscale="symlog", xlabel="nats")
+    axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
+    _plain(axis.xaxis)
+    axis.tick_params(axis="y", labelsize=8)
 
 
 def verdicts(diagnosis: Diagnosis) -> bytes:
     """Every effect's interval in its floors, by verdict."""
     colours = {
-        result.FOUND: AFTER,
+        result.FOUND: style.AFTER,
         result.CLASS: style.COLOURS[3],
         result.CANDIDATE: style.COLOURS[3],
         result.BOUNDED: style.QUIET,
         result.NOT_IDENTIFIABLE: style.COLOURS[4],
     }
     findings = [f for f in diagnosis.findings if f.verdict in colours][::-1]
-    figure, axes = _figure(1, 1, 0.8 + 0.19 * len(findings))
-    axis = axes[0, 0]
-    axis.axvspan(-1.0, 1.0, color=style.FAINT, lw=0)
+    figure, axis = _single(0.8 + 0.19 * len(findings))
+    axis.axvspan(-1.0, 1.0, **LOOKS["negligible"])
     for y, f in enumerate(findings):
         colour = colours[f.verdict]
         middle = f.estimate if f.verdict in result.NAMED else 0.5 * (f.low + f.high)
         ends = np.array([f.low, f.high]) / f.floor
-        axis.plot(ends, [y, y], color=colour, lw=2.4, solid_capstyle="butt")
+        axis.plot(ends, [y, y], color=colour, **LOOKS["interval"])
         marker = "o" if f.estimate else "|"
         axis.plot(middle / f.floor, y, marker, color=colour, ms=6, label=f.verdict)
-    axis.axvline(0.0, color=style.QUIET, lw=0.8)
+    axis.axvline(0.0, **LOOKS["zero"])
     axis.set_xlabel("size in floors (grey: within the floor)")
     _name_rows(axis, [f.name for f in findings], 8)
     axis.set_xscale("symlog", linthresh=1.0, linscale=0.5)
@@ -195,9 +200,9 @@ def horizons(gain: Gain) -> bytes:
     figure, axes = _figure(1, len(gain.channels), 2.9)
     for axis, channel in zip(axes[0], gain.channels):
         h, before, after, floor = np.array(channel.horizons).T
-        axis.plot(h, before, marker="^", color=BEFORE, label="model as it stands")
-        axis.plot(h, after, marker="o", color=AFTER, label="with what was named")
-        axis.plot(h, floor, ":", color=style.INK, label="noise alone")
+        axis.plot(h, before, marker="^", **LOOKS["before"])
+        axis.plot(h, after, marker="o", **LOOKS["after"])
+        axis.plot(h, floor, **LOOKS["floor"])
         axis.set(title=channel.channel, xlabel="horizon [s]", xscale="log", yscale="log")
         axis.set_xticks(SHOWN_HORIZONS, [f"{x:g}" for x in SHOWN_HORIZONS])
         axis.minorticks_off()
@@ -208,16 +213,13 @@ def horizons(gain: Gain) -> bytes:
 
 def landings(landing: LandingGain) -> bytes:
     """Draw where each throw was predicted to land, relative to where it landed."""
-    figure, axes = _figure(1, 1, 3.6)
-    axis = axes[0, 0]
-    for off, colour, marker, label in (
-        (landing.off_before, BEFORE, "^", "model as it stands"),
-        (landing.off_after, AFTER, "o", "with what was named"),
-    ):
-        axis.plot(*(1e3 * np.array(off).T), marker, color=colour, label=label)
-    for before, after in zip(landing.off_before, landing.off_after):
-        axis.plot(*(1e3 * np.array((before, after)).T), color=style.FAINT, lw=1, zorder=0)
-    axis.plot(0.0, 0.0, "+", color=style.INK, ms=12, label="measured")
+    figure, axis = _single(3.6)
+    before = 1e3 * np.array(landing.off_before)
+    after = 1e3 * np.array(landing.off_after)
+    axis.plot(*before.T, **LOOKS["landing_before"], **LOOKS["before"])
+    axis.plot(*after.T, **LOOKS["landing_after"], **LOOKS["after"])
+    axis.plot(*np.stack((before, after)).transpose(2, 0, 1), **LOOKS["miss"])
+    axis.plot(0.0, 0.0, **LOOKS["landing"])
     axis.set(xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
     return _with_legend(figure)
 
@@ -237,14 +239,13 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     strongest[np.isin(visible, work.active)] = 2.0
     strongest_effects = np.sort(np.argsort(-strongest, kind="stable")[:SHOWN_EFFECTS])
     names = [work.problem.model.effects[j].name for j in visible[strongest_effects]]
-    figure, axes = _figure(1, 1, 1.6 + 0.3 * len(strongest_effects))
-    axis = axes[0, 0]
+    figure, axis = _single(1.6 + 0.3 * len(strongest_effects))
     block = correlation[np.ix_(strongest_effects, strongest_effects)]
     image = axis.imshow(block, vmin=-1.0, vmax=1.0, cmap="RdBu_r")
     for (i, j), value in np.ndenumerate(block):
         if i != j and abs(value) > 0.3:
             colour = "white" if abs(value) > 0.7 else style.INK
-            axis.text(j, i, f"{value:.2f}", ha="center", va="center", fontsize=7, color=colour)
+            axis.text(j, i, f"{value:.2f}", color=colour, **LOOKS["correlation"])
     axis.set_xticks(range(len(strongest_effects)), names, rotation=60, ha="right", fontsize=8)
     axis.set_yticks(range(len(strongest_effects)), names, fontsize=8)
     figure.colorbar(image, ax=axis, shrink=0.7, label="correlation")
@@ -257,15 +258,13 @@ def completeness(blind: Blind, floors: Sequence[float]) -> bytes:
     """
     pairs = [(c, f) for c, f in zip(blind.curves, floors) if c.sizes]
     pairs.sort(key=lambda pair: np.nan_to_num(pair[0].limit / pair[1], nan=np.inf), reverse=True)
-    figure, axes = _figure(1, 1, 0.8 + 0.17 * len(pairs))
-    axis = axes[0, 0]
+    figure, axis = _single(0.8 + 0.17 * len(pairs))
     for y, (curve, floor) in enumerate(pairs):
         sizes = np.array(curve.sizes) / floor
         share = np.maximum.accumulate(curve.up_to_class)
         half, top = np.interp((0.5, 0.9), share, sizes)
-        marker, colour = ("o", AFTER) if share[-1] >= 0.9 else (">", BEFORE)
-        axis.plot((half, top), (y, y), color=style.QUIET, lw=2.4, solid_capstyle="butt")
-        axis.plot(top, y, marker, color=colour, ms=5)
+        axis.plot((half, top), (y, y), color=style.QUIET, **LOOKS["interval"])
+        axis.plot(top, y, **LOOKS["reached" if share[-1] >= 0.9 else "never"])
     axis.set(
         xscale="log",
         xlabel=(

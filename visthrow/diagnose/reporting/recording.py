@@ -9,7 +9,7 @@ import numpy as np
 import rerun as rr
 
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.reporting.pictures import AFTER, BEFORE, left_over
+from visthrow.diagnose.reporting.pictures import left_over
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.logs.flightlog import FlightLog
 from visthrow.view import style
@@ -49,7 +49,7 @@ def _channel(
     stamps = time[::width]
     old, new = (left_over(w, noise)[rows].reshape(-1, width) for w in (before, after))
     home = f"flight_{before.flight:02d}"
-    for values, label, colour in ((old, "before", BEFORE), (new, "after", AFTER)):
+    for values, label, colour in ((old, "before", style.BEFORE), (new, "after", style.AFTER)):
         _series(stream, f"{home}/residual/{name}/{label}", stamps, values, colour)
     if name not in PATHS or log is None or name not in log or width != 3:
         return
@@ -60,8 +60,8 @@ def _channel(
     place = measured.values[index]
     for points, label, colour in (
         (place, "measured", style.INK),
-        (place - old, "before", BEFORE),
-        (place - new, "after", AFTER),
+        (place - old, "before", style.BEFORE),
+        (place - new, "after", style.AFTER),
     ):
         _path(stream, f"{home}/{name}/{label}", stamps, points, colour)
 

@@ -6,14 +6,15 @@ from itertools import chain
 
 import numpy as np
 
+from visthrow.common.rotations import tilt_deg
 from visthrow.common.toml_text import tables_beside
 from visthrow.logs.check import relations
+from visthrow.logs.check.physics import ATTITUDES
 from visthrow.logs.check.rows import Row
 from visthrow.logs.check.thrust_checks import IDLE_SHARE, IDLE_SPEED
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import FlightLog, Samples
 
 POSITIONS = ("pos_w", "est_pos_w", "mocap_pos_w")
-ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 MOTORS = ("motor_command", "motor_speed", "pwm")
 THRUSTS = ("command", "thrust_command", "motor_command", "motor_speed", "pwm")
 
@@ -86,36 +87,35 @@ def _answer(question: Question, log: FlightLog, figures: dict) -> Row:
     missing = [
         " or ".join(group) for group in question.needs if not any(name in log for name in group)
     ]
+    reached = figures.get(question.excited, 0.0)
     if missing:
-        return Row(
-            "answers", question.name, "warn", f"cannot be answered: no {', no '.join(missing)}"
-        )
-    if figures.get("still") or figures.get("idle"):
-        return Row("answers", question.name, "warn", "cannot be answered: the vehicle did not fly")
-    reached = figures.get(question.excited)
-    if reached is None or reached < question.least:
-        measured = "nothing" if reached is None else f"{reached:.3g}"
-        text = (
-            f"cannot be answered: {question.excited} is {measured}, at least {question.least:g} is"
-            " needed"
-        )
-        return Row("answers", question.name, "warn", text)
-    return Row("answers", question.name, "ok", "can be answered")
+        reason = f"no {', no '.join(missing)}"
+    elif figures.get("still") or figures.get("idle"):
+        reason = "the vehicle did not fly"
+    elif question.excited not in figures or reached < question.least:
+        measured = f"{reached:.3g}" if question.excited in figures else "nothing"
+        reason = f"{question.excited} is {measured}, at least {question.least:g} is needed"
+    else:
+        return Row("answers", question.name, "ok", "can be answered")
+    return Row("answers", question.name, "warn", f"cannot be answered: {reason}")
 
 
 def _first(
-    log: FlightLog, names: tuple[str, ...], fewest: int = 20
-) -> tuple[str, np.ndarray, np.ndarray] | None:
-    """Name and samples of the first of several channels that holds more than so many."""
-    name = next((n for n in names if n in log and np.sum(log[n].valid) > fewest), None)
-    return None if name is None else (name, *log[name].samples())
+    log: FlightLog, names: tuple[str, ...], fewest: int = 21
+) -> tuple[str, Samples] | tuple[None, None]:
+    """Name and samples of the first of several channels that holds so many; None and None without
+    one.
+    """
+    for name in names:
+        samples = relations.samples_of(log, name, fewest)
+        if samples is not None:
+            return name, samples
+    return None, None
 
 
 def excitation(log: FlightLog) -> dict[str, float]:
     """Figures of what a log excites; what no channel tells is left out."""
-    spans = [
-        float(np.ptp(channel.time)) for channel in log.channels.values() if len(channel.time) > 1
-    ]
+    spans = [np.ptp(channel.time) for channel in log.channels.values() if len(channel.time) > 1]
     figures = {"seconds": max(spans, default=0.0)}
     flown = _flown(log, figures)
     _motion(log, figures, flown)
@@ -127,11 +127,12 @@ def excitation(log: FlightLog) -> dict[str, float]:
 
 def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
     """First and last time in the air, by height or by thrust."""
-    signal = _first(log, POSITIONS)
-    if signal is None:
+    _, path = _first(log, POSITIONS)
+    if path is None:
         return -np.inf, np.inf
-    _, time, pos = signal
-    above = pos[:, 2] - np.percentile(pos[:, 2], 1)
+    time = path.time
+    height = path.values[:, 2]
+    above = height - np.percentile(height, 1)
     up = above > 0.15 * np.max(above) if np.max(above) > 0.3 else np.ones(len(above), bool)
     if "flying" in log and len(log["flying"].time):
         up &= log["flying"].hold(time)
@@ -139,70 +140,75 @@ def _flown(log: FlightLog, figures: dict) -> tuple[float, float]:
             figures["grounded"] = figures["still"] = 1.0
             figures["seconds_flown"] = 0.0
             return np.inf, -np.inf
-    figures["seconds_flown"] = float(np.mean(up) * np.ptp(time))
-    figures["height_range_m"] = float(np.ptp(pos[:, 2]))
-    figures["seconds_low"] = float(np.mean(up & (pos[:, 2] < 0.3)) * np.ptp(time))
-    return (float(time[up][0]), float(time[up][-1])) if np.any(up) else (-np.inf, np.inf)
+    figures["seconds_flown"] = np.mean(up) * np.ptp(time)
+    figures["height_range_m"] = np.ptp(height)
+    figures["seconds_low"] = np.mean(up & (height < 0.3)) * np.ptp(time)
+    return (time[up][0], time[up][-1]) if np.any(up) else (-np.inf, np.inf)
 
 
 def _motion(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    if signal := _first(log, POSITIONS, 50):
-        time, vel = relations.derivative(*signal[1:], 0.1)
+    _, path = _first(log, POSITIONS, 51)
+    if path is not None:
+        time, vel = relations.derivative(*path, 0.1)
         flies = (time >= flown[0]) & (time <= flown[1])
         speed = np.linalg.norm(vel[flies], axis=1)
         if len(speed):
-            figures["speed_p95_m_s"] = float(np.percentile(speed, 95))
-            figures["seconds_hover"] = float(np.mean(speed < 0.15) * np.ptp(time[flies]))
-    if signal := _first(log, ATTITUDES):
-        x, y, z, w = signal[2].T
+            figures["speed_p95_m_s"] = np.percentile(speed, 95)
+            figures["seconds_hover"] = np.mean(speed < 0.15) * np.ptp(time[flies])
+    _, attitude = _first(log, ATTITUDES)
+    if attitude is not None:
+        x, y, z, w = attitude.values.T
         yaw = np.unwrap(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
-        figures["yaw_range_deg"] = float(np.degrees(np.percentile(yaw, 98) - np.percentile(yaw, 2)))
-    if signal := _first(log, ("rate_b",)):
-        figures["rate_p95_rad_s"] = float(np.percentile(np.linalg.norm(signal[2], axis=1), 95))
+        figures["yaw_range_deg"] = np.degrees(_range(yaw, 2))
+    rate = relations.samples_of(log, "rate_b", 21)
+    if rate is not None:
+        figures["rate_p95_rad_s"] = np.percentile(np.linalg.norm(rate.values, axis=1), 95)
+
+
+def _range(values: np.ndarray, part: float) -> np.ndarray:
+    """Return the range of each column without so many per cent at either end."""
+    low, high = np.percentile(values, [part, 100 - part], axis=0)
+    return high - low
 
 
 def _thrust(log: FlightLog, figures: dict, flown: tuple[float, float]) -> None:
-    if signal := _first(log, THRUSTS):
-        name, time, values = signal
-        values = values[(time >= flown[0]) & (time <= flown[1])]
+    name, driver = _first(log, THRUSTS)
+    if driver is not None:
+        values = driver.values[(driver.time >= flown[0]) & (driver.time <= flown[1])]
         thrust = values[:, 0] if name in ("command", "thrust_command") else np.mean(values, axis=1)
         thrust = thrust**2 if name == "motor_speed" else thrust
         if len(thrust):
-            low, middle, high = np.percentile(thrust, [5, 50, 95])
-            figures["thrust_range"] = float((high - low) / max(middle, 1e-9))
-    if signal := _first(log, ("battery_voltage",), 0):
-        figures["voltage_range"] = float(np.percentile(signal[2], 95) - np.percentile(signal[2], 5))
+            figures["thrust_range"] = _range(thrust, 5) / max(np.median(thrust), 1e-9)
+    voltage = relations.samples_of(log, "battery_voltage", 1)
+    if voltage is not None:
+        figures["voltage_range"] = _range(voltage.values[:, 0], 5)
 
 
 def _payload(log: FlightLog, figures: dict) -> None:
-    signal = _first(log, ("payload_pos_w",), 49)
-    if signal is None:
+    payload = relations.samples_of(log, "payload_pos_w")
+    if payload is None:
         return
-    _, time, pos = signal
-    _, vel = relations.derivative(time, pos, 0.1)
+    vel = relations.derivative(*payload, 0.1).values
     if len(vel):
-        figures["payload_speed_p95_m_s"] = float(np.percentile(np.linalg.norm(vel, axis=1), 95))
-    if vehicle := _first(log, ("pos_w",), 50):
-        gap = pos - relations.on_grid(*vehicle[1:], time)
-        angle = np.degrees(np.arctan2(np.linalg.norm(gap[:, :2], axis=1), -gap[:, 2]))
-        figures["swing_deg"] = float(np.percentile(angle, 95))
+        figures["payload_speed_p95_m_s"] = np.percentile(np.linalg.norm(vel, axis=1), 95)
+    vehicle = relations.samples_of(log, "pos_w", 51)
+    if vehicle is not None:
+        rope = relations.on_grid(*vehicle, payload.time) - payload.values
+        figures["swing_deg"] = np.percentile(tilt_deg(rope), 95)
     if "release_command" in log:
         pressed = log["release_command"].values.astype(float).ravel() > 0.0
         figures["releases"] = float(np.sum(np.diff(pressed.astype(int)) > 0))
 
 
 def _standing(log: FlightLog, figures: dict) -> None:
-    place = _first(log, POSITIONS)
-    thrust = _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 0)
+    _, place = _first(log, POSITIONS)
+    name, thrust = _first(log, ("motor_command", "pwm", "throttle", "motor_speed"), 1)
     idle = "throttle" in log and np.ptp(log["throttle"].values) == 0.0
     if thrust is not None:
-        name, _, values = thrust
-        idle |= float(np.percentile(values, 95)) < (
-            IDLE_SPEED if name == "motor_speed" else IDLE_SHARE
-        )
-    if place is not None:
-        width = np.max(np.percentile(place[2], 98, axis=0) - np.percentile(place[2], 2, axis=0))
-        if width < STILL_SPEED and (idle or thrust is None):
-            figures["still"] = 1.0
-    elif idle:
-        figures["idle"] = 1.0
+        lowest = IDLE_SPEED if name == "motor_speed" else IDLE_SHARE
+        idle |= np.percentile(thrust.values, 95) < lowest
+    if place is None:
+        if idle:
+            figures["idle"] = 1.0
+    elif np.max(_range(place.values, 2)) < STILL_SPEED and (idle or thrust is None):
+        figures["still"] = 1.0

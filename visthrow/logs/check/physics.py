@@ -8,17 +8,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back
+from visthrow.common.rotations import matrix_of_quat, rotate, rotate_back, tilt_deg
 from visthrow.logs.axes import is_mirror
 from visthrow.logs.check import relations
-from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
-from visthrow.logs.flightlog import Channel, FlightLog, Samples
+from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row, worst
+from visthrow.logs.check.signals import notes_of
+from visthrow.logs.flightlog import FlightLog, Samples
 
 # below this speed [m/s], rate [rad/s] or acceleration / 10 [m/s^2] a channel does not move enough
 # to be compared
 MOVES = 0.05
 STEEPEST = 75.0  # median tilt of a flight [deg]
 
+ATTITUDES = ("quat_wb", "est_quat_wb", "mocap_quat_wb")
 _PREFIXES = ("", "est_", "mocap_", "payload_")
 _FASTEST = 60.0  # of vehicles that throw [m/s]
 _FARTHEST = 2000.0  # likewise [m]
@@ -76,73 +78,70 @@ def usable(samples: Samples, threshold: float) -> bool:
     return bool(moves)
 
 
-def median_tilt(attitude: Channel) -> float:
-    """Middle of an attitude's angle from upright [deg]."""
-    up = matrix_of_quat(attitude.samples()[1])[:, 2, 2]
-    return float(np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0)))))
+def median_tilt(quat: np.ndarray) -> float:
+    """Middle of the angles from upright of attitudes, shape (N, 4) [deg]."""
+    up = matrix_of_quat(quat)[:, 2, 2]
+    return np.degrees(np.median(np.arccos(np.clip(up, -1.0, 1.0))))
 
 
 def _plausible(log: FlightLog) -> Iterator[Row]:
     for name, channel in log.channels.items():
-        if (
-            channel.unit != "m"
-            or channel.values.shape[1:] != (3,)
-            or np.sum(channel.valid) < 50
-            or "setpoint" in name
-        ):
-            continue
-        time, pos = channel.samples()
-        period = float(np.median(np.diff(time)))
-        if not _PERIOD[0] <= period <= _PERIOD[1]:
-            text = (
-                f"a sample every {period:.3g} s, expected {_PERIOD[0]:g} to {_PERIOD[1]:g}: is the"
-                " unit of time wrong?"
-            )
-            yield Row("units", name, "bad", text, {"period_s": period})
-            continue
-        speeds = np.linalg.norm(relations.derivative(time, pos, 0.1)[1], axis=1)
-        if not len(speeds):
-            continue
-        fast = float(np.percentile(speeds, 99))
-        farthest = float(np.max(np.abs(pos)))
-        figures = {"speed_p99_m_s": fast, "farthest_m": farthest}
-        if fast > _FASTEST or farthest > _FARTHEST:
-            text = (
-                f"{fast:.3g} m/s and {farthest:.3g} m from the origin: no such vehicle; millimetres"
-                " taken for metres?"
-            )
-            yield Row("units", name, "bad", text, figures)
+        path = relations.samples_of(log, name)
+        placed = channel.unit == "m" and channel.values.shape[1:] == (3,)
+        if placed and path is not None and "setpoint" not in name:
+            yield from _plausible_path(name, path)
     yield from _implausible_sizes(log)
+
+
+def _plausible_path(name: str, path: Samples) -> Iterator[Row]:
+    """Report positions that come, move or reach as no vehicle's do."""
+    period = np.median(np.diff(path.time))
+    if not _PERIOD[0] <= period <= _PERIOD[1]:
+        text = (
+            f"a sample every {period:.3g} s, expected {_PERIOD[0]:g} to {_PERIOD[1]:g}: is the"
+            " unit of time wrong?"
+        )
+        yield Row("units", name, "bad", text, {"period_s": period})
+        return
+    speeds = np.linalg.norm(relations.derivative(*path, 0.1).values, axis=1)
+    if not len(speeds):
+        return
+    fast = np.percentile(speeds, 99)
+    farthest = np.max(np.abs(path.values))
+    if fast > _FASTEST or farthest > _FARTHEST:
+        text = (
+            f"{fast:.3g} m/s and {farthest:.3g} m from the origin: no such vehicle; millimetres"
+            " taken for metres?"
+        )
+        figures = {"speed_p99_m_s": fast, "farthest_m": farthest}
+        yield Row("units", name, "bad", text, figures)
 
 
 def _implausible_sizes(log: FlightLog) -> Iterator[Row]:
     """Commands, voltages and angles of a size that only another unit gives them."""
-    for name in ("quat_wb", "est_quat_wb", "mocap_quat_wb"):
-        if name in log and np.sum(log[name].valid) > 50:
-            tilt = median_tilt(log[name])
-            if tilt > STEEPEST:
-                text = (
-                    f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for"
-                    " radians, axes, or quaternion order?"
-                )
-                yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
+    for name in ATTITUDES:
+        attitude = relations.samples_of(log, name)
+        tilt = 0.0 if attitude is None else median_tilt(attitude.values)
+        if tilt > STEEPEST:
+            text = (
+                f"half of the time tilted by more than {tilt:.0f} deg: degrees taken for"
+                " radians, axes, or quaternion order?"
+            )
+            yield Row("units", name, "bad", text, {"median_tilt_deg": tilt})
     for name in _SHARES:
-        if name in log and log[name].unit == "1" and np.any(log[name].valid):
-            high = float(np.percentile(np.abs(log[name].samples()[1]), 95))
-            if high > _LARGEST_SHARE:
-                text = f"95 % of the values reach {high:.3g}: no shares of the full command"
-                yield Row("units", name, "bad", text, {"p95": high})
+        share = relations.samples_of(log, name, 1)
+        if share is None or log[name].unit != "1":
+            continue
+        high = np.percentile(np.abs(share.values), 95)
+        if high > _LARGEST_SHARE:
+            text = f"95 % of the values reach {high:.3g}: no shares of the full command"
+            yield Row("units", name, "bad", text, {"p95": high})
     for name in ("battery_voltage", "supply_voltage"):
-        if name in log and np.any(log[name].valid):
-            middle = float(np.median(log[name].samples()[1]))
-            if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
-                yield Row(
-                    "units",
-                    name,
-                    "bad",
-                    f"{middle:.3g} V: no such pack; another unit?",
-                    {"median_v": middle},
-                )
+        voltage = relations.samples_of(log, name, 1)
+        middle = 0.0 if voltage is None else np.median(voltage.values)
+        if middle > _VOLTS[1] or 0.0 < middle < _VOLTS[0]:
+            text = f"{middle:.3g} V: no such pack; another unit?"
+            yield Row("units", name, "bad", text, {"median_v": middle})
 
 
 def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
@@ -150,21 +149,19 @@ def _velocity(log: FlightLog, pos: str, vel: str) -> Iterator[Row]:
     velocity = log[vel].samples()
     if not (usable(place, 0.02) and usable(velocity, 0.0)):
         return
-    notes = log.meta.get("ingest", {})
-    messages = {notes.get(name, {}).get("message") for name in (pos, vel)}
-    one_clock = len(messages) == 1 and None not in messages
+    message = notes_of(log, pos).get("message")
+    one_clock = message is not None and message == notes_of(log, vel).get("message")
     yield from _compared(relations.derivative(*place), velocity, f"d({pos})/dt, {vel}", one_clock)
 
 
 def _rates(log: FlightLog, quat: str) -> Iterator[Row]:
-    if "rate_b" not in log:
+    measured = relations.samples_of(log, "rate_b")
+    if measured is None:
         return
-    measured = log["rate_b"].samples()
     derived = relations.rates_of(*log[quat].samples())
-    both = derived, measured
-    if not all(usable(rates, 0.0) for rates in both) or not any(usable(r, MOVES) for r in both):
-        return
-    yield from _compared(*both, f"rate of {quat}, rate_b")
+    turns = usable(derived, MOVES) or usable(measured, MOVES)
+    if turns and usable(derived, 0.0) and usable(measured, 0.0):
+        yield from _compared(derived, measured, f"rate of {quat}, rate_b")
 
 
 def _compared(
@@ -185,17 +182,28 @@ def _compared(
     if _turned(relation):
         yield _in_other_axes(relation, channels, "go together")
         return
-    together = f"go together as they are, correlation {relation.correlation:.2f}"
-    yield Row("frames", channels, "ok", together, figures)
-    if not 0.67 < relation.scale < 1.5:
-        hint = relations.unit_hint(relation.scale) or "no unit explains it"
-        weak = abs(relation.correlation) < 0.7 and 0.4 < relation.scale < 1.5
-        text = (
-            f"the second is {relation.scale:.4g} times the first:"
-            f" {'noise dilutes it' if weak else hint}"
-        )
-        yield Row("units", channels, "warn" if weak else "bad", text, figures)
+    yield from _together_rows(relation, channels, figures, (0.67, 1.5))
     yield _late(relation, channels, figures, one_clock)
+
+
+def _together_rows(
+    relation: relations.Relation, channels: str, figures: dict, usual: tuple[float, float]
+) -> Iterator[Row]:
+    """Rows about a pair that goes together in its axes; ``usual``: ratios of two such signals."""
+    text = f"go together as they are, correlation {relation.correlation:.2f}"
+    yield Row("frames", channels, "ok", text, figures)
+    if usual[0] < relation.scale < usual[1]:
+        return
+    weak = abs(relation.correlation) < FIRMLY and 0.4 < relation.scale < usual[1]
+    hint = relations.unit_hint(relation.scale) or "no unit explains it"
+    text = f"the second is {relation.scale:.4g} times the first: "
+    text += "noise dilutes it" if weak else hint
+    yield Row("units", channels, "warn" if weak else "bad", text, figures)
+
+
+def _spread(vectors: np.ndarray) -> float:
+    """Root mean square of vectors about their mean, shape (N, 3)."""
+    return np.sqrt(np.sum(np.var(vectors, axis=0)))
 
 
 def _figures(relation: relations.Relation) -> dict[str, float]:
@@ -261,26 +269,23 @@ def _disagrees(relation: relations.Relation) -> bool:
 
 def _gravity(log: FlightLog, quat: str, pos: str) -> Iterator[Row]:
     """Check that the mean force on the body, turned to the world, carries the vehicle."""
-    if "acc_b" not in log:
+    attitude = relations.samples_of(log, quat)
+    force_b = relations.samples_of(log, "acc_b")
+    if attitude is None or force_b is None:
         return
-    time_q, q = log[quat].samples()
-    time_a, acc = log["acc_b"].samples()
-    if len(time_q) < 50 or len(time_a) < 50:
-        return
-    nearest = np.round(np.interp(time_q, time_a, np.arange(len(time_a)))).astype(int)
-    mean_w = np.mean(matrix_of_quat(q) @ acc[nearest][..., None], axis=0)[:, 0]
-    extra = np.zeros(3)
-    if pos in log and len(log[pos].time) > 50:
-        time_p, p = log[pos].samples()
-        _, v = relations.derivative(time_p, p)
-        extra = (v[-1] - v[0]) / float(np.ptp(time_p)) if len(v) else extra
-    mean_w = mean_w - extra
-    size = float(np.linalg.norm(mean_w))
-    tilt = float(np.degrees(np.arccos(np.clip(mean_w[2] / max(size, 1e-9), -1.0, 1.0))))
+    sample = np.interp(attitude.time, force_b.time, np.arange(len(force_b.time)))
+    nearest = force_b.values[np.round(sample).astype(int)]
+    mean_w = np.mean(matrix_of_quat(attitude.values) @ nearest[..., None], axis=0)[:, 0]
+    path = relations.samples_of(log, pos)
+    vel_w = [] if path is None else relations.derivative(*path).values
+    if len(vel_w):
+        mean_w = mean_w - (vel_w[-1] - vel_w[0]) / np.ptp(path.time)
+    size = np.linalg.norm(mean_w)
+    tilt = tilt_deg(mean_w)
     figures = {"mean_m_s2": mean_w.tolist(), "tilt_deg": tilt}
     channels = f"acc_b, {quat}"
-    hint = relations.unit_hint(size / GRAVITY)
     if not 0.85 < size / GRAVITY < 1.15:
+        hint = relations.unit_hint(size / GRAVITY)
         text = (
             f"the mean force is {size:.4g} m/s^2, not {GRAVITY}:"
             f" {hint or 'axes are exchanged, or gravity is missing'}"
@@ -301,18 +306,15 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
 
     Without an accelerometer the push is a multirotor's thrust, along body z, on vehicle and payload
     together."""
-    sensed = "acc_b" in log
-    if path not in log:
-        return
-    motion = log[path].samples()
-    attitude = log[quat].samples()
-    if min(len(motion.time), len(attitude.time)) < 50:
+    motion = relations.samples_of(log, path)
+    attitude = relations.samples_of(log, quat)
+    if motion is None or attitude is None:
         return
     time, acc = accelerations(*motion, log[path].unit)
-    if len(time) < 50 or float(np.sqrt(np.sum(np.var(acc, axis=0)))) < _PUSHED:
+    if len(time) < 50 or _spread(acc) < _PUSHED:
         return
     turn = relations.attitude_at(*attitude, time)
-    if not sensed:
+    if "acc_b" not in log:
         hangs, relative = _carried(log, quat, time, acc)
         if np.sum(hangs) < 50:
             return
@@ -330,10 +332,8 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     if relation is None:
         return
     channels = f"d({path})/dt, {quat} acc_b"
-    wrong = _exchanged(relation, channels)
-    if wrong is None:
-        expected_b = Samples(time, rotate_back(turn, acc + gravity))
-        wrong = _exchanged_body(expected_b, force_b, channels)
+    expected_b = Samples(time, rotate_back(turn, acc + gravity))
+    wrong = _exchanged(relation, channels) or _exchanged_body(expected_b, force_b, channels)
     if wrong is None:
         yield from _pushed(relation, acc, pushed, channels, True)
     else:
@@ -346,11 +346,11 @@ def _carried(
     """Return at which times the payload hangs on its cable, shape (N,), and its acceleration less
     the vehicle's [m/s^2], shape (N, 3); always and 0 where no payload is measured.
     """
-    pos = quat.replace("quat_wb", "pos_w")
-    if "payload_pos_w" not in log or np.sum(log["payload_pos_w"].valid) < 50 or pos not in log:
+    place = relations.samples_of(log, quat.replace("quat_wb", "pos_w"), 1)
+    payload = relations.samples_of(log, "payload_pos_w")
+    if payload is None or place is None:
         return np.ones(len(time), bool), np.zeros_like(acc)
-    payload = log["payload_pos_w"].samples()
-    gap = relations.on_grid(*payload, time) - relations.on_grid(*log[pos].samples(), time)
+    gap = relations.on_grid(*payload, time) - relations.on_grid(*place, time)
     length = np.linalg.norm(gap, axis=1)
     stamps, acc_p = accelerations(*payload, "m")
     if not len(stamps):
@@ -368,8 +368,8 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     lean = (up / np.maximum(up[:, 2:], 0.2))[:, :2]
     off = acc[:, :2] - lean * (acc[:, 2:] + GRAVITY)
     slope = relative[:, :2] - lean * relative[:, 2:]
-    power = max(float(np.sum(slope**2)), 1e-12)
-    share = np.clip(-float(np.sum(off * slope)) / power, 0.0, _HEAVIEST)
+    power = max(np.sum(slope**2), 1e-12)
+    share = np.clip(-np.sum(off * slope) / power, 0.0, _HEAVIEST)
     return acc + share * relative
 
 
@@ -392,7 +392,7 @@ def sparse(time: np.ndarray) -> bool:
     """Return whether samples are so far apart that single ones say nothing about the mean force
     between them.
     """
-    return len(time) > 1 and float(np.median(np.diff(time))) > relations.INDEPENDENT
+    return len(time) > 1 and np.median(np.diff(time)) > relations.INDEPENDENT
 
 
 def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row | None:
@@ -433,27 +433,16 @@ def _pushed(
         "scale": relation.scale,
         "offset_m_s2": off.tolist(),
     }
-    if relation.correlation < FIRMLY and not sensed:
-        return  # a payload or a draught pushes as well
     if relation.correlation < FIRMLY:
-        if relation.correlation < BELONGS and np.sqrt(np.sum(np.var(acc, axis=0))) > 1.0:
-            verdict = "bad"
-        else:
-            verdict = "warn"
-        text = (
-            f"hardly go together (correlation {relation.correlation:.2f}):"
-            " attitude or accelerometer of another flight, or noise"
-        )
-        yield Row("frames", channels, verdict, text, figures)
+        if sensed:  # else a payload or a draught pushes as well
+            strong = relation.correlation < BELONGS and _spread(acc) > 1.0
+            text = (
+                f"hardly go together (correlation {relation.correlation:.2f}):"
+                " attitude or accelerometer of another flight, or noise"
+            )
+            yield Row("frames", channels, "bad" if strong else "warn", text, figures)
         return
-    together = f"go together as they are, correlation {relation.correlation:.2f}"
-    yield Row("frames", channels, "ok", together, figures)
-    if not 0.5 < relation.scale < 2.0:
-        hint = relations.unit_hint(relation.scale)
-        text = (
-            f"the second is {relation.scale:.4g} times the first: {hint or 'no unit explains it'}"
-        )
-        yield Row("units", channels, "bad", text, figures)
+    yield from _together_rows(relation, channels, figures, (0.5, 2.0))
     if sensed:
         yield _late(relation, channels, figures, False)
         if np.linalg.norm(off) > _OFFSET:
@@ -476,19 +465,17 @@ def _exchanged(relation: relations.Relation, channels: str) -> Row | None:
 
 def _still_gravity(log: FlightLog) -> Iterator[Row]:
     """Without an attitude: the size of the force, in its median."""
-    if "acc_b" not in log or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
+    force_b = relations.samples_of(log, "acc_b", 20)
+    if force_b is None or any(f"{prefix}quat_wb" in log for prefix in _PREFIXES):
         return
-    _, acc = log["acc_b"].samples()
-    if len(acc) < 20:
-        return
-    size = float(np.median(np.linalg.norm(acc, axis=1)))
-    figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(acc, axis=0).tolist()}
-    if not 0.7 < size / GRAVITY < 1.4:
+    size = np.median(np.linalg.norm(force_b.values, axis=1))
+    figures = {"median_m_s2": size, "mean_b_m_s2": np.mean(force_b.values, axis=0).tolist()}
+    if 0.7 < size / GRAVITY < 1.4:
+        yield Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)
+    else:
         hint = relations.unit_hint(size / GRAVITY) or "gravity is missing or the unit is wrong"
         text = f"median force {size:.4g} m/s^2, not {GRAVITY}: {hint}"
         yield Row("units", "acc_b", "bad", text, figures)
-    else:
-        yield Row("units", "acc_b", "ok", f"median force {size:.3f} m/s^2", figures)
 
 
 def _commands(log: FlightLog) -> Iterator[Row]:
@@ -503,7 +490,7 @@ def _commands(log: FlightLog) -> Iterator[Row]:
         return
     if not usable(rates, MOVES):
         return
-    spread = float(np.max(np.std(rates.values, axis=0)))
+    spread = np.max(np.std(rates.values, axis=0))
     for name in ("command", "rate_setpoint_b"):
         if name not in log:
             continue
@@ -531,7 +518,7 @@ def _early(
         return None
     before = min(relation.axes_correlation, 0.999)
     after = min(max(later.axes_correlation, relation.correlation * (relation.delay > 0.0)), 0.999)
-    independent = float(np.ptp(time)) / relations.INDEPENDENT
+    independent = np.ptp(time) / relations.INDEPENDENT
     nats = 0.5 * independent * np.log((1.0 - after**2) / (1.0 - before**2))
     if nats < _NATS or before < after + CLEARLY:
         return None
@@ -575,16 +562,15 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> Row
 
 
 def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
-    if "pos_w" not in log or "payload_pos_w" not in log:
+    place = relations.samples_of(log, "pos_w", 20)
+    payload = relations.samples_of(log, "payload_pos_w", 20)
+    if place is None or payload is None:
         return
-    place = log["pos_w"].samples()
-    time, pos = log["payload_pos_w"].samples()
-    if len(place.time) < 20 or len(time) < 20:
-        return
+    time = payload.time
     overlap = (time > place.time[0]) & (time < place.time[-1])
     if "attached" in log:
         overlap &= log["attached"].hold(time).astype(bool)
-    payload = Samples(time[overlap], pos[overlap])
+    payload = Samples(time[overlap], payload.values[overlap])
     gap = payload.values - relations.on_grid(*place, payload.time)
     length = np.linalg.norm(gap, axis=1)
     channels = "pos_w, payload_pos_w"
@@ -592,9 +578,10 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         text = "vehicle and payload were never measured at one time"
         yield Row("frames", channels, "bad", text)
         return
-    middle = float(np.median(length))
-    spread = float(np.percentile(length, 90) - np.percentile(length, 10))
-    above = float(np.mean(gap[:, 2] > 0.5 * middle))
+    middle = np.median(length)
+    low, high = np.percentile(length, [10, 90])
+    spread = high - low
+    above = np.mean(gap[:, 2] > 0.5 * middle)
     figures = {"median_m": middle, "p10_to_p90_m": spread, "payload_above_share": above}
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
     if above > 0.5:
@@ -630,7 +617,7 @@ def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[R
     if taut[-1] == len(time) - 1:
         return
     since = stamps[max(commanded[0] - 1, 0)]  # the command came after this sample
-    early = float(since - time[taut[-1] + 1])
+    early = since - time[taut[-1] + 1]
     if early < _DELAY_BAD:
         return
     text = f"the payload leaves {1e3 * early:.0f} ms before its release is commanded: "
@@ -659,11 +646,11 @@ def _payload_late(place: Samples, payload: Samples, channels: str) -> Iterator[R
     gaps = pos - relations.on_grid(*place, time - delays[:, None])
     spread = np.std(np.linalg.norm(gaps, axis=2), axis=1)
     best = int(np.argmin(spread))
-    delay = float(delays[best])
-    independent = max(float(np.ptp(time)) / relations.INDEPENDENT, 10.0)
+    delay = delays[best]
+    independent = max(np.ptp(time) / relations.INDEPENDENT, 10.0)
     floor = 1e-9  # of a cable's length without any noise [m]
     plain, least = np.maximum(spread[[len(delays) // 2, best]], floor)
-    nats = independent * float(np.log(plain / least))
+    nats = independent * np.log(plain / least)
     if nats < _NATS or best in (0, len(delays) - 1) or abs(delay) < _DELAY_WARN:
         return
     text = (
@@ -680,15 +667,13 @@ def _same(log: FlightLog) -> Iterator[Row]:
     """
     bad = False
     for first, second in (("pos_w", "est_pos_w"), ("pos_w", "mocap_pos_w"), ("vel_w", "est_vel_w")):
-        if first not in log or second not in log:
-            continue
-        a = log[first].samples()
-        b = log[second].samples()
-        if not (usable(a, MOVES) and usable(b, MOVES)):
+        a = relations.samples_of(log, first)
+        b = relations.samples_of(log, second)
+        if a is None or b is None or not (usable(a, MOVES) and usable(b, MOVES)):
             continue
         rows = list(_compared(a, b, f"{first}, {second}"))
         yield from rows
-        bad = bad or "bad" in {row.verdict for row in rows}
+        bad = bad or worst(rows) == "bad"
         if not bad:
             yield from _drift(a, b, f"{first}, {second}")
 
@@ -700,23 +685,23 @@ def _within(samples: Samples, start: float, end: float) -> Samples:
 
 def _drift(first: Samples, second: Samples, channels: str) -> Iterator[Row]:
     """Whether the delay is the same from piece to piece of 5 s."""
+    starts = []
     delays = []
     piece = 5.0
     for start in np.arange(first.time[0], first.time[-1] - piece, piece):
         a = _within(first, start, start + piece)
         b = _within(second, start - 1.0, start + piece + 1.0)
-        if min(len(a.time), len(b.time)) < 50 or np.max(np.std(a.values, axis=0)) < MOVES:
+        if not usable(a, MOVES) or len(b.time) < 50:
             continue
         relation = relations.relate(a, b)
         if relation is not None and relation.correlation > 0.8 and relation.delay_sd < DELAY_KNOWN:
-            delays.append((start, relation.delay))
+            starts.append(start)
+            delays.append(relation.delay)
     if len(delays) < 3:
         return
-    late = np.array([delay for _, delay in delays])
-    spread = float(np.ptp(late))
-    figures = {"delays_s": late.tolist(), "from_s": [float(start) for start, _ in delays]}
+    figures = {"delays_s": delays, "from_s": starts}
     text = (
-        f"the delay runs from {1e3 * np.min(late):+.1f} to {1e3 * np.max(late):+.1f} ms over"
-        f" {len(late)} pieces of {piece:.0f} s"
+        f"the delay runs from {1e3 * min(delays):+.1f} to {1e3 * max(delays):+.1f} ms over"
+        f" {len(delays)} pieces of {piece:.0f} s"
     )
-    yield Row("delay", channels, "warn" if spread > 0.01 else "ok", text, figures)
+    yield Row("delay", channels, "warn" if np.ptp(delays) > 0.01 else "ok", text, figures)

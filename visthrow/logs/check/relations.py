@@ -6,7 +6,7 @@ import numpy as np
 
 from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
-from visthrow.logs.flightlog import Samples
+from visthrow.logs.flightlog import FlightLog, Samples
 
 REACH = 0.4  # largest delay looked for [s]
 # of the logarithm of a ratio from a unit's: noise dilutes, cables pull, filters smooth
@@ -48,6 +48,13 @@ class Relation:
     axes_correlation: float  # with that exchange
     axes_delay: float  # of the second behind the first with that exchange [s]
     nats: float  # by which that exchange beats the axes as they are, the choice among 48 paid for
+
+
+def samples_of(log: FlightLog, name: str, fewest: int = 50) -> Samples | None:
+    """Return the valid samples of a channel; None where a log holds fewer."""
+    if name not in log or np.sum(log[name].valid) < fewest:
+        return None
+    return log[name].samples()
 
 
 def on_grid(time: np.ndarray, values: np.ndarray, grid: np.ndarray) -> np.ndarray:
@@ -94,7 +101,7 @@ def _related(
     sums = np.zeros((2, lags, BLOCKS))
     cross = np.zeros((values.shape[1], len(usual), lags))
     norms = np.zeros(lags)
-    power = float(np.sum(centred**2))
+    power = np.sum(centred**2)
     for lag in range(lags):
         moved = on_grid(*second, grid + (lag - steps) * period)
         moved_centred = moved - np.mean(moved, axis=0)
@@ -103,57 +110,44 @@ def _related(
         moved = moved - usual
         products = np.sum(values * moved, axis=1), np.sum(moved**2, axis=1)
         sums[:, lag] = np.add.reduceat(products, edges, axis=1)
+    follows = np.ones(count, bool)
     if power <= 0.0 or np.min(norms) <= 0.0:
-        return None, np.ones(count, bool)
+        return None, follows
     powers = np.add.reduceat(np.sum(values**2, axis=1), edges)
     effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     narrowest = max(2, round(_WIDTH / period))
     offset, sd, residual, together = _delay(powers, *sums, narrowest, effective)
-    follows = np.ones(count, bool)
     if together > _TOGETHER:
         sizes = np.diff(np.append(edges, count))
         follows = np.repeat(residual < _TUMBLE * np.median(residual), sizes)
-    relation = _relation(cross, power, norms, effective, (offset, sd), period, steps)
+    correlation = np.trace(cross) / np.sqrt(power * norms)
+    lag = int(np.argmax(correlation))
+    axes, best, best_lag = _best_axes(cross / np.sqrt(power * norms))
+    plain, turned = (min(max(c, 0.0), 0.999) for c in (correlation[lag], best))
+    nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EXCHANGES))
+    relation = Relation(
+        delay=(offset - steps) * period,
+        delay_sd=min(sd, steps) * period,
+        correlation=correlation[lag],
+        scale=np.trace(cross[:, :, lag]) / power,
+        axes=axes,
+        axes_correlation=best,
+        axes_delay=(best_lag - steps) * period,
+        nats=nats,
+    )
     return relation, follows
 
 
-def _relation(
-    cross: np.ndarray,
-    power: float,
-    norms: np.ndarray,
-    effective: float,
-    delay: tuple[float, float],
-    period: float,
-    steps: int,
-) -> Relation:
-    """Return the relation of two signals from their cross-correlations by lag, shape (A, B, K),
-    with the delay and its deviation [steps].
+def _best_axes(correlations: np.ndarray) -> tuple[str, float, int]:
+    """Return the exchange of axes in which two signals go together best, with their correlation and
+    the lag; ``correlations``: of their components by lag, shape (A, B, K).
     """
-    offset, sd = delay
-    scale = np.sqrt(power * norms)
-    correlation = np.trace(cross) / scale
-    lag = int(np.argmax(correlation))
-    if cross.shape[0] == 3:
-        exchanges = EXCHANGES
-        matrices = MATRICES
-    else:
-        exchanges = ("x", "-x")
-        matrices = np.array([[[1.0]], [[-1.0]]])
-    scores = np.einsum("kij,jil->kl", matrices, cross / scale)
-    k, best_at = np.unravel_index(np.argmax(scores), scores.shape)
-    best = float(scores[k, best_at])
-    plain, turned = (min(max(c, 0.0), 0.999) for c in (correlation[lag], best))
-    nats = 0.5 * effective * np.log((1.0 - plain**2) / (1.0 - turned**2)) - np.log(len(EXCHANGES))
-    return Relation(
-        (offset - steps) * period,
-        min(sd, steps) * period,
-        float(correlation[lag]),
-        float(np.trace(cross[:, :, lag])) / power,
-        exchanges[k],
-        best,
-        float(best_at - steps) * period,
-        float(nats),
-    )
+    exchanges, matrices = EXCHANGES, MATRICES
+    if correlations.shape[0] != 3:
+        exchanges, matrices = ("x", "-x"), np.array([[[1.0]], [[-1.0]]])
+    scores = np.einsum("kij,jil->kl", matrices, correlations)
+    k, lag = np.unravel_index(np.argmax(scores), scores.shape)
+    return exchanges[k], scores[k, lag], lag
 
 
 def _delay(
@@ -176,7 +170,7 @@ def _delay(
     Returns:
         Lag, its deviation, what each block leaves, shape (K,), and the weighted correlation.
     """
-    scale = np.sum(xy, axis=1) / max(float(np.sum(xx)), 1e-300)
+    scale = np.sum(xy, axis=1) / max(np.sum(xx), 1e-300)
     floor = 1e-6 * np.mean(yy)
     for _ in range(_ROUNDS):
         residual = np.maximum(yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx, floor)
@@ -200,7 +194,7 @@ def _delay(
 
 def _together(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, residual: np.ndarray) -> float:
     """Correlation in which each block weighs by its noise."""
-    cross, first, second = (float(np.sum(products / residual)) for products in (xy, xx, yy))
+    cross, first, second = (np.sum(products / residual) for products in (xy, xx, yy))
     return cross / max(np.sqrt(first * second), 1e-300)
 
 
@@ -228,7 +222,7 @@ def _vertex(
         )
         product = powers @ xy
         second = powers @ yy  # value, slope and bend
-        scale = max(float(np.sum(product[0]) / np.sum(xx)), 0.0)
+        scale = max(np.sum(product[0]) / np.sum(xx), 0.0)
         residual = second[0] - 2.0 * scale * product[0] + scale**2 * xx
         weight = 1.0 / np.maximum(residual, floor)
         cross = product @ weight
@@ -239,7 +233,7 @@ def _vertex(
         bend = cross[2] / cross[0] - (cross[1] / cross[0]) ** 2
         bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
         slopes = weight * (product[1] / cross[0] - 0.5 * second[1] / power[0])
-        explained = min(float(cross[0] ** 2 / (power[0] * np.sum(weight * xx))), 0.999)
+        explained = min(cross[0] ** 2 / (power[0] * np.sum(weight * xx)), 0.999)
         # what the second would lose of its likelihood half the parabola's width aside
         nats = -0.5 * independent * bend * half**2 * explained / (1.0 - explained)
         if nats < _NATS or abs(vertex - slope / bend) > half:
@@ -248,7 +242,7 @@ def _vertex(
     # noise may last longer than a block: neighbours count together, paired in both ways
     pairs = np.convolve(slopes, [1.0, 1.0])
     variance = 0.5 * np.sum(pairs**2) * BLOCKS / (BLOCKS - 2)
-    return vertex, _STUDENT * float(np.sqrt(variance) / -bend)
+    return vertex, _STUDENT * (np.sqrt(variance) / -bend)
 
 
 def peak(score: np.ndarray, index: int) -> tuple[float, float]:
@@ -290,22 +284,22 @@ def _pairs(time: np.ndarray, span: float) -> tuple[np.ndarray, np.ndarray, np.nd
     """First and last sample of each stretch of about ``span``, the time in its middle [s] and its
     width [s].
     """
-    period = float(np.median(np.diff(time))) if len(time) > 2 else 1.0
+    period = np.median(np.diff(time)) if len(time) > 2 else 1.0
     reach = max(1, round(0.5 * span / period))
     first = np.arange(max(len(time) - 2 * reach, 0))
     width = time[first + 2 * reach] - time[first]
-    first, width = (x[width < 2.5 * max(span, 2.0 * period)] for x in (first, width))
+    whole = width < 2.5 * max(span, 2.0 * period)
+    first = first[whole]
     last = first + 2 * reach
-    return first, last, 0.5 * (time[first] + time[last]), width
+    return first, last, 0.5 * (time[first] + time[last]), width[whole]
 
 
 def mean_over(time: np.ndarray, values: np.ndarray, times: np.ndarray, span: float) -> np.ndarray:
     """Mean of a signal over ``span`` seconds about each time, shape (N, components)."""
     steps = 0.5 * (values[1:] + values[:-1]) * np.diff(time)[:, None]
-    whole = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps, axis=0)])
-    return (
-        on_grid(time, whole, times + 0.5 * span) - on_grid(time, whole, times - 0.5 * span)
-    ) / span
+    whole = np.vstack([0.0 * values[:1], np.cumsum(steps, axis=0)])
+    begin, end = on_grid(time, whole, np.stack([times - 0.5 * span, times + 0.5 * span]))
+    return (end - begin) / span
 
 
 def attitude_at(time: np.ndarray, quat: np.ndarray, times: np.ndarray) -> np.ndarray:

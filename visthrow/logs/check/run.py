@@ -56,14 +56,14 @@ def contradictions(results: Sequence[Checked], unread: frozenset[str] = frozense
 
     ``unread``: channels that the model does not read, and rows that are overruled, each by topic
     and channel; a bad row about one of them is no reason."""
-    return [
-        f"{checked.name}: {row.name}: {row.text}"
-        for checked in results
-        for row in checked.rows
-        if row.verdict == "bad"
-        and (row.topic in CONTRADICT or "never overlap" in row.text)
-        and not unread.intersection([row.name, *re.findall(r"\w+", row.channel)])
-    ]
+    reasons = []
+    for checked in results:
+        for row in checked.rows:
+            refuses = row.topic in CONTRADICT or "never overlap" in row.text
+            about = {row.name, *re.findall(r"\w+", row.channel)}
+            if row.verdict == "bad" and refuses and unread.isdisjoint(about):
+                reasons.append(f"{checked.name}: {row.name}: {row.text}")
+    return reasons
 
 
 def copies(results: Sequence[Checked]) -> dict[int, int]:
@@ -94,24 +94,24 @@ def _look(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     for name, channel in log.channels.items():
         yield from signals.look(name, channel, signals.notes_of(log, name))
     yield from _clocks(log)
-    full = {
-        name: channel
-        for name, channel in log.channels.items()
-        if np.sum(channel.valid) >= signals.FEW_SAMPLES
-    }
-    for name in [name for name in full if name.endswith("quat_wb")]:
-        if not np.all(np.any(full[name].samples()[1], axis=1)):
+    usable = {}
+    for name, channel in log.channels.items():
+        samples = channel.samples()
+        if len(samples.time) < signals.FEW_SAMPLES:
+            continue
+        if name.endswith("quat_wb") and not np.all(np.any(samples.values, axis=1)):
             yield Row("values", name, "bad", "holds quaternions of length 0")
-            del full[name]
-    usable = FlightLog(full, log.meta)
+        else:
+            usable[name] = channel
     kind = str(log.meta.get("vehicle", ""))
     if kind and not Vehicle(kind).rotors_alone:
         text = f"of a {kind}: only its channels are looked at; expected a vehicle of rotors"
         yield Row("vehicle", "", "bad", text)
         return
-    yield from physics.look(usable, vehicle)
-    yield from thrust_checks.look(usable, vehicle)
-    yield from excitation.look(usable)
+    whole = FlightLog(usable, log.meta)
+    yield from physics.look(whole, vehicle)
+    yield from thrust_checks.look(whole, vehicle)
+    yield from excitation.look(whole)
 
 
 def _until_landing(log: FlightLog) -> FlightLog:
@@ -153,14 +153,14 @@ def _reader(log: FlightLog) -> Iterator[Row]:
 def _clocks(log: FlightLog) -> Iterator[Row]:
     clocks: dict[str, list[str]] = {}
     for name in log.channels:
-        clocks.setdefault(str(signals.notes_of(log, name).get("clock", "main")), []).append(name)
-    spans = [(c.time[0], c.time[-1]) for c in log.channels.values() if len(c.time) > 1]
+        clock = str(signals.notes_of(log, name).get("clock", "main"))
+        clocks.setdefault(clock, []).append(name)
     if len(clocks) > 1:
-        text = f"{len(clocks)} clocks: " + "; ".join(
-            f"{name}: {', '.join(channels)}" for name, channels in clocks.items()
-        )
+        listed = "; ".join(f"{name}: {', '.join(channels)}" for name, channels in clocks.items())
+        text = f"{len(clocks)} clocks: {listed}"
         yield Row("clock", "", "ok", text, {"clocks": len(clocks)})
-    if spans and max(start for start, _ in spans) > min(end for _, end in spans):
+    times = [c.time for c in log.channels.values() if len(c.time) > 1]
+    if times and max(time[0] for time in times) > min(time[-1] for time in times):
         text = "channels that never overlap in time: different clocks, or different flights"
         yield Row("clock", "", "bad", text)
 
@@ -168,49 +168,42 @@ def _clocks(log: FlightLog) -> Iterator[Row]:
 def _copies(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
     """Report logs that hold what another one holds, each by its number."""
     prints = [_prints(log) for log in logs]
-    for j in range(len(logs)):
-        for i in range(j):
-            shared = len(prints[i] & prints[j]) / max(min(len(prints[i]), len(prints[j])), 1)
-            if shared > _ALIKE and prints[i]:
-                text = (
-                    f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy"
-                    " counts once"
-                )
-                yield j, Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
+    for i, j in combinations(range(len(logs)), 2):
+        fewer = max(min(len(prints[i]), len(prints[j])), 1)
+        shared = len(prints[i] & prints[j]) / fewer
+        if shared > _ALIKE:
+            text = (
+                f"shares {100 * shared:.0f} % of its samples with {label(logs[i], i)}: a copy"
+                " counts once"
+            )
+            yield j, Row("duplicates", "", "bad", text, {"copy_of": i, "shared": shared})
 
 
 def _masses(logs: Sequence[FlightLog], vehicle: KnownVehicle) -> Iterator[tuple[int, Row]]:
     """Report logs whose ratio of force to thrust differs from the others': another battery,
     vehicle, payload or map.
     """
-    masses = {
-        i: mass
-        for i, log in enumerate(logs)
-        if (mass := thrust_checks.mass_of(log, vehicle)) is not None
-    }
-    if len(masses) < 2:
-        return
-    middle = float(np.median(list(masses.values())))
-    for i, mass in masses.items():
-        if abs(np.log(mass / middle)) > _OTHER_SCALE:
+    carried = [thrust_checks.mass_of(log, vehicle) for log in logs]
+    known = [mass for mass in carried if mass is not None]
+    middle = np.median(known) if known else 0.0
+    for i, mass in enumerate(carried):
+        if mass is not None and abs(np.log(mass / middle)) > _OTHER_SCALE:
             text = (
                 f"thrust over force {mass:.4g} kg, {mass / middle:.3g} times that of the flights'"
-                " middle: "
+                " middle: the thrust's scale differs from flight to flight"
             )
-            text += "the thrust's scale differs from flight to flight"
             yield i, Row("thrust", "", "warn", text, {"mass_kg": mass, "middle_kg": middle})
 
 
 def _shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
     """Compare the clocks of several vehicles that carry one payload."""
-    named = [
-        i
-        for i, log in enumerate(logs)
-        if "payload_pos_w" in log and np.sum(log["payload_pos_w"].valid) > 100
-    ]
-    for first, second in combinations(named[:_MOST_PAIRED], 2):
-        a, b = (logs[i]["payload_pos_w"].samples() for i in (first, second))
-        if max(np.max(np.std(path.values, axis=0)) for path in (a, b)) < physics.MOVES:
+    paths = {}
+    for i, log in enumerate(logs):
+        path = relations.samples_of(log, "payload_pos_w", 101)
+        if path is not None and len(paths) < _MOST_PAIRED:
+            paths[i] = path
+    for (first, a), (second, b) in combinations(paths.items(), 2):
+        if not (physics.usable(a, physics.MOVES) or physics.usable(b, physics.MOVES)):
             continue
         # on a straight path an offset of positions looks like a delay; velocities have none
         relation = relations.relate(relations.derivative(*a), relations.derivative(*b))
@@ -219,12 +212,11 @@ def _shared_payloads(logs: Sequence[FlightLog]) -> Iterator[tuple[int, Row]]:
         late_time = a.time + relation.delay
         common = (late_time > b.time[0]) & (late_time < b.time[-1])
         difference = a.values[common] - relations.on_grid(*b, late_time[common])
-        off = float(np.sqrt(np.mean(difference**2))) if np.any(common) else np.inf
+        off = np.sqrt(np.mean(difference**2)) if np.any(common) else np.inf
         if off < _ONE_PAYLOAD:
-            late = 1e3 * relation.delay
-            sd = 1e3 * relation.delay_sd
             text = f"the payload of {label(logs[first], first)} to {1e3 * off:.1f} mm, "
-            text += f"this clock {late:+.1f} ms behind (sd {sd:.1f} ms)"
+            text += f"this clock {1e3 * relation.delay:+.1f} ms behind"
+            text += f" (sd {1e3 * relation.delay_sd:.1f} ms)"
             figures = {
                 "with": first,
                 "delay_s": relation.delay,
@@ -238,21 +230,17 @@ def _prints(log: FlightLog) -> set[bytes]:
     """Short runs of samples, whatever their time stamps."""
     prints: set[bytes] = set()
     for name, channel in log.channels.items():
-        if (
-            not any(word in name for word in _MOVING)
-            or len(channel.values) < 8
-            or channel.values.dtype.kind == "b"
-        ):
+        moving = any(word in name for word in _MOVING) and channel.values.dtype.kind != "b"
+        if not moving or len(channel.values) < 8:
             continue
         rows = channel.rows
-        moving = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
-        first = moving[:: max(1, len(moving) // 2000)]
-        runs = rows[first[first + 4 <= len(rows), None] + np.arange(4)].reshape(
-            -1, 4 * rows.shape[1]
-        )
+        changed = np.flatnonzero(np.any(rows[1:] != rows[:-1], axis=1))
+        first = changed[:: max(1, len(changed) // 2000)]
+        first = first[first + 4 <= len(rows)]
+        runs = rows[first[:, None] + np.arange(4)].reshape(-1, 4 * rows.shape[1])
         ordered = np.sort(runs, axis=1)  # NaN last
-        changes = np.sum((ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1]), axis=1)
-        prints.update(run.tobytes() for run in runs[changes > 2])
+        steps = (ordered[:, 1:] != ordered[:, :-1]) & ~np.isnan(ordered[:, :-1])
+        prints.update(run.tobytes() for run in runs[np.sum(steps, axis=1) > 2])
     return prints
 
 

@@ -39,6 +39,12 @@ _NEVER_STUCK = ("pos", "quat", "vel", "rate", "acc", "payload", "angle")
 _FASTEST = {"m": 30.0, "1": 20.0, "m/s": 1e3, "rad/s": 5e3, "m/s^2": 5e4, "rad": 50.0, "V": 500.0}
 """Unit -> change a second that is a jump and no motion: of vehicles, their rotors and their packs.
 """
+_NOTES = {
+    "repeated": "stamps repeated",
+    "backwards": "stamps going back",
+    "unstamped": "rows unstamped",
+}
+"""Counts of a reader's notes, in words."""
 _HARDEST = 30.0  # acceleration of a vehicle or payload that throws [m/s^2]
 _COMMANDED = (
     "setpoint",
@@ -101,52 +107,42 @@ def look(name: str, channel: Channel, notes: dict) -> Iterator[Row]:
     :func:`visthrow.logs.readers.table.make_channel`.
     """
     count = len(channel.time)
-    span = float(np.ptp(channel.time)) if count else 0.0
+    span = np.ptp(channel.time) if count else 0.0
     figures = {"samples": count, "seconds": span}
     if count >= FEW_STEPS and span > SLOW_PERIOD * count:
         text = f"{count} settled values over {span:.0f} s"
         yield Row("clock", name, "ok", text, figures)
-        return
-    if count < FEW_SAMPLES or span < SHORT:
+    elif count < FEW_SAMPLES or span < SHORT:
         text = (
             f"{count} samples over {span:.2f} s; at least {FEW_SAMPLES} over {SHORT} s are needed"
         )
-        event = name in _SWITCHES + ("separation", "landing", "goal_w")
+        event = name in (*_SWITCHES, "separation", "landing", "goal_w")
         yield Row("clock", name, "ok" if event else "bad", text, figures)
-        return
-    yield _clock(name, channel, notes)
-    yield from _gaps(name, channel)
-    yield from _values(name, channel)
-    yield from _noise(name, channel)
+    else:
+        yield _clock(name, channel, notes)
+        yield from _gaps(name, channel)
+        yield from _values(name, channel)
+        yield from _noise(name, channel)
 
 
 def _clock(name: str, channel: Channel, notes: dict) -> Row:
     steps = np.diff(channel.time)
-    period = float(np.median(steps))
-    span = float(np.ptp(channel.time))
-    jitter = float(np.percentile(np.abs(steps - period), 95)) / period
-    figures = {
-        "samples": len(channel.time),
-        "seconds": span,
-        "rate_hz": 1.0 / period,
-        "jitter_of_period": jitter,
-    }
-    text = (
-        f"{len(channel.time)} samples, {span:.1f} s, {1.0 / period:.4g} Hz, jitter"
-        f" {100 * jitter:.0f} % of a period"
-    )
+    count = len(channel.time)
+    period = np.median(steps)
+    span = np.ptp(channel.time)
+    jitter = np.percentile(np.abs(steps - period), 95) / period
+    rate = 1.0 / period
+    figures = {"samples": count, "seconds": span, "rate_hz": rate, "jitter_of_period": jitter}
+    text = f"{count} samples, {span:.1f} s, {rate:.4g} Hz, jitter {100 * jitter:.0f} % of a period"
     verdict = "warn" if jitter > _JITTER_WARN else "ok"
-    for key, words in (
-        ("repeated", "stamps repeated"),
-        ("backwards", "stamps going back"),
-        ("unstamped", "rows unstamped"),
-    ):
+    for key, words in _NOTES.items():
         if notes.get(key):
             verdict = "warn"
-            text = f"{text}; {notes[key]} {words}"
+            text += f"; {notes[key]} {words}"
             figures[key] = notes[key]
-            if key != "unstamped" and notes[key] > 0.05 * notes.get("rows", len(steps)):
-                verdict = "bad"
+    rows = notes.get("rows", len(steps))
+    if max(notes.get("repeated", 0), notes.get("backwards", 0)) > 0.05 * rows:
+        verdict = "bad"
     if notes.get("held"):
         text += f"; {notes['held']} repetitions of a held value left out"
         figures["held"] = notes["held"]
@@ -158,27 +154,23 @@ def _clock(name: str, channel: Channel, notes: dict) -> Row:
 
 def _gaps(name: str, channel: Channel) -> Iterator[Row]:
     steps = np.diff(channel.time)
-    period = float(np.median(steps))
+    period = np.median(steps)
     wide = steps > _GAP_PERIODS * period
-    lost = float(np.sum(steps[wide] - period))
-    invalid = float(np.mean(~channel.valid))
-    share = lost / float(np.ptp(channel.time))
-    figures = {
-        "gaps": int(np.sum(wide)),
-        "longest_s": float(np.max(steps)),
-        "lost_share": share,
-        "invalid_share": invalid,
-    }
-    if not np.any(wide) and invalid == 0.0:
+    gaps = int(np.sum(wide))
+    longest = np.max(steps)
+    invalid = np.mean(~channel.valid)
+    if not gaps and invalid == 0.0:
         return
+    share = np.sum(steps[wide] - period) / np.ptp(channel.time)
+    figures = {"gaps": gaps, "longest_s": longest, "lost_share": share, "invalid_share": invalid}
     if invalid + share > 0.5:
         verdict = "bad"
-    elif invalid + share > 0.02 or np.max(steps) > 0.5:
+    elif invalid + share > 0.02 or longest > 0.5:
         verdict = "warn"
     else:
         verdict = "ok"
     text = (
-        f"{figures['gaps']} gaps, the longest {np.max(steps):.3f} s; {100 * share:.1f} % of the"
+        f"{gaps} gaps, the longest {longest:.3f} s; {100 * share:.1f} % of the"
         f" time, {100 * invalid:.1f} % of the samples not valid"
     )
     yield Row("gaps", name, verdict, text, figures)
@@ -189,12 +181,18 @@ def _values(name: str, channel: Channel) -> Iterator[Row]:
     if len(values) < FEW_SAMPLES:
         yield Row("values", name, "bad", f"{len(values)} valid samples")
         return
-    if any(word in name for word in _NEVER_STUCK) and "setpoint" not in name:
+    measured = "setpoint" not in name
+    if measured and _speaks_of(name, _NEVER_STUCK):
         yield from _stuck(name, values, time)
-    if any(word in name for word in _RAILED) and "setpoint" not in name and name not in _SWITCHES:
+    if measured and _speaks_of(name, _RAILED) and name not in _SWITCHES:
         yield from _railed(name, values)
-    if channel.unit in _FASTEST and not any(word in name for word in _COMMANDED):
+    if channel.unit in _FASTEST and not _speaks_of(name, _COMMANDED):
         yield from _jumps(name, values, time, channel.unit)
+
+
+def _speaks_of(name: str, words: tuple[str, ...]) -> bool:
+    """Tell whether a channel's name holds one of some words."""
+    return any(word in name for word in words)
 
 
 def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
@@ -204,15 +202,15 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
     changes = np.flatnonzero(~same)
     firsts = np.append(0, changes + 1)
     lengths = time[np.append(changes, len(same))] - time[firsts]
-    longest = float(np.max(lengths))
-    start = float(time[firsts[np.argmax(lengths)]])
-    total = float(np.sum(lengths[lengths > _STUCK_TIME]))
-    share = float(np.mean(same))
+    longest = np.max(lengths)
+    start = time[firsts[np.argmax(lengths)]]
+    total = np.sum(lengths[lengths > _STUCK_TIME])
+    share = np.mean(same)
     figures = {"longest_s": longest, "at_s": start, "stuck_s": total, "repeated_share": share}
     if np.all(same):
         yield Row("values", name, "bad", "one value from beginning to end", figures)
     elif longest > _STUCK_TIME:
-        verdict = "bad" if total > 0.3 * float(np.ptp(time)) else "warn"
+        verdict = "bad" if total > 0.3 * np.ptp(time) else "warn"
         text = f"stands still to the last digit for {longest:.2f} s at {start:.2f} s"
         yield Row("values", name, verdict, text, figures)
     elif share > 0.2:
@@ -225,17 +223,18 @@ def _stuck(name: str, values: np.ndarray, time: np.ndarray) -> Iterator[Row]:
 
 def _railed(name: str, values: np.ndarray) -> Iterator[Row]:
     rails = [(0.0, "")]
-    stops = any(word in name for word in _STOPS_AT_ZERO)  # switched off is no rail
-    for column in values.T:
-        for rail, words in ((np.min(column), "lowest"), (np.max(column), "highest")):
-            if np.ptp(column) > 0.0 and not (stops and words == "lowest"):
-                share = float(np.sum(column == rail) - 1) / len(column)  # one always is
-                rails.append((share, f"its {words} value {rail:.6g}"))
+    stops = _speaks_of(name, _STOPS_AT_ZERO)  # switched off is no rail
+    for column in values.T[np.ptp(values, axis=0) > 0.0]:
+        ends = {"highest": np.max(column)}
+        if not stops:
+            ends["lowest"] = np.min(column)
+        for words, rail in ends.items():
+            share = (np.sum(column == rail) - 1) / len(column)  # one always is
+            rails.append((share, f"its {words} value {rail:.6g}"))
     worst, where = max(rails)
-    if worst <= _RAIL_SHARE:
-        return
-    text = f"{100 * worst:.1f} % of the samples at {where}: saturated"
-    yield Row("values", name, "warn", text, {"share": worst})
+    if worst > _RAIL_SHARE:
+        text = f"{100 * worst:.1f} % of the samples at {where}: saturated"
+        yield Row("values", name, "warn", text, {"share": worst})
 
 
 def _jumps(name: str, values: np.ndarray, time: np.ndarray, unit: str) -> Iterator[Row]:
@@ -273,10 +272,10 @@ def _jumps_across(
             continue
         middle = 0.5 * (time[i] + time[i + 1])
         ends = [np.polyfit(time[part] - middle, values[part], 1)[1] for part in (before, after)]
-        distance = float(np.linalg.norm(ends[1] - ends[0]))
-        width = float(time[i + 1] - time[i])
+        distance = np.linalg.norm(ends[1] - ends[0])
+        width = time[i + 1] - time[i]
         if distance > 0.05 + 0.25 * _HARDEST * width**2:
-            off.append((distance, float(time[i]), width))
+            off.append((distance, time[i], width))
     if not off:
         return
     distance, instant, width = max(off)
@@ -289,17 +288,12 @@ def _jumps_across(
 
 def _noise(name: str, channel: Channel) -> Iterator[Row]:
     sigma = noise(channel)
-    if (
-        channel.values.dtype.kind == "b"
-        or not np.all(np.isfinite(sigma))
-        or not np.any(sigma > 0.0)
-    ):
-        return
-    text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
-    yield Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})
+    known = np.all(np.isfinite(sigma)) and np.any(sigma > 0.0)
+    if known and channel.values.dtype.kind != "b":
+        text = f"sd of the noise {', '.join(f'{s:.3g}' for s in sigma[:4])} {channel.unit}"
+        yield Row("noise", name, "ok", text, {"sigma": sigma.tolist(), "unit": channel.unit})
 
 
 def notes_of(log: FlightLog, name: str) -> dict:
     """Return the reader's notes on a channel."""
-    notes = log.meta.get("ingest", {})
-    return notes.get(name, {}) if isinstance(notes, dict) else {}
+    return log.meta.get("ingest", {}).get(name, {})

@@ -12,6 +12,7 @@ from visthrow.logs.check import relations
 from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import FlightLog, Samples
+from visthrow.logs.unit_names import nearest
 
 INPUTS = (
     "command",
@@ -66,9 +67,10 @@ def thrust_of(
     Returns channel, times [s] and thrust, shape (N, 1), in newtons where channel or map say so;
     None where it says nothing."""
     name = vehicle.thrust_input or next((name for name in INPUTS if name in log), "")
-    if name not in log or np.sum(log[name].valid) < 50:
+    driver = relations.samples_of(log, name)
+    if driver is None:
         return None
-    time, values = log[name].samples()
+    values = driver.values
     if name == "command":
         values = values[:, :1]
     if vehicle.thrust_map is not None and name == vehicle.thrust_input:
@@ -77,7 +79,7 @@ def thrust_of(
         values = values**2
     elif name in ("motor_output", "pwm") and IDLE_PULSE - 200.0 < np.median(values) < 2300.0:
         values = np.maximum(values - IDLE_PULSE, 0.0)
-    return name, time, np.sum(values, axis=1, keepdims=True)
+    return name, driver.time, np.sum(values, axis=1, keepdims=True)
 
 
 def follows(log: FlightLog, name: str) -> float | None:
@@ -86,7 +88,7 @@ def follows(log: FlightLog, name: str) -> float | None:
     if thrust is None or np.median(thrust[2]) <= 0.0:
         return None
     curves = [curve for _, curve, _ in _correlations(log, *thrust[1:])]
-    return max((float(np.max(curve[_OF_MOTORS])) for curve in curves), default=None)
+    return max((np.max(curve[_OF_MOTORS]) for curve in curves), default=None)
 
 
 def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
@@ -94,22 +96,20 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     log does not tell.
     """
     thrust_signal = thrust_of(log, vehicle)
-    newtons = thrust_signal is not None and (
-        vehicle.thrust_map is not None or thrust_signal[0] in ("command", "thrust_command")
-    )
-    if not newtons or "acc_b" not in log or np.sum(log["acc_b"].valid) < 50:
+    force_b = relations.samples_of(log, "acc_b")
+    if thrust_signal is None or force_b is None:
         return None
-    _, time, thrust = thrust_signal
-    acc = relations.on_grid(*log["acc_b"].samples(), time)[:, 2]
+    name, time, thrust = thrust_signal
+    if vehicle.thrust_map is None and name not in ("command", "thrust_command"):
+        return None  # not in newtons
+    acc = relations.on_grid(*force_b, time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
-    if "attached" in log and np.any(
-        carries := log["attached"].hold(time) > 0.5
-    ):  # without its payload it is another mass
+    carries = log["attached"].hold(time) > 0.5 if "attached" in log else flies
+    if np.any(carries):  # without its payload it is another mass
         flies &= carries
-    if np.any(flies) and np.mean(acc[flies]) > 0.0:
-        mass = float(np.mean(thrust[flies]) / np.mean(acc[flies]))
-    else:
-        mass = 0.0
+    if not np.any(flies) or np.mean(acc[flies]) <= 0.0:
+        return None
+    mass = float(np.mean(thrust[flies]) / np.mean(acc[flies]))
     return mass if mass > 0.0 else None
 
 
@@ -130,26 +130,32 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if mass is not None:
         yield _weight(mass, vehicle, f"{name}, acc_b")
     if sparse(time):
-        period = 1e3 * float(np.median(np.diff(time)))
+        period = 1e3 * np.median(np.diff(time))
         text = f"comes every {period:.0f} ms: too seldom to be held against the force"
         yield Row("thrust", name, "warn", text)
         return
     correlations = list(_correlations(log, time, command))
-    if not correlations:
-        return
-    felt, curve, against = max(correlations, key=lambda correlation: np.max(correlation[1]))
-    peak = float(np.max(curve[_OF_MOTORS]))
-    best = float(np.max(curve))
-    delay = float(_DELAYS[np.argmax(np.where(_OF_MOTORS, curve, -1.0))])
-    figures = {"correlation": peak, "delay_s": delay, "nats_against": against, "felt_by": felt}
-    text = f"the force follows the thrust {1e3 * delay:.0f} ms later, correlation {peak:.2f}"
-    topic = "delay"
-    verdict = "ok"
+    if correlations:
+        yield _following(name, *max(correlations, key=lambda found: np.max(found[1])))
+
+
+def _following(name: str, measurement: str, curve: np.ndarray, against: float) -> Row:
+    """Report how the measured force follows a thrust, by their correlation at each delay and the
+    nats by which no thrust explains the force better.
+    """
+    channels = f"{name}, {measurement}"
+    peak = np.max(curve[_OF_MOTORS])
+    best = np.max(curve)
+    delay = _DELAYS[np.argmax(np.where(_OF_MOTORS, curve, -1.0))]
+    figures = {
+        "correlation": peak,
+        "delay_s": delay,
+        "nats_against": against,
+        "felt_by": measurement,
+    }
     if best > max(_FOLLOWS, peak + _CLEARER):
-        delay = float(_DELAYS[np.argmax(curve)])
+        delay = _DELAYS[np.argmax(curve)]
         way = "late" if delay < _MOTORS else "early"
-        verdict = "bad"
-        figures["delay_s"] = delay
         text = (
             f"the force follows the thrust by {1e3 * delay:+.0f} ms (correlation {best:.2f}, not"
             f" {peak:.2f}), motors by 0 to 120 ms: "
@@ -158,40 +164,37 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
             f"the stream of the thrust is about {1e3 * abs(delay - _MOTORS):.0f} ms {way}; add"
             f" {delay - _MOTORS:+.2f} s to its time"
         )
-    elif peak < _FOLLOWS:
-        topic = "frames"
-        verdict = "bad" if against > _AGAINST else "warn"
-        text = (
-            f"the force does not follow the thrust (best correlation {peak:.2f}; none at all"
-            f" explains it {against:.0f} nats better): "
-        )
-        text += "thrust of another flight, another channel" + (
-            "" if verdict == "bad" else ", or noise"
-        )
-    yield Row(topic, f"{name}, {felt}", verdict, text, figures)
+        return Row("delay", channels, "bad", text, figures | {"delay_s": delay})
+    if peak >= _FOLLOWS:
+        text = f"the force follows the thrust {1e3 * delay:.0f} ms later, correlation {peak:.2f}"
+        return Row("delay", channels, "ok", text, figures)
+    text = (
+        f"the force does not follow the thrust (best correlation {peak:.2f}; none at all"
+        f" explains it {against:.0f} nats better): thrust of another flight, another channel"
+    )
+    if against > _AGAINST:
+        return Row("frames", channels, "bad", text, figures)
+    return Row("frames", channels, "warn", f"{text}, or noise", figures)
 
 
-def _along_z(log: FlightLog, felt: str) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the times [s] and specific force along body z [m/s^2], shape (N, 1), by the
-    accelerometer or by the path.
+def _along_z(log: FlightLog, measurement: str) -> Samples | None:
+    """Return the specific force along body z [m/s^2], shape (N, 1), by the accelerometer or by the
+    path.
     """
-    if felt == "acc_b" and "acc_b" in log and sparse(log["acc_b"].time):
-        return None
-    if felt == "acc_b":
-        if "acc_b" in log:
-            time, force_b = log["acc_b"].samples()
-        else:
-            time = np.empty(0)
-            force_b = np.empty((0, 3))
-        return time, force_b[:, 2:3]
+    if measurement == "acc_b":
+        force_b = relations.samples_of(log, "acc_b")
+        if force_b is None or sparse(log["acc_b"].time):
+            return None
+        return Samples(force_b.time, force_b.values[:, 2:3])
     path = next((n for n in ("vel_w", "pos_w") if n in log), None)
-    if path is None or "quat_wb" not in log:
+    attitude = relations.samples_of(log, "quat_wb")
+    if path is None or attitude is None:
         return None
     time, acc = accelerations(*log[path].samples(), log[path].unit)
-    if len(time) < 50 or len(log["quat_wb"].samples()[0]) < 50:
+    if len(time) < 50:
         return None
-    turn = relations.attitude_at(*log["quat_wb"].samples(), time)
-    return time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3]
+    turn = relations.attitude_at(*attitude, time)
+    return Samples(time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3])
 
 
 def _correlations(
@@ -200,13 +203,14 @@ def _correlations(
     """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
     explains the force better, for each measurement of the force that is known and varies.
     """
-    for felt in ("acc_b", "path"):
-        force = _along_z(log, felt)
-        if force is None or len(force[0]) < 50:
+    usual = np.median(command[command > 0.2 * np.max(command)])
+    flies = time[command[:, 0] > 0.6 * usual]
+    for measurement in ("acc_b", "path"):
+        force = _along_z(log, measurement)
+        if force is None:
             continue
-        flies = time[command[:, 0] > 0.6 * np.median(command[command > 0.2 * np.max(command)])]
-        start = max(flies[0] + 0.5, force[0][0] + 0.3)
-        end = min(flies[-1] - 0.5, force[0][-1] - 0.5)
+        start = max(flies[0] + 0.5, force.time[0] + 0.3)
+        end = min(flies[-1], force.time[-1]) - 0.5
         grid = np.arange(start, end, 0.01)
         if len(grid) < 200:
             continue
@@ -214,7 +218,7 @@ def _correlations(
         y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
         curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
         if known := list(filter(None, curves)):
-            yield felt, *max(known, key=lambda curve: np.max(curve[0]))
+            yield measurement, *max(known, key=lambda curve: np.max(curve[0]))
 
 
 def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -228,7 +232,7 @@ def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
     best = int(np.argmax(np.where(_OF_MOTORS, curve, -1.0)))
     independent = 0.01 * len(x) / (2.0 * _SPAN)
-    return curve, float(0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best])))
+    return curve, 0.5 * independent * np.log(np.var(varies[best] - x) / np.var(varies[best]))
 
 
 def _trimmed(values: np.ndarray) -> np.ndarray:
@@ -240,81 +244,74 @@ def _trimmed(values: np.ndarray) -> np.ndarray:
 
 def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
     """Thrust over force against the mass that the model knows."""
+    text = f"thrust over force {mass:.4g} kg"
     if not vehicle.mass:
-        return Row("thrust", channels, "ok", f"thrust over force {mass:.4g} kg", {"mass_kg": mass})
-    off = float(np.log(mass / vehicle.mass))
+        return Row("thrust", channels, "ok", text, {"mass_kg": mass})
     ratio = mass / vehicle.mass
-    text = f"thrust over force {mass:.4g} kg, {ratio:.3g} times the model's {vehicle.mass:.4g} kg"
+    text += f", {ratio:.3g} times the model's {vehicle.mass:.4g} kg"
+    figures = {"mass_kg": mass, "model_kg": vehicle.mass}
+    off = np.log(ratio)
     if abs(off) > MASS_BAD:
-        sizes = {f"in {unit}": size for unit, size in UNITS.items()} | {
-            "the model's mass is in g": 1e3
-        }
-        words = min(sizes, key=lambda words: abs(np.log(ratio * sizes[words])))
-        if abs(np.log(ratio * sizes[words])) > _UNIT:
+        sizes = {f"in {unit}": size for unit, size in UNITS.items()}
+        words, miss = nearest(ratio, sizes | {"the model's mass is in g": 1e3})
+        if miss > _UNIT:
             words = (
                 "no battery's charge does that: mass or thrust map of another vehicle, or in"
                 " another unit"
             )
-        return Row(
-            "units",
-            channels,
-            "bad",
-            f"{text}: {words}",
-            {"mass_kg": mass, "model_kg": vehicle.mass},
-        )
-    verdict = "warn" if abs(off) > MASS_WARN else "ok"
-    if verdict == "warn":
-        text += ": the thrust map is of another vehicle, battery or channel"
-        text += ", or a load that the model lacks hangs below" if off > 0.0 else ""
-    return Row("thrust", channels, verdict, text, {"mass_kg": mass, "model_kg": vehicle.mass})
+        return Row("units", channels, "bad", f"{text}: {words}", figures)
+    if abs(off) <= MASS_WARN:
+        return Row("thrust", channels, "ok", text, figures)
+    text += ": the thrust map is of another vehicle, battery or channel"
+    text += ", or a load that the model lacks hangs below" if off > 0.0 else ""
+    return Row("thrust", channels, "warn", text, figures)
 
 
 def _rotors(log: FlightLog) -> Iterator[Row]:
     """Each rotor against the others: a vehicle that hovers turns all of them alike."""
     for name in ROTORS:
-        if name not in log or log[name].values.shape[1:] != (4,):
+        motors = relations.samples_of(log, name)
+        if motors is None or log[name].values.shape[1:] != (4,):
             continue
-        _, values = log[name].samples()
-        total = np.mean(values, axis=1)
-        flies = total > 0.5 * np.percentile(total, 90)
-        if len(values) < 50 or np.percentile(total, 90) <= (
-            IDLE_SPEED if name == "motor_speed" else IDLE_SHARE
-        ):
+        total = np.mean(motors.values, axis=1)
+        high = np.percentile(total, 90)
+        if high <= (IDLE_SPEED if name == "motor_speed" else IDLE_SHARE):
             continue
-        medians = np.median(values[flies], axis=0)
+        medians = np.median(motors.values[total > 0.5 * high], axis=0)
         for i, rotor in enumerate(NAMES):
-            typical = float(np.median(np.delete(medians, i)))
-            ratio = float(medians[i] / typical) if typical > 0.0 else 1.0
-            if abs(np.log(max(ratio, 1e-3))) < _UNEVEN:
-                continue
-            text = f"{rotor} reads {ratio:.2f} of the others in flight: "
-            if ratio < 0.02:
-                text += "its sensor is dead, or the rotor stands"
-            else:
-                for factor, word in ((0.5, "half"), (2.0, "twice")):
-                    if abs(np.log(ratio / factor)) < 0.15:
-                        text += f"{word}: "
-                text += "no trim explains it; a sensor (pole pairs, a lost wire), or the rotor"
-            yield Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio})
+            typical = np.median(np.delete(medians, i))
+            ratio = medians[i] / typical if typical > 0.0 else 1.0
+            if abs(np.log(max(ratio, 1e-3))) >= _UNEVEN:
+                text = f"{rotor} reads {ratio:.2f} of the others in flight: {_uneven(ratio)}"
+                yield Row("thrust", name, "bad", text, {"rotor": i, "ratio": ratio})
+
+
+def _uneven(ratio: float) -> str:
+    """Words about a rotor that reads so many times the others."""
+    if ratio < 0.02:
+        return "its sensor is dead, or the rotor stands"
+    factor, miss = nearest(ratio, {"half: ": 2.0, "twice: ": 0.5})
+    word = factor if miss < 0.15 else ""
+    return f"{word}no trim explains it; a sensor (pole pairs, a lost wire), or the rotor"
 
 
 def _turning(log: FlightLog) -> Iterator[Row]:
     """Which way the vehicle turns when motors differ: order of the motors, and sign."""
-    name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), None)
-    if name is None or "rate_b" not in log or log[name].values.shape[1:] != (4,):
+    name = next((n for n in ("motor_speed", "motor_command", "pwm") if n in log), "")
+    motors = relations.samples_of(log, name)
+    rate = relations.samples_of(log, "rate_b")
+    if motors is None or rate is None or log[name].values.shape[1:] != (4,):
         return
-    time_m, motors = log[name].samples()
-    rate = log["rate_b"].samples()
-    if not usable(rate, MOVES) or len(time_m) < 50:
+    if not usable(rate, MOVES):
         return
     time_d, turning = relations.derivative(*rate, 0.03)
-    front_left, front_right, rear_left, rear_right = motors.T
+    front_left, front_right, rear_left, rear_right = motors.values.T
     roll = front_left + rear_left - front_right - rear_right
     pitch = rear_left + rear_right - front_left - front_right
     if len(time_d) < 50 or max(np.std(roll), np.std(pitch)) <= 0.0:
         return
     for axis, (word, torque) in enumerate((("roll", roll), ("pitch", pitch))):
-        driven = Samples(time_m, torque[:, None])
+        driven = Samples(motors.time, torque[:, None])
         relation = relations.relate(driven, Samples(time_d, turning[:, axis : axis + 1]), 0.2)
         if relation is not None and relation.axes_correlation >= 0.2:
             yield _turned_by(word, relation, f"{name}, rate_b")
