@@ -1,6 +1,6 @@
 """Units at the edge of the house: what each is worth in ours."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -23,6 +23,16 @@ def nearest(number: float, sizes: Mapping[str, float]) -> tuple[str, float]:
     misses = {name: abs(float(np.log(number * size))) for name, size in sizes.items()}
     best = min(misses, key=misses.__getitem__)
     return best, misses[best]
+
+
+def nearest_unit(number: float, units: Iterable[str]) -> tuple[str, float]:
+    """Return :func:`nearest` of the sizes of units."""
+    return nearest(number, {unit: UNITS[unit][1] for unit in units})
+
+
+def fitting_units(number: float, units: Iterable[str], low: float, high: float) -> list[str]:
+    """Return the units in which a number lies between two sizes in ours."""
+    return [unit for unit in units if low <= number * UNITS[unit][1] <= high]
 
 
 def to_si(unit: str, where: str) -> tuple[str, float]:

@@ -103,9 +103,8 @@ def _bear_out(report: dict, anyway: bool) -> None:
 
     Raises DiagnoseError: they do, and nobody wants it all the same.
     """
-    doubts = (
-        harm(report) if report.get("theta") else []
-    )  # of a law alone, held-out flights have not been asked
+    # of a law alone, held-out flights have not been asked
+    doubts = harm(report) if report.get("theta") else []
     if doubts and not anyway:
         raise DiagnoseError(
             f"held-out flights do not bear this out: {'; '.join(doubts)}; --anyway writes it all"
@@ -145,64 +144,58 @@ def harm(report: dict) -> list[str]:
     """Reasons against a diagnosis: channels that held-out flights show worse with it,
     or no better.
     """
-    channels = (report.get("gain") or {}).get("channels", [])
-    worse = [
-        f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %"
-        for c in channels
-        if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]
-    ]
-    nats = (report.get("gain") or {}).get("nats_per_sample")
-    return worse + (
-        [f"log-likelihood {nats:+.3g} nats a sample"] if nats is not None and nats <= 0.0 else []
-    )
+    gain = report.get("gain") or {}
+    reasons = []
+    for c in gain.get("channels", ()):
+        if c.get("before") and c["after"] > (1.0 + HARM) * c["before"]:
+            reasons.append(f"{c['channel']} {100 * (c['after'] / c['before'] - 1):+.1f} %")
+    nats = gain.get("nats_per_sample")
+    if nats is not None and nats <= 0.0:
+        reasons.append(f"log-likelihood {nats:+.3g} nats a sample")
+    return reasons
 
 
 def origin(report: dict, path: str) -> list[str]:
     """Lines on where a diagnosis comes from."""
-    provenance = report.get("provenance") or {}
     lines = [
         f"Extended by `visthrow diagnose apply` from {path}:"
-        f" {report.get('overall', 'a diagnosis')}."
-    ]
-    lines += [
+        f" {report.get('overall', 'a diagnosis')}.",
         f"{report.get('flights', 0)} flights, {report.get('windows', 0)} windows,"
-        f" {report.get('samples', 0)} samples."
+        f" {report.get('samples', 0)} samples.",
     ]
-    lines += [
-        f"{name}: {provenance[name]}"
-        for name in ("commit", "time", "command")
-        if provenance.get(name)
-    ]
-    for c in (report.get("gain") or {}).get("channels", []) if report.get("theta") else []:
+    provenance = report.get("provenance") or {}
+    for name in ("commit", "time", "command"):
+        if provenance.get(name):
+            lines.append(f"{name}: {provenance[name]}")
+    theta = report.get("theta", {})
+    gain = report.get("gain") or {}
+    for c in gain.get("channels", ()) if theta else ():
         lines.append(
             f"Held-out error of {c['channel']}: {c.get('before', 0.0):.3g} before,"
             f" {c.get('after', 0.0):.3g} after."
         )
-    landing = (report.get("gain") or {}).get("landing")
-    if landing:
-        before = landing["before"]
-        after = landing["after"]
+    if landing := gain.get("landing"):
         lines.append(
-            f"Landing error of {landing['throws']} throws: {before:.3g} m before, {after:.3g} m"
-            " after."
+            f"Landing error of {landing['throws']} throws: {landing['before']:.3g} m before,"
+            f" {landing['after']:.3g} m after."
         )
-    causes = [
-        f
-        for f in report.get("findings") or []
-        if f["name"] in report.get("theta", {}) and f.get("low") is not None
-    ]
-    if causes:
+    sizes = []
+    for f in report.get("findings") or []:
+        if f["name"] in theta and f.get("low") is not None:
+            sizes.append(
+                f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
+                f" {f['high']:.3g})."
+            )
+    if sizes:
         lines.append(
             "Sizes and intervals as `explain` printed them. The deviations below also allow for"
             " differences between flights."
         )
-        lines += [
-            f"{f['name']} = {f['estimate']:.3g} {f['unit']} (95 %: {f['low']:.3g} to"
-            f" {f['high']:.3g})."
-            for f in causes
-        ]
-    scatter = [(s.get("by", "flight"), s) for s in report.get("scatter") or [] if s["found"]]
-    return lines + [
-        f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
-        for group, s in scatter
-    ]
+    lines += sizes
+    for s in report.get("scatter") or []:
+        if s["found"]:
+            group = s.get("by", "flight")
+            lines.append(
+                f"Varies from {group} to {group}: {s['name']} {s['size']:.3g} {s['unit']}."
+            )
+    return lines

@@ -3,6 +3,7 @@ next diagnosis read.
 """
 
 import dataclasses
+from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -75,62 +76,55 @@ def text(
         plants: to draw in training from the joint posterior.
         laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
-    named = [catalogue()[name] for name in theta]
+    effects = list(chosen(theta).values())
     covariance = np.reshape(covariance, (len(theta), len(theta)))
     # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
     # blocks there are
-    header = [
-        i
-        for i, e in enumerate(named)
-        if e.changes and all(key.path.startswith("plant.") for key in e.changes)
-    ]
-    rows = tuple(map(tuple, covariance[np.ix_(header, header)].tolist()))
+    of_plant = []
+    for i, effect in enumerate(effects):
+        paths = [key.path for key in effect.changes]
+        if paths and all(path.startswith("plant.") for path in paths):
+            of_plant.append(i)
     varied = dataclasses.replace(
         experiment.diagnosed,
-        effects=tuple(named[i].name for i in header),
-        covariance=rows,
+        effects=tuple(effects[i].name for i in of_plant),
+        covariance=tuple(map(tuple, covariance[np.ix_(of_plant, of_plant)].tolist())),
         plants=plants,
     )
-    after = dataclasses.replace(
-        extended(experiment, theta), diagnosed=varied, laws=(*experiment.laws, *laws)
-    )
-    check_laws(after.laws)
-    plain = load_experiment(base)
-    changed = differences(config.to_dict(plain), config.to_dict(after))
-    lines = [f"# {line}" for line in provenance] + [dumps({"base": base}).strip(), ""]
-    return "\n".join([*lines, *_commented(changed, named, theta, covariance)]).rstrip() + "\n"
+    both = (*experiment.laws, *laws)
+    check_laws(both)
+    after = dataclasses.replace(extended(experiment, theta), diagnosed=varied, laws=both)
+    changed = differences(config.to_dict(load_experiment(base)), config.to_dict(after))
+    words = defaultdict(list)
+    for effect, sd in zip(effects, np.sqrt(np.diag(covariance))):
+        size = f"{effect.name} {theta[effect.name]:+.4g} +- {sd:.2g} {effect.unit}"
+        for key in effect.changes:
+            words[key.path.removeprefix("plant.")].append(size)
+    switched = [e.name for e in effects if e.switch]
+    lines = _head(base, provenance) + _commented(changed, words, switched)
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _head(base: str, comments: Sequence[str]) -> list[str]:
+    """Return the first lines of a file on top of another."""
+    return [*(f"# {line}" for line in comments), dumps({"base": base}).strip(), ""]
 
 
 def _commented(
-    changed: Mapping[str, Any],
-    named: Sequence[Effect],
-    theta: Mapping[str, float],
-    covariance: np.ndarray,
+    changed: Mapping[str, Any], words: Mapping[str, Sequence[str]], others: Sequence[str] = ()
 ) -> list[str]:
-    """Return the lines of what changes, each with the effects that change it."""
-    sd = np.sqrt(np.diag(covariance))
-    values = {
-        e.name: f"{e.name} {theta[e.name]:+.4g} +- {s:.2g} {e.unit}" for e, s in zip(named, sd)
-    }
-    switched = [e.name for e in named if e.switch]
+    """Return the lines of what changes with comments: words by the path of an entry, ``others`` on
+    what has none.
+    """
     lines = []
     section = ""
     for line in dumps(changed).splitlines():
         section = line.strip("[]") if line.startswith("[") else section
-        path = f"{section}.{line.split(' = ')[0]}" if " = " in line else ""
-        words = [
-            values[e.name]
-            for e in named
-            for key in e.changes
-            if key.path.removeprefix("plant.") == path
-        ]
-        if " = " in line and not words:
-            words = (
-                ["of the diagnosis above"]
-                if section == "diagnosed" or line.startswith("laws")
-                else switched
-            )
-        lines.append(f"{line}  # {'; '.join(words)}" if words else line)
+        name, equals, _ = line.partition(" = ")
+        comment = words.get(f"{section}.{name}", [])
+        if equals and not comment:
+            comment = ["of the diagnosis above"] if section == "diagnosed" else others
+        lines.append(f"{line}  # {'; '.join(comment)}" if comment else line)
     return lines
 
 
@@ -140,14 +134,17 @@ def with_scatter(
     """Sizes and covariance of a flight that nobody has flown yet: what varies from flight to flight
     has the mean of those that were flown, and their scatter, to which that of days adds.
     """
-    count, sizes, scatter = len(theta), dict(theta), {}
+    sizes = dict(theta)
+    variance = dict.fromkeys(theta, 0.0)
     for row in report.get("scatter") or []:
+        means = row.get("mean", {})
         for name in row["of"] if row["found"] else ():
-            sizes.setdefault(name, float(row.get("mean", {}).get(name, 0.0)))
-            scatter[name] = scatter.get(name, 0.0) + float(row["size"]) ** 2
-    whole = np.zeros((len(sizes), len(sizes)))
-    whole[:count, :count] = np.reshape(covariance, (count, count))
-    return sizes, whole + np.diag([scatter.get(name, 0.0) for name in sizes])
+            sizes.setdefault(name, float(means.get(name, 0.0)))
+            variance[name] = variance.get(name, 0.0) + float(row["size"]) ** 2
+    whole = np.diag(list(variance.values()))
+    count = len(theta)
+    whole[:count, :count] += np.reshape(covariance, (count, count))
+    return sizes, whole
 
 
 def without_transient(
@@ -157,11 +154,10 @@ def without_transient(
 
     Returns the other sizes, their covariance, and the names that were left out.
     """
-    transient = [catalogue()[name].transient for name in theta]
-    rows = np.flatnonzero(np.logical_not(transient))
-    names = list(theta)
-    sizes = {names[i]: theta[names[i]] for i in rows}
-    return sizes, covariance[np.ix_(rows, rows)], [n for n in names if n not in sizes]
+    transient = [name for name in theta if catalogue()[name].transient]
+    sizes = {name: size for name, size in theta.items() if name not in transient}
+    rows = [i for i, name in enumerate(theta) if name in sizes]
+    return sizes, covariance[np.ix_(rows, rows)], transient
 
 
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
@@ -169,21 +165,22 @@ def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
 
     Raises DiagnoseError: it holds fewer.
     """
-    explanations = _explanations(report)
+    laws = []
+    for x in _explanation(report, path, rank):
+        factors = tuple(x["factors"])
+        laws.append(LawParams(x["block"], factors, x["vector"], float(x["coefficient"])))
+    return laws
+
+
+def _explanation(report: Mapping[str, Any], path: str, rank: int) -> list[dict[str, Any]]:
+    """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
+    explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
     if rank > len(explanations):
         raise DiagnoseError(
             f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks"
             f" for number {rank}"
         )
-    return [
-        LawParams(x["block"], tuple(x["factors"]), x["vector"], float(x["coefficient"]))
-        for x in (explanations[rank - 1] if rank else [])
-    ]
-
-
-def _explanations(report: Mapping[str, Any]) -> list[list[dict[str, Any]]]:
-    """Sets of laws that belong together, best first."""
-    return report.get("explanations") or [[law] for law in report.get("laws") or []]
+    return explanations[rank - 1] if rank else []
 
 
 def read(report: Mapping[str, Any], path: str) -> tuple[dict[str, float], list[list[float]]]:
@@ -260,8 +257,7 @@ def of_setup(
         provenance: lines on where it comes from.
         rank: of the explanation whose laws are written, from 1; 0 for none.
     """
-    named, covariance = read(report, path)
-    theta, covariance = with_scatter(named, covariance, report)
+    theta, covariance = with_scatter(*read(report, path), report)
     model = report.get("model", THROW)
     if model != setup.model:
         raise DiagnoseError(
@@ -271,27 +267,25 @@ def of_setup(
     effects = {e.name: e for e in effects_of(setup.model, getattr(setup, setup.model))}
     after = {name: setup.effects.get(name, 0.0) + size for name, size in theta.items()}
     refuse_strange(report, path, after, effects, setup.model)
-    laws = laws_of(report, path, rank)
-    of_laws = _explanations(report)[rank - 1] if rank else []
-    lines = [f"# {line}" for line in provenance]
-    lines += _rows_of(list(theta), covariance)
-    formulas = [term_of(law).formula for law in laws]
-    lines += _rows_of(formulas, [x.get("covariance") or [x["sd"] ** 2] for x in of_laws])
-    lines += dumps({"base": base}).splitlines()
-    if laws:
-        tables = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
-        lines.append(dumps({"laws": tables}).strip())
-    lines += ["", "[effects]"] * bool(theta)
+    changed: dict[str, Any] = {}
+    words = {}
+    comments = [*provenance, *_rows_of(list(theta), covariance)]
+    if laws := laws_of(report, path, rank):
+        changed["laws"] = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
+        known = _explanation(report, path, rank)
+        rows = [x.get("covariance") or [x["sd"] ** 2] for x in known]
+        comments += _rows_of([term_of(law).formula for law in laws], rows)
+    if theta:
+        changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}
     for (name, size), sd in zip(theta.items(), np.sqrt(np.diag(covariance))):
-        unit = effects[name].unit
-        lines.append(f"{name} = {after[name]:.9g}  # {size:+.4g} +- {sd:.2g} {unit}")
-    return "\n".join(lines) + "\n"
+        words[f"effects.{name}"] = [f"{size:+.4g} +- {sd:.2g} {effects[name].unit}"]
+    return "\n".join([*_head(base, comments), *_commented(changed, words)]) + "\n"
 
 
 def _rows_of(names: Sequence[str], covariance: Iterable[Sequence[float]]) -> list[str]:
-    """Return the comment that holds a covariance."""
-    rows = [f"#   {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
-    return [f"# covariance of {', '.join(names)}:", *rows] if names else []
+    """Return the comments that hold a covariance."""
+    rows = [f"  {'  '.join(f'{x: .3e}' for x in row)}" for row in covariance]
+    return [f"covariance of {', '.join(names)}:", *rows] if names else []
 
 
 def refuse_strange(

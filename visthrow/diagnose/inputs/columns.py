@@ -35,6 +35,16 @@ class Group:
         """The columns for messages."""
         return ", ".join(self.columns)
 
+    @property
+    def middle(self) -> float:
+        """Median of the values."""
+        return float(np.nanmedian(self.values))
+
+    @property
+    def reach(self) -> float:
+        """Size within which 99 % of the values lie."""
+        return float(np.nanpercentile(np.abs(self.values), 99))
+
     def matches(self, pattern: str) -> bool:
         """Tell whether what the names share matches a pattern of ``column_names.toml``."""
         return bool(PATTERNS[pattern].search(self.stem))

@@ -20,7 +20,9 @@ from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 from visthrow.logs.mapping import TableMap, TimeColumn
 from visthrow.logs.readers.table import Table, logs_of
-from visthrow.logs.unit_names import UNITS
+from visthrow.logs.unit_names import UNITS, fitting_units
+
+_STEP = (2e-4, 0.25)  # between two rows of a log [s]
 
 
 @dataclass
@@ -138,7 +140,7 @@ def _clock(
     suffix = f"1/{rate[1]} s" if rate else ""
     if suffix not in UNITS:
         suffix = stated_unit or unit_by_name(name)
-    fitting = [unit for unit in ("s", "ms", "us", "ns") if 2e-4 <= step * UNITS[unit][1] <= 0.25]
+    fitting = fitting_units(step, ("s", "ms", "us", "ns"), *_STEP)
     unit = suffix if UNITS.get(suffix, ("",))[0] == "s" else next(iter(fitting), "s")
     if not suffix and len(fitting) != 1:
         proposal.questions.append(

@@ -23,7 +23,7 @@ from visthrow.logs.check import physics, relations
 from visthrow.logs.flightlog import STANDARD_CHANNELS, Channel, Samples
 from visthrow.logs.mapping import ChannelMap
 from visthrow.logs.readers.table import lost_rows, make_channel
-from visthrow.logs.unit_names import UNITS
+from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 Y_UP = "x,-z,y"
 """Our axes in those of Motive's world, whose y is up."""
@@ -166,10 +166,10 @@ class Recognition:
             vector = group.matches("rotvec") and not group.matches("not_vehicle")
             if not vector and not (group.hints_at("euler") and self._smooth(group)):
                 continue
-            largest = np.nanpercentile(np.abs(group.values), 99)
             unit = _angle_unit(group)
             kind = "rotvec" if vector else "euler"
-            why = f"{'three angles' if vector else 'roll, pitch, yaw'} up to {largest:.3g} {unit}"
+            words = "three angles" if vector else "roll, pitch, yaw"
+            why = f"{words} up to {group.reach:.3g} {unit}"
             if self._take("quat_wb", group, unit, why, kind=kind) and vector:
                 self.questions.append(
                     f"are {group.listed} a rotation vector (Vicon's angle-axis), as taken, or roll,"
@@ -208,9 +208,9 @@ class Recognition:
         0.
         """
         for group in self._hinting("acc_b"):
-            middle = np.nanmedian(group.values, axis=0)
-            if abs(middle[2]) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
-                return -np.sign(middle[2])
+            z = np.nanmedian(group.values[:, 2])
+            if abs(z) > 0.8 * np.nanmedian(np.linalg.norm(group.values, axis=1)):
+                return -np.sign(z)
         return 0.0
 
     def _positions(self) -> None:
@@ -394,8 +394,8 @@ class Recognition:
             if turned or best is None:
                 continue
             relation, group = best
-            size = UNITS[entry.unit][1] / relation.scale
-            unit = min(("m/s", "cm/s", "mm/s"), key=lambda u: abs(np.log(size / UNITS[u][1])))
+            ratio = relation.scale / UNITS[entry.unit][1]
+            unit, _ = nearest_unit(ratio, ("m/s", "cm/s", "mm/s"))
             why = f"the derivative of {name}, correlation {relation.correlation:.2f},"
             why += f" {relation.scale:.3g} of its unit a second"
             self._take(name.replace("pos", "vel"), group, unit, why, axes=self._up())
@@ -428,21 +428,22 @@ class Recognition:
         derived = Samples(np.empty(0), np.empty((0, 3)))
         if "quat_wb" in self._made:
             derived = relations.rates_of(*self._made["quat_wb"][1].samples())
-        ranked = []
+        best = None
         for group in self._hinting("rate_b"):
             values = self._samples(group)
             relation = relations.relate(derived, values, reach=_REACH)
             score = relation.axes_correlation if relation is not None else 0.0
-            ranked.append((score, group, _size(values)))
-        if not ranked:
+            if best is None or score > best[0]:
+                best = score, group, values
+        if best is None:
             return
-        score, group, size = max(ranked, key=lambda candidate: candidate[0])
-        largest = np.nanpercentile(np.abs(group.values), 99)
-        why = f"99 % within {largest:.3g}"
-        unit = NAMES["usual_units"].get(group.columns[0], "deg/s" if largest > 30.0 else "rad/s")
+        score, group, values = best
+        why = f"99 % within {group.reach:.3g}"
+        guess = "deg/s" if group.reach > 30.0 else "rad/s"
+        unit = NAMES["usual_units"].get(group.columns[0], guess)
         unit = group.unit if group.unit.endswith("/s") else unit
         if score > _BELONGS:
-            times = size / max(_size(derived), 1e-6)
+            times = _size(values) / max(_size(derived), 1e-6)
             unit = "deg/s" if times > 7.0 else "rad/s"
             why = f"the rates of the attitude, correlation {score:.2f}, {times:.3g} times"
         elif not group.unit:
@@ -455,12 +456,12 @@ class Recognition:
     def _forces(self) -> None:
         for group in self._hinting("acc_b"):
             size = np.nanmedian(np.linalg.norm(group.values, axis=1))
-            for unit in ("m/s^2", "g", "mg"):
-                if 0.8 < size * UNITS[unit][1] / physics.GRAVITY < 1.25:
-                    why = f"a middle size of {size:.3g}: gravity in {unit}"
-                    self._take("acc_b", group, unit, why, axes=self._body())
+            for unit in fitting_units(size / physics.GRAVITY, ("m/s^2", "g", "mg"), 0.8, 1.25):
+                why = f"a middle size of {size:.3g}: gravity in {unit}"
+                self._take("acc_b", group, unit, why, axes=self._body())
 
     def _motors(self) -> None:
+        order = "front left, front right, rear left, rear right"
         for group in [g for g in self._open(4) if g.stem == "motor"]:
             high = np.nanpercentile(group.values, 99)
             words = " ".join(group.columns)
@@ -468,7 +469,6 @@ class Recognition:
                 unit = group.unit or ("rpm" if "rpm" in words.lower() else "rad/s")
                 why = f"four rotors' speeds up to {high:.5g} {unit}"
                 self._take("motor_speed", group, unit, why)
-                order = "front left, front right, rear left, rear right"
                 self.questions.append(
                     f"rotors {group.listed}: order them {order}; are they electrical revolutions"
                     " (divide by pole pairs)?"
@@ -477,23 +477,20 @@ class Recognition:
             unit = next(unit for above, unit in _MOTOR_UNITS if high > above)
             if self._take("motor_command", group, unit, f"four motors up to {high:.5g}"):
                 self.questions.append(
-                    f"motors {group.listed}: order them front left, front right, rear left, rear"
-                    " right (Crazyflie: 4, 1, 3, 2; Betaflight: 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are"
-                    " they commands, or speeds?"
+                    f"motors {group.listed}: order them {order} (Crazyflie: 4, 1, 3, 2; Betaflight:"
+                    " 4, 2, 3, 1; PX4: 3, 1, 2, 4). Are they commands, or speeds?"
                 )
 
     def _single_columns(self) -> None:
         for group in self._open(1):
-            middle = np.nanmedian(group.values)
             if group.matches("battery"):
                 units = (group.unit,) if group.unit in ("V", "mV") else ("V", "cV", "mV")
-                for unit in units:
-                    if _PACK[0] < middle * UNITS[unit][1] < _PACK[1]:
-                        why = f"a middle of {middle:.4g}: a pack in {unit}"
-                        self._take("battery_voltage", group, unit, why)
+                for unit in fitting_units(group.middle, units, *_PACK):
+                    why = f"a middle of {group.middle:.4g}: a pack in {unit}"
+                    self._take("battery_voltage", group, unit, why)
             elif group.matches("angle") and "quat_wb" not in self._made:
                 unit = _angle_unit(group)
-                why = f"an angle, by its name; a middle of {middle:.3g}"
+                why = f"an angle, by its name; a middle of {group.middle:.3g}"
                 if self._take("angle", group, unit, why) and not group.unit:
                     self.questions.append(
                         f"angle '{group.stem}': '{unit}' is taken by its reach: deg or rad?"
@@ -503,17 +500,15 @@ class Recognition:
         """Take the collective thrust, a command before what else bears its name, a word before a
         letter, which may be of a temperature.
         """
-        groups = [
-            g
-            for g in self._open(1, targets=True)
-            if PATTERNS["thrust"].search(split_unit(g.stem)[0])
-        ]
+        groups = []
+        for group in self._open(1, targets=True):
+            if PATTERNS["thrust"].search(split_unit(group.stem)[0]):
+                groups.append(group)
         groups.sort(key=lambda group: (len(group.stem) == 1, not group.matches("target")))
         for group in groups:
-            middle = np.nanmedian(group.values)
-            if middle <= _LARGEST_THRUST and not rises(group.values[:, 0]):
+            if group.middle <= _LARGEST_THRUST and not rises(group.values[:, 0]):
                 unit = group.unit if group.unit in THRUSTS else "N"
-                self._take("thrust_command", group, unit, f"a middle of {middle:.4g}")
+                self._take("thrust_command", group, unit, f"a middle of {group.middle:.4g}")
 
     def _ask_what_is_open(self) -> None:
         if "quat_wb" in self._made and not self._made.keys() & {"pos_w", "rate_b"}:
@@ -545,7 +540,7 @@ def _angle_unit(group: Group) -> str:
     """Return the unit of angles, as named, else by how far they reach."""
     if group.unit in ("deg", "rad"):
         return group.unit
-    return "deg" if np.nanpercentile(np.abs(group.values), 99) > _TURN else "rad"
+    return "deg" if group.reach > _TURN else "rad"
 
 
 def _lettered(group: Group) -> bool:

@@ -5,6 +5,7 @@ thrust carries.
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from visthrow.logs.check import physics, relations
 from visthrow.logs.check.thrust_checks import MASS_BAD
 from visthrow.logs.flightlog import Channel, Samples
 from visthrow.logs.mapping import ChannelMap
-from visthrow.logs.unit_names import UNITS
+from visthrow.logs.unit_names import UNITS, fitting_units, nearest_unit
 
 LENGTHS = ("m", "mm", "cm")
 """Units of a path, the usual ones first."""
@@ -78,6 +79,17 @@ class PathReading:
         return f"'{self.unit}'" + (f" with {way}" if way else "")
 
 
+class Lean(NamedTuple):
+    """A path's motion beside the lean of an attitude."""
+
+    size: float  # what the lean accelerates it by [m/s^2]
+    times: float  # how many times that it accelerates by in its own unit; 0: not known
+    nats: float  # for their going together
+
+
+NO_LEAN = Lean(0.0, 0.0, 0.0)
+
+
 def readings(
     time: np.ndarray, path: np.ndarray, units: Iterable[str], attitudes: Iterable[Attitude | None]
 ) -> list[PathReading]:
@@ -93,60 +105,60 @@ def readings(
         attitudes: Readings of the vehicle's attitude; None where there is no attitude.
     """
     reach = np.nanmax(np.abs(path))
+    in_hall = fitting_units(reach, units, *_HALL)
     fall = by_fall(time, path)
     attitudes = list(attitudes)
-    leans = [(0.0,) * 3 if way is None else _by_lean(time, path, way) for way in attitudes]
+    leans = [NO_LEAN if way is None else _by_lean(time, path, way) for way in attitudes]
     together: dict[tuple[str, str] | None, float] = {}  # angles in whatever unit
-    for way, (_, _, nats) in zip(attitudes, leans):
-        kind = way.kind if way is not None else None
-        together[kind] = max(together.get(kind, 0.0), nats)
+    kinds = [way.kind if way is not None else None for way in attitudes]
+    for kind, lean in zip(kinds, leans):
+        together[kind] = max(together.get(kind, 0.0), lean.nats)
     decades = []  # of what a lean makes, by which a unit is off
-    for (_, times, _), unit in product(leans, units):
-        if times > 0.0:
-            decades.append(abs(np.log10(UNITS[unit][1] * times)))
-    leaning = min(decades, default=np.inf) < _DECADES and max(size for size, *_ in leans) > _LEANS
+    for lean, unit in product(leans, units):
+        if lean.times > 0.0:
+            decades.append(abs(np.log10(UNITS[unit][1] * lean.times)))
+    leaning = min(decades, default=np.inf) < _DECADES and max(x.size for x in leans) > _LEANS
     listed = []
-    for attitude, (_, times, _) in zip(attitudes, leans):
-        nats = together[attitude.kind if attitude is not None else None] if leaning else 0.0
+    for attitude, kind, lean in zip(attitudes, kinds, leans):
+        below = 0.0
+        if attitude is not None:
+            height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
+            below = attitude.doubt + _BELOW * (height < 0.0)
         for unit in units:
-            size = UNITS[unit][1]
-            doubt = -nats
-            if attitude is not None:
-                height = np.nanmedian(path @ turn_to(attitude.entry.axes)[:, 2])
-                doubt += attitude.doubt + _BELOW * (height < 0.0)
-            doubt += _OUTSIDE * (not _HALL[0] <= size * reach <= _HALL[1])
+            doubt = below + _OUTSIDE * (unit not in in_hall)
             doubt += _OUTSIDE * (fall not in ("", unit))
             why = f"{unit} by the size of a hall: {reach:.3g} from the origin"
-            if leaning and times > 0.0:
-                doubt += _huber(np.log(size * times) / _SCATTER)
-                why = f"{unit} by gravity: it accelerates by {size * times:.2g} times what its lean"
-                why += " makes"
+            if leaning:
+                doubt -= together[kind]
+            if leaning and lean.times > 0.0:
+                times = UNITS[unit][1] * lean.times
+                doubt += _huber(np.log(times) / _SCATTER)
+                why = f"{unit} by gravity: it accelerates by {times:.2g} times what its lean makes"
             elif fall:
                 why = f"{unit} by gravity: a part of it falls freely"
             listed.append(PathReading(unit, attitude, doubt, why))
     return sorted(listed, key=lambda reading: reading.doubt)
 
 
-def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> tuple[float, float, float]:
-    """Return what its lean accelerates a path by [m/s^2], how many times that it accelerates by in
-    its own unit, and the nats for their going together; 0 where that is not known.
-    """
+def _by_lean(time: np.ndarray, path: np.ndarray, attitude: Attitude) -> Lean:
+    """Weigh a path against the lean that an attitude gives it."""
     time_q, quat = attitude.channel.samples()
     turned = path @ turn_to(attitude.entry.axes)
     stamps, acc = physics.accelerations(*rising(time, turned), "m", _SPAN)
     if min(len(stamps), len(time_q)) < 50:
-        return 0.0, 0.0, 0.0
+        return NO_LEAN
     up = matrix_of_quat(relations.attitude_at(time_q, quat, stamps))[:, :, 2]
     lean = relations.mean_over(stamps, GRAVITY * up[:, :2], stamps, _SPAN)
-    lean = lean - np.mean(lean, axis=0)
-    acc = acc[:, :2] - np.mean(acc[:, :2], axis=0)
-    size, moves = (np.sqrt(np.mean(np.sum(x**2, axis=1))) for x in (lean, acc))
-    if size <= 0.0 or moves <= 0.0:
-        return 0.0, 0.0, 0.0
-    correlation = np.mean(np.sum(lean * acc, axis=1)) / (size * moves)
+    lean = (lean - np.mean(lean, axis=0)).ravel()
+    moved = (acc[:, :2] - np.mean(acc[:, :2], axis=0)).ravel()
+    power = np.linalg.norm(lean) * np.linalg.norm(moved)
+    if power <= 0.0:
+        return NO_LEAN
+    correlation = min(max(lean @ moved / power, 0.0), 0.999)
     independent = np.ptp(stamps) / _SPAN
-    correlation = min(max(correlation, 0.0), 0.999)
-    return size, moves / size, -0.5 * independent * np.log(1.0 - correlation**2)
+    nats = -0.5 * independent * np.log(1.0 - correlation**2)
+    times = np.linalg.norm(moved) / np.linalg.norm(lean)
+    return Lean(np.linalg.norm(lean) / np.sqrt(len(stamps)), times, nats)
 
 
 def _huber(deviations: float) -> float:
@@ -188,9 +200,8 @@ def by_mass(carried: float, weighed: float, units: Iterable[str] = THRUSTS) -> s
     Returns:
         The unit, "" where none does.
     """
-    off = {unit: abs(np.log(weighed / (carried * UNITS[unit][1]))) for unit in units}
-    best = min(off, key=off.__getitem__)
-    return best if off[best] < MASS_BAD else ""
+    unit, miss = nearest_unit(carried / weighed, units)
+    return unit if miss < MASS_BAD else ""
 
 
 def rising(time: np.ndarray, path: np.ndarray) -> Samples:
