@@ -68,7 +68,8 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
     """Choose the basis from the states that were flown; None where windows carry no knots, or no
     latent force acts.
     """
-    if not all("time" in w.knots and w.latent.size for w in point.windows):
+    blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
+    if not blocks or not all("time" in w.knots and w.latent.size for w in point.windows):
         return None
     inputs = np.vstack([_inputs(w) for w in point.windows])
     if not inputs.shape[1]:
@@ -76,9 +77,6 @@ def table_of(point: Point, rng: np.random.Generator) -> ForceTable | None:
     mean = inputs.mean(0)
     deviation = np.maximum(inputs.std(0), 1e-9)
     chosen = rng.choice(len(inputs), size=min(CENTRES, len(inputs)), replace=False)
-    blocks = tuple(LATENT_BLOCKS[b] for b in sorted({b for b, _ in point.noise.latent_sd}))
-    if not blocks:
-        return None
     return ForceTable(mean, deviation, ((inputs - mean) / deviation)[chosen], blocks)
 
 
@@ -117,21 +115,20 @@ def train(
     ``point``: linearised anywhere; ``theta``: sizes of the effects beside the table, in floors,
     shape (K,); default 0."""
     shift = point.statistics.theta - (0.0 if theta is None else theta)
-    names = np.array(sorted(set(groups)))
+    names, row = np.unique(groups, return_inverse=True)
     size = table.columns(point.windows[0]).shape[1]
     information = np.zeros((len(names), size, size))
     score = np.zeros((len(names), size))
     parts = statistics(point.grams, point.noise, point.device)
-    for window, part, group in zip(point.windows, parts, groups):
+    for window, part, f in zip(point.windows, parts, row):
         columns = table.columns(window)
-        f = int(np.searchsorted(names, group))
         information[f] += columns.T @ part.latent_information @ columns
         score[f] += columns.T @ (part.latent_score + part.latent_effects @ shift)
     strongest = dict.fromkeys(table.blocks, 0.0)
     for (block, _), sd in point.noise.latent_sd.items():
         name = LATENT_BLOCKS[block]
         strongest[name] = max(strongest[name], sd)
-    reach = np.repeat([*strongest.values()], size // len(table.blocks))
+    reach = np.repeat(list(strongest.values()), size // len(table.blocks))
     return Trained(names, information, score, reach)
 
 

@@ -12,9 +12,9 @@ import numpy as np
 from visthrow.common.statistics import mean
 from visthrow.diagnose.likelihood.correlation import with_correlations
 from visthrow.diagnose.likelihood.forms import FAR_ABOVE, errors, predicted
-from visthrow.diagnose.likelihood.marginal import finite, grams_of
+from visthrow.diagnose.likelihood.marginal import Noise, finite, grams_of
 from visthrow.diagnose.likelihood.noise_levels import without_outliers
-from visthrow.diagnose.models.model_interface import Model
+from visthrow.diagnose.models.model_interface import Model, Window
 from visthrow.diagnose.reporting.blackbox import table_of, train
 from visthrow.diagnose.select.held_out import (
     Crossed,
@@ -23,7 +23,7 @@ from visthrow.diagnose.select.held_out import (
     crossed,
     regrouped,
 )
-from visthrow.diagnose.select.point import Point
+from visthrow.diagnose.select.point import Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
 from visthrow.diagnose.throw.landing import PredictedLandings
 
@@ -79,17 +79,16 @@ def measure(diagnosis: Diagnosis, *, seed: int = 0) -> Gain:
     ``diagnosis``: of :func:`visthrow.diagnose.select.diagnose_flights.explain`; ``seed``: of the
     black box's basis."""
     work = diagnosis.work
-    rng = np.random.default_rng(seed)
     cross = crossed(diagnosis)
-    box = _blackbox(
-        work.before, cross.groups, cross.folds, work.after, len(work.problem.model.channels), rng
-    )
+    box = _blackbox(work, cross, np.random.default_rng(seed))
     gains = channel_gains(work, cross.groups, cross.trained, box)
-    sizes = cross.trained if cross.left_out == "flights" and diagnosis.theta else ()
-    trained = {int(f): work.problem.sizes(size) for f, size in zip(cross.statistics.flights, sizes)}
+    trained = {}
+    if cross.left_out == "flights" and diagnosis.theta:
+        for flight, sizes in zip(cross.statistics.flights, cross.trained):
+            trained[int(flight)] = work.problem.sizes(sizes)
     landing = landing_gain(work, diagnosis.theta, trained, seed)
     whole = all(w.nuisance.shape[1] == 0 for w in work.after.windows)
-    nats = _nats(work.before, work.after, cross)
+    nats = _nats(work, cross)
     return Gain(gains, nats, cross.named, len(cross.folds), cross.left_out, landing, whole)
 
 
@@ -121,23 +120,23 @@ def landing_gain(
         without = model.landings(remaining, flown) if remaining else plain
         level = (named.predicted - without.predicted)[good, :2]
         moved[name] = np.nanmean(np.linalg.norm(level, axis=1))
-    after = mean(held_landings.errors[good], seed=seed)
-    released = []
     off = []
     for prediction in (plain, held_landings):
-        released.append(np.nanmean(prediction.released_errors[good]))
         level = (prediction.predicted - prediction.measured)[good, :2]
         off.append(tuple(map(tuple, level.tolist())))
+    after = mean(held_landings.errors[good], seed=seed)
     return LandingGain(
-        int(good.sum()),
-        bool(trained),
-        plain.errors[good].mean(),
-        after.value,
-        after.low,
-        after.high,
-        *released,
-        moved,
-        *off,
+        throws=int(good.sum()),
+        held_out=bool(trained),
+        before=plain.errors[good].mean(),
+        after=after.value,
+        low=after.low,
+        high=after.high,
+        released_before=np.nanmean(plain.released_errors[good]),
+        released_after=np.nanmean(held_landings.released_errors[good]),
+        moved=moved,
+        off_before=off[0],
+        off_after=off[1],
     )
 
 
@@ -170,30 +169,13 @@ def on_others(
         diagnosis: that diagnosis, whose noise is taken.
         without: flights that are left out.
     """
-    noise = replace(
-        diagnosis.work.after.noise,
-        scale=np.array([diagnosis.sensor_scale[name] for name in after.channels]),
-    )
+    work = diagnosis.work
+    scale = np.array([diagnosis.sensor_scale[name] for name in after.channels])
+    noise = replace(work.after.noise, scale=scale)
     rms = []
-    floors = diagnosis.work.problem.priors.floor
-    channels = len(after.channels)
-    outliers = 0
     for model, sizes in ((before, {}), (after, theta)):
-        sums = np.zeros((3, channels))
         windows = [w for w in model.windows(sizes) if finite(w) and w.flight not in without]
-        floors_of = floors[: windows[0].effects.shape[1]] if windows else floors
-        correlated = with_correlations(windows, diagnosis.work.problem.correlated)
-        mended = without_outliers(correlated, grams_of(correlated, floors_of, channels))
-        outliers = 0
-        for plain, window in zip(correlated, mended):
-            innovation, expected, horizon = predicted(window, noise, window.residual)
-            weight = (plain.sigma / window.sigma) ** 2
-            outliers += int((weight < 1.0).sum())
-            squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2
-            weighted = np.where(horizon >= 0, weight * squares, 0.0)
-            added = np.array([np.bincount(window.channel, row, channels) for row in weighted])
-            added[1] = np.where(added[1] > FAR_ABOVE * added[0], added[0], added[1])
-            sums += added
+        sums, outliers = _weighted_squares(windows, work.problem, noise)
         rms.append(np.sqrt(sums[:2] / np.maximum(sums[2], 1.0)))
     (plain, _), (named, floor) = rms
     rows = np.column_stack((plain, named, floor)).tolist()
@@ -202,38 +184,56 @@ def on_others(
     return Tested(errors, len({w.flight for w in windows}), len(windows), samples, outliers)
 
 
-def _blackbox(
-    before: Point,
-    groups: Sequence[int],
-    folds,
-    after: Point,
-    channels: int,
-    rng: np.random.Generator,
-):
+def _weighted_squares(
+    windows: Sequence[Window], problem: Problem, noise: Noise
+) -> tuple[np.ndarray, int]:
+    """Return sums over the samples ahead of squared errors, of those expected of noise, and of
+    weights, shape (3, C), where samples far outside weigh less; and the number of these.
+    """
+    count = len(noise.scale)
+    sums = np.zeros((3, count))
+    outliers = 0
+    correlated = with_correlations(windows, problem.correlated)
+    floors = problem.priors.floor[: windows[0].effects.shape[1]] if windows else np.empty(0)
+    mended = without_outliers(correlated, grams_of(correlated, floors, count))
+    for plain, window in zip(correlated, mended):
+        innovation, expected, horizon = predicted(window, noise, window.residual)
+        weight = (plain.sigma / window.sigma) ** 2
+        outliers += int((weight < 1.0).sum())
+        squares = np.array([innovation**2, expected, window.sigma**-2.0]) * window.sigma**2
+        weighted = np.where(horizon >= 0, weight * squares, 0.0)
+        added = np.array([np.bincount(window.channel, row, count) for row in weighted])
+        added[1] = np.where(added[1] > FAR_ABOVE * added[0], added[0], added[1])
+        sums += added
+    return sums, outliers
+
+
+def _blackbox(work: Work, cross: Crossed, rng: np.random.Generator) -> np.ndarray | None:
     """Squared errors of the black box on held-out groups, shape (F, C, H); None where it cannot be
     trained.
     """
+    before = work.before
     table = table_of(before, rng)
     if table is None:
         return None
-    trained = train(before, table, groups)
+    trained = train(before, table, cross.groups)
     weights = np.zeros((len(trained.groups), len(trained.reach)))
-    for fold in folds:
+    for fold in cross.folds:
         training = np.setdiff1d(np.arange(len(weights)), fold)
         weights[fold] = trained.weights(training) if len(training) else 0.0
-    weights_of = weights[np.searchsorted(trained.groups, groups)]
     residuals = []
-    for window, size in zip(before.windows, weights_of):
+    for window, size in zip(before.windows, weights[np.searchsorted(trained.groups, cross.groups)]):
         force = table.columns(window) @ size
         residuals.append(window.residual - window.latent @ force)
-    return errors(before.windows, groups, after.noise, residuals, channels).square
+    channels = len(work.problem.model.channels)
+    return errors(before.windows, cross.groups, work.after.noise, residuals, channels).square
 
 
-def _nats(before: Point, after: Point, cross: Crossed) -> float:
+def _nats(work: Work, cross: Crossed) -> float:
     """Held-out log-likelihood per sample, after minus before, each with its own noise levels."""
-    plain = regrouped(before, cross.groups)
-    named = regrouped(after, cross.groups)
-    change = cross.trained - after.theta
+    plain = regrouped(work.before, cross.groups)
+    named = regrouped(work.after, cross.groups)
+    change = cross.trained - work.after.theta
     quadratic = np.einsum("fi,fij,fj->f", change, named.information, change)
     square = named.square - 2.0 * np.einsum("fi,fi->f", change, named.score) + quadratic
     return 0.5 * (plain.square.sum() - square.sum()) / named.samples.sum()

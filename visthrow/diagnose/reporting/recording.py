@@ -40,17 +40,19 @@ def _channel(
     stream, name: str, channel: int, before: Window, after: Window, noise, log: FlightLog | None
 ) -> None:
     rows = np.flatnonzero(before.channel == channel)
-    if not len(rows):
-        return
     time = before.time[rows]
-    width = int(np.sum(time == time[0]))  # components of a sample stand together
-    if len(rows) % width:
+    width = np.count_nonzero(time == time[:1])  # components of a sample stand together
+    if not width or len(rows) % width:
         return
     stamps = time[::width]
     old, new = (left_over(w, noise)[rows].reshape(-1, width) for w in (before, after))
     home = f"flight_{before.flight:02d}"
     for values, label, colour in ((old, "before", style.BEFORE), (new, "after", style.AFTER)):
-        _series(stream, f"{home}/residual/{name}/{label}", stamps, values, colour)
+        entity = f"{home}/residual/{name}/{label}"
+        look = rr.SeriesPoints(colors=[colour_code(colour)] * width, marker_sizes=[1.5] * width)
+        stream.log(entity, look, static=True)
+        scalars = np.ascontiguousarray(values, dtype=float)
+        _send(stream, entity, stamps, rr.Scalars.columns(scalars=scalars))
     if name not in PATHS or log is None or name not in log or width != 3:
         return
     measured = log[name]
@@ -58,31 +60,20 @@ def _channel(
     if np.abs(measured.time[index] - stamps).max() > 1e-6:
         return
     place = measured.values[index]
-    for points, label, colour in (
-        (place, "measured", style.INK),
-        (place - old, "before", style.BEFORE),
-        (place - new, "after", style.AFTER),
-    ):
-        _path(stream, f"{home}/{name}/{label}", stamps, points, colour)
+    _path(stream, f"{home}/{name}/measured", stamps, place, style.INK)
+    _path(stream, f"{home}/{name}/before", stamps, place - old, style.BEFORE)
+    _path(stream, f"{home}/{name}/after", stamps, place - new, style.AFTER)
 
 
-def _series(stream, entity: str, time: np.ndarray, values: np.ndarray, colour: str) -> None:
-    count = values.shape[1]
-    stream.log(
-        entity,
-        rr.SeriesPoints(colors=[colour_code(colour)] * count, marker_sizes=[1.5] * count),
-        static=True,
-    )
-    column = rr.TimeColumn(TIMELINE, duration=time)
-    stream.send_columns(
-        entity, [column], rr.Scalars.columns(scalars=np.ascontiguousarray(values, dtype=float))
-    )
+def _send(stream, entity: str, time: np.ndarray, columns) -> None:
+    """Send columns that have a row for each time [s]."""
+    stream.send_columns(entity, [rr.TimeColumn(TIMELINE, duration=time)], columns)
 
 
 def _path(stream, entity: str, time: np.ndarray, points: np.ndarray, colour: str) -> None:
-    code = colour_code(colour)
-    stream.log(entity, rr.Points3D.from_fields(radii=0.006, colors=[code]), static=True)
-    column = rr.TimeColumn(TIMELINE, duration=time)
-    stream.send_columns(entity, [column], rr.Points3D.columns(positions=points.astype(np.float32)))
-    whole = rr.LineStrips3D([points.astype(np.float32)], radii=0.0015, colors=[code])
+    points = points.astype(np.float32)
+    look = {"colors": [colour_code(colour)]}
+    stream.log(entity, rr.Points3D.from_fields(radii=0.006, **look), static=True)
+    _send(stream, entity, time, rr.Points3D.columns(positions=points))
+    whole = rr.LineStrips3D([points], radii=0.0015, **look)
     stream.log(f"{entity}/window_{time[0]:.2f}", whole, static=True)
