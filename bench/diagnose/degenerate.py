@@ -47,7 +47,7 @@ class Pair:
     def run(self, recipe: Recipe, folder: Path) -> dict:
         """Fly, ask, do as told, ask again."""
         tables = [
-            table_of(manoeuvre_of(name).reference().csv(), self.payload)
+            table_of(manoeuvre_of(name).csv(), self.payload)
             for name in self.flights
             for _ in range(2)
         ]

@@ -68,15 +68,15 @@ def test_the_optimiser_finds_more_than_the_best_that_it_began_with(quadrotor):
 
 @mark.parametrize("base", BASES.values(), ids=lambda m: m.name)
 def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(base: Manoeuvre):
-    same, own = design.designed(base, design.Limits(), design.START).reference(), base.reference()
+    same = design.designed(base, design.Limits(), design.START)
     for name in ("pos_w", "yaw", "rates_b", "thrust_factor", "release"):
         np.testing.assert_allclose(
-            getattr(same, name), getattr(own, name), atol=1e-12, err_msg=name
+            getattr(same, name), getattr(base, name), atol=1e-12, err_msg=name
         )
     limits = design.Limits(half=(1.5, 1.0), highest=2.0, speed=1.5)
-    allowed = limits.around(own.pos_w)
+    allowed = limits.around(base.pos_w)
     for numbers in np.random.default_rng(3).random((20, len(design.NUMBERS))):
-        r = design.designed(base, limits, numbers).reference()
+        r = design.designed(base, limits, numbers)
         moved = np.abs(r.pos_w[:, :2]).max(0)
         assert np.all(moved <= np.array(allowed.half) + 1e-9)
         assert (
@@ -88,7 +88,7 @@ def test_the_start_is_the_manoeuvre_and_every_design_keeps_within_the_limits(bas
         assert (
             np.linalg.norm(r.vel_w, axis=1).max() <= 1.02 * allowed.speed
         )  # the hover before and after is not part of the fit
-        assert np.abs(r.rates_b).max() <= limits.rate + np.abs(own.rates_b).max() + 1e-9
+        assert np.abs(r.rates_b).max() <= limits.rate + np.abs(base.rates_b).max() + 1e-9
 
 
 def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
@@ -98,7 +98,7 @@ def test_a_payload_is_never_dropped_where_the_vehicle_cannot():
             m for m in (fly_manoeuvres.carried(m, params) for m in BASES.values()) if m is not None
         ]
         assert {m.payload for m in flown} == {params.cable is not None}
-        assert not any(np.isfinite(m.release) for m in flown)
+        assert not any(np.any(m.release) for m in flown)
 
 
 @mark.parametrize("name", ["cf_payload", "nanobench_cf21"])

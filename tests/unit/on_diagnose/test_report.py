@@ -191,7 +191,7 @@ def test_measurements_that_are_none_are_refused(item):
 
 @mark.parametrize("manoeuvre", manoeuvres.catalogue(), ids=lambda m: m.name)
 def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
-    r = manoeuvre.reference()
+    r = manoeuvre
     assert r.time[-1] == approx(manoeuvre.seconds, abs=0.05)
     assert np.abs(r.vel_w[[0, -1]]).max() < 1e-6
     assert np.abs(r.acc_w).max() < 12.0
@@ -207,10 +207,9 @@ def test_manoeuvres_are_smooth_bounded_and_begin_at_rest(manoeuvre):
 def test_a_flight_that_nears_the_ground_has_no_model(part, used):
     """It hovers 0.11 m high and is aborted at half of it."""
     chosen = next(m for m in manoeuvres.catalogue() if m.name == "hover low without payload")
-    reference = chosen.reference()
-    assert reference.lowest == approx(0.055)
-    place = np.repeat(reference.pos_w, 4, axis=0) - [0.0, 0.0, part * reference.lowest]
-    flight = fly_manoeuvres.SimulatedFlight(chosen, reference, None, {"pos_w": place}, None, None)
+    assert chosen.lowest == approx(0.055)
+    place = np.repeat(chosen.pos_w, 4, axis=0) - [0.0, 0.0, part * chosen.lowest]
+    flight = fly_manoeuvres.SimulatedFlight(chosen, None, {"pos_w": place}, None, None)
     simulated = flight.simulated(lambda _: "a model")
     assert simulated.used == approx(used)
     assert (simulated.model is None) == (used > 1.0)
@@ -223,17 +222,16 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
 
     def level(turn: float) -> fly_manoeuvres.SimulatedFlight:
         chosen = next(m for m in manoeuvres.catalogue() if m.name == "throw at 2 m/s")
-        reference = chosen.reference()
-        rows = 4 * len(reference.time)
-        place = np.repeat(reference.pos_w, 4, axis=0)
+            rows = 4 * len(chosen.time)
+        place = np.repeat(chosen.pos_w, 4, axis=0)
         hangs = np.where(
-            np.arange(rows)[:, None] < 4 * np.argmax(reference.release),
+            np.arange(rows)[:, None] < 4 * np.argmax(chosen.release),
             [-0.38, 0.0, 0.0],
             [0.0, 0.0, 5.0],
         )  # then let go
         quat = np.tile([0.0, np.sin(0.5 * turn), 0.0, np.cos(0.5 * turn)], (rows, 1))
         truth = {"pos_w": place, "payload_pos_w": place + hangs, "quat_wb": quat}
-        return fly_manoeuvres.SimulatedFlight(chosen, reference, None, truth, None, None)
+        return fly_manoeuvres.SimulatedFlight(chosen, None, truth, None, None)
 
     flights = [level(0.0), level(0.2 * np.pi)]
     assert [flight.swing for flight in flights] == approx([90.0, 54.0])

@@ -26,7 +26,7 @@ from scipy.stats import qmc
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.planning.fly_manoeuvres import Simulate, Simulated
-from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, rise
+from visthrow.diagnose.planning.manoeuvres import PERIOD, SETTLE, Manoeuvre, moving_times, rise
 from visthrow.diagnose.planning.plan import PlanningGoal
 
 PATH = 0.08, 2.0
@@ -165,12 +165,12 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     x = dict(zip(NUMBERS, np.clip(numbers, 0.0, 1.0).tolist()))
     kept = x["kept"]
     seconds = base.seconds - 2.0 * SETTLE
-    limits = limits.around(base.reference().pos_w)
-    middle = np.array([0.0, 0.0, base.path(np.zeros(1))[0, 2]])
+    t = moving_times(base.seconds)
+    limits = limits.around(base.pos_w)
     half_height = 0.5 * (limits.highest - limits.lowest)
     reaches = dict(zip("xyz", (*limits.half, half_height)))
 
-    def swept(axis: str, t: np.ndarray) -> np.ndarray:
+    def swept(axis: str) -> np.ndarray:
         def farthest(frequency: np.ndarray) -> np.ndarray:
             turned = 2.0 * np.pi * frequency
             if axis == "yaw":
@@ -182,36 +182,24 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
         high = _between(PATH, x[f"to_{axis}"])
         return x[f"share_{axis}"] * sweep(t, seconds, low, high, farthest)
 
-    def ramped(t: np.ndarray) -> np.ndarray:
-        return middle + kept * (base.path(t) - middle)
-
-    def moved(t: np.ndarray) -> np.ndarray:
-        return np.column_stack([swept(axis, t) for axis in "xyz"])
-
-    rows = np.arange(0.0, seconds + 0.5 * PERIOD, PERIOD)
-    fitting = limits.share(ramped(rows), moved(rows))
+    middle = np.array([0.0, 0.0, base.pos_w[0, 2]])
+    ramped = middle + kept * (base.pos_w - middle)
+    moved = np.column_stack([swept(axis) for axis in "xyz"])
     slow = ADDED[0]
     fast = _between(ADDED, x["added_to"])
-
-    def rates(t: np.ndarray) -> np.ndarray:
-        sweeps = []
-        for i, axis in enumerate("xyz"):
-            added = sweep(t, seconds, slow, fast, phase=2.0 * np.pi * i / 3.0)
-            sweeps.append(x[f"rate_{axis}"] * added)
-        return kept * base.rates(t) + limits.rate * np.column_stack(sweeps)
-
-    def thrust(t: np.ndarray) -> np.ndarray:
-        added = limits.thrust * x["thrust"] * sweep(t, seconds, fast, slow)
-        return 1.0 + kept * (base.thrust(t) - 1.0) + added
-
+    rates_b = kept * base.rates_b
+    for i, axis in enumerate("xyz"):
+        added = sweep(t, seconds, slow, fast, phase=2.0 * np.pi * i / 3.0)
+        rates_b[:, i] += limits.rate * x[f"rate_{axis}"] * added
+    thrust = limits.thrust * x["thrust"] * sweep(t, seconds, fast, slow)
     return replace(
         base,
         name=base.name + OPTIMISED,
         purpose="the most nats a second within the limits",
-        rates=rates,
-        path=lambda t: ramped(t) + fitting * moved(t),
-        yaw=lambda t: kept * base.yaw(t) + swept("yaw", t),
-        thrust=thrust,
+        pos_w=ramped + limits.share(ramped, moved) * moved,
+        yaw=kept * base.yaw + swept("yaw"),
+        rates_b=rates_b,
+        thrust_factor=1.0 + kept * (base.thrust_factor - 1.0) + thrust,
     )
 
 

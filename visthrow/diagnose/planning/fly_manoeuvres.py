@@ -20,7 +20,7 @@ from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
 from visthrow.diagnose.models.thrust_map import command_of
-from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre, Reference
+from visthrow.diagnose.planning.manoeuvres import PERIOD, Manoeuvre
 from visthrow.diagnose.select.result import Diagnosis
 from visthrow.diagnose.throw.throw_model import ThrowModel, effects_for
 from visthrow.logs.flightlog import Channel, FlightLog
@@ -36,7 +36,7 @@ APPROACH_SECONDS = 1.5
 HIGHEST = 75.0
 
 ASTRAY = 0.5
-"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Reference.limits`
+"""Distance from the reference [m] beyond which a flight is aborted: as :meth:`Manoeuvre.limits`
 says, its box is wider by that.
 """
 
@@ -47,6 +47,8 @@ LOST = 10.0  # the same of a vehicle that flies off
 # mass of a setup's cable, in that of its payload: the setup's model has it without mass
 THREAD = 1e-3
 
+ROWS = ("pos_w", "yaw", "rates_b", "thrust_factor", "release")
+"""What is flown of a manoeuvre."""
 STEPS = round(PERIOD / SAMPLE_PERIOD)  # samples in a row of a reference
 SAMPLED = ("pos_w", "quat_wb", "payload_pos_w", "vel_w", "rate_b", "motor_speed", "voltage")
 LOGGED = {
@@ -126,7 +128,7 @@ def _throw_model(
     log = flight.log(noise, model.has_voltage)
     carries = flight.manoeuvre.payload
     setting = model.setting
-    releases = np.isfinite(flight.manoeuvre.release)
+    releases = bool(np.any(flight.manoeuvre.release))
     effects = effects_for(setting, set(log.channels), carries, releases)
     requested = {e.name for e in model.effects}
     return ThrowModel(
@@ -144,7 +146,7 @@ def _throw_model(
 def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
     """The manoeuvre with what a setup's vehicle carries; None where it would have to drop it."""
     carries = params.cable is not None
-    if np.isfinite(manoeuvre.release) or (carries and not manoeuvre.payload):
+    if np.any(manoeuvre.release) or (carries and not manoeuvre.payload):
         return None
     return replace(manoeuvre, payload=carries)
 
@@ -194,7 +196,6 @@ class SimulatedFlight:
     """A simulated manoeuvre; arrays of :data:`SAMPLED`, without noise, every ``SAMPLE_PERIOD``."""
 
     manoeuvre: Manoeuvre
-    reference: Reference
     plant: PlantParams
     truth: Mapping[str, np.ndarray]
     commands: np.ndarray  # [N, rad/s], shape (rows of the reference, 4)
@@ -209,8 +210,8 @@ class SimulatedFlight:
         """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
         it if it was not.
         """
-        off = self.truth["pos_w"][::STEPS] - self.reference.pos_w
-        height = self.reference.pos_w[:, 2] - self.reference.lowest
+        off = self.truth["pos_w"][::STEPS] - self.manoeuvre.pos_w
+        height = self.manoeuvre.pos_w[:, 2] - self.manoeuvre.lowest
         sunk = np.max(-off[:, 2] / height)
         astray = np.max(np.linalg.norm(off, axis=1)) / ASTRAY
         used = np.max([self.swing / HIGHEST, astray, sunk])  # NaN counts
@@ -227,7 +228,7 @@ class SimulatedFlight:
         """
         if not self.manoeuvre.payload:
             return 0.0
-        released = self.reference.time[self.reference.release]
+        released = self.manoeuvre.time[self.manoeuvre.release]
         hanging = self.time < np.min(released, initial=np.inf)
         rope_w = (self.truth["pos_w"] - self.truth["payload_pos_w"])[hanging]
         rope_b = rotate_back(self.truth["quat_wb"][hanging], rope_w)
@@ -241,8 +242,8 @@ class SimulatedFlight:
         values = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         if voltage:
             values["battery_voltage"] = self.truth["voltage"]
-        sent = {"command": self.commands, "release_command": self.reference.release.astype(float)}
-        return self._log(_channels(self.time, values) | _channels(self.reference.time, sent))
+        sent = {"command": self.commands, "release_command": self.manoeuvre.release.astype(float)}
+        return self._log(_channels(self.time, values) | _channels(self.manoeuvre.time, sent))
 
     def setup_log(
         self, params: FlyerParams, noise: Mapping[str, float], voltage: bool = False
@@ -278,7 +279,7 @@ class SimulatedFlight:
             values = command_of(params.thrust_map, self.commands[:, :1])
             if params.input == "command":
                 values = np.hstack((values, self.commands[:, 1:]))
-            return _channels(self.reference.time, {params.input: values})
+            return _channels(self.manoeuvre.time, {params.input: values})
         thrust = self.plant.vehicle.thrust.k_f * self.truth["motor_speed"] ** 2
         lag = self.plant.vehicle.motor.time_constant
         lagged = thrust + lag * np.gradient(thrust, SAMPLE_PERIOD, axis=0)
@@ -300,19 +301,19 @@ def fly(
     """
     from sim.hybrid import HybridSim
 
-    references = [m.reference() for m in manoeuvres]
-    count = len(references)
-    plan = _stacked(references)
+    count = len(manoeuvres)
+    pos_w, yaw, rates_b, thrust_factor, release = (_stacked(manoeuvres, name) for name in ROWS)
     plant = replace(plant, sim=replace(plant.sim, control_period=SAMPLE_PERIOD))
     motors = plant.vehicle.controller
     thrusts = {"min_thrust": 4.0 * motors.min_thrust, "max_thrust": 4.0 * motors.max_thrust}
     gains = replace(TRACKING, **thrusts)
     controller = HoverController(gains, PERIOD, count)
     # a controller that follows velocities and accelerations by a goal that is ahead
-    push = plan.vel_w + plan.acc_w / gains.velocity_gain
-    goals = plan.pos_w + push / gains.position_gain
+    vel_w = np.gradient(pos_w, PERIOD, axis=0)
+    push = vel_w + np.gradient(vel_w, PERIOD, axis=0) / gains.velocity_gain
+    goals = pos_w + push / gains.position_gain
     sim = HybridSim(plant, count, device)
-    sim.place(plan.pos_w[0])
+    sim.place(pos_w[0])
     dropped = ~np.array([m.payload for m in manoeuvres])
     commands = []
     samples = []
@@ -321,11 +322,11 @@ def fly(
         i = max(row, 0)
         state = [sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")]
         mass = np.where(dropped, plant.vehicle.body.mass, plant.total_mass)
-        command = controller.step(*state, goals[i], mass, plan.yaw[i])
+        command = controller.step(*state, goals[i], mass, yaw[i])
         if flown:
-            command[:, 1:] += plan.rates_b[i]
-            command[:, 0] *= plan.thrust_factor[i]
-            dropped = dropped | plan.release[i]
+            command[:, 1:] += rates_b[i]
+            command[:, 0] *= thrust_factor[i]
+            dropped = dropped | release[i]
             commands.append(command)
         sim.set_command(command, dropped)
         for _ in range(STEPS):
@@ -335,20 +336,16 @@ def fly(
     truth = {name: np.array(values) for name, values in zip(SAMPLED, zip(*samples))}
     sent = np.array(commands)
     flights = []
-    for e, (reference, manoeuvre) in enumerate(zip(references, manoeuvres)):
-        rows = len(reference.time)
+    for e, manoeuvre in enumerate(manoeuvres):
+        rows = len(manoeuvre.time)
         states = {name: values[: rows * STEPS, e] for name, values in truth.items()}
         rng = np.random.default_rng([seed, e])
-        flights.append(SimulatedFlight(manoeuvre, reference, plant, states, sent[:rows, e], rng))
+        flights.append(SimulatedFlight(manoeuvre, plant, states, sent[:rows, e], rng))
     return flights
 
 
-def _stacked(references: Sequence[Reference]) -> Reference:
-    """Return references side by side, each at its last row from its end on."""
-    rows = max(len(r.time) for r in references)
-    columns = []
-    for f in fields(Reference):
-        values = [getattr(r, f.name) for r in references]
-        held = [v[np.minimum(np.arange(rows), len(v) - 1)] for v in values]
-        columns.append(np.stack(held, 1))
-    return Reference(*columns)
+def _stacked(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
+    """Return rows of manoeuvres side by side, each at its last one from its end on."""
+    columns = [getattr(m, name) for m in manoeuvres]
+    rows = np.arange(max(map(len, columns)))
+    return np.stack([column[np.minimum(rows, len(column) - 1)] for column in columns], 1)

@@ -3,10 +3,10 @@ commands, 50 times a second.
 
 A pilot or controller follows the position; doublets and thrust steps are added to its commands.
 Each stays within a box of a few metres and leaves the payload well below the rotors;
-:meth:`Reference.limits` says when to abort."""
+:meth:`Manoeuvre.limits` says when to abort."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -18,18 +18,29 @@ PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
 # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
 HEIGHT = 1.5
+MIDDLE = {"x": 0.0, "y": 0.0, "z": HEIGHT}  # where a manoeuvre without an axis stays [m]
 
 
 @dataclass(frozen=True)
-class Reference:
-    """Rows of a manoeuvre, N of them."""
+class Manoeuvre:
+    """One flight: N rows of a reference, ``PERIOD`` apart, from the start of the hover before it to
+    the end of that after it.
+    """
 
-    time: np.ndarray  # [s], shape (N,)
+    name: str
+    purpose: str
+    seconds: float  # with SETTLE at both ends
     pos_w: np.ndarray  # [m], shape (N, 3)
     yaw: np.ndarray  # [rad], shape (N,)
     rates_b: np.ndarray  # added to the commanded body rates [rad/s], shape (N, 3)
     thrust_factor: np.ndarray  # on the commanded thrust, shape (N,)
     release: np.ndarray  # bool, shape (N,)
+    payload: bool = True
+
+    @property
+    def time(self) -> np.ndarray:
+        """Times of the rows [s], shape (N,)."""
+        return times_of(self.seconds)
 
     @cached_property
     def vel_w(self) -> np.ndarray:
@@ -44,8 +55,13 @@ class Reference:
     @property
     def lowest(self) -> float:
         """Return the height at which a flight is aborted [m]."""
-        low = self.pos_w[:, 2].min()
+        low = float(self.pos_w[:, 2].min())
         return max(0.05, low - min(0.3, 0.5 * low))
+
+    @property
+    def file(self) -> str:
+        """Name of the file that holds its reference."""
+        return "".join(c if c.isalnum() else "_" for c in self.name) + ".csv"
 
     def limits(self) -> str:
         """Return when to abort, in words."""
@@ -71,38 +87,16 @@ class Reference:
         return "\n".join(lines) + "\n"
 
 
-@dataclass(frozen=True)
-class Manoeuvre:
-    """One flight."""
+def times_of(seconds: float) -> np.ndarray:
+    """Return the times of a manoeuvre's rows [s]."""
+    return np.arange(0.0, seconds - 0.5 * PERIOD, PERIOD)
 
-    name: str
-    purpose: str
-    seconds: float  # with SETTLE at both ends
-    path: Callable[
-        [np.ndarray], np.ndarray
-    ]  # of the time after SETTLE [s], shape (N,), to a place [m], shape (N, 3)
-    yaw: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.zeros_like(t))
-    rates: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.zeros((len(t), 3)))
-    thrust: Callable[[np.ndarray], np.ndarray] = field(default=lambda t: np.ones_like(t))
-    release: float = np.inf  # [s] after SETTLE
-    payload: bool = True
 
-    @property
-    def file(self) -> str:
-        """Name of the file that holds its reference."""
-        return "".join(c if c.isalnum() else "_" for c in self.name) + ".csv"
-
-    def reference(self) -> Reference:
-        """Rows from the start of the hover before it to the end of that after it."""
-        time = np.arange(0.0, self.seconds - 0.5 * PERIOD, PERIOD)
-        inner = np.clip(time - SETTLE, 0.0, self.seconds - 2.0 * SETTLE)
-        moving = (time > SETTLE) & (time < self.seconds - SETTLE)
-        rates = np.where(moving[:, None], self.rates(inner), 0.0)
-        thrust = np.where(moving, self.thrust(inner), 1.0)
-        path = self.path(inner)
-        yaw = self.yaw(inner)
-        release = time - SETTLE >= self.release
-        return Reference(time, path, yaw, rates, thrust, release)
+def moving_times(seconds: float) -> np.ndarray:
+    """Return the times after SETTLE of a manoeuvre's rows [s], those in the hover before and after
+    at the ends of its motion.
+    """
+    return np.clip(times_of(seconds) - SETTLE, 0.0, seconds - 2.0 * SETTLE)
 
 
 def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
@@ -169,31 +163,36 @@ SHAPES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 """What the table of manoeuvres names."""
 
 
-def _along(shape: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """Return a function of time: a named shape, or a value and its rises, each with its size, its
-    begin and its length [s].
+def _along(shape: Any, t: np.ndarray) -> np.ndarray:
+    """Return values at times [s] of a named shape, or of a value and its rises, each with its size,
+    its begin and its length [s].
     """
     if isinstance(shape, str):
-        return SHAPES[shape]
+        return SHAPES[shape](t)
     start, *rises = shape if isinstance(shape, list) else [shape]
-
-    def along(t: np.ndarray) -> np.ndarray:
-        total = start + 0.0 * t
-        for size, *span in rises:
-            total = total + size * rise(t, *span)
-        return total
-
-    return along
+    total = start + 0.0 * t
+    for size, begin, length in rises:
+        total = total + size * rise(t, begin, length)
+    return total
 
 
 def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
-    axes = [_along(row.pop(a, default)) for a, default in zip("xyz", (0.0, 0.0, HEIGHT))]
-    shapes = {key: _along(row.pop(key)) for key in ("yaw", "rates", "thrust") if key in row}
-
-    def path(t: np.ndarray) -> np.ndarray:
-        return np.column_stack([axis(t) for axis in axes])
-
-    return Manoeuvre(name, path=path, **shapes, **row)
+    seconds = row["seconds"]
+    time = times_of(seconds)
+    t = moving_times(seconds)
+    moving = (time > SETTLE) & (time < seconds - SETTLE)
+    rates = SHAPES[row["rates"]](t) if "rates" in row else np.zeros((len(t), 3))
+    return Manoeuvre(
+        name,
+        row["purpose"],
+        seconds,
+        pos_w=np.column_stack([_along(row.get(axis, MIDDLE[axis]), t) for axis in "xyz"]),
+        yaw=_along(row.get("yaw", 0.0), t),
+        rates_b=np.where(moving[:, None], rates, 0.0),
+        thrust_factor=np.where(moving, _along(row.get("thrust", 1.0), t), 1.0),
+        release=time - SETTLE >= row.get("release", np.inf),
+        payload=row.get("payload", True),
+    )
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:

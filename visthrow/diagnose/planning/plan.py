@@ -169,7 +169,7 @@ class PlanningGoal:
             self.nats(new),
             separates,
             repeats,
-            manoeuvre.reference().limits(),
+            manoeuvre.limits(),
             manoeuvre.file,
         )
 

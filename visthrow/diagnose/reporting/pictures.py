@@ -90,12 +90,11 @@ def planned(base: Manoeuvre, designed: Manoeuvre, rates: Mapping[str, float]) ->
     ``rates``: expected nats a second of manoeuvres by their name.
     """
     figure, axes = _figure(3, 3, 6.2)
-    for manoeuvre, colour in ((base, style.BEFORE), (designed, style.AFTER)):
-        r = manoeuvre.reference()
+    for r, colour in ((base, style.BEFORE), (designed, style.AFTER)):
         percent = 100.0 * (r.thrust_factor - 1.0)
         columns = np.column_stack((r.pos_w, np.degrees(r.yaw), percent, r.rates_b)).T
         for axis, label, values in zip(axes.flat, REFERENCE, columns):
-            axis.plot(r.time, values, color=colour, lw=1.0, label=manoeuvre.name)
+            axis.plot(r.time, values, color=colour, lw=1.0, label=r.name)
             axis.set(ylabel=label, xlabel="time [s]")
     best = sorted(rates, key=rates.get)[-6:]
     colours = [style.AFTER if name == designed.name else style.BEFORE for name in best]

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
         atomic_write(Path(args.out) / "plan.png", picture)
     ranked = plan.propose(aim, informed)
     for manoeuvre, _ in informed:
-        atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.reference().csv())
+        atomic_write(Path(args.out) / manoeuvre.file, manoeuvre.csv())
     _print(ranked)
     session = plan.session(ranked)
     if session:
