@@ -76,7 +76,7 @@ def text(
         plants: to draw in training from the joint posterior.
         laws: terms outside the catalogue, to stand beside those that the configuration has.
     """
-    effects = list(chosen(theta).values())
+    effects = [catalogue()[name] for name in theta]
     covariance = np.reshape(covariance, (len(theta), len(theta)))
     # the joint posterior of the plant's own numbers: not of the sensors, the replay's step or which
     # blocks there are
