@@ -222,7 +222,7 @@ def test_a_flight_in_which_the_payload_swings_too_far_has_no_model():
 
     def level(turn: float) -> fly_manoeuvres.SimulatedFlight:
         chosen = next(m for m in manoeuvres.catalogue() if m.name == "throw at 2 m/s")
-            rows = 4 * len(chosen.time)
+        rows = 4 * len(chosen.time)
         place = np.repeat(chosen.pos_w, 4, axis=0)
         hangs = np.where(
             np.arange(rows)[:, None] < 4 * np.argmax(chosen.release),
