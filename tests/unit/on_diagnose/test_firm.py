@@ -92,6 +92,18 @@ def test_the_test_that_failed_is_told_with_the_flight_that_would_settle_it(monke
     assert "fly once more, such as: swing" in diagnosis.reasons[0]
 
 
+def test_intervals_of_the_gain_hold_what_they_promise():
+    """Ratios of sums over ten flights, whose sizes and gains are lognormal."""
+    rng = np.random.default_rng(0)
+    before = rng.lognormal(0.0, 0.5, (200, 10))
+    after = before * 0.25 * rng.lognormal(-0.5 * 0.4**2, 0.4, before.shape)
+    inside = 0
+    for errors in zip(before, after):
+        _, low, high = held_out.jackknifed(*errors)
+        inside += low < 1.0 - np.sqrt(0.25) < high
+    assert 0.88 < inside / len(before) < 0.995
+
+
 def test_a_channel_without_an_interval_neither_confirms_nor_denies(monkeypatch):
     """One flight alone holds it, such as a payload that was tracked once."""
     monkeypatch.setattr(held_out, "compares_phases", lambda point: False)

@@ -187,6 +187,17 @@ def test_what_flights_share_and_what_each_has_for_itself_are_weighed_alike(sizes
     assert best_set(sizes) == expected
 
 
+def test_gusts_are_no_causes():
+    assert not diagnose_flights.explain(world(gust=2.0, seed=7), laws=False).theta
+
+
+def test_causes_at_their_floors_are_not_named():
+    signs = default_rng(3).choice([-1.0, 1.0], len(EFFECTS))
+    truth = {e.name: sign for e, sign in zip(EFFECTS, signs)}
+    model = world(truth=truth, seed=3, gust=0.3, noise=0.5)
+    assert not diagnose_flights.explain(model, laws=False).theta
+
+
 def test_commands_of_other_flights_are_inconsistent_data():
     """Poses that have nothing to do with the commands leave forces of the order of the thrust."""
     diagnosis = diagnose_flights.explain(world(gust=80.0))
