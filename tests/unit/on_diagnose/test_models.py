@@ -3,7 +3,9 @@ parameters found again.
 """
 
 import json
+from copy import deepcopy
 from dataclasses import replace
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -308,7 +310,13 @@ class TestFlyer:
 class TestImu:
     """Motors' commands, accelerometer and gyro, and nothing else."""
 
-    def log(self, tau: float, curve: float, inertia: tuple[float, float], seed: int) -> FlightLog:
+    def log(self, *drawn) -> FlightLog:
+        """Return a copy of a flight: a test may change it."""
+        return deepcopy(self.flight(*drawn))
+
+    @staticmethod
+    @cache
+    def flight(tau: float, curve: float, inertia: tuple[float, float], seed: int) -> FlightLog:
         """A vehicle that turns to and fro about all axes while its thrust swings; Euler steps of
         0.5 ms of the test's own, an accelerometer off by 0.2 m/s^2.
         """
@@ -320,7 +328,10 @@ class TestImu:
         )
         moment = np.array(p.torque.inertia) * (1.0 + np.array([inertia[0], inertia[0], inertia[1]]))
         hover = p.mass * G / 4.0
-        tones = rng.uniform(8.0, 25.0, 3), rng.uniform(0.0, 6.0, 4)
+        tones, unmixed = (
+            (rng.uniform(8.0, 25.0, 3), rng.uniform(0.0, 6.0, 4)),
+            np.linalg.pinv(mixer),
+        )
         thrust, rate, sent = np.full(4, hover), np.zeros(3), np.zeros(4)
         rows = []
         for i, t in enumerate(time):
@@ -328,7 +339,7 @@ class TestImu:
                 wanted = [3.0, 3.0, 1.0] * np.sin(tones[0] * t + tones[1][:3])
                 torque = np.array(p.torque.inertia) * [30.0, 30.0, 10.0] * (wanted - rate)
                 level = hover * (1.0 + 0.3 * np.sin(9.0 * t + tones[1][3]))
-                sent = np.clip(level + np.linalg.pinv(mixer) @ torque, 0.2 * hover, 3.0 * hover)
+                sent = np.clip(level + unmixed @ torque, 0.2 * hover, 3.0 * hover)
                 acc = (thrust * (1.0 + curve * (thrust / hover - 1.0))).sum() / p.mass
                 command = (-0.06 + np.sqrt(0.06**2 + 0.4 * sent)) / 0.2
                 rows.append([t, acc, *rate, *command])
