@@ -26,7 +26,7 @@ class LevelPlant:
             flight.
     """
 
-    period, home_w, mass, max_thrust = 0.005, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
+    period, home_w, mass, max_thrust = 0.01, np.array([0.0, 0.0, 1.333]), (0.272, 0.21), 14.0
 
     def __init__(self, lag: float = 0.11) -> None:
         """Start at time 0.

@@ -4,6 +4,7 @@ setup, and worth it on flights never seen.
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.linalg import norm
@@ -21,6 +22,7 @@ from visthrow.diagnose.inputs import setup as setups
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.models.ball import BallModel
 from visthrow.diagnose.models.law_terms import term_of
+from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import TorqueParams
@@ -72,17 +74,24 @@ ACTING = [
 ]
 
 
+@cache
+def undisturbed(kind: str) -> tuple[NumericModel, list[Window]]:
+    """Return a model and its windows without any effect."""
+    model = MODELS[kind]()
+    return model, model.windows({})
+
+
 @mark.parametrize(("kind", "law"), ACTING)
 def test_a_law_in_the_simulation_does_what_its_column_says(kind, law):
     """Two ways to the same: forces at the knots through the latents' derivatives, and the law in
     every step.
     """
-    model = MODELS[kind]()
+    model, windows = undisturbed(kind)
     term = term_of(law)
     effect = TermEffect(
         term.formula, "", "", "", law.block, (-1.0, 1.0), 1.0, 1.0, (), "", term=term
     )
-    windows, there = model.windows({}), model.with_laws([law]).residuals({})
+    there = model.with_laws([law]).residuals({})
     column, change = [], []
     for window, residual in zip(windows, there):
         basis = np.linalg.qr(window.nuisance)[0]  # initial states are fitted in both

@@ -20,6 +20,8 @@ from tests.level import LevelPlant
 from tests.loopback.wire import AUTOPILOTS, QUICK, peers, throw
 
 HOVER = (2.668, 0.0, 0.0, 0.0)
+STEPS = round(0.02 / LevelPlant.period)
+"""Of the plant in a tick."""
 
 SEPARATION = 5e-4
 """Latch to separation against the trained lag [s]: 5 ms are asked for; the clock is simulated, so
@@ -46,7 +48,7 @@ class Desk:
     def turn(self, seconds, command=None, ask=None):
         end = self.now + seconds
         while self.now < end - 1e-9:
-            for _ in range(4):
+            for _ in range(STEPS):
                 self.fake.step()
             self.source.poll(self.now)
             if command is not None:
@@ -551,7 +553,7 @@ def test_the_hover_share_is_measured_before_a_flight(kind, factor, good):
     check = AutopilotCheck(desk.runner.params, desk.backend)
     desk.fake.flown = lambda: np.array([2.668, 0.0, 0.0, 0.0])
     for _ in range(400):
-        for _ in range(4):
+        for _ in range(STEPS):
             desk.fake.step()
         for pose in desk.source.poll(desk.now):
             desk.runner.tracks[pose.body].update(pose)

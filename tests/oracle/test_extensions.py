@@ -86,7 +86,7 @@ number of segments.
 @mark.parametrize("name", CASES)
 def test_extension_is_the_reference_plants(name):
     of_rope = name in ("payload_drag", "wind", "drag in wind")
-    plain = fine(changed(paper_plant(), {"rope.segments": 15 if of_rope else 1}))
+    plain = fine(changed(paper_plant(), {"rope.segments": 5 if of_rope else 1}))
     extended = changed(plain, CASES[name])
     there = swing(extended, ReferenceExtras(payload_drag=extended.rope.payload_drag))
     here = swing(extended)

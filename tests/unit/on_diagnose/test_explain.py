@@ -32,12 +32,19 @@ def explained(logs, folder, *arguments):
     return status, json.loads((folder / "diagnosis.json").read_text())
 
 
+@fixture(scope="module")
+def once(flights, tmp_path_factory):
+    """Folder, exit status and JSON of the flights' explanation."""
+    folder = tmp_path_factory.mktemp("once")
+    return folder, *explained(flights, folder)
+
+
 def in_millimetres(log: FlightLog) -> FlightLog:
     return with_values(log, {"pos_w": lambda x: 1e3 * x, "payload_pos_w": lambda x: 1e3 * x})
 
 
-def test_a_copied_log_counts_once(flights, tmp_path):
-    status, once = explained(flights, tmp_path)
+def test_a_copied_log_counts_once(flights, once, tmp_path):
+    _, status, once = once
     again, twice = explained([*flights, flights[0]], tmp_path)
     assert status == again == 0
     assert twice["duplicates"] == {"3": 0}
@@ -47,11 +54,10 @@ def test_a_copied_log_counts_once(flights, tmp_path):
     assert twice["theta"] == approx(once["theta"])
 
 
-def test_what_was_explained_is_what_training_draws(flights, tmp_path):
+def test_what_was_explained_is_what_training_draws(once, tmp_path):
     """From flights to the draws of a training, through the files that users pass on."""
-    explained(flights, tmp_path)
     out = tmp_path / "mine.toml"
-    assert run_command(f"diagnose apply {tmp_path}/diagnosis.json --out {out}") == 0
+    assert run_command(f"diagnose apply {once[0]}/diagnosis.json --out {out}") == 0
     diagnosed = config.load(Experiment, out).diagnosed
     assert diagnosed.effects == ("com_x",)
     (sd,) = np.sqrt(diagnosed.covariance[0])

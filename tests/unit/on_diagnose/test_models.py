@@ -268,7 +268,7 @@ class TestFlyer:
             return Rotation.from_euler("ZYX", plain(time).as_euler("ZYX") * [0.0, 0.1, 0.1])
 
         monkeypatch.setattr(flown, "attitude", north)
-        logs = [fly(6.0, drag=0.03, wind=1.5, seed=seed) for seed in range(3)]
+        logs = [fly(6.0, drag=0.03, wind=1.5, seed=seed) for seed in range(2)]
         model = FlyerModel(logs, replace(FLYER, drag_xy=0.03))
         model.choose(
             ["wind_x", "wind_y", "frame_tilt_y", "marker_rot_y", "thrust_gain", "cmd_delay"]

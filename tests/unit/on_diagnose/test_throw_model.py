@@ -3,7 +3,6 @@ effects and lost commands recovered, initial states that gusts do not enter.
 """
 
 from dataclasses import replace
-from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -24,7 +23,6 @@ from visthrow.config.effects import catalogue
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
 from visthrow.diagnose.planning.manoeuvres import catalogue as catalogue_of_manoeuvres
-from visthrow.diagnose.select import diagnose_flights
 from visthrow.diagnose.select import lost_commands as dropped
 from visthrow.diagnose.select.diagnose_flights import explain
 from visthrow.diagnose.select.point import Problem, curvature, linearise, moved
@@ -456,27 +454,12 @@ SHARE = 0.12
 ONLY = ("cmd_delay", "com_x", "rate_gain", "wind_x", "payload_drag")
 
 
-@cache
-def model_of(lost: float, throws: int = 2, **theta: float) -> ThrowModel:
-    return ThrowModel(
-        fly(setting_with(theta), seed=4, free=1, throws=throws, seconds=3.0, lost=lost),
-        paper_plant(),
-        only=ONLY,
-    )
-
-
-def told(diagnosis):
-    return [s for s in diagnosis.scatter if s.found]
-
-
 def test_lost_commands_are_found_beside_a_cause():
-    diagnosis = diagnose_flights.explain(model_of(SHARE, com_x=0.003))
-    assert (diagnosis.overall, diagnosis.named, [s.name for s in told(diagnosis)]) == (
-        "KNOWN",
-        ("com_x",),
-        [dropped.NAME],
-    )
+    setting = setting_with({"com_x": 0.003})
+    logs = fly(setting, seed=4, free=1, throws=1, seconds=3.0, lost=SHARE)
+    diagnosis = explain(ThrowModel(logs, paper_plant(), only=ONLY))
+    (found,) = [share for share in diagnosis.scatter if share.found]
+    assert (diagnosis.overall, diagnosis.named, found.name) == ("KNOWN", ("com_x",), dropped.NAME)
     assert abs(diagnosis.theta["com_x"] - 0.003) < 3e-4
-    found = told(diagnosis)[0]
     assert found.low < SHARE < found.high
     assert found.nats > 50.0

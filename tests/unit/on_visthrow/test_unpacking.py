@@ -18,7 +18,7 @@ from visthrow.logs import read
 from visthrow.logs.readers.recordings import read_recording
 from visthrow.logs.readers.table import read_table
 
-ROWS = 200_000
+ROWS = 140_000
 TEXT = b"time,x\n" + b"0.000,0.000\n" * ROWS
 ZEROS = np.zeros(ROWS)
 
