@@ -5,7 +5,6 @@ import json
 import numpy as np
 from pytest import approx
 
-from bench.cooperative import split
 from tests.commands import run_command
 from visthrow.cooperative.team_command import load
 from visthrow.cooperative.throw_track import record_throw
@@ -33,15 +32,6 @@ def test_a_drawn_flight_ends_where_and_when_the_load_lands():
     assert np.diff(np.append(track.time, track.flight_time)).min() > 0.0
     centres = track.frames_w.mean(axis=(2, 3))
     np.testing.assert_allclose(centres, track.pos_w, atol=1e-6)
-
-
-def test_the_load_in_halves_takes_two_throws_of_time(tmp_path):
-    file = tmp_path / "split.json"
-    assert split.main(["--throws", "10", "--json", str(file)]) == 0
-    pair, halves = json.loads(file.read_text())
-    assert 1.7 < halves["duration_mean"] / pair["duration_mean"] < 2.5
-    assert halves["error_mean"] < 0.05
-    assert halves["landed"] == 1.0
 
 
 def test_a_policy_that_is_not_there_is_told(tmp_path, refused):
