@@ -128,3 +128,15 @@ def test_neither_a_ball_nor_a_vehicle_without_position_flies_a_manoeuvre():
 def test_limits_that_leave_no_room_are_refused(limits):
     with raises(DiagnoseError, match="above"):
         design.Limits(**limits)
+
+
+@mark.parametrize("name", ["motor_command", "motor_speed", "thrust_command", "command"])
+def test_the_simulated_log_holds_whatever_input_a_setup_names(name):
+    """Channels of standard names have one unit and frame; a log in another cannot be made."""
+    params = replace(setup.load("nanobench_cf21").flyer, input=name, torque=None)
+    hover = replace(BASES["hover without payload"], seconds=3.0)
+    rows = slice(len(hover.time))
+    names = ("pos_w", "yaw", "rates_b", "thrust_factor", "release")
+    short = replace(hover, **{n: getattr(hover, n)[rows] for n in names})
+    (flight,) = fly_manoeuvres.fly(plant(params), [short], 0)
+    assert np.sum(flight.setup_log(params, {})[name].valid) >= len(short.time)

@@ -86,24 +86,17 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     slab = problem.priors.slab[columns]
     posterior = np.linalg.inv(point.information[np.ix_(columns, columns)] + np.diag(slab**-2.0))
     floors = problem.priors.floor[columns]
-    sizes = point.theta[columns] * floors
-    identified = tuple(
-        bool(s < UNKNOWN_SHARE * prior) for s, prior in zip(np.sqrt(np.diag(posterior)), slab)
-    )
+    identified = np.sqrt(np.diag(posterior)) < UNKNOWN_SHARE * slab
     after = model.residuals(problem.sizes(point.theta))
-    units = tuple(model.effects[i].unit for i in columns)
-    covariance = posterior * np.outer(floors, floors) + np.diag(floors**2)
-    rms_before = _rms(model, before, [w.residual for w in before])
-    rms_after = _rms(model, before, after)
     return FitResult(
         tuple(free),
-        units,
-        sizes,
-        covariance,
-        identified,
-        rms_before,
-        rms_after,
-        model.middle_speed,
+        units=tuple(model.effects[i].unit for i in columns),
+        theta=point.theta[columns] * floors,
+        covariance=posterior * np.outer(floors, floors) + np.diag(floors**2),
+        identified=tuple(identified.tolist()),
+        rms_before=_rms(model, before, [w.residual for w in before]),
+        rms_after=_rms(model, before, after),
+        middle_speed=model.middle_speed,
     )
 
 
@@ -156,7 +149,8 @@ def _of_flyer(p: Any, size: Mapping[str, float], base: VehicleParams) -> Vehicle
     }
     if p.input == "motor_speed":
         # the curve's departure in thrust is taken at hover, where it is measured
-        values |= {"thrust.k_f": p.thrust_map[2] * gain, "thrust.k_1": p.thrust_map[1] * gain}
+        values["thrust.k_f"] = p.thrust_map[2] * gain
+        values["thrust.k_1"] = p.thrust_map[1] * gain
     elif p.input == "motor_command":
         full = sum(p.thrust_map) * gain
         hover = mass * p.gravity / 4.0
@@ -225,10 +219,10 @@ def _head(name: str, result: FitResult, sources: Mapping[str, str]) -> str:
         lines.append(
             f"# {effect} = {result.theta[i]:.6g} {unit}, 95 % [{low:.6g}, {high:.6g}]{note}"
         )
-    lines.append(
-        "# covariance, row by row:"
-        f" {json.dumps([[float(f'{x:.4g}') for x in row] for row in result.covariance])}"
-    )
+    rows = []
+    for row in result.covariance:
+        rows.append([float(f"{x:.4g}") for x in row])
+    lines.append(f"# covariance, row by row: {json.dumps(rows)}")
     lines += [f"# log {Path(source).name}: {digest}" for source, digest in sources.items()]
     return "\n".join(lines) + "\n\n"
 

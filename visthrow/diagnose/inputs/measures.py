@@ -4,7 +4,6 @@ catalogue.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 
 import numpy as np
 
@@ -56,15 +55,14 @@ def narrowed(effects: Sequence[Effect], measured: Mapping[str, float]) -> tuple[
     for name, sd in measured.items():
         if not sd >= 0.0:
             raise DiagnoseError(f"{name} measured with a deviation of {sd}; expected 0 or more")
-    deviations = [(e, measured.get(e.name, np.inf) or RIGHT * e.floor) for e in effects]
-    limits = [
-        (max(e.bounds[0], -CERTAIN_DEVIATIONS * sd), min(e.bounds[1], CERTAIN_DEVIATIONS * sd))
-        for e, sd in deviations
-    ]
-    return tuple(
-        replace(e, bounds=bounds, prior_sd=min(e.prior_sd, sd))
-        for (e, sd), bounds in zip(deviations, limits)
-    )
+    changed = []
+    for effect in effects:
+        sd = measured.get(effect.name, np.inf) or RIGHT * effect.floor
+        farthest = CERTAIN_DEVIATIONS * sd
+        low, high = effect.bounds
+        bounds = (max(low, -farthest), min(high, farthest))
+        changed.append(replace(effect, bounds=bounds, prior_sd=min(effect.prior_sd, sd)))
+    return tuple(changed)
 
 
 def parsed(items: Sequence[str]) -> dict[str, float]:
@@ -72,7 +70,7 @@ def parsed(items: Sequence[str]) -> dict[str, float]:
 
     Raises DiagnoseError: something else."""
     out = {}
-    for item in chain.from_iterable(entry.split(",") for entry in items):
+    for item in ",".join(items).split(",") if items else ():
         name, _, sd = item.partition("=")
         try:
             out[name.strip()] = float(sd)

@@ -58,6 +58,13 @@ class Path:
     pos_w: np.ndarray  # shape (T, 3)
     why: str
 
+    @property
+    def usual_name(self) -> str:
+        """Name of the channel by what its columns are called."""
+        if self.group.matches("estimate"):
+            return "est_pos_w"
+        return "mocap_pos_w" if self.group.matches("capture") else "pos_w"
+
 
 def moves(values: np.ndarray) -> bool:
     """Tell whether rows of numbers, shape (T, columns), differ."""
@@ -236,14 +243,13 @@ class Recognition:
         if pay is not None and upper is not None and not upper.group.matches("estimate"):
             paths.sort(key=lambda path: path is not upper)  # the payload hangs below it
         for path in paths:
-            group = path.group
-            usual = "mocap_pos_w" if group.matches("capture") else "pos_w"
-            usual = "est_pos_w" if group.matches("estimate") else usual
-            wide = np.nanmax(np.nanstd(group.values, axis=0))
-            smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd){path.why}"
-            first = path is paths[0]
-            if not first or not self._take("pos_w", group, path.unit, smoothly, axes=self._up()):
-                self._take(usual, group, path.unit, smoothly, axes=self._up())
+            names = ["pos_w"] if path is paths[0] else []
+            names.append(path.usual_name)
+            wide = np.nanmax(np.nanstd(path.group.values, axis=0))
+            smoothly = f"three columns that move smoothly, by {wide:.3g} {path.unit} (sd)"
+            for name in names:
+                if self._take_path(name, path, smoothly):
+                    break
         if len(paths) > 1:
             listed = "; ".join(path.group.listed for path in paths)
             self.questions.append(
@@ -251,7 +257,11 @@ class Recognition:
                 " first is taken"
             )
         if pay is not None:
-            self._take("payload_pos_w", lower.group, lower.unit, why + lower.why, axes=self._up())
+            self._take_path("payload_pos_w", lower, why)
+
+    def _take_path(self, name: str, path: Path, why: str) -> bool:
+        """Make a channel of a path."""
+        return self._take(name, path.group, path.unit, why + path.why, axes=self._up())
 
     def _up(self) -> str:
         """Axes of the world, as the attitude has them."""

@@ -39,6 +39,11 @@ READABLE = {"m": (1e3, "mm"), "rad": (180.0 / np.pi, "deg"), "m/s": (1e3, "mm/s"
 """Unit -> factor and unit in pictures and tables, where residuals are small."""
 
 
+def readable(unit: str) -> tuple[float, str]:
+    """Return what a unit of residuals is multiplied by where people read it, and the unit then."""
+    return READABLE.get(unit, (1.0, unit))
+
+
 def unit_of(channel: str) -> str:
     """Unit of a channel's residuals; empty where it has none, or none that is known."""
     standard = STANDARD_CHANNELS.get(channel)

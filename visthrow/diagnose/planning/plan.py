@@ -161,16 +161,18 @@ class PlanningGoal:
     def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> FlightProposal:
         """Return the promise of a manoeuvre of this information."""
         separated, repeats = self.settled(new)
-        separates = tuple(tuple(self.names[j] for j in group) for group in separated)
+        separates = []
+        for group in separated:
+            separates.append(tuple(self.names[j] for j in group))
         return FlightProposal(
             manoeuvre.name,
             manoeuvre.purpose,
             manoeuvre.seconds,
-            self.nats(new),
-            separates,
-            repeats,
-            manoeuvre.limits(),
-            manoeuvre.file,
+            nats=self.nats(new),
+            separates=tuple(separates),
+            repeats=repeats,
+            limits=manoeuvre.limits(),
+            reference=manoeuvre.file,
         )
 
 
@@ -230,13 +232,15 @@ def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
     """Nats by which the other member is ahead once the measurement has found the configured value
     right.
     """
-    point = diagnosis.work.after
-    model = diagnosis.work.problem.model
+    work = diagnosis.work
+    model = work.problem.model
     effects = narrowed(model.effects, {m.effect: m.sd})
     priors = Priors.of(effects, tuple(model.channels))
-    remaining = [k for k in diagnosis.work.active if k not in (j, truth)]
-    right = log_evidence(point.information, point.score, priors, [*remaining, truth])
-    return right - log_evidence(point.information, point.score, priors, [*remaining, j])
+    remaining = [k for k in work.active if k not in (j, truth)]
+    information = work.after.information
+    score = work.after.score
+    right = log_evidence(information, score, priors, [*remaining, truth])
+    return right - log_evidence(information, score, priors, [*remaining, j])
 
 
 def expected_information(

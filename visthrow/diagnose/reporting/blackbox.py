@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.common.rotations import rotate_back
+from visthrow.common.rotations import matrix_of_quat, rotate_back
 from visthrow.diagnose.likelihood import grammar
 from visthrow.diagnose.likelihood.stack import statistics
 from visthrow.diagnose.models import law_terms as laws
@@ -52,12 +52,12 @@ class ForceTable:
     def columns(self, window: Window) -> np.ndarray:
         """Latent-force coefficients of every weight, shape (L, weights)."""
         basis = self.radial(_inputs(window))
-        parts = []
         values = laws.KnotValues(window.knots)
+        parts = []
         for block in self.blocks:
             axes = np.broadcast_to(np.eye(3), (len(basis), 3, 3))
-            if block != "vehicle torque" and "quat_wb" in values:
-                axes = np.stack([values[f"axis_{i}"] for i in "xyz"], -1)
+            if block != "vehicle torque" and "quat_wb" in window.knots:
+                axes = matrix_of_quat(window.knots["quat_wb"])
             latents = grammar.through_latents(window, values, block)
             columns = axes[..., None] * basis[:, None, None]
             parts.append(latents @ columns.reshape(latents.shape[1], -1))
@@ -93,16 +93,14 @@ class Trained:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
         information = self.information[keep].sum(0)
         score = self.score[keep].sum(0)
-        best = -np.inf
-        mean = np.zeros(len(score))
+        likeliest = -np.inf
         for reach in REACHES:
             prior = reach * self.reach
-            normal = information * np.outer(prior, prior) + np.eye(len(prior))
-            lower = np.linalg.cholesky(normal)
+            lower = np.linalg.cholesky(information * np.outer(prior, prior) + np.eye(len(prior)))
             half = np.linalg.solve(lower, score * prior)
-            value = 0.5 * half @ half - np.log(np.diag(lower)).sum()
-            if value > best:
-                best = value
+            nats = 0.5 * half @ half - np.log(np.diag(lower)).sum()
+            if nats > likeliest:
+                likeliest = nats
                 mean = prior * np.linalg.solve(lower.T, half)
         return mean
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.inputs.measures import MEASUREMENTS
-from visthrow.diagnose.likelihood.forms import HEAD_SECONDS, READABLE
+from visthrow.diagnose.likelihood.forms import HEAD_SECONDS, readable
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
@@ -84,7 +84,7 @@ def _errors(c: ChannelGain) -> tuple[str, str, str, str, str]:
     """Unit and errors of a channel as text: as it stands, with what was named, of noise alone, of
     the black box if there is one.
     """
-    factor, unit = READABLE.get(c.unit, (1.0, c.unit))
+    factor, unit = readable(c.unit)
     before, after, floor, box = (
         "" if np.isnan(value) else f"{factor * value:.3g}"
         for value in (c.before, c.after, c.floor, c.blackbox)

@@ -56,7 +56,7 @@ def _tested(
     """Return prediction errors of other flights by the model as its setup has it without
     extensions, by that with all that was found, and of noise alone; print them.
     """
-    from visthrow.diagnose.likelihood.forms import READABLE, unit_of
+    from visthrow.diagnose.likelihood.forms import readable, unit_of
     from visthrow.diagnose.models.law_terms import term_of
     from visthrow.diagnose.reporting.gain import on_others
     from visthrow.diagnose.select.diagnose_flights import refused_of
@@ -78,7 +78,7 @@ def _tested(
         f" {tested.outliers} of {tested.samples} samples are outliers, which weigh less"
     )
     for channel, channel_errors in tested.errors.items():
-        factor, unit = READABLE.get(unit_of(channel), (1.0, unit_of(channel)))
+        factor, unit = readable(unit_of(channel))
         before, after, floor = (factor * x for x in channel_errors)
         won = ""
         if before > floor:

@@ -7,7 +7,7 @@ import numpy as np
 from visthrow.common.storage import atomic_write
 from visthrow.logs.check.rows import worst
 from visthrow.logs.check.run import Checked
-from visthrow.logs.flightlog import FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.view import style
 from visthrow.view.parts import png_of
 
@@ -38,13 +38,11 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     size = (9, 1.1 + 1.25 * rows)
     figure, axes = plt.subplots(rows, 1, figsize=size, sharex=True, squeeze=False)
     for axis, name in zip(axes[:, 0], names):
-        _channel(axis, log, name)
+        _channel(axis, log[name])
         concern = [row for row in checked.rows if name in row.channel.replace(",", " ").split()]
-        verdict = worst(concern)
         label = f"{name}\n[{log[name].unit}]"
         axis.set_ylabel(label, rotation=0, ha="right", va="center", fontsize=8)
-        axis.spines["left"].set_color(_SHADE[verdict])
-        axis.spines["left"].set_linewidth(4)
+        axis.spines["left"].set(color=_SHADE[worst(concern)], linewidth=4)
     axes[-1, 0].set_xlabel("time [s]")
     legend = "left bar: green ok, yellow warn, red bad; x, y, z: blue, red, green"
     axes[0, 0].set_title(f"{checked.name}: {checked.verdict} ({legend})", loc="left", fontsize=10)
@@ -52,16 +50,16 @@ def draw(log: FlightLog, checked: Checked, path: str | Path) -> None:
     atomic_write(path, png_of(figure))
 
 
-def _channel(axis, log: FlightLog, name: str) -> None:
-    channel = log[name]
-    values = np.where(channel.valid[:, None], channel.rows, np.nan)
-    step = max(1, len(values) // _POINTS)
+def _channel(axis, channel: Channel) -> None:
+    step = max(1, len(channel.time) // _POINTS)
+    valid = channel.valid[:, None]
+    values = np.where(valid, channel.rows, np.nan)[::step]
     time = channel.time[::step]
-    values = values[::step]
-    wide = np.flatnonzero(np.diff(time) > 5 * np.median(np.diff(time)))
-    time = np.insert(time, wide + 1, np.nan)
-    values = np.insert(values, wide + 1, np.nan, axis=0)
-    for i, column in enumerate(values.T[:4]):
-        axis.plot(time, column, lw=0.8, color=style.COLOURS[i])
+    periods = np.diff(time)
+    gaps = np.flatnonzero(periods > 5 * np.median(periods)) + 1
+    values = np.insert(values, gaps, np.nan, axis=0)
+    time = np.insert(time, gaps, np.nan)
+    for column, colour in zip(values.T[:4], style.COLOURS):
+        axis.plot(time, column, lw=0.8, color=colour)
     axis.grid(True, axis="y")
     axis.tick_params(labelsize=8)

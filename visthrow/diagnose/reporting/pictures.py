@@ -9,7 +9,7 @@ import numpy as np
 
 from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.likelihood.evidence import covariance
-from visthrow.diagnose.likelihood.forms import READABLE, unit_of
+from visthrow.diagnose.likelihood.forms import readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
@@ -110,7 +110,7 @@ def residuals(work: Work, channel: int) -> bytes:
     was gained, and in a usual one.
     """
     name = work.problem.model.channels[channel]
-    factor, unit = READABLE.get(unit_of(name), (1.0, unit_of(name)))
+    factor, unit = readable(unit_of(name))
     pairs = []
     for before, after in zip(work.before.windows, work.after.windows):
         rows = before.channel == channel

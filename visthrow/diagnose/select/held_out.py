@@ -18,9 +18,9 @@ from visthrow.diagnose.likelihood.correlation import components
 from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG, mean_sizes
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
-    READABLE,
     errors,
     predicted,
+    readable,
     unit_of,
 )
 from visthrow.diagnose.likelihood.marginal import Statistics, gather
@@ -446,7 +446,7 @@ def _one_more(diagnosis: Diagnosis, names: Sequence[str]) -> str:
 
 def _remaining(c: ChannelGain, work: Work) -> str:
     """Return a sentence on what remains of a channel's error, and of which kind it is."""
-    factor, unit = READABLE.get(c.unit, (1.0, c.unit))
+    factor, unit = readable(c.unit)
     text = f"{factor * c.after:.3g} of {factor * c.before:.3g} {unit}".rstrip()
     kind = _kind(work, work.problem.model.channels.index(c.channel))
     return (

@@ -51,6 +51,7 @@ _SPAN = 0.06  # over which velocities and accelerations are averaged [s]
 _CORRELATED = 0.5
 _TAUT = 0.1  # of its median, by which the length of a cable that carries may differ
 _HEAVIEST = 0.9  # share of the mass that a payload may have
+_UP = np.array([0.0, 0.0, GRAVITY])  # what an accelerometer at rest measures [m/s^2]
 _OFFSET = 0.5  # mean acceleration that bias and tilt of an accelerometer leave [m/s^2]
 
 
@@ -314,28 +315,30 @@ def _forces(log: FlightLog, quat: str, path: str) -> Iterator[Row]:
     if len(time) < 50 or _spread(acc) < _PUSHED:
         return
     turn = relations.attitude_at(*attitude, time)
-    if "acc_b" not in log:
+    sensed = "acc_b" in log
+    channels = f"d({path})/dt, {quat} {'acc_b' if sensed else 'thrust along z'}"
+    if sensed:
+        force_b = log["acc_b"].samples()
+        if len(force_b.time) < 50 or sparse(force_b.time) or sparse(motion.time):
+            return
+        force_w = rotate(relations.attitude_at(*attitude, force_b.time), force_b.values)
+        pushed = relations.mean_over(force_b.time, force_w - _UP, time, _SPAN)
+    else:
         hangs, relative = _carried(log, quat, time, acc)
         if np.sum(hangs) < 50:
             return
-        turn = turn[hangs]
-        acc = _together(acc[hangs], relative[hangs], turn)
-        yield from _leaning(time[hangs], acc, turn, f"d({path})/dt, {quat} thrust along z")
-        return
-    force_b = log["acc_b"].samples()
-    if len(force_b.time) < 50 or sparse(force_b.time) or sparse(motion.time):
-        return
-    gravity = np.array([0.0, 0.0, GRAVITY])
-    pushed = rotate(relations.attitude_at(*attitude, force_b.time), force_b.values) - gravity
-    pushed = relations.mean_over(force_b.time, pushed, time, _SPAN)
+        time = time[hangs]
+        acc = _together(acc[hangs], relative[hangs], turn[hangs])
+        acc, pushed = _leaning(acc, turn[hangs])
     relation = relations.relate(Samples(time, acc), Samples(time, pushed))
     if relation is None:
         return
-    channels = f"d({path})/dt, {quat} acc_b"
-    expected_b = Samples(time, rotate_back(turn, acc + gravity))
-    wrong = _exchanged(relation, channels) or _exchanged_body(expected_b, force_b, channels)
+    wrong = _exchanged(relation, channels)
+    if wrong is None and sensed:
+        expected_b = Samples(time, rotate_back(turn, acc + _UP))
+        wrong = _exchanged_body(expected_b, force_b, channels)
     if wrong is None:
-        yield from _pushed(relation, acc, pushed, channels, True)
+        yield from _pushed(relation, acc, pushed, channels, sensed)
     else:
         yield wrong
 
@@ -373,19 +376,14 @@ def _together(acc: np.ndarray, relative: np.ndarray, turn: np.ndarray) -> np.nda
     return acc + share * relative
 
 
-def _leaning(time: np.ndarray, acc: np.ndarray, turn: np.ndarray, channels: str) -> Iterator[Row]:
-    """Hold the level push of a thrust along body z against accelerations [m/s^2]."""
+def _leaning(acc: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return accelerations and the push of a thrust along body z that carries them, both level
+    [m/s^2], shape (N, 3).
+    """
     level = np.array([1.0, 1.0, 0.0])
     up = matrix_of_quat(turn)[:, :, 2]
-    pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY) * level
-    relation = relations.relate(Samples(time, acc * level), Samples(time, pushed))
-    if relation is None:
-        return
-    wrong = _exchanged(relation, channels)
-    if wrong is None:
-        yield from _pushed(relation, acc * level, pushed, channels, False)
-    else:
-        yield wrong
+    pushed = up / np.maximum(up[:, 2:], 0.2) * (acc[:, 2:] + GRAVITY)
+    return acc * level, pushed * level
 
 
 def sparse(time: np.ndarray) -> bool:
