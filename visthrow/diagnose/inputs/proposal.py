@@ -278,7 +278,7 @@ def _flyer(log: FlightLog, proposal: MappingProposal, weighed: float | None) -> 
     applied = thrust_checks.thrust_of(log, KnownVehicle(thrust_input=_driving(log, proposal)))
     if applied is None or not {"quat_wb", "pos_w"} <= log.channels.keys():
         return None
-    name, _, total = applied
+    name, (_, total) = applied
     if np.median(total) <= 0.0:
         return None
     mass = thrust_checks.mass_of(log)

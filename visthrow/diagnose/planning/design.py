@@ -111,8 +111,10 @@ def _extremes(path: np.ndarray) -> np.ndarray:
     x, y, z = path.T
     vel = np.gradient(path, PERIOD, axis=0)
     acc = np.gradient(vel, PERIOD, axis=0)
-    reach = [np.abs(x).max(), np.abs(y).max(), -z.min(), z.max()]
-    return np.array(reach + [np.linalg.norm(motion, axis=1).max() for motion in (vel, acc)])
+    fastest = np.linalg.norm(vel, axis=1).max()
+    strongest = np.linalg.norm(acc, axis=1).max()
+    aside = [np.abs(x).max(), np.abs(y).max()]
+    return np.array([*aside, -z.min(), z.max(), fastest, strongest])
 
 
 def sweep(
@@ -135,9 +137,12 @@ def sweep(
         phase: at its start [rad].
     """
     slope = (high - low) / seconds
+    frequency = low + slope * t
     turned = 2.0 * np.pi * (low + 0.5 * slope * t) * t
-    fade = rise(t, 0.0, FADE) * (1.0 - rise(t, seconds - FADE, FADE))
-    return limit(low + slope * t) * fade * np.sin(turned + phase)
+    begun = rise(t, 0.0, FADE)
+    ended = rise(t, seconds - FADE, FADE)
+    fade = begun * (1.0 - ended)
+    return limit(frequency) * fade * np.sin(turned + phase)
 
 
 def _between(range_hz: tuple[float, float], share: float) -> float:

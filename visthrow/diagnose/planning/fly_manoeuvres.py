@@ -127,10 +127,11 @@ def _throw_model(
     """Return the throw's model of a simulated flight, with the effects of another flight's."""
     log = flight.log(noise, model.has_voltage)
     carries = flight.manoeuvre.payload
-    setting = model.setting
     releases = bool(np.any(flight.manoeuvre.release))
+    setting = model.setting
     effects = effects_for(setting, set(log.channels), carries, releases)
     requested = {e.name for e in model.effects}
+    names = [name for name in effects if name in requested]
     return ThrowModel(
         [log],
         setting.plant,
@@ -138,7 +139,7 @@ def _throw_model(
         camera=setting.camera,
         device=model.device,
         substep=COARSE * model.substep,
-        only=[name for name in effects if name in requested],
+        only=names,
         carries=carries,
     )
 
@@ -210,16 +211,20 @@ class SimulatedFlight:
         """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
         it if it was not.
         """
-        off = self.truth["pos_w"][::STEPS] - self.manoeuvre.pos_w
-        height = self.manoeuvre.pos_w[:, 2] - self.manoeuvre.lowest
+        planned = self.manoeuvre.pos_w
+        off = self.truth["pos_w"][::STEPS] - planned
+        height = planned[:, 2] - self.manoeuvre.lowest
         sunk = np.max(-off[:, 2] / height)
-        astray = np.max(np.linalg.norm(off, axis=1)) / ASTRAY
-        used = np.max([self.swing / HIGHEST, astray, sunk])  # NaN counts
+        distance = np.linalg.norm(off, axis=1)
+        astray = np.max(distance) / ASTRAY
+        swing = self.swing / HIGHEST
+        used = np.max([swing, astray, sunk])  # NaN counts
         used = min(float(used), LOST) if np.isfinite(used) else LOST
         try:
-            return Simulated(model_of(self) if used < 1.0 else None, used)
+            model = model_of(self) if used < 1.0 else None
         except (DiagnoseError, LogError):
-            return Simulated(None, used)
+            model = None
+        return Simulated(model, used)
 
     @property
     def swing(self) -> float:
@@ -348,4 +353,8 @@ def _stacked(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
     """Return rows of manoeuvres side by side, each at its last one from its end on."""
     columns = [getattr(m, name) for m in manoeuvres]
     rows = np.arange(max(map(len, columns)))
-    return np.stack([column[np.minimum(rows, len(column) - 1)] for column in columns], 1)
+    held = []
+    for column in columns:
+        last = len(column) - 1
+        held.append(column[np.minimum(rows, last)])
+    return np.stack(held, 1)

@@ -99,37 +99,45 @@ def moving_times(seconds: float) -> np.ndarray:
     return np.clip(times_of(seconds) - SETTLE, 0.0, seconds - 2.0 * SETTLE)
 
 
+def _share(t: np.ndarray, begin: float, length: float) -> np.ndarray:
+    """Return the share of a stretch that is over, 0 to 1."""
+    return np.clip((t - begin) / length, 0.0, 1.0)
+
+
 def rise(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     """Return a rise from 0 to 1 with speed and acceleration 0 at both ends."""
-    s = np.clip((t - begin) / length, 0.0, 1.0)
+    s = _share(t, begin, length)
     return s**3 * (10.0 + s * (-15.0 + 6.0 * s))
 
 
 def _doublets(t: np.ndarray) -> np.ndarray:
     """Rates of 3 rad/s about roll, pitch and yaw in turn, every 0.8 s, 0.08 s there and back."""
     out = np.zeros((len(t), 3))
-    number = np.floor(t / 0.8).astype(int)
-    phase = np.mod(t, 0.8)
-    out[np.arange(len(t)), number % 3] = 3.0 * (1.0 * (phase < 0.08) - _between(phase, 0.08, 0.16))
+    number, phase = np.divmod(t, 0.8)
+    rows = np.arange(len(t))
+    out[rows, number.astype(int) % 3] = 3.0 * _pulse(phase, 0.08)
     return out
 
 
-def _between(t: np.ndarray, begin: float, end: float) -> np.ndarray:
-    return (t >= begin) & (t < end)
+def _pulse(phase: np.ndarray, width: float) -> np.ndarray:
+    """Return 1 for a time and -1 for as long after it, then 0."""
+    forth = phase < width
+    back = (phase >= width) & (phase < 2.0 * width)
+    return 1.0 * forth - back
 
 
 def _steps(t: np.ndarray) -> np.ndarray:
     """Thrust up and down by 40 %, 0.15 s each way and back, every 1.5 s; the controller brings the
     height back.
     """
-    phase = np.mod(t, 1.5)
-    return 1.0 + 0.4 * ((phase < 0.15) * 1.0 - _between(phase, 0.15, 0.3))
+    return 1.0 + 0.4 * _pulse(np.mod(t, 1.5), 0.15)
 
 
 def _risen(t: np.ndarray, begin: float, length: float) -> np.ndarray:
     """Integral of :func:`rise` over time."""
-    s = np.clip((t - begin) / length, 0.0, 1.0)
-    return length * s**4 * (2.5 + s * (-3.0 + s)) + np.maximum(t - begin - length, 0.0)
+    s = _share(t, begin, length)
+    after = np.maximum(t - begin - length, 0.0)
+    return length * s**4 * (2.5 + s * (-3.0 + s)) + after
 
 
 def _stop(t: np.ndarray) -> np.ndarray:
@@ -180,19 +188,17 @@ def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
     seconds = row["seconds"]
     time = times_of(seconds)
     t = moving_times(seconds)
-    moving = (time > SETTLE) & (time < seconds - SETTLE)
+    place = [_along(row.get(axis, default), t) for axis, default in MIDDLE.items()]
+    yaw = _along(row.get("yaw", 0.0), t)
+    thrust = _along(row.get("thrust", 1.0), t)
     rates = SHAPES[row["rates"]](t) if "rates" in row else np.zeros((len(t), 3))
-    return Manoeuvre(
-        name,
-        row["purpose"],
-        seconds,
-        pos_w=np.column_stack([_along(row.get(axis, MIDDLE[axis]), t) for axis in "xyz"]),
-        yaw=_along(row.get("yaw", 0.0), t),
-        rates_b=np.where(moving[:, None], rates, 0.0),
-        thrust_factor=np.where(moving, _along(row.get("thrust", 1.0), t), 1.0),
-        release=time - SETTLE >= row.get("release", np.inf),
-        payload=row.get("payload", True),
-    )
+    moving = (time > SETTLE) & (time < seconds - SETTLE)
+    thrust[~moving] = 1.0
+    rates[~moving] = 0.0
+    release = time - SETTLE >= row.get("release", np.inf)
+    pos_w = np.column_stack(place)
+    payload = row.get("payload", True)
+    return Manoeuvre(name, row["purpose"], seconds, pos_w, yaw, rates, thrust, release, payload)
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:

@@ -114,13 +114,14 @@ class PlanningGoal:
     def _named(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
         """Return the effects that so many flights tell well enough to be named."""
         able = self.priors.slab[self.vague] * NAMEABLE
-        shows = self._deviations(count * new) < able
-        shows &= self._deviations(0.0 * new) > able  # unknown yet
+        unknown = self._deviations(0.0 * new) > able
+        known = self._deviations(count * new) < able
         # a name is confirmed by so many flights that tell of it
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
-        telling = np.sum(at_hand > TELLING * new[self.vague, self.vague], axis=0)
-        shows &= telling + count >= PARTS
-        return [(j,) for j in np.compress(shows, self.vague).tolist()]
+        least = TELLING * new[self.vague, self.vague]
+        telling = np.sum(at_hand > least, axis=0)
+        confirmed = telling + count >= PARTS
+        return [(j,) for j in np.compress(unknown & known & confirmed, self.vague).tolist()]
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:
         """Expected nats between two members after the new flight, with either as the truth; the
@@ -243,6 +244,22 @@ def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
     return right - log_evidence(information, score, priors, [*remaining, j])
 
 
+def _expected_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:
+    """Return the latent forces of each block in each phase: where none were flown, those of the
+    block's roughest phase.
+    """
+    loudest: dict[int, float] = {}
+    for (block, _), level in noise.latent_sd.items():
+        loudest[block] = max(level, loudest.get(block, 0.0))
+    # of a payload that has not been flown: as strongly as the vehicle [N]
+    default = loudest.get(0, 1.0)
+    levels = {}
+    for block, phase in product(range(len(LATENT_BLOCKS)), phases):
+        usual = loudest.get(block, default)
+        levels[block, phase] = noise.latent_sd.get((block, phase), usual)
+    return levels
+
+
 def expected_information(
     model: Model, theta: Mapping[str, float], noise: Noise, names: Sequence[str], priors: Priors
 ) -> np.ndarray:
@@ -252,19 +269,13 @@ def expected_information(
     flown = {e.name: i for i, e in enumerate(model.effects)}
     windows = model.windows({name: value for name, value in theta.items() if name in flown})
     floors = np.array([e.floor for e in model.effects])
-    grams = grams_of(windows, floors, len(model.channels))
+    channels = len(model.channels)
+    grams = grams_of(windows, floors, channels)
     grams = correlated_of(grams, windows, noise.correlation_time)
-    blocks = range(len(LATENT_BLOCKS))
-    phases = {w.phase for w in windows}
-    rising = sorted(noise.latent_sd.items(), key=lambda item: item[1])
-    loudest = {block: level for (block, _), level in rising}
-    # of a payload that has not been flown: as strongly as the vehicle [N]
-    usual = {block: loudest.get(block, loudest.get(0, 1.0)) for block in blocks}
-    levels = {(block, phase): usual[block] for block, phase in product(blocks, phases)}
     expected = replace(
         noise,
-        scale=np.ones(len(model.channels)),
-        latent_sd=levels | {key: noise.latent_sd[key] for key in levels.keys() & noise.latent_sd},
+        scale=np.ones(channels),
+        latent_sd=_expected_levels(noise, {w.phase for w in windows}),
         share=np.ones((len(windows), len(LATENT_BLOCKS))),
     )
     parts = integrals(grams, expected).shares(grams, expected)

@@ -60,7 +60,6 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     parametric = len(score_of) < FEWEST_FLIGHTS
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-
     shape = draws, len(effects)
 
     def worlds() -> np.ndarray:
@@ -76,26 +75,24 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
     curves = []
     for j, effect in enumerate(effects):
         rows = []
-        for size in SIZES:
-            signs = [s for s in (-1.0, 1.0) if priors.low[j] <= s * size <= priors.high[j]]
-            if not signs or not priors.visible[j]:
+        for size in SIZES if priors.visible[j] else ():
+            hidden = [s for s in (-size, size) if priors.low[j] <= s <= priors.high[j]]
+            if not hidden:
                 break
-            score = np.vstack([worlds() + s * size * information[j] for s in signs])
+            score = np.vstack([worlds() + s * information[j] for s in hidden])
             gain, named_effect = named(score)
             best = gain.argmax(axis=1) == j
             close = gain[:, j] > gain.max(axis=1) - STRONG
             hits = [np.mean(named_effect & answer) for answer in (best, close, ~close)]
             rows.append((size, *hits))
         size, exact, similar, wrong = np.array(rows, dtype=float).reshape(-1, 4).T
-        limit = _limit(size, similar) * effect.floor if rows else float("nan")
+        limit = _limit(size, similar) * effect.floor if rows else np.nan
         shares = map(tuple, (size * effect.floor, exact, similar, wrong))
         curves.append(Completeness(effect.name, effect.unit, *shares, limit))
     _, alarms = named(np.vstack([worlds() for _ in range(10)]))
-    source = (
-        "drawn from its fitted level"
-        if parametric
-        else "the flights' own residuals, with random signs a flight"
-    )
+    source = "the flights' own residuals, with random signs a flight"
+    if parametric:
+        source = "drawn from its fitted level"
     return Blind(tuple(curves), alarms.mean(), 10 * draws, source)
 
 
@@ -108,6 +105,6 @@ def _limit(size: np.ndarray, share: np.ndarray) -> float:
         return size[0]
     last = below[-1]
     if last == len(size) - 1:
-        return float("nan")
-    part = (NAMED - share[last]) / (share[last + 1] - share[last])
-    return np.exp(np.log(size[last]) + part * np.log(size[last + 1] / size[last]))
+        return np.nan
+    crossing = slice(last, last + 2)
+    return np.exp(np.interp(NAMED, share[crossing], np.log(size[crossing])))

@@ -59,13 +59,11 @@ def look(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> Iterator[Row]:
     yield from _turning(log)
 
 
-def thrust_of(
-    log: FlightLog, vehicle: KnownVehicle = NOTHING
-) -> tuple[str, np.ndarray, np.ndarray] | None:
+def thrust_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> tuple[str, Samples] | None:
     """Return what a log says of its collective thrust.
 
-    Returns channel, times [s] and thrust, shape (N, 1), in newtons where channel or map say so;
-    None where it says nothing."""
+    Returns channel and thrust, shape (N, 1), in newtons where channel or map say so; None where it
+    says nothing."""
     name = vehicle.thrust_input or next((name for name in INPUTS if name in log), "")
     driver = relations.samples_of(log, name)
     if driver is None:
@@ -79,15 +77,15 @@ def thrust_of(
         values = values**2
     elif name in ("motor_output", "pwm") and IDLE_PULSE - 200.0 < np.median(values) < 2300.0:
         values = np.maximum(values - IDLE_PULSE, 0.0)
-    return name, driver.time, np.sum(values, axis=1, keepdims=True)
+    return name, Samples(driver.time, np.sum(values, axis=1, keepdims=True))
 
 
 def follows(log: FlightLog, name: str) -> float | None:
     """Return how well the measured force follows an input, as a correlation; None where unknown."""
     thrust = thrust_of(log, KnownVehicle(thrust_input=name))
-    if thrust is None or np.median(thrust[2]) <= 0.0:
+    if thrust is None or np.median(thrust[1].values) <= 0.0:
         return None
-    curves = [curve for _, curve, _ in _correlations(log, *thrust[1:])]
+    curves = [curve for _, curve, _ in _correlations(log, thrust[1])]
     return max((np.max(curve[_OF_MOTORS]) for curve in curves), default=None)
 
 
@@ -99,7 +97,7 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
     force_b = relations.samples_of(log, "acc_b")
     if thrust_signal is None or force_b is None:
         return None
-    name, time, thrust = thrust_signal
+    name, (time, thrust) = thrust_signal
     if vehicle.thrust_map is None and name not in ("command", "thrust_command"):
         return None  # not in newtons
     acc = relations.on_grid(*force_b, time)[:, 2]
@@ -123,18 +121,18 @@ def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         yield Row("thrust", driver, "warn", text)
         return
     thrust = thrust_of(log, vehicle)
-    if thrust is None or np.median(thrust[2]) <= 0.0:
+    if thrust is None or np.median(thrust[1].values) <= 0.0:
         return
-    name, time, command = thrust
+    name, command = thrust
     mass = mass_of(log, vehicle)
     if mass is not None:
         yield _weight(mass, vehicle, f"{name}, acc_b")
-    if sparse(time):
-        period = 1e3 * np.median(np.diff(time))
+    if sparse(command.time):
+        period = 1e3 * np.median(np.diff(command.time))
         text = f"comes every {period:.0f} ms: too seldom to be held against the force"
         yield Row("thrust", name, "warn", text)
         return
-    correlations = list(_correlations(log, time, command))
+    correlations = list(_correlations(log, command))
     if correlations:
         yield _following(name, *max(correlations, key=lambda found: np.max(found[1])))
 
@@ -197,14 +195,13 @@ def _along_z(log: FlightLog, measurement: str) -> Samples | None:
     return Samples(time, rotate_back(turn, acc + [0.0, 0.0, GRAVITY])[:, 2:3])
 
 
-def _correlations(
-    log: FlightLog, time: np.ndarray, command: np.ndarray
-) -> Iterator[tuple[str, np.ndarray, float]]:
+def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.ndarray, float]]:
     """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
     explains the force better, for each measurement of the force that is known and varies.
     """
-    usual = np.median(command[command > 0.2 * np.max(command)])
-    flies = time[command[:, 0] > 0.6 * usual]
+    thrust = command.values[:, 0]
+    usual = np.median(thrust[thrust > 0.2 * np.max(thrust)])
+    flies = command.time[thrust > 0.6 * usual]
     for measurement in ("acc_b", "path"):
         force = _along_z(log, measurement)
         if force is None:
@@ -214,7 +211,7 @@ def _correlations(
         grid = np.arange(start, end, 0.01)
         if len(grid) < 200:
             continue
-        x = relations.mean_over(time, command, grid, _SPAN)[:, 0]
+        x = relations.mean_over(*command, grid, _SPAN)[:, 0]
         y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
         curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
         if known := list(filter(None, curves)):
