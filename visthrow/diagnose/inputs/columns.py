@@ -1,6 +1,7 @@
 """Columns of a foreign table by their names: which belong together, and in which unit."""
 
 import re
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,31 +60,30 @@ def groups_of(numbers: Table) -> list[Group]:
     """Group columns by their names: whole vectors, quaternions, matrices and sets of motors, then
     single ones.
     """
-    families: dict[tuple[int, str, str, str], dict[str, str]] = {}
+    families: dict[tuple[int, str, str, str], dict[str, str]] = defaultdict(dict)
     for name in numbers:
         base, unit = split_unit(name)
         if motor := PATTERNS["motor"].match(base):
-            key = (0, "motor", motor[1] + (motor[3] or ""), unit)
-            families.setdefault(key, {})[motor[2]] = name
+            kind = motor[1] + (motor[3] or "")
+            families[0, "motor", kind, unit][motor[2]] = name
         if numbered := _NUMBERED.match(base):
-            families.setdefault((1, numbered[1], "", unit), {})[numbered[2]] = name
+            families[1, numbered[1], "", unit][numbered[2]] = name
         if part := PATTERNS["component"].match(base):
             ending = part[2].lower()
             unit = unit or NAMES["units"].get((part[3] or "").lower(), "")
-            key = (2, part[1] + NAMES["families"].get(ending, ""), "", unit)
-            families.setdefault(key, {}).setdefault(NAMES["components"][ending], name)
-    listed = [
-        (stem, unit, [places[place] for place in whole])
-        for (_, stem, _, unit), places in sorted(families.items(), key=lambda item: item[0][0])
-        for whole in WHOLE
-        if set(whole) == places.keys()
-    ]
+            stem = part[1] + NAMES["families"].get(ending, "")
+            families[2, stem, "", unit].setdefault(NAMES["components"][ending], name)
+    listed = []
+    for (_, stem, _, unit), places in sorted(families.items(), key=lambda item: item[0][0]):
+        for whole in WHOLE:
+            if places.keys() == set(whole):
+                listed.append((stem, unit, [places[place] for place in whole]))
     listed += [("", "", names) for names in _neighbours(numbers)]
     listed += [(name, unit_by_name(name), [name]) for name in numbers]
     groups = []
     used: set[str] = set()
     for stem, unit, names in listed:
-        if not used.intersection(names):
+        if used.isdisjoint(names):
             values = np.column_stack([numbers[name] for name in names])
             groups.append(Group(stem, tuple(names), values, unit))
             used.update(names)

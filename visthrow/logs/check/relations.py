@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial.polynomial import polyfit
 
 from visthrow.common.rotations import continuous, vectors_between
 from visthrow.logs.axes import EXCHANGES, MATRICES
@@ -116,7 +117,8 @@ def _related(
     powers = np.add.reduceat(np.sum(values**2, axis=1), edges)
     effective = max(count * min(1.0, period / INDEPENDENT), 10.0)
     narrowest = max(2, round(_WIDTH / period))
-    offset, sd, residual, together = _delay(powers, *sums, narrowest, effective)
+    blocks = _Blocks(powers, *sums, effective)
+    offset, sd, residual, together = blocks.delay(narrowest)
     if together > _TOGETHER:
         sizes = np.diff(np.append(edges, count))
         follows = np.repeat(residual < _TUMBLE * np.median(residual), sizes)
@@ -150,99 +152,98 @@ def _best_axes(correlations: np.ndarray) -> tuple[str, float, int]:
     return exchanges[k], scores[k, lag], lag
 
 
-def _delay(
-    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, half: int, independent: float
-) -> tuple[float, float, np.ndarray, float]:
-    """Lag at which the second signal follows the first best, and its standard deviation [steps].
-
-    Each block has a noise of its own: a tumble, after which nothing follows anything, weighs as
-    little as its noise is large. A parabola is laid through the peak of the correlation; how much
-    the blocks disagree about its slope is the deviation, whatever the noise is correlated with, as
-    long as two blocks last longer.
-
-    Args:
-        xx: Power of the first signal in each block, shape (K,).
-        xy: Its product with the second at each lag, shape (L, K).
-        yy: Power of the second, shape (L, K).
-        half: Half the width of the narrowest parabola [steps].
-        independent: Number of samples that count as independent.
-
-    Returns:
-        Lag, its deviation, what each block leaves, shape (K,), and the weighted correlation.
+@dataclass(frozen=True)
+class _Blocks:
+    """Two signals of a stretch, by blocks of it, each of which has a noise of its own: a tumble,
+    after which nothing follows anything, weighs as little as its noise is large.
     """
-    scale = np.sum(xy, axis=1) / max(np.sum(xx), 1e-300)
-    floor = 1e-6 * np.mean(yy)
-    for _ in range(_ROUNDS):
-        residual = np.maximum(yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx, floor)
-        scale = np.sum(xy / residual, axis=1) / np.maximum(np.sum(xx / residual, axis=1), 1e-300)
-    likelihood = np.where(scale > 0.0, np.sum(-0.5 * np.log(residual), axis=1), -np.inf)
-    best = int(np.argmax(likelihood))
-    together = _together(xx, xy[best], yy[best], residual[best])
-    while 2 * half < len(likelihood):
-        # the middle of the window in which the second follows best: of a slow motion noise alone
-        # would make the peak of a narrow one
-        mean = np.convolve(likelihood, np.full(2 * half + 1, 1.0 / (2 * half + 1)), "valid")
-        best = int(np.argmax(mean)) + half
-        window = np.arange(max(best - half, 0), best + half + 1)
-        fits = np.polynomial.polynomial.polyfit(window - best, np.hstack([xy, yy])[window], 2)
-        vertex, sd = _vertex(xx, fits[:, : len(xx)], fits[:, len(xx) :], floor, half, independent)
-        if np.isfinite(sd):
-            return best + vertex, sd, residual[best], together
-        half *= 2
-    return float(best), np.inf, residual[best], together
 
+    xx: np.ndarray  # power of the first signal in each block, shape (K,)
+    xy: np.ndarray  # its product with the second at each lag, shape (L, K)
+    yy: np.ndarray  # power of the second, shape (L, K)
+    independent: float  # number of samples that count as independent
 
-def _together(xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, residual: np.ndarray) -> float:
-    """Correlation in which each block weighs by its noise."""
-    cross, first, second = (np.sum(products / residual) for products in (xy, xx, yy))
-    return cross / max(np.sqrt(first * second), 1e-300)
+    def delay(self, half: int) -> tuple[float, float, np.ndarray, float]:
+        """Lag at which the second signal follows the first best, and its deviation [steps].
 
+        A parabola is laid through the peak of the correlation; how much the blocks disagree about
+        its slope is the deviation, whatever the noise is correlated with, as long as two blocks
+        last longer. ``half``: half the width of the narrowest parabola [steps].
 
-def _vertex(
-    xx: np.ndarray, xy: np.ndarray, yy: np.ndarray, floor: float, half: int, independent: float
-) -> tuple[float, float]:
-    """Peak of a correlation of which each block has parabolas, and its deviation [steps]; infinite
-    where noise alone may make such a peak.
+        Returns lag, its deviation, what each block leaves, shape (K,), and the weighted
+        correlation."""
+        xx, xy, yy = self.xx, self.xy, self.yy
+        scale = np.sum(xy, axis=1) / max(np.sum(xx), 1e-300)
+        for _ in range(_ROUNDS):
+            squares = yy - 2.0 * scale[:, None] * xy + scale[:, None] ** 2 * xx
+            residual = np.maximum(squares, self._floor)
+            power = np.sum(xx / residual, axis=1)
+            scale = np.sum(xy / residual, axis=1) / np.maximum(power, 1e-300)
+        likelihood = np.where(scale > 0.0, np.sum(-0.5 * np.log(residual), axis=1), -np.inf)
+        best = int(np.argmax(likelihood))
+        cross, first, second = (np.sum(part / residual[best]) for part in (xy[best], xx, yy[best]))
+        together = cross / max(np.sqrt(first * second), 1e-300)
+        while 2 * half < len(likelihood):
+            # the middle of the window in which the second follows best: of a slow motion noise
+            # alone would make the peak of a narrow one
+            width = 2 * half + 1
+            mean = np.convolve(likelihood, np.full(width, 1.0 / width), "valid")
+            best = int(np.argmax(mean)) + half
+            window = np.arange(best - half, best + half + 1)
+            fits = [polyfit(window - best, curves[window], 2) for curves in (xy, yy)]
+            vertex, sd = self._vertex(*fits, half)
+            if np.isfinite(sd):
+                return best + vertex, sd, residual[best], together
+            half *= 2
+        return float(best), np.inf, residual[best], together
 
-    The peak is that of the correlation's logarithm, so that noise of neither signal, nor one of
-    them that is larger at one end, pulls it aside.
+    @property
+    def _floor(self) -> float:
+        """Least that a block leaves."""
+        return 1e-6 * np.mean(self.yy)
 
-    Args:
-        xx: Power of the first signal in each block, shape (K,).
-        xy: Parabolas of its product with the second, powers 0 to 2, shape (3, K).
-        yy: Those of the second's power.
-        floor: Least that a block leaves.
-        half: Half the width of the parabolas [steps].
-        independent: Number of samples that count as independent.
-    """
-    vertex = 0.0
-    for _ in range(_ROUNDS):
-        powers = np.array(
-            [[1.0, vertex, vertex * vertex], [0.0, 1.0, 2.0 * vertex], [0.0, 0.0, 2.0]]
-        )
-        product = powers @ xy
-        second = powers @ yy  # value, slope and bend
-        scale = max(np.sum(product[0]) / np.sum(xx), 0.0)
-        residual = second[0] - 2.0 * scale * product[0] + scale**2 * xx
-        weight = 1.0 / np.maximum(residual, floor)
-        cross = product @ weight
-        power = second @ weight
-        if cross[0] <= 0.0 or power[0] <= 0.0:
-            return vertex, np.inf
-        slope = cross[1] / cross[0] - 0.5 * power[1] / power[0]
-        bend = cross[2] / cross[0] - (cross[1] / cross[0]) ** 2
-        bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
-        slopes = weight * (product[1] / cross[0] - 0.5 * second[1] / power[0])
-        explained = min(cross[0] ** 2 / (power[0] * np.sum(weight * xx)), 0.999)
-        # what the second would lose of its likelihood half the parabola's width aside
-        nats = -0.5 * independent * bend * half**2 * explained / (1.0 - explained)
-        if nats < _NATS or abs(vertex - slope / bend) > half:
-            return vertex, np.inf
-        vertex -= slope / bend
-    # noise may last longer than a block: neighbours count together, paired in both ways
-    pairs = np.convolve(slopes, [1.0, 1.0])
-    variance = 0.5 * np.sum(pairs**2) * BLOCKS / (BLOCKS - 2)
-    return vertex, _STUDENT * (np.sqrt(variance) / -bend)
+    def _vertex(self, xy: np.ndarray, yy: np.ndarray, half: int) -> tuple[float, float]:
+        """Peak of a correlation of which each block has parabolas, and its deviation [steps];
+        infinite where noise alone may make such a peak.
+
+        The peak is that of the correlation's logarithm, so that noise of neither signal, nor one of
+        them that is larger at one end, pulls it aside.
+
+        Args:
+            xy: Parabolas of the signals' product, powers 0 to 2, shape (3, K).
+            yy: Those of the second's power.
+            half: Half the width of the parabolas [steps].
+        """
+        xx = self.xx
+        vertex = 0.0
+        for _ in range(_ROUNDS):
+            # rows: value, slope and bend of a parabola
+            powers = np.array(
+                [[1.0, vertex, vertex * vertex], [0.0, 1.0, 2.0 * vertex], [0.0, 0.0, 2.0]]
+            )
+            product = powers @ xy
+            second = powers @ yy
+            scale = max(np.sum(product[0]) / np.sum(xx), 0.0)
+            residual = second[0] - 2.0 * scale * product[0] + scale**2 * xx
+            weight = 1.0 / np.maximum(residual, self._floor)
+            cross = product @ weight
+            power = second @ weight
+            if cross[0] <= 0.0 or power[0] <= 0.0:
+                return vertex, np.inf
+            slope = cross[1] / cross[0] - 0.5 * power[1] / power[0]
+            bend = cross[2] / cross[0] - (cross[1] / cross[0]) ** 2
+            bend -= 0.5 * (power[2] / power[0] - (power[1] / power[0]) ** 2)
+            slopes = weight * (product[1] / cross[0] - 0.5 * second[1] / power[0])
+            explained = min(cross[0] ** 2 / (power[0] * np.sum(weight * xx)), 0.999)
+            # what the second would lose of its likelihood half the parabola's width aside
+            nats = -0.5 * self.independent * bend * half**2 * explained / (1.0 - explained)
+            if nats < _NATS or abs(vertex - slope / bend) > half:
+                return vertex, np.inf
+            vertex -= slope / bend
+        # noise may last longer than a block: neighbours count together, paired in both ways
+        pairs = np.convolve(slopes, [1.0, 1.0])
+        variance = 0.5 * np.sum(pairs**2) * BLOCKS / (BLOCKS - 2)
+        return vertex, _STUDENT * (np.sqrt(variance) / -bend)
 
 
 def peak(score: np.ndarray, index: int) -> tuple[float, float]:
