@@ -60,8 +60,8 @@ class Opened:
 
         args = self._args
         logs = self.logs
-        chosen = setup.load(args.config) if args.config else None
-        if chosen is None or not (chosen.model or chosen.example):
+        chosen = setup.load(args.config)
+        if not (chosen.model or chosen.example):
             model, self.logs = throw_model(args, logs)
         elif args.overrides:
             raise ConfigError(
@@ -123,9 +123,8 @@ def made_with(args: argparse.Namespace) -> dict[str, Any]:
     """
     from visthrow.diagnose.inputs import setup
 
-    model_name = setup.load(args.config).model if args.config else ""
     return {
-        "model": model_name or THROW,
+        "model": setup.load(args.config).model or THROW,
         "plant": args.plant,
         "config": args.config,
         "overrides": args.overrides,

@@ -89,11 +89,14 @@ def model_of(setup: Setup, logs: Sequence[FlightLog]) -> NumericModel:
     return model
 
 
-def load(name: str | Path) -> Setup:
-    """Load a setup by its name in ``configs/diagnose``, or a file.
+def load(name: str | Path | None) -> Setup:
+    """Load a setup by its name in ``configs/diagnose``, or a file; without a name one that states
+    nothing.
 
     Raises ConfigError: there is none, or it does not fill the schema.
     """
+    if name is None:
+        return Setup("")
     try:
         return config.load(Setup, config.find("diagnose", str(name)))
     except ConfigError as error:
@@ -113,12 +116,11 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
     setup has no flying model.
     Raises ConfigError: as :func:`load`.
     """
-    setup = load(name) if name is not None else None
-    if setup is not None and (imu := setup.imu) is not None:
+    setup = load(name)
+    if (imu := setup.imu) is not None:
         unread = VELOCITIES | UNREAD
         return KnownVehicle(0.0, imu.mass, imu.input, imu.thrust_map, unread)
-    flyer = setup.flyer if setup is not None else None
-    if flyer is not None:
+    if (flyer := setup.flyer) is not None:
         length = flyer.cable.length - flyer.cable.mount[2] if flyer.cable is not None else 0.0
         return KnownVehicle(length, flyer.total_mass, flyer.input, flyer.thrust_map, VELOCITIES)
     if plant is None:
@@ -127,10 +129,9 @@ def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:
 
     trained = plant_of(load_experiment(plant))
     rope = trained.rope
-    return KnownVehicle(
-        rope.length + rope.payload_offset,
-        trained.vehicle.body.mass + rope.rope_mass + rope.payload_mass,
-    )
+    length = rope.length + rope.payload_offset
+    hanging = rope.rope_mass + rope.payload_mass
+    return KnownVehicle(length, trained.vehicle.body.mass + hanging)
 
 
 def read_logs(
@@ -141,15 +142,10 @@ def read_logs(
     ``models``: those that make a setup of use for logs that are no tables.
     Raises LogError, ConfigError: as the readers and :func:`load`; ConfigError: no log is a table,
     and the setup is for tables alone."""
-    chosen = load(name) if name is not None else None
-    logs = read_all(paths, chosen.table if chosen is not None else None)
-    if (
-        chosen is not None
-        and paths
-        and chosen.table is not None
-        and chosen.model not in models
-        and not any(map(takes_mapping, paths))
-    ):
+    chosen = load(name)
+    logs = read_all(paths, chosen.table)
+    of_use = chosen.table is None or chosen.model in models
+    if not of_use and paths and not any(map(takes_mapping, paths)):
         raise ConfigError(
             f"the setup '{name}' is not used: it states how to read the columns of a table, and"
             f" {', '.join(map(str, paths))} needs no mapping; expected a table, or no"
