@@ -21,6 +21,7 @@ from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.scatter import (
     DAY,
     FLIGHT,
+    Scatter,
     Varies,
     freed,
     own_shares,
@@ -83,6 +84,26 @@ def test_what_is_drawn_anew_each_day_drifts():
     worlds = [on_days(rng, 0.012, 0.0) for _ in range(12)]
     assert np.mean([w == {DAY} for w in worlds]) > 0.7
     assert not any(on_days(rng, 0.0, 0.0) for _ in range(20))
+
+
+def test_a_drift_is_told_with_its_size_and_its_days():
+    found = Scatter(
+        "lag_jitter",
+        "The lag varies",
+        "",
+        "release",
+        "s",
+        ("release_lag",),
+        True,
+        *(0.01, 0.005, 0.02, 0.001),
+        nats=7.0,
+        flights=5,
+        by=DAY,
+    )
+    assert found.sentence == (
+        "drifts, a value for each day. The lag varies: lag_jitter = 0.01 s (95 %: 0.005 to 0.02),"
+        " 7 nats from 5 days."
+    )
 
 
 def test_a_mean_is_as_sure_as_there_are_days():
