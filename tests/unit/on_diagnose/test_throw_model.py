@@ -387,6 +387,11 @@ BENDING = 0.1
 """
 
 
+def begun(model: ThrowModel) -> dict[str, np.ndarray]:
+    """States at the starts of a model's windows."""
+    return model.begun({}, model.flights.cuts)[1]
+
+
 @fixture(scope="module")
 def throw_logs():
     return fly(setting_with({}), noise=0.2, free=1, throws=1, seconds=2.0)
@@ -394,7 +399,7 @@ def throw_logs():
 
 def test_gusts_do_not_take_the_place_of_states(throw_logs):
     calm, shaken = (
-        ThrowModel(found, paper_plant(), only=["rope_length"]).begun({})[1]
+        begun(ThrowModel(found, paper_plant(), only=["rope_length"]))
         for found in (throw_logs, map(swayed, throw_logs))
     )
     away = shaken["rate_b"] - calm["rate_b"]
@@ -426,7 +431,7 @@ def test_a_rope_that_is_too_long_does_not_bend_until_it_fits():
         paper_plant(),
         only=["rope_length"],
     )
-    assert bend(model.begun({})[1]).max() < BENDING
+    assert bend(begun(model)).max() < BENDING
 
 
 SHARE = 0.12

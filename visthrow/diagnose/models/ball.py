@@ -125,10 +125,12 @@ def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[f
         return []
     stamps, acc = derivative(stamps, vel, 0.05)
     off = np.linalg.norm(acc + np.array([0.0, 0.0, params.gravity]), axis=1)
-    falls = off < FALLS * params.gravity
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], falls, [False]]).astype(int)))
-    spans = [
-        (stamps[a] + params.edge, stamps[b - 1] - params.edge)
-        for a, b in zip(edges[::2], edges[1::2])
-    ]
-    return [(a, b) for a, b in spans if b - a >= params.shortest]
+    falls = np.pad((off < FALLS * params.gravity).astype(int), 1)
+    edges = np.flatnonzero(np.diff(falls))
+    spans = []
+    for first, behind in edges.reshape(-1, 2):
+        start = stamps[first] + params.edge
+        end = stamps[behind - 1] - params.edge
+        if end - start >= params.shortest:
+            spans.append((start, end))
+    return spans

@@ -17,7 +17,7 @@ conserved."""
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain, combinations_with_replacement
+from itertools import combinations_with_replacement
 
 import numpy as np
 
@@ -60,7 +60,7 @@ class Factor:
     symbol: str
     unit: str  # of BASE_UNITS with their exponents
     quantity: str  # at the knots, (k,) for a scalar, (k, 3) for a vector, in the block's frame
-    needs: tuple[str, ...]  # keys of Window.knots
+    needs: frozenset[str]  # keys of Window.knots
 
     def read(self, values: KnotValues) -> np.ndarray:
         """Return its values at the knots."""
@@ -103,7 +103,7 @@ class Term:
     @property
     def needs(self) -> set[str]:
         """Keys of Window.knots that its factors are made of."""
-        return {key for factor in self.parts for key in factor.needs}
+        return set().union(*(factor.needs for factor in self.parts))
 
     @property
     def unit(self) -> str:
@@ -257,7 +257,7 @@ def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
     factors = {}
     for name, (symbol, unit, quantity, words) in rows.items():
         groups = [LAW_FACTORS["groups"].get(word, [word]) for word in words.split()]
-        factors[name] = Factor(symbol, unit, quantity, tuple(chain.from_iterable(groups)))
+        factors[name] = Factor(symbol, unit, quantity, frozenset().union(*groups))
     return factors
 
 
@@ -280,17 +280,15 @@ MOST_SCALARS = 2
 def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
     have = set(quantities)
-    out = () if block == JOINT else ONLY_JOINT
-    scalars = [
-        name for name, factor in SCALARS.items() if set(factor.needs) <= have and name not in out
-    ]
-    vectors = [name for name, factor in VECTORS[block].items() if set(factor.needs) <= have]
-    return [
-        Term(block, factors, vector)
-        for count in range(MOST_SCALARS + 1)
-        for factors in combinations_with_replacement(scalars, count)
-        for vector in vectors
-    ]
+    scalars = [name for name, factor in SCALARS.items() if factor.needs <= have]
+    vectors = [name for name, factor in VECTORS[block].items() if factor.needs <= have]
+    if block != JOINT:
+        scalars = [name for name in scalars if name not in ONLY_JOINT]
+    terms = []
+    for count in range(MOST_SCALARS + 1):
+        for factors in combinations_with_replacement(scalars, count):
+            terms += [Term(block, factors, vector) for vector in vectors]
+    return terms
 
 
 def table(terms: Sequence[Term], values: KnotValues) -> np.ndarray:

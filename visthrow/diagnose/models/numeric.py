@@ -151,6 +151,7 @@ class NumericModel(Model, ABC):
         time, channel, measured, sigma = np.concatenate(rows, axis=1)
         none = np.zeros((len(time), 0))
         block, axis = np.repeat(self.pushes, self.knot_count, axis=0).T
+        knots = np.linspace(*span, self.knot_count)
         return Stretch(
             flight,
             phase,
@@ -163,7 +164,7 @@ class NumericModel(Model, ABC):
             nuisance_sd=np.array(start_sd, dtype=float),
             latent_block=block,
             latent_axis=axis,
-            latent_time=np.tile(np.linspace(*span, self.knot_count), len(self.pushes)),
+            latent_time=np.tile(knots, len(self.pushes)),
             start=np.array(start, dtype=float),
             data=data,
         )
@@ -303,15 +304,19 @@ class NumericModel(Model, ABC):
         steps = np.full(len(self.stretches[0].latent_block), self.latent_step)
         latent = self._slopes_by(size, "latent", steps, range(len(steps)))
         lanes = self._lanes(size)
-        parts = {
-            "residual": residuals,
-            "effects": effects,
-            "nuisance": self._slopes,
-            "latent": latent,
-            "knots": self.knots(lanes, self.simulate(lanes)),
-        }
-        rows = zip(self.stretches, zip(*parts.values()))
-        return [replace(stretch, **dict(zip(parts, row))) for stretch, row in rows]
+        knots = self.knots(lanes, self.simulate(lanes))
+        windows = []
+        for i, stretch in enumerate(self.stretches):
+            window = replace(
+                stretch,
+                residual=residuals[i],
+                effects=effects[i],
+                nuisance=self._slopes[i],
+                latent=latent[i],
+                knots=knots[i],
+            )
+            windows.append(window)
+        return windows
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None

@@ -60,15 +60,12 @@ class StandModel(NumericModel):
         rows = settled(log, p)
         if len(rows) < 4:
             return []
-        speed, thrust, volts, current = rows.T
+        speed, thrust, volts, current = rows.T[..., None]
         steps = np.arange(len(rows), dtype=float)
         thrust_sd = np.hypot(p.thrust_sd, p.thrust_share * thrust)
         current_sd = np.hypot(p.current_sd, p.current_share * current)
-        channels = [
-            (steps, values[:, None], sd[:, None])
-            for values, sd in ((thrust, thrust_sd), (current, current_sd))
-        ]
-        data = {"speed": speed, "volts": volts}
+        channels = [(steps, thrust, thrust_sd), (steps, current, current_sd)]
+        data = {"speed": speed[:, 0], "volts": volts[:, 0]}
         return [self.lay_out(number, "steps", channels, (0.0, len(rows) - 1.0), data)]
 
     def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
@@ -80,15 +77,12 @@ class StandModel(NumericModel):
         middle = self.middle_speed
         speed = stretch.data["speed"]
         volts = stretch.data["volts"]
-        thrust = p.k_f * (
-            speed**2 * (speed / middle) ** exponent * (1.0 + gain) + linear * middle * speed
-        )
-        thrust = thrust * (1.0 + voltage * (volts - p.reference_voltage)) + zero
-        power = (
-            p.k_p * (1.0 + power_gain) * speed**3 * (speed / middle) ** power_exponent
-            + p.idle_power
-            + idle
-        )
+        ratio = speed / middle
+        square = speed**2 * ratio**exponent * (1.0 + gain)
+        at_reference = p.k_f * (square + linear * middle * speed)
+        thrust = at_reference * (1.0 + voltage * (volts - p.reference_voltage)) + zero
+        lifting = p.k_p * (1.0 + power_gain) * speed**3 * ratio**power_exponent
+        power = lifting + p.idle_power + idle
         ohm = np.maximum(p.resistance + resistance, 1e-6)
         root = np.sqrt(np.maximum(volts**2 - 4.0 * ohm * power, 0.0))
         share = 1.0 + self.pushes_at(lanes, np.linspace(0.0, 1.0, len(speed)))
@@ -102,10 +96,6 @@ def settled(log: FlightLog, params: StandParams) -> np.ndarray:
     """
     rows = np.column_stack([log[name].values.astype(float) for name in NEEDED])
     good = np.all([log[name].valid for name in NEEDED], axis=0)
-    good &= (
-        (rows[:, 0] > params.lowest_speed)
-        & (rows[:, 2] > 1.0)
-        & (rows[:, 1] > 0.0)
-        & (rows[:, 3] > 0.0)
-    )
-    return rows[good]
+    # of speed [rad/s], thrust [N], voltage [V] and current [A]
+    lowest = params.lowest_speed, 0.0, 1.0, 0.0
+    return rows[good & np.all(rows > lowest, axis=1)]

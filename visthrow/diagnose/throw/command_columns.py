@@ -71,7 +71,7 @@ def _flown(
             lanes.append(Lane(w, 0, w, resume=row, parent=parent, rough=True, skip=number))
         first_knot += int(flights.knots[w])
     seen = flights.fly(simulation, states, lanes).seen
-    return [
-        flights.differences(seen, w, parent, len(numbers))
-        for parent, (w, numbers) in zip(parents, commands.items())
-    ]
+    columns = []
+    for parent, (w, numbers) in zip(parents, commands.items()):
+        columns.append(flights.differences(seen, w, parent, len(numbers)))
+    return columns

@@ -65,16 +65,14 @@ def suspected(logs: Sequence[FlightLog], plant: PlantParams) -> list[Mistake]:
     """Return what may be wrong with the commands of all logs, in the order of correction; not
     weighed yet.
     """
+    full = 4.0 * plant.vehicle.controller.max_thrust
+    units = thrust_checks.UNITS | {"shares of the full thrust": full}
     mistakes: list[Mistake] = []
     for look in (_axes, _rate_unit):
-        relation = [r for log in logs if (r := _followed(log)) is not None]
-        mistake = look(relation) if relation else None
-        if mistake is not None:
+        relations = [relation for relation in map(_followed, logs) if relation is not None]
+        if relations and (mistake := look(relations)) is not None:
             mistakes.append(mistake)
-            logs = [mistake.mended(log) for log in logs]
-    units = thrust_checks.UNITS | {
-        "shares of the full thrust": 4.0 * plant.vehicle.controller.max_thrust
-    }
+            logs = list(map(mistake.mended, logs))
     mistake = _thrust_unit(logs, GRAVITY * plant.total_mass, units)
     return mistakes if mistake is None else [*mistakes, mistake]
 
@@ -101,10 +99,13 @@ def commanded(
         rates = log["rate_setpoint_b"]
         share = log["throttle"].hold(rates.time)
         thrust_n = np.maximum(weight * (1.0 + slope * (share / hover - 1.0)), 0.0)
-        values = np.column_stack([thrust_n, np.where(rates.valid[:, None], rates.values, 0.0)])
+        turns = np.where(rates.valid[:, None], rates.values, 0.0)
+        values = np.column_stack([thrust_n, turns])
         command = Channel(rates.time, values, "N, rad/s", "body", rates.valid)
-        channels = {**log.channels, "command": command}
-        flown = {n: c.only((c.time >= start) & (c.time <= end)) for n, c in channels.items()}
+        flown = {}
+        for name, channel in {**log.channels, "command": command}.items():
+            in_flight = (channel.time >= start) & (channel.time <= end)
+            flown[name] = channel.only(in_flight)
         corrected[i] = replace(log, channels=flown)
         shares.append((hover, slope))
     if not shares:
@@ -121,11 +122,7 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     """
     time, values = log["throttle"].samples()
     share = values[:, 0]
-    flies = (
-        share > 0.5 * np.percentile(share, 75)
-        if np.any(share > 0.0)
-        else np.zeros(len(share), bool)
-    )
+    flies = share > 0.5 * np.percentile(share, 75) if np.any(share > 0.0) else share > 0.0
     place = measured(log, "pos_w")
     if place is not None:
         height = relations.on_grid(*place.samples(), time)[:, 2]
@@ -170,24 +167,14 @@ def _axes(relation: Sequence[relations.Relation]) -> Mistake | None:
         return None
     text = clear[0].axes
     axes = [axis[-1] for axis in text.split(",")]
-    turned = sorted(axes) == axes
-    name, cause = (
-        ("rate_sign", "A commanded rate has the other sign")
-        if turned
-        else ("rate_axes", "Commanded rates are exchanged")
-    )
+    words = "rate_axes", "Commanded rates are exchanged"
+    if sorted(axes) == axes:
+        words = "rate_sign", "A commanded rate has the other sign"
     change = np.eye(4)
     change[1:, 1:] = matrix_of(text)
     nats = sum(r.nats for r in clear)
-    return Mistake(
-        name,
-        cause,
-        f"x, y, z of the vehicle are ({text}) of the command",
-        nats,
-        len(clear),
-        len(EXCHANGES),
-        _rows(change),
-    )
+    equation = f"x, y, z of the vehicle are ({text}) of the command"
+    return Mistake(*words, equation, nats, len(clear), len(EXCHANGES), _rows(change))
 
 
 def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
@@ -202,16 +189,9 @@ def _rate_unit(relation: Sequence[relations.Relation]) -> Mistake | None:
     if factor == 1.0:
         return None
     change = np.diag([1.0, factor, factor, factor])
+    cause = f"Commanded rates are in {words[factor]}"
     equation = f"rates times {factor:.5g}"
-    return Mistake(
-        "rate_unit",
-        f"Commanded rates are in {words[factor]}",
-        equation,
-        0.0,
-        len(relation),
-        len(words),
-        _rows(change),
-    )
+    return Mistake("rate_unit", cause, equation, 0.0, len(relation), len(words), _rows(change))
 
 
 def _thrust_unit(
@@ -229,16 +209,9 @@ def _thrust_unit(
     if unit == "N":
         return None
     change = np.diag([units[unit], 1.0, 1.0, 1.0])
+    cause = f"Commanded thrust is in {unit}"
     equation = f"thrust times {units[unit]:.5g}"
-    return Mistake(
-        "thrust_unit",
-        f"Commanded thrust is in {unit}",
-        equation,
-        0.0,
-        len(medians),
-        len(units),
-        _rows(change),
-    )
+    return Mistake("thrust_unit", cause, equation, 0.0, len(medians), len(units), _rows(change))
 
 
 def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:

@@ -63,9 +63,7 @@ def payload_down(flight: RecordedFlight, landing_height: float) -> float:
         return flight.landing
     after = flight.payload.time > flight.latch
     low = after & (flight.payload.values[:, 2] < landing_height + GROUND_MARGIN)
-    return (
-        min(flight.landing, float(flight.payload.time[low][0])) if np.any(low) else flight.landing
-    )
+    return min([flight.landing, *flight.payload.time[low][:1].tolist()])
 
 
 def cut(
@@ -106,10 +104,11 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
     room = max(WINDOW_LIMIT - len(cuts) + len(plain), WINDOW_LIMIT // 4)
     if len(plain) <= room:
         return cuts
-    whole = {k: np.var(flights[k].command, axis=0) for k in {cuts[i].flight for i in plain}}
-    variation = {
-        i: _variation(flights[cuts[i].flight], cuts[i], whole[cuts[i].flight]) for i in plain
-    }
+    whole = [np.var(flight.command, axis=0) for flight in flights]
+    variation = {}
+    for i in plain:
+        number = cuts[i].flight
+        variation[i] = _variation(flights[number], cuts[i], whole[number])
     chosen = {max(part, key=variation.__getitem__) for part in np.array_split(plain, room)}
     dropped = set(plain) - chosen
     return [c for i, c in enumerate(cuts) if i not in dropped]
@@ -127,17 +126,17 @@ def around_slack(c: Cut, first: float, last: float, separation: float) -> list[C
 
     ``first, last``: of that time [s]; ``separation``: of the payload [s]; a rope that comes taut no
     sooner leaves a window of the flight after it."""
-    free = c.start < separation < min(last + LEAST_TAUT, c.end)
-    last = min(max(last, separation + LATE), c.end) if free else min(last, c.end)
-    quiet = (
-        replace(c, start=last, payload=LOOSE, phase="ballistic")
-        if free
-        else replace(c, start=last, after_slack=True)
-    )
+    if c.start < separation < min(last + LEAST_TAUT, c.end):
+        last = min(max(last, separation + LATE), c.end)
+        afterwards = replace(c, start=last, payload=LOOSE, phase="ballistic")
+    else:
+        last = min(last, c.end)
+        afterwards = replace(c, start=last, after_slack=True)
     before = replace(c, end=first, phase="flight" if c.phase == "throw" else c.phase)
-    pieces = [before, replace(c, start=first, end=last, retained=False), quiet]
-    return [
-        replace(p, retained=p.retained and p.end - p.start > SHORTEST)
-        for p in pieces
-        if p.end - p.start > 1e-6
-    ]
+    slack = replace(c, start=first, end=last, retained=False)
+    pieces = []
+    for piece in (before, slack, afterwards):
+        seconds = piece.end - piece.start
+        if seconds > 1e-6:
+            pieces.append(replace(piece, retained=piece.retained and seconds > SHORTEST))
+    return pieces

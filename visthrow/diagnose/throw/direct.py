@@ -61,6 +61,10 @@ class DirectMeasurement(Protocol):
         """Return the measurement in a setting, shape (N,)."""
         ...
 
+    def differs(self, setting: Setting, second: Setting) -> bool:
+        """Whether it may be another one in another setting."""
+        ...
+
 
 def direct_measurements(
     logs: Sequence[FlightLog],
@@ -106,25 +110,25 @@ def with_direct(
         settings: the one that is linearised about, then one for each effect, a step away.
         steps: of the effects, 0 for those without a derivative here, shape (K,).
     """
-    for kind in (kind for kind in kinds if number in kind.windows):
+    nominal, *perturbed = settings
+    for kind in kinds:
+        if number not in kind.windows:
+            continue
         time, values, sigma = kind.samples(number)
-        plain = kind.predicted(number, settings[0])
-        columns = np.zeros((len(time), len(steps)))
-        behind = (0, len(time)), (0, 0)
+        plain = kind.predicted(number, nominal)
+        count = len(time)
+        columns = np.zeros((count, len(steps)))
         for k in np.flatnonzero(steps):
-            perturbed = settings[1 + k]
-            if (
-                perturbed.sensing != settings[0].sensing
-                or perturbed.camera != settings[0].camera
-                or kind.channel == LANDING
-            ):
-                columns[:, k] = (kind.predicted(number, perturbed) - plain) / steps[k]
+            if kind.differs(nominal, perturbed[k]):
+                columns[:, k] = (kind.predicted(number, perturbed[k]) - plain) / steps[k]
+        channel = channels.index(kind.channel)
+        behind = (0, count), (0, 0)
         window = replace(
             window,
             time=np.append(window.time, time),
             residual=np.append(window.residual, values - plain),
-            channel=np.append(window.channel, np.full(len(time), channels.index(kind.channel))),
-            sigma=np.append(window.sigma, np.full(len(time), sigma)),
+            channel=np.append(window.channel, [channel] * count),
+            sigma=np.append(window.sigma, [sigma] * count),
             effects=np.vstack((window.effects, columns)),
             nuisance=np.pad(window.nuisance, behind),
             latent=np.pad(window.latent, behind),
@@ -157,6 +161,10 @@ class LandingHeight:
         point[2] = setting.plant.release.landing_height + x.payload_offset[2]
         return (1.0 + x.scale) * Rotation.from_rotvec(x.frame_tilt).apply(point)[2:]
 
+    def differs(self, setting: Setting, second: Setting) -> bool:
+        """See :class:`DirectMeasurement`."""
+        return True
+
 
 class CameraView:
     """Keypoints that a camera saw, normalised: payload's box, and the goal's corners where the log
@@ -179,12 +187,10 @@ class CameraView:
         self._nominal = setting
         self.windows = {}
         for w, c in enumerate(cuts):
-            if (
-                c.retained
-                and seen_by_camera(logs[c.flight])
-                and flights[c.flight].payload is not None
-            ):
-                view = _view(logs[c.flight], flights[c.flight], c, setting.sensing)
+            log = logs[c.flight]
+            flight = flights[c.flight]
+            if c.retained and flight.payload is not None and seen_by_camera(log):
+                view = _view(log, flight, c, setting.sensing)
                 if view is not None:
                     self.windows[w] = view
 
@@ -205,22 +211,24 @@ class CameraView:
             time = view["time"] - x.camera_delay + x.camera_line_time * middle
             points = _visible_keypoints(view, setting, self._nominal, time)
             if x.camera_line_time != 0.0:
-                slope = (
-                    _visible_keypoints(view, setting, self._nominal, time + SHORT) - points
-                ) / SHORT
-                points = points + slope * (x.camera_line_time * (row - middle[:, None]))[..., None]
+                later = _visible_keypoints(view, setting, self._nominal, time + SHORT)
+                after = x.camera_line_time * (row - middle[:, None])
+                points = points + (later - points) / SHORT * after[..., None]
         except ValueError:
             return np.full(np.count_nonzero(view["valid"]), np.nan)
         return points[view["valid"]].ravel()
+
+    def differs(self, setting: Setting, second: Setting) -> bool:
+        """See :class:`DirectMeasurement`; the poses are measured ones."""
+        return (setting.sensing, setting.camera) != (second.sensing, second.camera)
 
 
 def _reach(camera) -> np.ndarray:
     """Pixels of 1 in normalised coordinates along x and y."""
     from camera.fisheye import Fisheye
 
-    return np.array([camera.fisheye.fx, camera.fisheye.fy]) * float(
-        Fisheye(camera.fisheye).edge_radius
-    )
+    lens = camera.fisheye
+    return np.array([lens.fx, lens.fy]) * float(Fisheye(lens).edge_radius)
 
 
 def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> dict | None:
@@ -236,13 +244,10 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     stamps = channel.time[during]
     index = np.searchsorted(log["keypoints_valid"].time, stamps - 1e-9)
     points = np.asarray(channel.values[during], dtype=float)
-    goal = (
-        np.asarray(log["goal_w"].values, dtype=float)[0]
-        if "goal_w" in log
-        else log.meta.get("goal_w")
-    )
     visible = valid[np.minimum(index, len(valid) - 1)]
+    goal = log["goal_w"].values[0] if "goal_w" in log else log.meta.get("goal_w")
     if goal is None:
+        goal = np.zeros(3)
         visible[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
     tracks = {
@@ -268,7 +273,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         "time": stamps,
         "points": points,
         "valid": visible,
-        "goal": np.zeros(3) if goal is None else np.asarray(goal, dtype=float)[:3],
+        "goal": np.asarray(goal, dtype=float)[:3],
         "sigma": max(_noise(points, visible), LEAST_KEYPOINT_SIGMA),
     }
 
@@ -277,8 +282,11 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
     """Estimate the noise of coordinates while they are seen: what stands in the log elsewhere is
     none.
     """
-    tracks = [points[visible[:, k, i], k, i] for k, i in zip(*np.nonzero(MEASURED))]
-    sigmas = [highpass_sigma(track) for track in tracks if len(track) > 3]
+    sigmas = []
+    for k, i in zip(*np.nonzero(MEASURED)):
+        track = points[visible[:, k, i], k, i]
+        if len(track) > 3:
+            sigmas.append(highpass_sigma(track))
     return float(np.median(sigmas)) if sigmas else 0.0
 
 
@@ -305,11 +313,10 @@ def _visible_keypoints(
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)
-    arrays = pos, turned.as_matrix(), np.tile(view["goal"], (len(time), 1)), ball
-    points = keypoints(lens, *[torch.from_numpy(np.ascontiguousarray(v)) for v in arrays])[
-        0
-    ].numpy()
+    goals = np.tile(view["goal"], (len(time), 1))
+    arrays = map(torch.tensor, (pos, turned.as_matrix(), goals, ball))
+    points, _ = keypoints(lens, *arrays)
     fisheye = camera.fisheye
-    nominal_fisheye = nominal.camera.fisheye
-    pixel = points * _reach(camera) + np.array([fisheye.cx, fisheye.cy])
-    return (pixel - np.array([nominal_fisheye.cx, nominal_fisheye.cy])) / _reach(nominal.camera)
+    believed = nominal.camera.fisheye
+    shift = np.array([fisheye.cx - believed.cx, fisheye.cy - believed.cy])
+    return (points.numpy() * _reach(camera) + shift) / _reach(nominal.camera)

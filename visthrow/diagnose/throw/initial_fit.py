@@ -154,19 +154,14 @@ class _WindowFit:
 
     def _lower_gusts(self) -> bool:
         """Take gusts for as strong as what is left says, if that is much less than was thought."""
-        square = self.residual**2
-        noise = self.sigma**2
-        drift = self.drift**2
         samples = np.count_nonzero(self.sensitive)
-        calmer = [
-            g
-            for g in CALMER
-            if g < self.gusts and np.sum(square / (noise + g * g * drift)) < samples
-        ]
-        if calmer:
-            self.gusts = min(calmer)
-            self.spread = np.hypot(self.sigma, self.gusts * self.drift)
-        return bool(calmer)
+        before = self.gusts
+        for gusts in CALMER:
+            spread = np.hypot(self.sigma, gusts * self.drift)
+            if gusts < self.gusts and np.sum((self.residual / spread) ** 2) < samples:
+                self.gusts = gusts
+                self.spread = spread
+        return self.gusts < before
 
 
 class InitialFit:
@@ -190,16 +185,16 @@ class InitialFit:
         """
         return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
-    def fit(self, states: States, slopes: Mapping[int, np.ndarray] | None = None) -> States:
+    def fit(self, states: States, slopes: Mapping[int, np.ndarray]) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
         ``states``: to begin with; ``slopes``: of windows' samples by their states, as
-        :attr:`slopes` of another fit has them."""
+        :attr:`slopes` of another fit has them, as far as they are known."""
         remaining = [fit for fit in self._fits if self.flights.cuts[fit.number].retained]
         states = {name: value.copy() for name, value in states.items()}
         flown = self._residuals(rows_of(states, _numbers(remaining)), remaining)
         for fit, residual in zip(remaining, flown):
-            fit.begin(residual, (slopes or {}).get(fit.number))
+            fit.begin(residual, slopes.get(fit.number))
         remaining = [fit for fit in remaining if np.isfinite(fit.cost)]
         for _ in range(ROUNDS):
             if not remaining:

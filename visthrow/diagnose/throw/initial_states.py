@@ -70,6 +70,11 @@ class Direction:
     )
 
     @property
+    def place(self) -> tuple[str, int, str | int]:
+        """Return where it leads, whatever its size."""
+        return self.field, self.axis, self.part
+
+    @property
     def follows(self) -> bool:
         """Whether it goes with the effects: a bend of the rope does not, which would take the place
         of a wrong length.
@@ -100,14 +105,14 @@ def deviations(directions: Sequence[Direction], cuts: Sequence[Cut]) -> np.ndarr
 def directions(plant: PlantParams) -> tuple[Direction, ...]:
     """Directions, vague in whatever a sensing effect can move."""
     controller = plant.vehicle.controller
-    rows = [(field, range(3), sd, step) for field, sd, step in RIGID]
+    listed = [Direction(field, i, sd, step) for field, sd, step in RIGID for i in range(3)]
     if controller.kind != "geometric":
-        gains = [(i, gain) for i, gain in enumerate(controller.i_gain) if gain > 0.0]
-        rows += [("integral", [i], INTEGRAL * gain, 1e-3 * gain) for i, gain in gains]
+        for i, gain in enumerate(controller.i_gain):
+            if gain > 0.0:
+                listed.append(Direction("integral", i, INTEGRAL * gain, 1e-3 * gain))
     if plant.vehicle.motor.kind != "instant":
         hover = np.sqrt(plant.vehicle.body.mass * GRAVITY / 4.0 / plant.vehicle.thrust.k_f)
-        rows.append(("motor_speed", range(4), 0.15 * hover, 1e-4 * hover))
-    listed = [Direction(field, i, sd, step) for field, axes, sd, step in rows for i in axes]
+        listed += [Direction("motor_speed", i, 0.15 * hover, 1e-4 * hover) for i in range(4)]
     for part in ("all", *("last", *range(1, MODES + 1))[: plant.rope.segments - 1]):
         deviations = zip(SHAKEN, BENT) if part != "all" else [(0.1, None), (1.5, None)]
         for field, step, (sd, calm) in zip(ROPE, (1e-4, 1e-3), deviations):
@@ -140,29 +145,33 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
             value = (Rotation.from_quat(value) * Rotation.from_rotvec(turn)).as_quat()
         elif field.startswith("cable"):
             n = out["cable_dir_w"]
-            frame = _tangents(n[:, -1])[
-                :, axes
-            ]  # one plane for the whole rope: that of its mean direction
+            # one plane for the whole rope: that of its mean direction
+            frame = _tangents(n[:, -1])[:, axes]
             shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in members])
             displacement = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
-            value = out[field] + displacement - np.sum(displacement * n, axis=-1, keepdims=True) * n
+            value = out[field] + _across(displacement, n)
             if field == "cable_dir_w":
                 value /= np.linalg.norm(value, axis=-1, keepdims=True)
-                u = states["cable_vel_w"]
-                out["cable_vel_w"] = u - np.sum(u * value, axis=-1, keepdims=True) * value
+                out["cable_vel_w"] = _across(states["cable_vel_w"], value)
         else:
             value[:, axes] += size
         out[field] = value
     return out
 
 
+def _across(vectors: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Return what of vectors is normal to unit vectors, shape (..., 3)."""
+    return vectors - np.sum(vectors * n, axis=-1, keepdims=True) * n
+
+
 def _shape(part: str | int, segments: int) -> np.ndarray:
     """Return the angle by which each segment turns, shape (L,)."""
-    if isinstance(part, int):
-        return np.cos(part * np.pi * (np.arange(segments) + 0.5) / segments)
-    return (
-        np.ones(segments) if part == "all" else (np.arange(segments) == segments - 1).astype(float)
-    )
+    number = np.arange(segments)
+    if part == "all":
+        return np.ones(segments)
+    if part == "last":
+        return (number == segments - 1).astype(float)
+    return np.cos(part * np.pi * (number + 0.5) / segments)
 
 
 def rows_of(states: States, rows: np.ndarray) -> States:
@@ -286,29 +295,34 @@ def _hang(
 def hover_state(flight: RecordedFlight, plant: PlantParams) -> States:
     """A state in hover at the flight's start: what the first window's measurements do not tell."""
     v = plant.vehicle
+    battery = v.battery
     rope = plant.rope
-    L = plant.rope.segments
+    L = rope.segments
     thrust = max(float(flight.command[0, 0]), 0.05)
-    speed = np.sqrt(thrust / 4.0 / v.thrust.k_f)
     power = _power(v, thrust)
     used = _charge(flight, v, power)
-    open_volts = float(np.polynomial.polynomial.polyval(used, v.battery.ocv))
-    sagged = 0.5 * (
-        open_volts + np.sqrt(max(open_volts**2 - 4.0 * v.battery.resistance * power, 0.0))
-    )
-    down = np.array([0.0, 0.0, -1.0])
-    shapes = {"real": (1,), "vec3[]": (1, L, 3)}
-    state = {name: np.zeros(shapes.get(kind, (1, 3))) for name, kind in STATE_FIELDS.items()}
-    below = rope.payload_mass + rope.rope_mass * (np.arange(L, 0, -1) - 0.5) / L
-    state |= {
-        "quat_wb": np.array([[0.0, 0.0, 0.0, 1.0]]),
-        "motor_speed": np.full((1, 4), speed),
-        "setpoint": flight.command[:1, 1:].copy(),
-        "charge_used": np.array([used]),
-        "voltage": np.array([sagged if v.battery.kind == "sag" else v.battery.reference_voltage]),
-        "cable_dir_w": np.tile(down, (1, L, 1)),
-        "stiffness": below[None] * GRAVITY * rope.length / L,
+    volts = battery.reference_voltage
+    if battery.kind == "sag":
+        open_volts = float(np.polynomial.polynomial.polyval(used, battery.ocv))
+        square = open_volts**2 - 4.0 * battery.resistance * power
+        volts = 0.5 * (open_volts + np.sqrt(max(square, 0.0)))
+    shapes = {
+        "real": (1,),
+        "vec4": (1, 4),
+        "quat": (1, 4),
+        "real[]": (1, L),
+        "vec3[]": (1, L, 3),
     }
+    state = {name: np.zeros(shapes.get(kind, (1, 3))) for name, kind in STATE_FIELDS.items()}
+    state["quat_wb"][:, 3] = 1.0
+    state["motor_speed"][:] = np.sqrt(thrust / 4.0 / v.thrust.k_f)
+    state["setpoint"][:] = flight.command[0, 1:]
+    state["charge_used"][:] = used
+    state["voltage"][:] = volts
+    state["cable_dir_w"][..., 2] = -1.0
+    segments_below = np.arange(L, 0, -1) - 0.5
+    mass_below = rope.payload_mass + rope.rope_mass * segments_below / L
+    state["stiffness"][:] = mass_below * GRAVITY * rope.length / L
     return state
 
 

@@ -71,27 +71,21 @@ def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, np.ndarr
         return flight.landing, flight.landing_point
     if flight.payload is None:
         return None
-    track = flight.payload
     down = payload_down(flight, height)
-    above = (
-        (track.time > max(down - TRACK, flight.latch))
-        & (track.time < down + TICK)
-        & (track.values[:, 2] > height)
-    )
-    if (
-        down == NEVER
-        or np.count_nonzero(above) < LEAST_TRACK
-        or track.values[above][-1, 2] > height + 2.0 * GROUND_MARGIN
-    ):
-        return None
+    track = flight.payload.during(max(down - TRACK, flight.latch), down + TICK)
+    above = track.values[:, 2] > height
     time = track.time[above] - down
-    fit = np.polynomial.polynomial.polyfit(time, track.values[above], 2)
-    falls = np.roots((fit[::-1, 2]) - [0.0, 0.0, height])
+    points = track.values[above]
+    if len(time) < LEAST_TRACK or points[-1, 2] > height + 2.0 * GROUND_MARGIN:
+        return None
+    fit = np.polynomial.polynomial.polyfit(time, points, 2)
+    falls = np.roots(fit[::-1, 2] - [0.0, 0.0, height])
     falls = falls[np.isreal(falls)].real
     late = falls[(falls > time[0]) & (falls < TRACK)]
     if not len(late):
         return None
-    return down + float(late.min()), np.polynomial.polynomial.polyval(float(late.min()), fit)
+    first = float(late.min())
+    return down + first, np.polynomial.polynomial.polyval(first, fit)
 
 
 def landings(
@@ -104,22 +98,20 @@ def landings(
     flights to look at; default all."""
     plane = model.setting.plant.release.landing_height
     numbers = range(len(model.flights.flights)) if flights is None else flights
-    measured = {
-        n: landing
-        for n in numbers
-        if (landing := seen_landing(model.flights.flights[n], plane)) is not None
-    }
-    spans = {n: span for n in measured if (span := _spans(model, n)) is not None}
-    if not spans:
+    before, separating, ends, points = {}, {}, {}, {}
+    for n in numbers:
+        landing = seen_landing(model.flights.flights[n], plane)
+        spans = None if landing is None else _spans(model, n)
+        if spans is None:
+            continue
+        before[n], separating[n] = spans
+        ends[n] = landing[0] + AFTERWARDS
+        points[n] = landing[1]
+    if not points:
         return PredictedLandings(np.zeros(0, dtype=int), *np.zeros((3, 0, 3)))
-    ends = {n: measured[n][0] + AFTERWARDS for n in spans}
-    paths = [
-        _fly(model, theta, {n: spans_of[k] for n, spans_of in spans.items()}, ends)
-        for k in range(2)
-    ]
-    return PredictedLandings(
-        np.array(list(spans)), np.array([measured[n][1] for n in spans]), *paths
-    )
+    predicted, released = (_fly(model, theta, spans, ends) for spans in (before, separating))
+    measured = np.array(list(points.values()))
+    return PredictedLandings(np.array(list(points)), measured, predicted, released)
 
 
 def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, float]] | None:
@@ -131,17 +123,14 @@ def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, f
     cuts = [c for c in model.flights.cuts if c.flight == number and c.start < separation]
     if not cuts:
         return None
-    slack = [(c.start, c.end) for c in cuts if not c.retained]
-    end = min(
-        [separation - LEAD + HEAD, *[first for first, last in slack if last > separation - LEAD]]
-    )
-    last = max([separation - BEFORE, cuts[0].start, *[last for _, last in slack]])
-    head = max(end - HEAD, cuts[0].start), end
-    return (
-        (head, (last, separation))
-        if head[1] - head[0] > SHORTEST and separation - last > LEAST_TAUT
-        else None
-    )
+    slack = [c for c in cuts if not c.retained]
+    near = [c.start for c in slack if c.end > separation - LEAD]
+    end = min([separation - LEAD + HEAD, *near])
+    begin = max(end - HEAD, cuts[0].start)
+    last = max([separation - BEFORE, cuts[0].start, *[c.end for c in slack]])
+    if end - begin <= SHORTEST or separation - last <= LEAST_TAUT:
+        return None
+    return (begin, end), (last, separation)
 
 
 def _fly(

@@ -59,20 +59,19 @@ def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[
 
     ``window``: with all columns; ``wind_w``: of the setting [m/s].
     """
-    knots = window.knots
-    if (
-        "vel_w" not in knots
-        or np.sqrt(np.mean(np.sum((knots["vel_w"] - wind_w) ** 2, axis=1))) > CALM_SPEED
-    ):
+    knots = dict(window.knots)
+    if _typical_speed(knots["vel_w"] - wind_w) > CALM_SPEED:
         return window
-    calm = {"vel_w": np.zeros_like(knots["vel_w"])}
-    if (
-        "payload_vel_w" in knots
-        and np.sqrt(np.mean(np.sum(knots["payload_vel_w"] ** 2, axis=1))) < CALM_SPEED
-    ):
-        calm["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
+    knots["vel_w"] = np.zeros_like(knots["vel_w"])
+    if "payload_vel_w" in knots and _typical_speed(knots["payload_vel_w"]) < CALM_SPEED:
+        knots["payload_vel_w"] = np.zeros_like(knots["payload_vel_w"])
     unaffected = np.array([block != AERODYNAMIC for block in blocks])
-    return replace(window, effects=window.effects * unaffected, knots={**knots, **calm})
+    return replace(window, effects=window.effects * unaffected, knots=knots)
+
+
+def _typical_speed(vel: np.ndarray) -> float:
+    """Return the root mean square of velocities, shape (k, 3)."""
+    return np.sqrt(np.mean(np.sum(vel**2, axis=1)))
 
 
 @dataclass(frozen=True)
@@ -162,20 +161,16 @@ class Linearisation:
         axes = 6 if c.payload == NO_PAYLOAD else 9
         latents = np.stack(np.mgrid[:axes, :knots], axis=-1).reshape(-1, 2)
         # 0: rides along, 1: of nominal steps, 2: of longer ones
-        group = np.concatenate(
-            (
-                np.where(alike, 0, np.where(fine, 1, 2)),
-                np.full(len(states), 1 if c.after_slack else 2),
-                np.full(len(latents), 2),
-            )
-        )
+        of_effects = np.where(alike, 0, np.where(fine, 1, 2))
+        of_states = np.full(len(states), 1 if c.after_slack else 2)
+        of_latents = np.full(len(latents), 2)
+        group = np.concatenate((of_effects, of_states, of_latents))
         rough_first = 1 + np.count_nonzero(group < 2)
         order = np.argsort(group, kind="stable")
         windows = len(self._flights.cuts)
-        columns = [Lane(w, 1 + k, w, rough=not fine[k]) for k in range(len(fine))]
-        columns += [
-            Lane(w, 0, (1 + d) * windows + w, rough=not c.after_slack) for d in states.tolist()
-        ]
+        columns = [Lane(w, 1 + k, w, rough=not x) for k, x in enumerate(fine)]
+        for d in states.tolist():
+            columns.append(Lane(w, 0, (1 + d) * windows + w, rough=not c.after_slack))
         for axis, knot in latents.tolist():
             resume = first_knot + knots + max(knot - 1, 0)
             force = axis, knot, LATENT_SIZES[axis]
@@ -186,12 +181,8 @@ class Linearisation:
         lanes.insert(rough_first, Lane(w, 0, w, keep=first_knot + knots, rough=True))
         rough = group == 2
         place = np.argsort(order) + 1 + rough
-        sizes = (
-            self._steps,
-            self._state_steps[states],
-            np.array(LATENT_SIZES)[latents[:, 0]],
-        )
-        steps = np.concatenate(sizes)
+        latent_steps = np.array(LATENT_SIZES)[latents[:, 0]]
+        steps = np.concatenate((self._steps, self._state_steps[states], latent_steps))
         nominal = rough_first * rough
         return Plan(w, lanes, first, first_knot, place, nominal, steps, states, latents)
 
@@ -255,15 +246,12 @@ def at_knots(
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]
     time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
-    values = {"time": np.minimum(time, c.end)} | {
-        name: value.copy() for name, value in knots.items()
-    }
+    values = {name: value.copy() for name, value in knots.items()}
+    values["time"] = np.minimum(time, c.end)
     if c.payload == NO_PAYLOAD:
-        return {
-            name: value
-            for name, value in values.items()
-            if not name.startswith("payload") and name != "tension"
-        }
+        for name in ("payload_pos_w", "payload_vel_w", "tension"):
+            del values[name]
+        return values
     arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
     values["mount_b"] = np.tile(arm, (len(time), 1))
     reach = KnotValues(values)["reach_w"]

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
-from scipy.signal import savgol_coeffs
+from scipy.signal import savgol_filter
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
@@ -129,17 +128,15 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     stride = int(1.0 / (SUFFICIENT_RATE * np.median(steps)) + 0.1)  # clocks are some per cent off
     if stride < 2:
         return time, values
-    weights = savgol_coeffs(2 * stride + 1, 2)
-    parts = []
-    for stretch in np.split(
-        np.arange(len(time)), np.flatnonzero(steps > 1.5 / SUFFICIENT_RATE) + 1
-    ):
-        if len(stretch) >= len(weights):
-            averaged = sliding_window_view(
-                np.column_stack((time, values))[stretch], len(weights), axis=0
-            )[::stride]
-            parts.append(averaged @ weights)
-    thinned = np.concatenate(parts) if parts else np.zeros((0, 1 + values.shape[1]))
+    width = 2 * stride + 1
+    gaps = np.flatnonzero(steps > 1.5 / SUFFICIENT_RATE) + 1
+    table = np.column_stack((time, values))
+    parts = [table[:0]]
+    for stretch in np.split(table, gaps):
+        if len(stretch) >= width:
+            smooth = savgol_filter(stretch, width, 2, axis=0)
+            parts.append(smooth[stride:-stride:stride])
+    thinned = np.concatenate(parts)
     return thinned[:, 0], thinned[:, 1:]
 
 
@@ -171,12 +168,14 @@ def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:
         )
     pos = _samples(log, "pos_w")
     quat = _samples(log, "quat_wb")
-    landing, landing_point = _landing(log)
     if pos is None or quat is None:
         raise DiagnoseError(f"flight {number} holds fewer than five poses of the vehicle")
     pos, quat = _paired(pos, quat, number)
+    landing, landing_point = _landing(log)
+    time, command = log["command"].samples()
     return RecordedFlight(
-        *log["command"].samples(),
+        time,
+        command,
         _latch(log),
         landing,
         pos,

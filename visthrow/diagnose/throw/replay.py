@@ -72,16 +72,18 @@ def step_lengths(setting: Setting, substep: float) -> tuple[float, float]:
     """
     controller = setting.plant.vehicle.controller
     motor = setting.plant.vehicle.motor
-    lags = (
-        [controller.gyro_time_constant, controller.setpoint_time_constant]
-        if controller.kind != "geometric"
-        else []
-    )
-    lags += [motor.time_constant] if motor.kind != "instant" else []
-    lags += [motor.time_constant_down] if motor.kind == "asymmetric" else []
-    nominal = substep * np.sqrt(max(setting.step_square, FINEST))
-    longer = substep * np.sqrt(max(setting.step_square, FINEST) + ROUGHER)
-    return nominal, max(nominal, min([longer, *[STABLE * lag for lag in lags]]))
+    lags = []
+    if controller.kind != "geometric":
+        lags += [controller.gyro_time_constant, controller.setpoint_time_constant]
+    if motor.kind != "instant":
+        lags.append(motor.time_constant)
+    if motor.kind == "asymmetric":
+        lags.append(motor.time_constant_down)
+    square = max(setting.step_square, FINEST)
+    nominal = substep * np.sqrt(square)
+    longer = substep * np.sqrt(square + ROUGHER)
+    stable = [STABLE * lag for lag in lags]
+    return nominal, max(nominal, min([longer, *stable]))
 
 
 class Simulation:
@@ -165,17 +167,17 @@ class ReplayedFlights:
         self.recording = Recording(self.windows, self._recorded())
         self.rows = self.recording.rows
         self._groups = [_groups_of(*samples) for samples in self.samples]
-        self.sigma = [
-            self.spread(w, *[part.sigma for part in samples])
-            for w, samples in enumerate(self.samples)
-        ]
+        self.sigma = []
         self.time = []
         self._measured = []
-        for groups, (vehicle, _, payload, gyro) in zip(self._groups, self.samples):
-            stamps = np.repeat(vehicle.time, 2), payload.time, gyro.time
-            self.time.append(np.repeat(np.concatenate(stamps), 3))
-            measured = np.zeros((len(groups), 3))  # attitudes are measured against themselves
-            measured[groups != 1] = np.concatenate((vehicle.values, payload.values, gyro.values))
+        for w, (vehicle, _, payload, gyro) in enumerate(self.samples):
+            sigmas = [part.sigma for part in self.samples[w]]
+            self.sigma.append(self.spread(w, *sigmas))
+            stamps = vehicle.time.repeat(2), payload.time, gyro.time
+            self.time.append(np.concatenate(stamps).repeat(3))
+            measured = np.zeros((len(self._groups[w]), 3))
+            shown = self._groups[w] != 1  # attitudes are measured against themselves
+            measured[shown] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
     def _recorded(self) -> dict[str, np.ndarray]:
@@ -194,11 +196,11 @@ class ReplayedFlights:
         """Return the window's samples of vehicle, attitude, payload and gyro."""
         f = self.flights[c.flight]
         payload = f.payload if c.payload in (ATTACHED, LOOSE) else None
-        sources = zip((f.vehicle, f.attitude, payload, f.gyro), (delays[0], *delays))
-        return [
-            (source or NO_SAMPLES).during(c.start + delay + EARLY, c.end + delay)
-            for source, delay in sources
-        ]
+        samples = []
+        for source, delay in zip((f.vehicle, f.attitude, payload, f.gyro), (delays[0], *delays)):
+            source = source or NO_SAMPLES
+            samples.append(source.during(c.start + delay + EARLY, c.end + delay))
+        return samples
 
     def _row(self, w: int) -> dict[str, float]:
         """Return a window's fields, without the ranges of its stamps."""
@@ -266,10 +268,8 @@ class ReplayedFlights:
         rough = columns.pop("rough").astype(int)
         fineness = self._fineness[columns["window"], rough]
         columns["substep"] = simulation.steps[columns["plant"], rough] * fineness
-        retained = columns["keep"] >= 0
-        knots = max(
-            1, int(np.max((columns["keep"] + self.knots[columns["window"]])[retained], initial=1))
-        )
+        behind = columns["keep"] + self.knots[columns["window"]]
+        knots = int(np.max(behind[columns["keep"] >= 0], initial=1))
         return simulation.replay.run(
             states, recording or self.recording, columns, KNOT_SPACING, knots
         )
@@ -313,7 +313,8 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
     by_flight = groupby(range(len(flights.cuts)), key=lambda w: flights.cuts[w].flight)
     states: list[States | None] = [None] * len(flights.cuts)
     ends: list[States | None] = [None] * len(flights.cuts)
-    for k, side_by_side in enumerate(zip_longest(*[list(group) for _, group in by_flight])):
+    columns = zip_longest(*[list(group) for _, group in by_flight])
+    for k, side_by_side in enumerate(columns):
         windows = [w for w in side_by_side if w is not None]
         for w in windows:
             c = flights.cuts[w]

@@ -5,6 +5,7 @@ commands.
 import dataclasses
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -53,6 +54,7 @@ UNKNOWN_CHARGE = "{} of {} logs hold no battery_voltage: the charge at their sta
 OTHER_CHARGE = (
     "; battery_charge stands for a fuller or emptier pack, which intervals of thrust leave out"
 )
+REPLAYED = ("pos_w", "quat_wb", "payload_pos_w", "rate_b")  # channels that a replay shows
 AFTER_SLACK = 0.05  # that a rope is given to come taut [s]
 FINER = 4  # times as fine a step, by which the step's error is measured
 
@@ -102,33 +104,30 @@ class ThrowModel(Model):
             limit_threads_beside_gpu()
         flights = [record_of(log, i) for i, log in enumerate(logs)]
         hangs = carriers(flights) if carries is None else [carries] * len(flights)
-        carries = any(hangs)
         states = self._settled_without_slack(flights, self._cuts_of(flights, hangs))
         self._retained = np.array([w for w, c in enumerate(self.flights.cuts) if c.retained])
         self._direct = direct_measurements(logs, flights, self.flights.cuts, self.setting)
-        self.channels = [*_measured(flights, carries), *(kind.channel for kind in self._direct)]
+        self.channels = [*_measured(flights, any(hangs)), *(kind.channel for kind in self._direct)]
         thrown = any(f.latch != NEVER for f in flights)
-        measured = {*self.channels, *(["battery_voltage"] if self.has_voltage else [])}
-        concerned = effects_for(self.setting, measured, carries, thrown, simpler)
-        self._choose(concerned, concerned if only is None else only)
         silent = sum(f.voltage is None for f in flights)
+        self.has_voltage = silent < len(flights)  # whether any log holds the battery's voltage
+        measured = set(self.channels)
+        if self.has_voltage:
+            measured.add("battery_voltage")
+        concerned = effects_for(self.setting, measured, any(hangs), thrown, simpler)
+        self._choose(concerned, concerned if only is None else only)
         if silent and plant.vehicle.battery.kind == "sag":
             other = OTHER_CHARGE if "battery_charge" in self.entries else ""
             self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + other)
         fitter = self._initial_fit(self.setting, self.flights)
-        begun = fitter.fit(states)
+        begun = fitter.fit(states, {})
         # states at theta = 0, and the samples' derivatives by them
-        self._nominal: tuple[States, dict[int, np.ndarray]] = begun, fitter.slopes
+        self._nominal = begun, fitter.slopes
         # by kinds of blocks: the latest states, and what their fit took from windows' residuals
         self._latest: dict[frozenset[str], tuple[States, Sequence]] = {}
         self._latest[frozenset()] = begun, self._none
         self._settled_at: dict[frozenset[tuple[str, float]], States] = {}
         self._lock = threading.Lock()  # residuals may be asked for side by side
-
-    @property
-    def has_voltage(self) -> bool:
-        """Return whether any flight's log holds the battery's voltage."""
-        return any(f.voltage is not None for f in self.flights.flights)
 
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
         """Cut flights into windows, fewer where there are many."""
@@ -177,9 +176,8 @@ class ThrowModel(Model):
         self._switched = [e for e in effects if e.switch]
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
-        self._secants: dict[
-            str, list[np.ndarray]
-        ] = {}  # of other kinds of blocks, by their name, where they were asked for first
+        # of other kinds of blocks, by their name, where they were asked for first
+        self._secants: dict[str, list[np.ndarray]] = {}
 
     def at(self, theta: Mapping[str, float]) -> Setting:
         """Return the setting with effects of these sizes."""
@@ -286,12 +284,11 @@ class ThrowModel(Model):
         flown = self._flown(setting, states)
         residuals = []
         for i, (w, residual, offset) in enumerate(zip(self._retained, flown, fitted)):
-            direct = [
-                kind.samples(w)[1] - kind.predicted(w, setting)
-                for kind in self._direct
-                if w in kind.windows
-            ]
-            residual = np.concatenate((residual + offset, *direct))
+            parts = [residual + offset]
+            for kind in self._direct:
+                if w in kind.windows:
+                    parts.append(kind.samples(w)[1] - kind.predicted(w, setting))
+            residual = np.concatenate(parts)
             if i in moves:
                 residual = residual + linearised.windows[i].nuisance @ moves[i]
             residuals.append(residual)
@@ -369,18 +366,14 @@ class ThrowModel(Model):
         """See :func:`visthrow.diagnose.throw.landing.landings`."""
         return landings(self, theta, flights)
 
-    def begun(
-        self, theta: Mapping[str, float], cuts: Sequence[Cut] | None = None
-    ) -> tuple[Setting, States]:
-        """The setting with effects at ``theta``, and initial states fitted in it.
-
-        ``cuts``: windows of the model's flights; default the model's."""
+    def begun(self, theta: Mapping[str, float], cuts: Sequence[Cut]) -> tuple[Setting, States]:
+        """The setting with effects at ``theta``, and states fitted in it at the starts of windows
+        of the model's flights.
+        """
         setting = self.at(theta)
-        if cuts is None:
-            return setting, self._settled(setting)
         flights = self.cut_into(self.flights.flights, cuts)
         start, _ = self._settled_throughout(setting, flights)
-        return setting, self._initial_fit(setting, flights).fit(start)
+        return setting, self._initial_fit(setting, flights).fit(start, {})
 
     def simulation(
         self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded
@@ -406,12 +399,10 @@ class ThrowModel(Model):
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting, self.flights)
-        kinds = [
-            [(x.field, x.axis, x.part) for x in members]
-            for members in (fitter.directions, directions(self.setting.plant))
-        ]
         start, _ = self._settled_throughout(setting, self.flights)
-        return fitter.fit(start, slopes if kinds[0] == kinds[1] else None)
+        known = [way.place for way in directions(self.setting.plant)]
+        alike = [way.place for way in fitter.directions] == known
+        return fitter.fit(start, slopes if alike else {})
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:
@@ -422,10 +413,9 @@ class ThrowModel(Model):
         return -step if theta + step > e.bounds[1] else step
 
     def _channel(self, w: int) -> np.ndarray:
-        index = {name: i for i, name in enumerate(self.channels)}
-        return self.flights.spread(
-            w, 0, 1, index.get("payload_pos_w", -1), index.get("rate_b", -1)
-        ).astype(int)
+        listed = list(self.channels)
+        numbers = [listed.index(name) if name in listed else -1 for name in REPLAYED]
+        return self.flights.spread(w, *numbers).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
         """The windows, with the time in which the rope was slack until their ends cut out; those
@@ -439,11 +429,11 @@ class ThrowModel(Model):
             separation = self.flights.flights[c.flight].latch + self.setting.plant.release.lag
             if c.payload == ATTACHED and c.start < rings.get(c.flight, -np.inf):
                 c = dataclasses.replace(c, after_slack=True)
-            if last >= c.start:
-                rings[c.flight] = last + RINGING
-            cuts += (
-                [c] if last < c.start else around_slack(c, first, last + AFTER_SLACK, separation)
-            )
+            if last < c.start:
+                cuts.append(c)
+                continue
+            rings[c.flight] = last + RINGING
+            cuts += around_slack(c, first, last + AFTER_SLACK, separation)
         return cuts
 
 
@@ -456,23 +446,24 @@ def effects_for(
     ``simpler``: whether blocks simpler than the setting's are considered.
     """
     chosen = {}
+    unconcerned: set[str] = set()  # blocks
+    if not payload:
+        unconcerned |= {"rope", "rope mount", "payload", "payload air"}
+    if not releases:
+        unconcerned |= {"release", "ballistic"}
+    missing = {"rate_b", "landing"} - channels
     for name, e in catalogue().items():
+        if e.block in unconcerned or not e.applies(setting):
+            continue
         if e.simpler and not simpler:
-            continue
-        if e.block in ("rope", "rope mount", "payload", "payload air") and not payload:
-            continue
-        if (e.block in ("release", "ballistic") and not releases) or not e.applies(setting):
             continue
         if name == "battery_charge" and "battery_voltage" in channels:
             continue
-        if any(c in e.channels and c not in channels for c in ("rate_b", "landing")):
+        of_payload = name.startswith(("payload_marker", "mocap_delay_payload"))
+        if of_payload and "payload_pos_w" not in channels:
             continue
-        if (
-            name.startswith(("payload_marker", "mocap_delay_payload"))
-            and "payload_pos_w" not in channels
-        ):
-            continue
-        chosen[name] = e.bounded(setting)
+        if missing.isdisjoint(e.channels):
+            chosen[name] = e.bounded(setting)
     return chosen
 
 
@@ -483,5 +474,5 @@ def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
 
 def _measured(flights: Sequence[RecordedFlight], carries: bool) -> list[str]:
     """Return the channels of poses and rates that these flights have."""
-    payload = ["payload_pos_w"] if carries and any(f.payload for f in flights) else []
-    return ["pos_w", "quat_wb", *payload, *(["rate_b"] if any(f.gyro for f in flights) else [])]
+    shown = [True, True, carries and any(f.payload for f in flights), any(f.gyro for f in flights)]
+    return list(compress(REPLAYED, shown))

@@ -351,17 +351,18 @@ class FlyerModel(NumericModel):
 
         def quantities(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
             values = {name: table[:, half + self._spare] for name, table in measured.items()}
-            values |= {"time": np.zeros(len(state)), "thrust": total[half], "slope": rise[half]}
-            values |= {"pos_w": state[:, :3], "vel_w": state[:, 3:6]}
+            values["time"] = np.zeros(len(state))
+            values["thrust"] = total[half]
+            values["slope"] = rise[half]
+            values["pos_w"] = state[:, :3]
+            values["vel_w"] = state[:, 3:6]
             if cable is not None:
                 direction, pull = hung_at(half, state)
-                values |= {
-                    "payload_pos_w": state[:, :3] + state[:, 6:9],
-                    "payload_vel_w": state[:, 3:6] + state[:, 9:12],
-                    "cable_dir_w": direction,
-                    "tension": pull[:, 0],
-                    "mount_b": np.tile(cable.mount, (len(state), 1)),
-                }
+                values["payload_pos_w"] = state[:, :3] + state[:, 6:9]
+                values["payload_vel_w"] = state[:, 3:6] + state[:, 9:12]
+                values["cable_dir_w"] = direction
+                values["tension"] = pull[:, 0]
+                values["mount_b"] = np.tile(cable.mount, (len(state), 1))
             return values
 
         return quantities

@@ -60,16 +60,19 @@ def cut_flying(
     # hours are thinned before they are cut
     stride = max(1, len(starts) // (4 * params.most_windows))
     for start in starts[::stride].tolist():
-        if all(covered(c, start, start + params.window) for c in driven):
-            inputs = held_inputs(log[params.input], params, start)
-            if flies(inputs, params):
-                rows = [take_samples(log[name], params, start) for name in channels]
-                tables = [(*row, sd) for row, sd in zip(rows, sigma)]
-                middle = np.array([start + 0.5 * params.window])
-                volts = log["battery_voltage"].hold(middle)[0] if "battery_voltage" in log else 0.0
-                since = start - float(log[params.input].time[0])
-                common = {"start": start, "input": inputs, "volts": float(volts), "since": since}
-                yield start, tables, common
+        if not all(covered(c, start, start + params.window) for c in driven):
+            continue
+        inputs = held_inputs(log[params.input], params, start)
+        if not flies(inputs, params):
+            continue
+        rows = [take_samples(log[name], params, start) for name in channels]
+        tables = [(*row, sd) for row, sd in zip(rows, sigma)]
+        common: dict[str, Any] = {"start": start, "input": inputs, "volts": 0.0}
+        common["since"] = start - float(log[params.input].time[0])
+        if "battery_voltage" in log:
+            middle = np.array([start + 0.5 * params.window])
+            common["volts"] = float(log["battery_voltage"].hold(middle)[0])
+        yield start, tables, common
 
 
 def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch]:
