@@ -181,7 +181,8 @@ def _unit(i: int) -> Callable[[KnotValues], np.ndarray]:
 
 
 def _slope(k: KnotValues) -> np.ndarray:
-    return np.gradient(k["thrust"], k["time"]) if len(k["time"]) > 1 else np.zeros(len(k["time"]))
+    thrust = k["thrust"]
+    return np.gradient(thrust, k["time"]) if len(thrust) > 1 else np.zeros(len(thrust))
 
 
 def _swing(k: KnotValues) -> np.ndarray:

@@ -397,7 +397,8 @@ class NumericModel(Model, ABC):
         """Return the Gauss-Newton step of a window's unknowns; 0 where it promises little."""
         s = self.stretches[i]
         none = np.zeros(len(s.start))
-        rows = np.concatenate([self._slopes[i] / s.sigma[:, None], np.diag(1.0 / s.nuisance_sd)])
+        prior = np.diag(1.0 / s.nuisance_sd)
+        rows = np.concatenate([self._slopes[i] / s.sigma[:, None], prior])
         if not (np.all(np.isfinite(aim)) and np.all(np.isfinite(rows))):
             return none  # no step mends that; the search says which window it is
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]

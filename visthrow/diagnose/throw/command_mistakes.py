@@ -136,7 +136,8 @@ def _calibrated(log: FlightLog) -> tuple[float, float, float, float] | None:
     if "acc_b" not in log or np.std(share[rows]) < VARIED * hover:
         return hover, 1.0, start, end
     acc = log["acc_b"].samples()
-    grid = time[rows][(time[rows] > acc.time[0] + 0.2) & (time[rows] < acc.time[-1] - 0.2)]
+    first, last = acc.time[[0, -1]]
+    grid = time[rows & (time > first + 0.2) & (time < last - 0.2)]
     force = relations.mean_over(*acc, grid + LATE, 0.1)[:, 2] / GRAVITY
     commanded = relations.mean_over(time, values, grid, 0.1)[:, 0] / hover
     slope, level = np.polyfit(commanded, force, 1)

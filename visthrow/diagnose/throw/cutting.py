@@ -88,12 +88,15 @@ def cut(
         end = min(down, last)
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
-    cuts = [Cut(number, phase or _phase(flight, a, b), a, b, mode) for a, b, phase, mode in spans]
-    return [
-        replace(c, at_rest=before.phase == "hover")
-        for before, c in pairwise([*cuts[:1], *cuts])  # of before the first nothing is known
-        if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST
-    ]
+    cuts = []
+    at_rest = False
+    for start, end, kind, payload in spans:
+        phase = kind or _phase(flight, start, end)
+        if not cuts:  # what was before the first is taken for alike
+            at_rest = phase == "hover"
+        cuts.append(Cut(number, phase, start, end, payload, at_rest=at_rest))
+        at_rest = phase == "hover"
+    return [c for c in cuts if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST]
 
 
 def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:

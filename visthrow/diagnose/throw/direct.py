@@ -236,8 +236,9 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     that are smoothed on a grid about them.
     """
     channel = measured(log, KEYPOINTS)
+    first, last = flight.payload.time[[0, -1]]
     during = channel.valid & (channel.time >= c.start) & (channel.time < c.end)
-    during &= (channel.time > flight.payload.time[0]) & (channel.time < flight.payload.time[-1])
+    during &= (channel.time > first) & (channel.time < last)
     if np.count_nonzero(during) < 5:
         return None
     valid = np.asarray(log["keypoints_valid"].values, dtype=bool)
@@ -250,13 +251,12 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
         goal = np.zeros(3)
         visible[:, :4] = False
     grid = np.arange(stamps[0] - 3 * GRID, stamps[-1] + 4 * GRID, GRID)
-    tracks = {
-        "vehicle": (flight.vehicle, x.vehicle_delay),
-        "attitude": (flight.attitude, x.vehicle_delay),
-        "payload": (flight.payload, x.payload_delay),
-    }
     view = {}
-    for name, (track, delay) in tracks.items():
+    for name, track, delay in (
+        ("vehicle", flight.vehicle, x.vehicle_delay),
+        ("attitude", flight.attitude, x.vehicle_delay),
+        ("payload", flight.payload, x.payload_delay),
+    ):
         stamped = replace(track, time=track.time - delay)  # at the times that they show
         fits = [smoothed(stamped, t, SMOOTHING_SECONDS, SMOOTHING_SECONDS) for t in grid]
         if any(fit is None for fit in fits):

@@ -102,7 +102,8 @@ class _WindowFit:
         off = np.abs(residual) / self.spread
         if not np.all(off < FARTHEST):
             return np.inf
-        return float(np.sum(np.where(off < HUBER, 0.5 * off**2, HUBER * (off - 0.5 * HUBER))))
+        near = np.minimum(off, HUBER)
+        return float(np.sum(near * (off - 0.5 * near)))
 
     def increment(self, done: np.ndarray) -> tuple[np.ndarray, float]:
         """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the
@@ -299,6 +300,6 @@ def perturbed(states: States, directions: Sequence[Direction]) -> States:
     parts = [states]
     for _, members in groupby(directions, key=lambda d: d.field):
         group = list(members)
-        steps = np.repeat(np.diag([d.step for d in group]), len(rows), axis=0)
+        steps = np.diag([d.step for d in group]).repeat(len(rows), axis=0)
         parts.append(moved_along(rows_of(states, np.tile(rows, len(group))), group, steps))
     return stacked(parts)

@@ -123,7 +123,8 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
 
 def _tangents(n: np.ndarray) -> np.ndarray:
     """Two unit vectors normal to each direction, shape (..., 2, 3)."""
-    axis = np.where(np.abs(n[..., :1]) < 0.7, [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    x_axis, y_axis, _ = np.eye(3)
+    axis = np.where(np.abs(n[..., :1]) < 0.7, x_axis, y_axis)
     first = np.cross(n, axis)
     first /= np.linalg.norm(first, axis=-1, keepdims=True)
     return np.stack((first, np.cross(n, first)), axis=-2)
@@ -240,10 +241,9 @@ def measured_state(
     out = {name: value.copy() for name, value in inner.items()}
     x = setting.sensing
     plant = setting.plant
-    (pos, vel), (quat, rate) = (
-        smoothed(samples, time + x.vehicle_delay) or (samples.values[0], np.zeros(3))
-        for samples in (flight.vehicle, flight.attitude)
-    )
+    shown = time + x.vehicle_delay
+    pos, vel = smoothed(flight.vehicle, shown) or (flight.vehicle.values[0], np.zeros(3))
+    quat, rate = smoothed(flight.attitude, shown) or (flight.attitude.values[0], np.zeros(3))
     attitude = without_marker(x, Rotation.from_quat(quat))
     rate = Rotation.from_rotvec(x.marker_rotation).apply(rate)
     gyro = flight.gyro and smoothed(flight.gyro, time + x.gyro_delay)

@@ -142,7 +142,9 @@ def _fly(
     """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``,
     shape (F, 3).
     """
-    cuts = [c for n, (begin, end) in spans.items() for c in _approach(model, n, begin, end)]
+    cuts: list[Cut] = []
+    for n, (begin, end) in spans.items():
+        cuts += _approach(model, n, begin, end)
     setting, states = model.begun(theta, cuts)
     release = setting.plant.release
     retained = [w for w, c in enumerate(cuts) if c.retained]
@@ -175,12 +177,14 @@ def _with_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
     if end is None:
         return flight
     time = np.arange(flight.latch, end + 1.0, TICK)
-    return replace(flight, payload=ChannelSamples(time, np.zeros((len(time), 3)), 1.0), gyro=None)
+    payload = ChannelSamples(time, np.zeros((len(time), 3)), 1.0)
+    return replace(flight, payload=payload, gyro=None)
 
 
 def _crossing(path: np.ndarray, height: float) -> np.ndarray:
     """Return where a path, shape (T, 3), comes down through a height; NaN where it does not."""
-    down = np.flatnonzero((path[:-1, 2] > height) & (path[1:, 2] <= height))
+    above = path[:, 2] > height
+    down = np.flatnonzero(above[:-1] & ~above[1:])
     if not len(down):
         return np.full(3, np.nan)
     a = path[down[0]]

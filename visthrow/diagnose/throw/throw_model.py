@@ -30,6 +30,7 @@ from visthrow.diagnose.throw.direct import (
 from visthrow.diagnose.throw.initial_fit import InitialFit, following, perturbed
 from visthrow.diagnose.throw.initial_states import (
     MOVED,
+    Direction,
     States,
     deviations,
     directions,
@@ -133,7 +134,9 @@ class ThrowModel(Model):
         """Cut flights into windows, fewer where there are many."""
         release = self.setting.plant.release
         known = release.lag, release.landing_height
-        cuts = [c for i, f in enumerate(flights) for c in cut(f, i, *known, hangs[i])]
+        cuts: list[Cut] = []
+        for i, flight in enumerate(flights):
+            cuts += cut(flight, i, *known, hangs[i])
         if not cuts:
             raise DiagnoseError(
                 f"{len(flights)} flights hold no stretch of poses and commands long enough to"
@@ -204,13 +207,15 @@ class ThrowModel(Model):
         listed: list[Window] = []
         for batch in grouped(self._retained, lanes, room):
             listed += linearisation.windows(batch, [self._channel(w) for w in batch])
-        fitted = [x.nuisance @ self._moved(states, w) for w, x in zip(self._retained, listed)]
+        present = self._present(self._directions)
+        fitted = []
+        for w, window in zip(self._retained, listed):
+            fitted.append(window.nuisance @ states[MOVED][w, present[w]])
         self._latest[self._switches(theta)] = states, fitted
-        listed = self._with_switches(theta, listed)
-        return [
-            with_direct(w, number, self._direct, self.channels, settings, steps)
-            for number, w in zip(self._retained, listed)
-        ]
+        whole = []
+        for w, window in zip(self._retained, self._with_switches(theta, listed)):
+            whole.append(with_direct(window, w, self._direct, self.channels, settings, steps))
+        return whole
 
     def _with_switches(self, theta: Mapping[str, float], listed: list[Window]) -> list[Window]:
         """Return windows with columns of other kinds of blocks, and empty ones of what cameras
@@ -242,28 +247,25 @@ class ThrowModel(Model):
         start = self._settled(perturbed)
         self._latest[self._switches(elsewhere)] = start, self._none
         sign = -1.0 if on else 1.0
-        _, before = self._latest[self._switches(theta)]
-        return [
-            sign * (x.residual - before_row - after_row)
-            for x, before_row, after_row in zip(windows, before, self._flown(perturbed, start))
-        ]
+        _, fitted = self._latest[self._switches(theta)]
+        columns = []
+        for window, offset, after in zip(windows, fitted, self._flown(perturbed, start)):
+            columns.append(sign * (window.residual - offset - after))
+        return columns
 
     @property
     def _none(self) -> np.ndarray:
         """Return a fit that took nothing from any window."""
         return np.zeros(len(self._retained))
 
-    def _moved(self, states: States, w: int) -> np.ndarray:
-        """Return how far a window's state is from the middle of its prior, in its directions, shape
-        (D,).
-        """
-        return states[MOVED][w, deviations(self._directions, [self.flights.cuts[w]])[0] > 0.0]
+    def _present(self, ways: Sequence[Direction]) -> np.ndarray:
+        """Return which directions windows' states have, shape (W, directions), bool."""
+        return deviations(ways, self.flights.cuts) > 0.0
 
     def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
-        measured = self.flights.fly(
-            self.simulation(setting), states, [Lane(w, 0, w) for w in self._retained]
-        ).seen
+        lanes = [Lane(w, 0, w) for w in self._retained]
+        measured = self.flights.fly(self.simulation(setting), states, lanes).seen
         return [self.flights.residual(measured, w, lane) for lane, w in enumerate(self._retained)]
 
     def residuals(
@@ -329,14 +331,15 @@ class ThrowModel(Model):
         """States that belong to other sizes of the effects by the derivatives, and how each
         window's were moved.
         """
-        change = [theta.get(name, 0.0) - linearised.theta.get(name, 0.0) for name in self.entries]
+        before = linearised.theta
+        change = np.array([theta.get(name, 0.0) - before.get(name, 0.0) for name in self.entries])
         ways = directions(setting.plant)
-        present = deviations(ways, self.flights.cuts) > 0.0
+        present = self._present(ways)
         follows = np.array([x.follows for x in ways])
         lag = self.setting.plant.release.lag
 
         def move(w: int, window: Window) -> np.ndarray:
-            return following(self.flights, w, window, follows[present[w]], np.array(change), lag)
+            return following(self.flights, w, window, follows[present[w]], change, lag)
 
         numbers = self._retained[list(linearised.windows)]
         sizes = np.zeros(present.shape)
@@ -357,7 +360,8 @@ class ThrowModel(Model):
         worst = np.zeros(len(self.channels))
         flown = (self._flown(setting, self._nominal[0]) for setting in (self.setting, fine))
         for w, plain, finer in zip(self._retained, *flown):
-            np.fmax.at(worst, self._channel(w), np.abs(plain - finer) / self.flights.sigma[w])
+            change = np.abs(plain - finer) / self.flights.sigma[w]
+            np.fmax.at(worst, self._channel(w), change)
         return dict(zip(self.channels, worst.tolist()))
 
     def landings(

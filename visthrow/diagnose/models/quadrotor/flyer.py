@@ -334,7 +334,8 @@ class FlyerModel(NumericModel):
         """Return the slope of whole thrusts [N], shape (half steps, B), as knots show it [N/s]."""
         knots = np.linspace(0.0, self.params.window, self.knot_count)
         grid = self.params.window * halves(self.steps)
-        slope = np.gradient(triangles(knots, grid[::2]) @ total[::2], knots, axis=0)
+        at_knots = triangles(knots, grid[::2]) @ total[::2]
+        slope = np.gradient(at_knots, knots, axis=0)
         return triangles(grid, knots) @ slope
 
     def _quantities(self, lanes: Lanes, total: np.ndarray, hung_at: Callable) -> Quantities:

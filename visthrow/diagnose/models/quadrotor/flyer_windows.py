@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import matrix_of_quat, vectors_between
+from visthrow.common.rotations import cross, matrix_of_quat, vectors_between
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -196,7 +196,7 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
     even = np.arange(time[0], time[-1], step)
     keep = np.exp(-rate * step)
     tilt = lfilter([1.0 - keep], [1.0, -keep], on_grid(time, share, even), axis=0)
-    turn = np.column_stack([tilt[:, 1], -tilt[:, 0], np.zeros(len(tilt))])
+    turn = cross(np.pad(tilt, ((0, 0), (0, 1))), np.array([0.0, 0.0, 1.0]))
     if "rate_b" in log and np.any(log["rate_b"].valid):
         turn[:, :2] -= _offset(log, attitude)[:2] / rate
     return on_grid(even, turn, times)
