@@ -7,6 +7,7 @@ The log holds no mass: forces are per kilogram, which is what a path can tell.
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from scipy.interpolate import CubicHermiteSpline
 
 from visthrow.common.rotations import cross
@@ -74,7 +75,7 @@ class BallModel(NumericModel):
             flights.append(self.lay_out(number, "ballistic", [table], span, data, *begin))
         return flights
 
-    def simulate(self, lanes: Lanes) -> np.ndarray:
+    def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; the unknowns are position and velocity at the first stamp.
 
         Returns them over the grid.
@@ -88,7 +89,7 @@ class BallModel(NumericModel):
         quadratic = (self.params.drag + drag)[:, None]
         linear = linear[:, None]
 
-        def slope(index: int, state: np.ndarray) -> np.ndarray:
+        def slope(index: int, state: ndarray) -> ndarray:
             vel = state[:, 3:]
             air = vel - wind
             speed = np.sqrt(np.sum(air * air, 1, keepdims=True))
@@ -98,11 +99,11 @@ class BallModel(NumericModel):
         step = self.of_windows(lanes, "span")[:, None] / STEPS * (1.0 + clock[:, None])
         return integrate(slope, lanes.nuisance, STEPS, step)
 
-    def quantities(self, time: np.ndarray, state: np.ndarray) -> dict[str, np.ndarray]:
+    def quantities(self, time: ndarray, state: ndarray) -> dict[str, ndarray]:
         """See the base class; a law's coefficient is that of a ball of 1 kg."""
         return {"time": time, "payload_pos_w": state[:, :3], "payload_vel_w": state[:, 3:]}
 
-    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+    def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
         tilt_x, tilt_y, clock, scale = lanes.theta.T[6:]
         time = stretch.data["time"]
@@ -116,7 +117,7 @@ class BallModel(NumericModel):
         return (first + gone * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
 
 
-def _free(time: np.ndarray, pos: np.ndarray, params: BallParams) -> list[tuple[float, float]]:
+def _free(time: ndarray, pos: ndarray, params: BallParams) -> list[tuple[float, float]]:
     """First and last time of the stretches that fall: nearer to gravity than to rest, over a tenth
     of a second each way.
     """

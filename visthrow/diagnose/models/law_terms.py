@@ -20,14 +20,15 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
+from numpy import ndarray
 
 from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.common.rotations import cross, rotate, rotate_back
+from visthrow.common.rotations import across, cross, rotate, rotate_back
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
-Knots = Mapping[str, np.ndarray]
+Knots = Mapping[str, ndarray]
 
 JOINT = (  # block of the torque between vehicle and rope, which acts in all latent blocks at once
     "rope joint"
@@ -40,7 +41,7 @@ BASE_UNITS = ("kg", "m", "s")
 class KnotValues(dict):
     """Quantities at the knots, and what follows from them, computed when it is first asked for."""
 
-    def __missing__(self, name: str) -> np.ndarray:
+    def __missing__(self, name: str) -> ndarray:
         """Compute a size, a cross product, or one of the quantities of ``DERIVED``."""
         first, crossed, second = name.partition(" x ")
         if name.startswith("|"):
@@ -62,12 +63,12 @@ class Factor:
     quantity: str  # at the knots, (k,) for a scalar, (k, 3) for a vector, in the block's frame
     needs: frozenset[str]  # keys of Window.knots
 
-    def read(self, values: KnotValues) -> np.ndarray:
+    def read(self, values: KnotValues) -> ndarray:
         """Return its values at the knots."""
         return values[self.quantity]
 
     @property
-    def exponents(self) -> np.ndarray:
+    def exponents(self) -> ndarray:
         """Return the exponents of kg, m and s."""
         powers = dict(part.partition("^")[::2] for part in self.unit.split())
         return np.array([int(powers[u] or 1) if u in powers else 0 for u in BASE_UNITS])
@@ -91,7 +92,7 @@ class Term:
         """Scalars, then the vector."""
         return [*(SCALARS[name] for name in self.factors), VECTORS[self.block][self.vector]]
 
-    def read(self, values: KnotValues) -> np.ndarray:
+    def read(self, values: KnotValues) -> ndarray:
         """Return what it exerts at the knots with a coefficient of 1, shape (k, 3)."""
         vector = VECTORS[self.block][self.vector].read(values)
         return _product(self.factors, values)[:, None] * vector
@@ -139,7 +140,7 @@ def term_of(law: LawParams) -> Term:
     return Term(law.block, law.factors, law.vector)
 
 
-def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
+def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, ndarray]:
     """Return the forces and torques of laws in each latent block at states with these quantities,
     shape (k, 3); empty without laws.
     """
@@ -152,52 +153,45 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, np.ndarray]:
     return total
 
 
-def carries(latent_block: np.ndarray, block: str) -> bool:
+def carries(latent_block: ndarray, block: str) -> bool:
     """Whether a window has all latents that terms of a block act through."""
     latent_blocks = LATENT_BLOCKS if block == JOINT else (block,)
     return all(LATENT_BLOCKS.index(name) in latent_block for name in latent_blocks)
 
 
-def _product(factors: Sequence[str], values: KnotValues) -> np.ndarray:
+def _product(factors: Sequence[str], values: KnotValues) -> ndarray:
     """Return the product of scalars at the knots, shape (k,)."""
     scalars = (SCALARS[name].read(values) for name in factors)
     return math.prod(scalars, start=np.ones(len(values["time"])))
 
 
-def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _dot(a: ndarray, b: ndarray) -> ndarray:
     return np.einsum("ki,ki->k", a, b)
 
 
-def _in_world(name: str) -> Callable[[KnotValues], np.ndarray]:
+def _in_world(name: str) -> Callable[[KnotValues], ndarray]:
     return lambda k: rotate(k["quat_wb"], k[name])
 
 
-def _in_body(name: str) -> Callable[[KnotValues], np.ndarray]:
+def _in_body(name: str) -> Callable[[KnotValues], ndarray]:
     return lambda k: rotate_back(k["quat_wb"], k[name])
 
 
-def _unit(i: int) -> Callable[[KnotValues], np.ndarray]:
+def _unit(i: int) -> Callable[[KnotValues], ndarray]:
     return lambda k: np.tile(np.eye(3)[i], (len(k["time"]), 1))
 
 
-def _slope(k: KnotValues) -> np.ndarray:
+def _slope(k: KnotValues) -> ndarray:
     thrust = k["thrust"]
     return np.gradient(thrust, k["time"]) if len(thrust) > 1 else np.zeros(len(thrust))
 
 
-def _swing(k: KnotValues) -> np.ndarray:
-    """Velocity of the payload against the vehicle, across the rope."""
-    relative = k["payload_vel_w"] - k["vel_w"]
-    n = k["cable_dir_w"]
-    return relative - _dot(relative, n)[:, None] * n
-
-
-def _reach(k: KnotValues) -> np.ndarray:
+def _reach(k: KnotValues) -> ndarray:
     """Return the vector from the mount to the payload's centre [m], world frame."""
     return k["payload_pos_w"] - k["pos_w"] - rotate(k["quat_wb"], k["mount_b"])
 
 
-def _joint_rate(k: KnotValues) -> np.ndarray:
+def _joint_rate(k: KnotValues) -> ndarray:
     """Rate of the rope against the vehicle [1/s], body frame; 0 where nothing hangs on it."""
     reach = k["reach_w"]
     mount_vel = k["vel_w"] + rotate(k["quat_wb"], cross(k["rate_b"], k["mount_b"]))
@@ -205,23 +199,23 @@ def _joint_rate(k: KnotValues) -> np.ndarray:
     return (k["tension"] > 0.0)[:, None] * (rotate_back(k["quat_wb"], rope_rate) - k["rate_b"])
 
 
-def _friction(k: KnotValues) -> np.ndarray:
+def _friction(k: KnotValues) -> ndarray:
     """Direction of that rate, and less than a unit vector where it is slow."""
     return k["joint_rate_b"] / np.hypot(k["|joint_rate_b|"], SLOWEST)[:, None]
 
 
-def _spring(k: KnotValues) -> np.ndarray:
+def _spring(k: KnotValues) -> ndarray:
     """Return the direction that turns the vehicle's axis against the rope, body frame; 0 where
     nothing hangs on it.
     """
     return (k["tension"] > 0.0)[:, None] * k["unit_z x cable_dir_b"]
 
 
-def _size(value: np.ndarray) -> np.ndarray:
+def _size(value: ndarray) -> ndarray:
     return np.abs(value) if value.ndim == 1 else np.linalg.norm(value, axis=1)
 
 
-DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
+DERIVED: dict[str, Callable[[KnotValues], ndarray]] = {
     "axis_x": _in_world("unit_x"),
     "axis_y": _in_world("unit_y"),
     "axis_z": _in_world("unit_z"),
@@ -229,9 +223,9 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "unit_y": _unit(1),
     "unit_z": _unit(2),
     "slope": _slope,
-    "swing": _swing,
+    "swing": lambda k: across(k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]),
     "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
-    "across": lambda k: k["vel_w"] - k["along"][:, None] * k["axis_z"],
+    "across": lambda k: across(k["vel_w"], k["axis_z"]),
     "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]),
     "vel_b": _in_body("vel_w"),
     "cable_dir_b": _in_body("cable_dir_w"),
@@ -248,7 +242,7 @@ DERIVED: dict[str, Callable[[KnotValues], np.ndarray]] = {
     "inverse_distance": lambda k: 1.0 / np.maximum(k["|apart|"], LOWEST),
     "neighbour": lambda k: k["apart"] * k["inverse_distance"][:, None],
     "distance_upright": lambda k: k["neighbour"][:, 2],
-    "sideways": lambda k: k["cable_dir_w"] + k["under"][:, None] * k["axis_z"],
+    "sideways": lambda k: across(k["cable_dir_w"], k["axis_z"]),
 }
 """What :class:`KnotValues` computes of the quantities at the knots."""
 
@@ -292,7 +286,7 @@ def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     return terms
 
 
-def table(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
+def table(terms: Sequence[Term], values: KnotValues) -> ndarray:
     """Return what all terms of :func:`terms_of` exert at the knots with a coefficient of 1, shape
     (k, 3, T); the scalars of each are multiplied once.
     """
@@ -305,7 +299,7 @@ def table(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
     return every.reshape(len(directions), 3, len(terms))
 
 
-def loads(block: str, knots: KnotValues, values: np.ndarray) -> dict[str, np.ndarray]:
+def loads(block: str, knots: KnotValues, values: ndarray) -> dict[str, ndarray]:
     """Return the loads of terms in each latent block: a torque in the joint acts on the vehicle, on
     the rope and, by it, on the payload.
 

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
+from numpy import ndarray
 
 from sim.effects.effect import Effect
 from sim.params import LawParams
@@ -29,25 +30,23 @@ class Window:
 
     flight: int  # number of the flight it was cut from
     phase: str  # hover, flight, throw or ballistic; free text for other models
-    time: np.ndarray  # of the samples, in the flight's clock [s], shape (N,)
-    channel: np.ndarray  # index into Model.channels, shape (N,)
+    time: ndarray  # of the samples, in the flight's clock [s], shape (N,)
+    channel: ndarray  # index into Model.channels, shape (N,)
     # measured minus simulated, from b = 0 along the derivatives, in the channel's unit, shape (N,)
-    residual: np.ndarray
-    sigma: np.ndarray  # standard deviation of the sensor noise, same unit, shape (N,)
-    effects: np.ndarray  # S: derivative of the simulated sample by theta, shape (N, K)
-    nuisance: np.ndarray  # X, shape (N, D)
-    nuisance_sd: np.ndarray  # vague prior of b, about 0, shape (D,)
-    latent: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
-    latent_block: np.ndarray = field(
+    residual: ndarray
+    sigma: ndarray  # standard deviation of the sensor noise, same unit, shape (N,)
+    effects: ndarray  # S: derivative of the simulated sample by theta, shape (N, K)
+    nuisance: ndarray  # X, shape (N, D)
+    nuisance_sd: ndarray  # vague prior of b, about 0, shape (D,)
+    latent: ndarray = field(default_factory=lambda: np.zeros((0, 0)))  # G, shape (N, G)
+    latent_block: ndarray = field(
         default_factory=lambda: np.zeros(0, dtype=int)
     )  # index into LATENT_BLOCKS, shape (G,)
-    latent_axis: np.ndarray = field(
+    latent_axis: ndarray = field(
         default_factory=lambda: np.zeros(0, dtype=int)
     )  # 0, 1, 2 for x, y, z, shape (G,)
-    latent_time: np.ndarray = field(
-        default_factory=lambda: np.zeros(0)
-    )  # of the knot [s], shape (G,)
-    knots: Mapping[str, np.ndarray] = field(default_factory=dict)
+    latent_time: ndarray = field(default_factory=lambda: np.zeros(0))  # of the knot [s], shape (G,)
+    knots: Mapping[str, ndarray] = field(default_factory=dict)
     """Simulated quantities at the knots of the latent forces, shape (knots, ...), for laws outside
     the catalogue: ``time``, ``pos_w``, ``vel_w``, ``quat_wb``, ``rate_b``, ``thrust`` [N],
     ``payload_pos_w``, ``payload_vel_w``, ``cable_dir_w``, ``tension`` [N], ``mount_b`` (of the
@@ -55,7 +54,7 @@ class Window:
     """
     # whether it begins in a motion that nobody can know, such as a rope's that has just come taut
     shaken: bool = False
-    correlated: tuple[tuple[np.ndarray, np.ndarray], ...] = ()
+    correlated: tuple[tuple[ndarray, ndarray], ...] = ()
     """Of channels whose noise is not white: rows of their samples, shape (stamps, components), and
     the lower Cholesky factor of the correlation of a component's noise, shape (stamps, stamps).
     """
@@ -108,7 +107,7 @@ class Model(Protocol):
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[np.ndarray]:
+    ) -> list[ndarray]:
         """Only the residuals of :meth:`windows`, one array of shape (N,) a window; cheaper.
 
         Args:
@@ -132,9 +131,7 @@ class Model(Protocol):
         """Return the model with further laws; itself where none can act in it."""
         return self
 
-    def without_commands(
-        self, theta: Mapping[str, float], windows: Sequence[int]
-    ) -> list[np.ndarray]:
+    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """Return the change of some windows' samples by each command that does not come, shape
         (N, T) each; none where the model has no commands.
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
@@ -39,13 +40,13 @@ class Stretch(Window):
     All stretches of a model have the same D and G.
     """
 
-    start: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    start: ndarray = field(default_factory=lambda: np.zeros(0))
     """First guess of what is not known at the start, shape (D,)."""
     data: Mapping[str, Any] = field(default_factory=dict)
     """What simulation and sensors read: inputs, stamps."""
 
     @property
-    def measured(self) -> np.ndarray:
+    def measured(self) -> ndarray:
         """Return the measurements, shape (N,)."""
         return self.residual
 
@@ -54,10 +55,10 @@ class Stretch(Window):
 class Lanes:
     """Simulations of one batch."""
 
-    owner: np.ndarray  # index of the stretch, shape (B,)
-    theta: np.ndarray  # sizes of the effects, shape (B, K)
-    nuisance: np.ndarray  # unknowns at the start, shape (B, D)
-    latent: np.ndarray  # coefficients of the latent forces, shape (B, G)
+    owner: ndarray  # index of the stretch, shape (B,)
+    theta: ndarray  # sizes of the effects, shape (B, K)
+    nuisance: ndarray  # unknowns at the start, shape (B, D)
+    latent: ndarray  # coefficients of the latent forces, shape (B, G)
 
     def part(self, rows: Any) -> "Lanes":
         """Some of them."""
@@ -98,7 +99,7 @@ class NumericModel(Model, ABC):
         self.effects = tuple(effects)
         self.numbers = {effect.name: i for i, effect in enumerate(self.effects)}
         self._start = np.array([stretch.start for stretch in self.stretches], dtype=float)
-        self._slopes: list[np.ndarray] = []  # by the unknowns at the start
+        self._slopes: list[ndarray] = []  # by the unknowns at the start
         self._base = np.zeros(
             len(self.effects)
         )  # sizes that the model has before anything is found
@@ -132,7 +133,7 @@ class NumericModel(Model, ABC):
         self,
         flight: int,
         phase: str,
-        channels: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+        channels: Sequence[tuple[ndarray, ndarray, ndarray]],
         span: tuple[float, float],
         data: Mapping[str, Any],
         start: Sequence[float] = (),
@@ -169,11 +170,11 @@ class NumericModel(Model, ABC):
             data=data,
         )
 
-    def pushes_at(self, lanes: Lanes, shares: np.ndarray) -> np.ndarray:
+    def pushes_at(self, lanes: Lanes, shares: ndarray) -> ndarray:
         """Return latent forces of lanes at shares of a window's span, shape (T, B, pushes)."""
         weights = triangles(shares, np.linspace(0.0, 1.0, self.knot_count))
         latent = lanes.latent.reshape(len(lanes.latent), -1, self.knot_count)
-        forces: np.ndarray = np.einsum("bpk,tk->tbp", latent, weights)
+        forces: ndarray = np.einsum("bpk,tk->tbp", latent, weights)
         return forces
 
     def extend(self, sizes: Mapping[str, float], laws: Sequence[LawParams] = ()) -> None:
@@ -199,7 +200,7 @@ class NumericModel(Model, ABC):
             shifted.append(replace(effect, bounds=(low - size, high - size)))
         self.effects = tuple(shifted)
 
-    def _expect_law(self, term: Term, known: Mapping[str, np.ndarray]) -> None:
+    def _expect_law(self, term: Term, known: Mapping[str, ndarray]) -> None:
         lacking = sorted(term.needs - known.keys())
         if not lacking and not carries(self.stretches[0].latent_block, term.block):
             lacking = [term.block]
@@ -229,7 +230,7 @@ class NumericModel(Model, ABC):
         self._flown.laws = (*self.laws, *laws)
         return self._flown
 
-    def simulate(self, lanes: Lanes) -> np.ndarray:
+    def simulate(self, lanes: Lanes) -> ndarray:
         """Simulate lanes; returns the states on each one's grid, shape (B, T, S).
 
         Models without a state need not override it.
@@ -237,10 +238,10 @@ class NumericModel(Model, ABC):
         return np.zeros((len(lanes.owner), 2, 0))
 
     @abstractmethod
-    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+    def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """Return the sensors' measurements in lanes of one stretch, shape (L, N)."""
 
-    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
         """Return quantities of laws at the knots of each stretch's latent forces.
 
         ``lanes``: one a stretch; ``paths``: the states on their grids, shape (S, T, states).
@@ -252,42 +253,42 @@ class NumericModel(Model, ABC):
             knots.append(self.quantities(time, weights @ path))
         return knots
 
-    def quantities(self, time: np.ndarray, state: np.ndarray) -> Mapping[str, np.ndarray]:
+    def quantities(self, time: ndarray, state: ndarray) -> Mapping[str, ndarray]:
         """Return quantities of laws outside the catalogue at states, shape (k, S); none by
         default.
         """
         return {}
 
-    def exerted(self, block: str, state: np.ndarray) -> np.ndarray:
+    def exerted(self, block: str, state: ndarray) -> ndarray:
         """Return what the model's laws exert in a latent block at states of lanes, shape (B, 3)."""
         if not self.laws:
             return np.zeros((len(state), 3))
         return exerted(self.laws, self.quantities(np.zeros(len(state)), state))[block]
 
-    def size(self, theta: Mapping[str, float]) -> np.ndarray:
+    def size(self, theta: Mapping[str, float]) -> ndarray:
         """Sizes of all effects in order, with those it had before, shape (K,).
 
         Raises LogError for an effect that it does not know.
         """
         expect_known(theta, self.numbers, "no effect '{}'", LogError)
         sizes = np.array([float(theta.get(name, 0.0)) for name in self.numbers])
-        total: np.ndarray = self._base + sizes
+        total: ndarray = self._base + sizes
         return total
 
-    def of_windows(self, lanes: Lanes, name: str) -> np.ndarray:
+    def of_windows(self, lanes: Lanes, name: str) -> ndarray:
         """Return an entry of the windows' data, of one shape in all windows, a row for each
         lane.
         """
         values = np.array([s.data[name] for s in self.stretches])
         return np.take(values, lanes.owner, axis=0)
 
-    def size_of(self, lanes: Lanes, name: str) -> np.ndarray:
+    def size_of(self, lanes: Lanes, name: str) -> ndarray:
         """Sizes of one effect, shape (B,); zeros where the catalogue leaves it out."""
         if name not in self.numbers:
             return np.zeros(len(lanes.owner))
         return lanes.theta[:, self.numbers[name]]
 
-    def stack(self, lanes: Lanes, *names: str) -> np.ndarray:
+    def stack(self, lanes: Lanes, *names: str) -> ndarray:
         """Sizes of several effects, shape (B, N); zeros for an empty name."""
         return np.stack([self.size_of(lanes, name) for name in names], axis=1)
 
@@ -320,25 +321,25 @@ class NumericModel(Model, ABC):
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[np.ndarray]:
+    ) -> list[ndarray]:
         """See :class:`.model_interface.Model`; initial states are fitted anew."""
         return self._from_prior(self._settle(self.size(theta)))
 
-    def _from_prior(self, residuals: list[np.ndarray]) -> list[np.ndarray]:
+    def _from_prior(self, residuals: list[ndarray]) -> list[ndarray]:
         """Return residuals as with the unknowns in the middle of their prior, where that counts."""
         if not self.anchored:
             return residuals
         moves = [start - s.start for start, s in zip(self._start, self.stretches)]
         return [r + slope @ move for r, slope, move in zip(residuals, self._slopes, moves)]
 
-    def _lanes(self, size: np.ndarray, start: np.ndarray | None = None) -> Lanes:
+    def _lanes(self, size: ndarray, start: ndarray | None = None) -> Lanes:
         """One lane a stretch."""
         count = len(self.stretches)
         start = self._start if start is None else start
         latent = np.zeros((count, len(self.stretches[0].latent_block)))
         return Lanes(np.arange(count), np.tile(size, (count, 1)), start, latent)
 
-    def _measured(self, lanes: Lanes) -> list[np.ndarray]:
+    def _measured(self, lanes: Lanes) -> list[ndarray]:
         """Return what lanes measure, (lanes of it, N) a stretch; all have as many, in turn."""
         each = len(lanes.owner) // len(self.stretches)
         batch = max(1, MOST_LANES // each)
@@ -351,12 +352,12 @@ class NumericModel(Model, ABC):
                 measured.append(self.measure(stretch, paths[rows], part.part(rows)))
         return measured
 
-    def _off(self, size: np.ndarray, start: np.ndarray) -> list[np.ndarray]:
+    def _off(self, size: ndarray, start: ndarray) -> list[ndarray]:
         """Return the residuals of all stretches from states at their starts, shape (N,) each."""
         measured = self._measured(self._lanes(size, start))
         return [s.measured - only for s, (only,) in zip(self.stretches, measured)]
 
-    def _settle(self, size: np.ndarray) -> list[np.ndarray]:
+    def _settle(self, size: ndarray) -> list[ndarray]:
         """Fit what is not known at the start, window by window; returns the residuals."""
         residuals = self._off(size, self._start)
         if not self._start.shape[1]:
@@ -383,7 +384,7 @@ class NumericModel(Model, ABC):
                 break
         return residuals
 
-    def _aims(self, residuals: list[np.ndarray], start: np.ndarray) -> list[np.ndarray]:
+    def _aims(self, residuals: list[ndarray], start: ndarray) -> list[ndarray]:
         """Return residuals, and behind them the way back to the prior's middle, in their
         deviations.
         """
@@ -393,7 +394,7 @@ class NumericModel(Model, ABC):
             aims.append(np.concatenate([residual / s.sigma, back]))
         return aims
 
-    def _newton(self, i: int, aim: np.ndarray) -> np.ndarray:
+    def _newton(self, i: int, aim: ndarray) -> ndarray:
         """Return the Gauss-Newton step of a window's unknowns; 0 where it promises little."""
         s = self.stretches[i]
         none = np.zeros(len(s.start))
@@ -404,14 +405,14 @@ class NumericModel(Model, ABC):
         step = np.linalg.lstsq(rows, aim, rcond=None)[0]
         return step if 0.5 * aim @ rows @ step > SETTLED else none
 
-    def _slopes_by_start(self, size: np.ndarray) -> list[np.ndarray]:
+    def _slopes_by_start(self, size: ndarray) -> list[ndarray]:
         """Return the derivatives of the samples by what is not known at the start."""
         steps = NUISANCE_STEP * np.array([s.nuisance_sd for s in self.stretches])
         return self._slopes_by(size, "nuisance", steps, range(steps.shape[1]))
 
     def _slopes_by(
-        self, size: np.ndarray, name: str, steps: np.ndarray, columns: Sequence[int]
-    ) -> list[np.ndarray]:
+        self, size: ndarray, name: str, steps: ndarray, columns: Sequence[int]
+    ) -> list[ndarray]:
         """Return derivatives of the samples by central differences, (N, C) a stretch.
 
         Args:
@@ -435,7 +436,7 @@ class NumericModel(Model, ABC):
         return [(0.5 * (a - b)).T / step for a, b, step in zip(above, below, steps)]
 
 
-def _costs(aims: list[np.ndarray]) -> np.ndarray:
+def _costs(aims: list[ndarray]) -> ndarray:
     """Return the sum of squares of each window; infinite where a simulation ran away."""
     squares = np.array([aim @ aim for aim in aims])
     return np.where(np.isnan(squares), np.inf, squares)
@@ -445,7 +446,7 @@ def _holds(log: FlightLog, name: str) -> bool:
     return name in log and bool(np.any(log[name].valid))
 
 
-def sigma_of(channel: Channel, floor: float) -> np.ndarray:
+def sigma_of(channel: Channel, floor: float) -> ndarray:
     """Noise of a channel's components as the samples show it.
 
     ``floor``: below which none is believed; ten times that stands where too few samples tell.
@@ -454,24 +455,24 @@ def sigma_of(channel: Channel, floor: float) -> np.ndarray:
     return np.maximum(np.where(np.isfinite(estimate), estimate, 10.0 * floor), floor)
 
 
-def take_samples(channel: Channel, params: Any, start: float) -> tuple[np.ndarray, np.ndarray]:
+def take_samples(channel: Channel, params: Any, start: float) -> tuple[ndarray, ndarray]:
     """Return stamps and values of every n-th sample in a window of a model's parameters."""
     inside = (channel.time >= start) & (channel.time < start + params.window)
     rows = np.flatnonzero(channel.valid & inside)[:: params.every]
     return channel.time[rows], channel.values[rows].astype(float).reshape(len(rows), -1)
 
 
-def halves(steps: int) -> np.ndarray:
+def halves(steps: int) -> ndarray:
     """Return the half steps of a window as shares of it."""
     return np.linspace(0.0, 1.0, 2 * steps + 1)
 
 
 def integrate(
-    slope: Callable[[int, np.ndarray], np.ndarray],
-    state: np.ndarray,
+    slope: Callable[[int, ndarray], ndarray],
+    state: ndarray,
     steps: int,
-    step: np.ndarray | float,
-) -> np.ndarray:
+    step: ndarray | float,
+) -> ndarray:
     """Path of lanes on their grids by Runge-Kutta steps of fourth order, shape (B, steps + 1, S).
 
     ``slope``: of the half step counted from the start, and the state; ``state``: at the start,
@@ -488,6 +489,6 @@ def integrate(
     return path
 
 
-def triangles(time: np.ndarray, knots: np.ndarray) -> np.ndarray:
+def triangles(time: ndarray, knots: ndarray) -> ndarray:
     """Weights of the knots at each time: linear between neighbours, shape (T, knots)."""
     return np.column_stack([np.interp(time, knots, row) for row in np.eye(len(knots))])

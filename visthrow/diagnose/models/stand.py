@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
 from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
@@ -68,7 +69,7 @@ class StandModel(NumericModel):
         data = {"speed": speed[:, 0], "volts": volts[:, 0]}
         return [self.lay_out(number, "steps", channels, (0.0, len(rows) - 1.0), data)]
 
-    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+    def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class: thrusts [N], then currents [A]."""
         p = self.params
         gain, exponent, linear, voltage, zero, power_gain, power_exponent, idle, resistance = (
@@ -90,7 +91,7 @@ class StandModel(NumericModel):
         return np.concatenate([thrust * share[..., 0].T, currents * share[..., 1].T], axis=1)
 
 
-def settled(log: FlightLog, params: StandParams) -> np.ndarray:
+def settled(log: FlightLog, params: StandParams) -> ndarray:
     """Speed [rad/s], thrust [N], voltage [V] and current [A] of the steps that can be used, shape
     (N, 4).
     """

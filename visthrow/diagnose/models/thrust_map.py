@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 
 import numpy as np
+from numpy import ndarray
 
 
-def command_of(thrust_map: Sequence[float], thrust: np.ndarray) -> np.ndarray:
+def command_of(thrust_map: Sequence[float], thrust: ndarray) -> ndarray:
     """Return the command at which a map gives a thrust.
 
     ``thrust_map``: thrust by powers 0, 1, 2 of the command [N]; ``thrust``: [N], of any shape.

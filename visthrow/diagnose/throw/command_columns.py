@@ -8,6 +8,7 @@ place."""
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
 from visthrow.diagnose.throw.initial_states import States
@@ -27,7 +28,7 @@ def without_each_command(
     delay: float,
     simulation: Simulation,
     states: States,
-) -> list[np.ndarray]:
+) -> list[ndarray]:
     """Change of windows' samples by each of their commands that the one before takes the place of.
 
     ``windows``: their numbers; ``delay``: of the commands [s], the same in all settings: it says
@@ -48,10 +49,10 @@ def without_each_command(
 
 def _flown(
     flights: ReplayedFlights,
-    commands: Mapping[int, np.ndarray],
+    commands: Mapping[int, ndarray],
     simulation: Simulation,
     states: States,
-) -> list[np.ndarray]:
+) -> list[ndarray]:
     """Fly a few windows: a lane with all commands, then one without each of them, which leaves the
     first at the knot before.
     """

@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy import ndarray
 
 from sim.params import GRAVITY, PlantParams
 from visthrow.diagnose.throw.recorded_flight import measured
@@ -57,7 +58,7 @@ class Mistake:
         if "command" not in log:
             return log
         c = log["command"]
-        values = np.asarray(c.values, dtype=float) @ np.array(self.change).T
+        values = np.asarray(c.values, dtype=float) @ np.transpose(self.change)
         return replace(log, channels={**log.channels, "command": replace(c, values=values)})
 
 
@@ -215,5 +216,5 @@ def _thrust_unit(
     return Mistake("thrust_unit", cause, equation, 0.0, len(medians), len(units), _rows(change))
 
 
-def _rows(matrix: np.ndarray) -> tuple[tuple[float, ...], ...]:
+def _rows(matrix: ndarray) -> tuple[tuple[float, ...], ...]:
     return tuple(map(tuple, matrix.tolist()))

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
+from numpy import ndarray
 
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD
 from visthrow.diagnose.throw.recorded_flight import NEVER, RecordedFlight
@@ -117,7 +118,7 @@ def thinned(cuts: list[Cut], flights: Sequence[RecordedFlight]) -> list[Cut]:
     return [c for i, c in enumerate(cuts) if i not in dropped]
 
 
-def _variation(flight: RecordedFlight, c: Cut, whole: np.ndarray) -> float:
+def _variation(flight: RecordedFlight, c: Cut, whole: ndarray) -> float:
     """Variance of a window's commands, against that of the whole flight's."""
     acts = slice(*np.searchsorted(flight.command_time, (c.start, c.end)))
     variance = np.var(flight.command[acts], axis=0)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
+from numpy import ndarray
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
@@ -53,11 +54,11 @@ class DirectMeasurement(Protocol):
     channel: str
     windows: Mapping[int, Any]  # by their numbers, those that have samples
 
-    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
         """Stamps [s], values and sigma of a window, shape (N,), (N,), ()."""
         ...
 
-    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+    def predicted(self, window: int, setting: Setting) -> ndarray:
         """Return the measurement in a setting, shape (N,)."""
         ...
 
@@ -100,7 +101,7 @@ def with_direct(
     kinds: Sequence[DirectMeasurement],
     channels: Sequence[str],
     settings: Sequence[Setting],
-    steps: np.ndarray,
+    steps: ndarray,
 ) -> Window:
     """A window with its direct measurements behind the simulated samples.
 
@@ -143,18 +144,18 @@ class LandingHeight:
 
     def __init__(self, flights: Sequence[RecordedFlight], cuts: Sequence[Cut]):
         """Give each landing to the last window of its flight that counts."""
-        self.windows: dict[int, tuple[float, np.ndarray]] = {}
+        self.windows: dict[int, tuple[float, ndarray]] = {}
         for n, flight in enumerate(flights):
             windows = [w for w, c in enumerate(cuts) if c.flight == n and c.retained]
             if flight.landing_point is not None and flight.latch != NEVER and windows:
                 self.windows[windows[-1]] = flight.landing, flight.landing_point
 
-    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
         """See :class:`DirectMeasurement`."""
         time, point = self.windows[window]
         return np.array([time]), point[2:], LANDING_SIGMA
 
-    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+    def predicted(self, window: int, setting: Setting) -> ndarray:
         """See :class:`DirectMeasurement`."""
         x = setting.sensing
         point = without_frame(x, self.windows[window][1])
@@ -194,13 +195,13 @@ class CameraView:
                 if view is not None:
                     self.windows[w] = view
 
-    def samples(self, window: int) -> tuple[np.ndarray, np.ndarray, float]:
+    def samples(self, window: int) -> tuple[ndarray, ndarray, float]:
         """See :class:`DirectMeasurement`."""
         view = self.windows[window]
         time = np.broadcast_to(view["time"][:, None, None], view["points"].shape)
         return time[view["valid"]].ravel(), view["points"][view["valid"]].ravel(), view["sigma"]
 
-    def predicted(self, window: int, setting: Setting) -> np.ndarray:
+    def predicted(self, window: int, setting: Setting) -> ndarray:
         """See :class:`DirectMeasurement`; NaN where the lens is none."""
         view = self.windows[window]
         x = setting.sensing
@@ -223,7 +224,7 @@ class CameraView:
         return (setting.sensing, setting.camera) != (second.sensing, second.camera)
 
 
-def _reach(camera) -> np.ndarray:
+def _reach(camera) -> ndarray:
     """Pixels of 1 in normalised coordinates along x and y."""
     from camera.fisheye import Fisheye
 
@@ -278,7 +279,7 @@ def _view(log: FlightLog, flight: RecordedFlight, c: Cut, x: SensingParams) -> d
     }
 
 
-def _noise(points: np.ndarray, visible: np.ndarray) -> float:
+def _noise(points: ndarray, visible: ndarray) -> float:
     """Estimate the noise of coordinates while they are seen: what stands in the log elsewhere is
     none.
     """
@@ -290,9 +291,7 @@ def _noise(points: np.ndarray, visible: np.ndarray) -> float:
     return float(np.median(sigmas)) if sigmas else 0.0
 
 
-def _visible_keypoints(
-    view: dict, setting: Setting, nominal: Setting, time: np.ndarray
-) -> np.ndarray:
+def _visible_keypoints(view: dict, setting: Setting, nominal: Setting, time: ndarray) -> ndarray:
     """Keypoints that the setting's camera sees at times, in the nominal lens's normalised
     coordinates, shape (T, 8, 2).
     """
@@ -306,10 +305,10 @@ def _visible_keypoints(
     turned = without_marker(x, view["attitude"](vehicle))
     # The mount is stated from the centre of mass as it was believed: where the weight really lies
     # moves no lens.
-    off = np.array(x.marker_offset) - np.array(nominal.plant.vehicle.body.com)
+    off = np.subtract(x.marker_offset, nominal.plant.vehicle.body.com)
     pos = without_frame(x, view["vehicle"](vehicle)) - turned.apply(off)
     payload = time + (x.payload_delay - nominal.sensing.payload_delay)
-    ball = without_frame(x, view["payload"](payload)) - np.array(x.payload_offset)
+    ball = without_frame(x, view["payload"](payload)) - x.payload_offset
     # Smooth past the edge too: what was seen counts also where this predicts it out of view.
     smooth = replace(camera, noise=replace(camera.noise, invalid_reads="edge"))
     lens = KeypointCamera(smooth, dtype=torch.float64)

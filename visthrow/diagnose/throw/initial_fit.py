@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 
 import numpy as np
+from numpy import ndarray
 
 from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.likelihood.threads import parallel_map
@@ -83,12 +84,12 @@ class _WindowFit:
         self.sensitive, self.end = sensitive_samples(flights, w, lag)
         self.gusts = 1.0  # against the drift that is thought possible
         self.spread = np.hypot(self.sigma, self.drift)
-        self.slopes: np.ndarray | None = None
+        self.slopes: ndarray | None = None
         self.aged = False
         self.stale = True
         self.damping = DAMPING
 
-    def begin(self, residual: np.ndarray, slopes: np.ndarray | None) -> None:
+    def begin(self, residual: ndarray, slopes: ndarray | None) -> None:
         """Start from a residual, with slopes of another fit if there are any."""
         self.residual = residual
         self.cost = self.cost_of(residual)
@@ -97,7 +98,7 @@ class _WindowFit:
             self.aged = True
             self.stale = False
 
-    def cost_of(self, residual: np.ndarray) -> float:
+    def cost_of(self, residual: ndarray) -> float:
         """Huber's cost of a residual; infinite where it leads nowhere."""
         off = np.abs(residual) / self.spread
         if not np.all(off < FARTHEST):
@@ -105,7 +106,7 @@ class _WindowFit:
         near = np.minimum(off, HUBER)
         return float(np.sum(near * (off - 0.5 * near)))
 
-    def increment(self, done: np.ndarray) -> tuple[np.ndarray, float]:
+    def increment(self, done: ndarray) -> tuple[ndarray, float]:
         """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the
         cost that it promises.
 
@@ -124,7 +125,7 @@ class _WindowFit:
         out[self.free] = step * self.sd
         return out, step @ slope - 0.5 * step @ bend @ step
 
-    def judge(self, residual: np.ndarray, promised: float) -> bool:
+    def judge(self, residual: ndarray, promised: float) -> bool:
         """Take a step if it helps; returns whether it did."""
         cost = self.cost_of(residual)
         better = cost < self.cost
@@ -180,13 +181,13 @@ class InitialFit:
         self._shortened = flights.ended([fit.end for fit in self._fits])
 
     @property
-    def slopes(self) -> dict[int, np.ndarray]:
+    def slopes(self) -> dict[int, ndarray]:
         """Return the derivatives of windows' samples by their states, where they were taken
         last.
         """
         return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
-    def fit(self, states: States, slopes: Mapping[int, np.ndarray]) -> States:
+    def fit(self, states: States, slopes: Mapping[int, ndarray]) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
         ``states``: to begin with; ``slopes``: of windows' samples by their states, as
@@ -213,7 +214,7 @@ class InitialFit:
             remaining = [fit for fit in remaining if fit.goes_on]
         return states
 
-    def _residuals(self, states: States, fits: Sequence[_WindowFit]) -> list[np.ndarray]:
+    def _residuals(self, states: States, fits: Sequence[_WindowFit]) -> list[ndarray]:
         """Residuals of windows, of what depends on their initial states; a row of the states for
         each.
         """
@@ -244,12 +245,12 @@ class InitialFit:
             first += 1 + len(fit.free)
 
 
-def _numbers(fits: Sequence[_WindowFit]) -> np.ndarray:
+def _numbers(fits: Sequence[_WindowFit]) -> ndarray:
     """Return the windows' numbers."""
     return np.array([fit.number for fit in fits], dtype=int)
 
 
-def drift(flights: ReplayedFlights, w: int) -> np.ndarray:
+def drift(flights: ReplayedFlights, w: int) -> ndarray:
     """Return how far gusts may have moved a window's samples by their time, as a deviation, shape
     (N,).
     """
@@ -257,7 +258,7 @@ def drift(flights: ReplayedFlights, w: int) -> np.ndarray:
     return flights.spread(w, *DRIFT) * since ** flights.spread(w, *GROWTH)
 
 
-def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[np.ndarray, float]:
+def sensitive_samples(flights: ReplayedFlights, w: int, lag: float) -> tuple[ndarray, float]:
     """Which samples tell of a window's start, and how long it is flown for their sake [s].
 
     They are 1 before the payload may have left, 0 later, for these tell of the release; all 1 where
@@ -274,10 +275,10 @@ def following(
     flights: ReplayedFlights,
     w: int,
     window: Window,
-    free: np.ndarray,
-    change: np.ndarray,
+    free: ndarray,
+    change: ndarray,
     lag: float,
-) -> np.ndarray:
+) -> ndarray:
     """Return how a window's initial state follows a change of the effects, so that the flight stays
     as near to where it was as it can, in the state's units, shape (D,).
 

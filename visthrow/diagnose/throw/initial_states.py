@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from sim.params import GRAVITY, PlantParams, SensingParams, VehicleParams
-from visthrow.common.rotations import cross
+from visthrow.common.rotations import across, cross
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
@@ -49,7 +50,7 @@ RIGID = (
 
 ROPE = ("cable_dir_w", "cable_vel_w")
 
-States = dict[str, np.ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
+States = dict[str, ndarray]  # fields of ``STATE_FIELDS``, shape (S, ...)
 MOVED = "moved"
 """Beside the fields: how far a fit moved each state along the directions from where their prior has
 its middle, shape (S, directions).
@@ -95,7 +96,7 @@ class Direction:
         return HUNG * self.calm if c.at_rest else self.calm
 
 
-def deviations(directions: Sequence[Direction], cuts: Sequence[Cut]) -> np.ndarray:
+def deviations(directions: Sequence[Direction], cuts: Sequence[Cut]) -> ndarray:
     """Return what is not known of windows' initial states, shape (W, directions); 0 where a state
     does not have a direction.
     """
@@ -121,7 +122,7 @@ def directions(plant: PlantParams) -> tuple[Direction, ...]:
     return (*listed, *[Direction("payload_vel_w", i, 1.0, 1e-3) for i in range(3)])
 
 
-def _tangents(n: np.ndarray) -> np.ndarray:
+def _tangents(n: ndarray) -> ndarray:
     """Two unit vectors normal to each direction, shape (..., 2, 3)."""
     x_axis, y_axis, _ = np.eye(3)
     axis = np.where(np.abs(n[..., :1]) < 0.7, x_axis, y_axis)
@@ -130,7 +131,7 @@ def _tangents(n: np.ndarray) -> np.ndarray:
     return np.stack((first, np.cross(n, first)), axis=-2)
 
 
-def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarray) -> States:
+def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray) -> States:
     """States moved along all directions by ``sizes``, shape (S, directions); directions of the rope
     before its rates.
     """
@@ -150,22 +151,17 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: np.ndarr
             frame = _tangents(n[:, -1])[:, axes]
             shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in members])
             displacement = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
-            value = out[field] + _across(displacement, n)
+            value = out[field] + across(displacement, n)
             if field == "cable_dir_w":
                 value /= np.linalg.norm(value, axis=-1, keepdims=True)
-                out["cable_vel_w"] = _across(states["cable_vel_w"], value)
+                out["cable_vel_w"] = across(states["cable_vel_w"], value)
         else:
             value[:, axes] += size
         out[field] = value
     return out
 
 
-def _across(vectors: np.ndarray, n: np.ndarray) -> np.ndarray:
-    """Return what of vectors is normal to unit vectors, shape (..., 3)."""
-    return vectors - np.sum(vectors * n, axis=-1, keepdims=True) * n
-
-
-def _shape(part: str | int, segments: int) -> np.ndarray:
+def _shape(part: str | int, segments: int) -> ndarray:
     """Return the angle by which each segment turns, shape (L,)."""
     number = np.arange(segments)
     if part == "all":
@@ -175,7 +171,7 @@ def _shape(part: str | int, segments: int) -> np.ndarray:
     return np.cos(part * np.pi * (number + 0.5) / segments)
 
 
-def rows_of(states: States, rows: np.ndarray) -> States:
+def rows_of(states: States, rows: ndarray) -> States:
     """Some of the states."""
     return {name: value[rows] for name, value in states.items()}
 
@@ -187,7 +183,7 @@ def stacked(parts: list[States]) -> States:
 
 def smoothed(
     samples: ChannelSamples, time: float, before: float = SMOOTH_BEFORE, after: float = SMOOTH_AFTER
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> tuple[ndarray, ndarray] | None:
     """Value and derivative at a time from a local cubic through the samples about it; None without
     enough of them.
     """
@@ -198,7 +194,7 @@ def smoothed(
 
 def _smoothed(
     samples: ChannelSamples, instant: float, before: float, after: float
-) -> tuple[np.ndarray, np.ndarray] | None:
+) -> tuple[ndarray, ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
         near = samples.during(instant - reach * before, instant + reach * after)
         if len(near.time) >= LEAST_SAMPLES:
@@ -211,7 +207,7 @@ def _smoothed(
     return None
 
 
-def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _smoothed_turn(time: ndarray, quats: ndarray) -> tuple[ndarray, ndarray]:
     """Attitude at time 0 (xyzw) and the body rate there [rad/s]."""
     middle = Rotation.from_quat(quats[np.argmin(np.abs(time))])
     turn = (middle.inv() * Rotation.from_quat(quats)).as_rotvec()
@@ -219,7 +215,7 @@ def _smoothed_turn(time: np.ndarray, quats: np.ndarray) -> tuple[np.ndarray, np.
     return (middle * Rotation.from_rotvec(fit[0])).as_quat(), fit[1]
 
 
-def without_frame(x: SensingParams, vectors: np.ndarray) -> np.ndarray:
+def without_frame(x: SensingParams, vectors: ndarray) -> ndarray:
     """Return measured points [m] or velocities [m/s], shape (..., 3), in the world's frame."""
     return Rotation.from_rotvec(x.frame_tilt).inv().apply(vectors) / (1.0 + x.scale)
 
@@ -248,8 +244,8 @@ def measured_state(
     rate = Rotation.from_rotvec(x.marker_rotation).apply(rate)
     gyro = flight.gyro and smoothed(flight.gyro, time + x.gyro_delay)
     if gyro:
-        rate = gyro[0] - np.array(x.gyro_bias)
-    off = np.array(x.marker_offset) - np.array(plant.vehicle.body.com)
+        rate = gyro[0] - x.gyro_bias
+    off = np.subtract(x.marker_offset, plant.vehicle.body.com)
     pos, vel = without_frame(x, np.array([pos, vel]))
     out["pos_w"][0] = pos - attitude.apply(off)
     out["quat_wb"][0] = attitude.as_quat()
@@ -258,7 +254,7 @@ def measured_state(
     track = flight.payload and smoothed(flight.payload, time + x.payload_delay)
     if track and payload in (ATTACHED, LOOSE):
         point, speed = without_frame(x, np.array(track))
-        point = point - np.array(x.payload_offset)
+        point = point - x.payload_offset
         out["payload_pos_w"][0] = point
         out["payload_vel_w"][0] = speed
         if payload == ATTACHED:
@@ -267,12 +263,12 @@ def measured_state(
 
 
 def _hang(
-    state: States, plant: PlantParams, attitude: Rotation, point: np.ndarray, speed: np.ndarray
+    state: States, plant: PlantParams, attitude: Rotation, point: ndarray, speed: ndarray
 ) -> None:
     """Turn the rope, in the shape that it has, so that it reaches from the mount to the payload and
     follows both.
     """
-    arm = np.array(plant.rope.mount) - np.array(plant.vehicle.body.com)
+    arm = np.subtract(plant.rope.mount, plant.vehicle.body.com)
     mount = state["pos_w"][0] + attitude.apply(arm)
     mount_vel = state["vel_w"][0] + attitude.apply(cross(state["rate_b"][0], arm))
     reach = point - mount

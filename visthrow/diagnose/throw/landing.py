@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from sim.kernels.replay.kernel import ATTACHED
 from visthrow.diagnose.throw.cutting import (
@@ -38,29 +39,29 @@ class PredictedLandings:
     frame.
     """
 
-    flights: np.ndarray  # their numbers, shape (F,)
-    measured: np.ndarray  # shape (F, 3)
+    flights: ndarray  # their numbers, shape (F,)
+    measured: ndarray  # shape (F, 3)
     # open loop from before the throw, shape (F, 3); NaN where it never comes down
-    predicted: np.ndarray
-    released: np.ndarray  # from a state fitted up to the separation, shape (F, 3)
+    predicted: ndarray
+    released: ndarray  # from a state fitted up to the separation, shape (F, 3)
 
     @property
-    def errors(self) -> np.ndarray:
+    def errors(self) -> ndarray:
         """Horizontal distance of the open-loop prediction from the measured landing [m], shape
         (F,).
         """
         return self._distance(self.predicted)
 
     @property
-    def released_errors(self) -> np.ndarray:
+    def released_errors(self) -> ndarray:
         """Return the errors of the prediction from the separation [m], shape (F,)."""
         return self._distance(self.released)
 
-    def _distance(self, points: np.ndarray) -> np.ndarray:
+    def _distance(self, points: ndarray) -> ndarray:
         return np.linalg.norm((points - self.measured)[:, :2], axis=1)
 
 
-def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, np.ndarray] | None:
+def seen_landing(flight: RecordedFlight, height: float) -> tuple[float, ndarray] | None:
     """Time [s] and point [m] at which a payload came down; None where nobody saw it.
 
     Without a logged landing the track just above the ground is carried on to ``height`` by a
@@ -138,7 +139,7 @@ def _fly(
     theta: Mapping[str, float],
     spans: Mapping[int, tuple[float, float]],
     ends: Mapping[int, float],
-) -> np.ndarray:
+) -> ndarray:
     """Landing points of throws whose states are fitted over ``spans`` and flown on to ``ends``,
     shape (F, 3).
     """
@@ -181,7 +182,7 @@ def _with_path(flight: RecordedFlight, end: float | None) -> RecordedFlight:
     return replace(flight, payload=payload, gyro=None)
 
 
-def _crossing(path: np.ndarray, height: float) -> np.ndarray:
+def _crossing(path: ndarray, height: float) -> ndarray:
     """Return where a path, shape (T, 3), comes down through a height; NaN where it does not."""
     above = path[:, 2] > height
     down = np.flatnonzero(above[:-1] & ~above[1:])

@@ -11,6 +11,7 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
@@ -69,7 +70,7 @@ def without_calm_speeds(window: Window, blocks: Sequence[str], wind_w: Sequence[
     return replace(window, effects=window.effects * unaffected, knots=knots)
 
 
-def _typical_speed(vel: np.ndarray) -> float:
+def _typical_speed(vel: ndarray) -> float:
     """Return the root mean square of velocities, shape (k, 3)."""
     return np.sqrt(np.mean(np.sum(vel**2, axis=1)))
 
@@ -85,11 +86,11 @@ class Plan:
     lanes: list[Lane]
     first: int  # number of its first lane in the run
     first_knot: int  # first row of the knots
-    place: np.ndarray  # lane of each column, behind the first one
-    nominal: np.ndarray  # lane of the same steps that it differs from, likewise
-    steps: np.ndarray  # of each column's derivative
-    states: np.ndarray  # directions of the initial state
-    latents: np.ndarray  # axis and knot, shape (L, 2)
+    place: ndarray  # lane of each column, behind the first one
+    nominal: ndarray  # lane of the same steps that it differs from, likewise
+    steps: ndarray  # of each column's derivative
+    states: ndarray  # directions of the initial state
+    latents: ndarray  # axis and knot, shape (L, 2)
 
 
 class Linearisation:
@@ -100,7 +101,7 @@ class Linearisation:
         flights: ReplayedFlights,
         simulation: Simulation,
         effects: Sequence[SettingEffect],
-        steps: np.ndarray,
+        steps: ndarray,
         directions: Sequence[Direction],
         states: States,
     ):
@@ -127,7 +128,7 @@ class Linearisation:
             for kind in kinds
         }
 
-    def windows(self, batch: Sequence[int], channels: Sequence[np.ndarray]) -> list[Window]:
+    def windows(self, batch: Sequence[int], channels: Sequence[ndarray]) -> list[Window]:
         """Linearise windows whose lanes fit a run; ``channels``: of the samples of each."""
         plans: list[Plan] = []
         lanes: list[Lane] = []
@@ -203,10 +204,10 @@ class Linearisation:
     def _window(
         self,
         plan: Plan,
-        channel: np.ndarray,
-        residual: np.ndarray,
-        slopes: np.ndarray,
-        knots: Mapping[str, np.ndarray],
+        channel: ndarray,
+        residual: ndarray,
+        slopes: ndarray,
+        knots: Mapping[str, ndarray],
     ) -> Window:
         """Return the window that the lanes make up; ``knots``: quantities at those of all lanes.
 
@@ -241,8 +242,8 @@ class Linearisation:
 
 
 def at_knots(
-    flights: ReplayedFlights, setting: Setting, w: int, knots: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
+    flights: ReplayedFlights, setting: Setting, w: int, knots: Mapping[str, ndarray]
+) -> dict[str, ndarray]:
     """Simulated quantities at the knots, those of the payload where there is one."""
     c = flights.cuts[w]
     time = c.start + KNOT_SPACING * np.arange(len(knots["thrust"]))
@@ -252,7 +253,7 @@ def at_knots(
         for name in ("payload_pos_w", "payload_vel_w", "tension"):
             del values[name]
         return values
-    arm = np.array(setting.plant.rope.mount) - np.array(setting.plant.vehicle.body.com)
+    arm = np.subtract(setting.plant.rope.mount, setting.plant.vehicle.body.com)
     values["mount_b"] = np.tile(arm, (len(time), 1))
     reach = KnotValues(values)["reach_w"]
     values["cable_dir_w"] = reach / np.linalg.norm(reach, axis=1, keepdims=True)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy import ndarray
 from scipy.signal import savgol_filter
 
 from visthrow.common.errors import DiagnoseError
@@ -31,8 +32,8 @@ AT_START = 0.25  # of a log, whose voltages tell how much charge was used before
 class ChannelSamples:
     """Valid samples of one measured channel."""
 
-    time: np.ndarray  # [s], shape (T,)
-    values: np.ndarray  # shape (T, 3) or (T, 4)
+    time: ndarray  # [s], shape (T,)
+    values: ndarray  # shape (T, 3) or (T, 4)
     sigma: float  # of one component; of an attitude the angle's [rad]
     estimates: dict = field(
         default_factory=dict, repr=False, compare=False
@@ -51,8 +52,8 @@ NO_SAMPLES = ChannelSamples(np.zeros(0), np.zeros((0, 3)), 1.0)
 class RecordedFlight:
     """One flight."""
 
-    command_time: np.ndarray  # [s], shape (C,)
-    command: np.ndarray  # [N, rad/s], shape (C, 4)
+    command_time: ndarray  # [s], shape (C,)
+    command: ndarray  # [N, rad/s], shape (C, 4)
     latch: float  # of the release, or NEVER [s]
     landing: float  # of the payload, or NEVER [s]
     vehicle: ChannelSamples  # positions [m]; attitudes at the same stamps in ``attitude``
@@ -63,7 +64,7 @@ class RecordedFlight:
     hanging: bool | None = (
         None  # whether the log says that a payload hung below at its start; None where it does not
     )
-    landing_point: np.ndarray | None = (
+    landing_point: ndarray | None = (
         None  # where the log says that the payload came down [m], shape (3,)
     )
 
@@ -114,7 +115,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     return ChannelSamples(time, values, max(float(sigma), LEAST_SIGMA[name]))
 
 
-def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _thinned(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
     """Thin samples that come at twice :data:`SUFFICIENT_RATE` or faster, shape (T,) and (T, N), out
     to fewer that say as much: every n-th of them smoothed.
 
@@ -140,7 +141,7 @@ def _thinned(time: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return thinned[:, 0], thinned[:, 1:]
 
 
-def resolution(values: np.ndarray) -> float:
+def resolution(values: ndarray) -> float:
     """Step that a channel was recorded in, of shape (T, N), where most of its changes are of one
     step; 0 where they are not.
 
@@ -246,7 +247,7 @@ def _latch(log: FlightLog) -> float:
     return float(min(time[values[:, 0] > 0.5], default=NEVER))
 
 
-def _landing(log: FlightLog) -> tuple[float, np.ndarray | None]:
+def _landing(log: FlightLog) -> tuple[float, ndarray | None]:
     """Time and point of the payload's landing."""
     channel = measured(log, "landing")
     if channel is None:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, NO_PAYLOAD, WINDOW_FIELDS
@@ -45,7 +46,7 @@ BATCH, CUDA_BATCH = (
 )  # lanes of one run, which bounds its memory; on a GPU more lanes cost hardly more time
 
 
-def downloaded(array: wp.array) -> np.ndarray:
+def downloaded(array: wp.array) -> ndarray:
     """Copy an array that a replay wrote to the host."""
     return to_host(wp.to_torch(array)) if array.device.is_cuda else array.numpy()
 
@@ -180,7 +181,7 @@ class ReplayedFlights:
             measured[shown] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
-    def _recorded(self) -> dict[str, np.ndarray]:
+    def _recorded(self) -> dict[str, ndarray]:
         """Return commands and stamps of all windows, as the kernel reads them."""
         vehicle, attitude, payload, gyro = zip(*self.samples)
         return {
@@ -230,17 +231,17 @@ class ReplayedFlights:
         c = self.cuts[w]
         return c.payload, self.flights[c.flight].latch >= c.end
 
-    def spread(self, w: int, *values: float) -> np.ndarray:
+    def spread(self, w: int, *values: float) -> ndarray:
         """Give every sample of a window the value of its kind: vehicle, attitude, payload, gyro."""
         return np.repeat(np.array(values)[self._groups[w]], 3)
 
-    def residual(self, measured: np.ndarray, w: int, lane: int) -> np.ndarray:
+    def residual(self, measured: ndarray, w: int, lane: int) -> ndarray:
         """Measured minus simulated, shape (N,); of an attitude the rotation vector from the
         simulated to the measured.
         """
         return (self._measured[w] - measured[: int(self.rows[w]), lane]).ravel()
 
-    def differences(self, seen: np.ndarray, w: int, first: int, count: int) -> np.ndarray:
+    def differences(self, seen: ndarray, w: int, first: int, count: int) -> ndarray:
         """Return what ``count`` lanes of a window saw, less what the lane before them saw, shape
         (N, count).
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import warp as wp
+from numpy import ndarray
 
 from camera.params import CameraParams
 from sim.effects.effect import SettingEffect, apply, possible_together
@@ -180,7 +181,7 @@ class ThrowModel(Model):
         self.effects = (*self._graded, *self._switched, *self._sighted)
         self.entries = {e.name: e for e in self.effects}
         # of other kinds of blocks, by their name, where they were asked for first
-        self._secants: dict[str, list[np.ndarray]] = {}
+        self._secants: dict[str, list[ndarray]] = {}
 
     def at(self, theta: Mapping[str, float]) -> Setting:
         """Return the setting with effects of these sizes."""
@@ -235,7 +236,7 @@ class ThrowModel(Model):
 
     def _secant(
         self, e: SettingEffect, theta: Mapping[str, float], windows: list[Window]
-    ) -> list[np.ndarray]:
+    ) -> list[ndarray]:
         """Samples with the other kind of block less those with this one, per theta; a column for
         each window.
 
@@ -254,15 +255,15 @@ class ThrowModel(Model):
         return columns
 
     @property
-    def _none(self) -> np.ndarray:
+    def _none(self) -> ndarray:
         """Return a fit that took nothing from any window."""
         return np.zeros(len(self._retained))
 
-    def _present(self, ways: Sequence[Direction]) -> np.ndarray:
+    def _present(self, ways: Sequence[Direction]) -> ndarray:
         """Return which directions windows' states have, shape (W, directions), bool."""
         return deviations(ways, self.flights.cuts) > 0.0
 
-    def _flown(self, setting: Setting, states: States) -> list[np.ndarray]:
+    def _flown(self, setting: Setting, states: States) -> list[ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
         lanes = [Lane(w, 0, w) for w in self._retained]
         measured = self.flights.fly(self.simulation(setting), states, lanes).seen
@@ -270,7 +271,7 @@ class ThrowModel(Model):
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
-    ) -> list[np.ndarray]:
+    ) -> list[ndarray]:
         """See :class:`.model_interface.Model`; by default from the states settled last
         with the same kinds of blocks.
 
@@ -300,9 +301,7 @@ class ThrowModel(Model):
         """See the base class."""
         return possible_together(self.entries, self.setting, theta)
 
-    def without_commands(
-        self, theta: Mapping[str, float], windows: Sequence[int]
-    ) -> list[np.ndarray]:
+    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """See the base class; the command before stays."""
         setting = self.at(theta)
         states = self._settled_at.get(_key(theta))
@@ -327,7 +326,7 @@ class ThrowModel(Model):
 
     def _following(
         self, setting: Setting, theta: Mapping[str, float], linearised: Linearised
-    ) -> tuple[States, dict[int, np.ndarray]]:
+    ) -> tuple[States, dict[int, ndarray]]:
         """States that belong to other sizes of the effects by the derivatives, and how each
         window's were moved.
         """
@@ -338,7 +337,7 @@ class ThrowModel(Model):
         follows = np.array([x.follows for x in ways])
         lag = self.setting.plant.release.lag
 
-        def move(w: int, window: Window) -> np.ndarray:
+        def move(w: int, window: Window) -> ndarray:
             return following(self.flights, w, window, follows[present[w]], change, lag)
 
         numbers = self._retained[list(linearised.windows)]
@@ -416,7 +415,7 @@ class ThrowModel(Model):
         step = 0.0 if e.switch else e.step * e.floor
         return -step if theta + step > e.bounds[1] else step
 
-    def _channel(self, w: int) -> np.ndarray:
+    def _channel(self, w: int) -> ndarray:
         listed = list(self.channels)
         numbers = [listed.index(name) if name in listed else -1 for name in REPLAYED]
         return self.flights.spread(w, *numbers).astype(int)

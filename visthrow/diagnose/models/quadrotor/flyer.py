@@ -10,11 +10,12 @@ from copy import copy
 from dataclasses import replace
 
 import numpy as np
+from numpy import ndarray
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 
-from visthrow.common.rotations import cross
+from visthrow.common.rotations import across, cross
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
@@ -38,10 +39,10 @@ from visthrow.diagnose.models.quadrotor.flyer_windows import (
 from visthrow.logs.check.relations import on_grid
 from visthrow.logs.flightlog import FlightLog
 
-Slope = Callable[[int, np.ndarray], np.ndarray]
+Slope = Callable[[int, ndarray], ndarray]
 """Of the half step, and states or velocities of lanes."""
 
-Quantities = Callable[[int, np.ndarray], dict[str, np.ndarray]]
+Quantities = Callable[[int, ndarray], dict[str, ndarray]]
 """Of laws, by the half step and states of lanes."""
 
 SHORTEST = 1e-3  # of the motors' lag [s]: a lag of nothing divides by it
@@ -119,7 +120,7 @@ class FlyerModel(NumericModel):
         """See the base class."""
         return windows_of(self, log, number)
 
-    def _thrusts(self, lanes: Lanes) -> np.ndarray:
+    def _thrusts(self, lanes: Lanes) -> ndarray:
         """Thrust of each motor at the half steps [N], shape (half steps, B, motors): of held
         commands by the map, through a lag.
 
@@ -160,7 +161,7 @@ class FlyerModel(NumericModel):
         curved = 1.0 + curve * (thrust / hover - 1.0)
         return thrust * self._scale(lanes) * curved * faded[..., None]
 
-    def simulate(self, lanes: Lanes) -> np.ndarray:
+    def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class.
 
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
@@ -172,7 +173,7 @@ class FlyerModel(NumericModel):
         path = integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
         return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
 
-    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
         """See the base class."""
         rot = self._rotations(lanes)
         _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
@@ -187,7 +188,7 @@ class FlyerModel(NumericModel):
             knots.append(values | {"time": time})
         return knots
 
-    def _scale(self, lanes: Lanes) -> np.ndarray:
+    def _scale(self, lanes: Lanes) -> ndarray:
         """Thrust over what the map says, shape (B, motors)."""
         p = self.params
         volts = np.zeros(len(lanes.owner))
@@ -198,7 +199,7 @@ class FlyerModel(NumericModel):
         scales = self.stack(lanes, *(f"motor_{name}" for name in MOTORS))
         return scale[:, None] * (1.0 + scales[:, : self.motors])
 
-    def measure(self, stretch: Stretch, path: np.ndarray, lanes: Lanes) -> np.ndarray:
+    def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
         measured = np.empty((len(path), len(stretch.time)))
         for channel, name in enumerate(self.channels):
@@ -208,8 +209,8 @@ class FlyerModel(NumericModel):
         return measured
 
     def _sampled(
-        self, name: str, time: np.ndarray, stretch: Stretch, path: np.ndarray, lanes: Lanes
-    ) -> np.ndarray:
+        self, name: str, time: ndarray, stretch: Stretch, path: ndarray, lanes: Lanes
+    ) -> ndarray:
         """Return what lanes of a stretch show of a channel, shape (L, n, C); ``time``: of all
         components of its samples, shape (n C,).
         """
@@ -233,15 +234,13 @@ class FlyerModel(NumericModel):
         rot = stretch.data["rot"][np.clip(half, 0, 2 * self.steps) + self._spare]
         return pos + np.einsum("nij,bj->bni", rot, lever)
 
-    def without_commands(
-        self, theta: Mapping[str, float], windows: Sequence[int]
-    ) -> list[np.ndarray]:
+    def without_commands(self, theta: Mapping[str, float], windows: Sequence[int]) -> list[ndarray]:
         """See the base class; commands that an autopilot logs of its own motors all came."""
         if self.params.input != "command":
             return []
         return [self._without_each(self.size(theta), i) for i in windows]
 
-    def _without_each(self, size: np.ndarray, i: int) -> np.ndarray:
+    def _without_each(self, size: ndarray, i: int) -> ndarray:
         """Return the change of a window's samples by each command that does not come, shape
         (N, T).
         """
@@ -256,18 +255,18 @@ class FlyerModel(NumericModel):
         seen = self.measure(stretch, model.simulate(lanes), lanes)
         return (seen[1:] - seen[:1]).T
 
-    def _mount(self, rot: np.ndarray) -> Sequence[np.ndarray]:
+    def _mount(self, rot: ndarray) -> Sequence[ndarray]:
         """Return where the cable is attached, from the centre of mass, the velocity and the
         acceleration of that point at the half steps, world frame, each of shape (half steps, B, 3).
         """
         cable = self.params.cable
         if cable is None:
             return ()
-        arm = rot @ np.array(cable.mount)
+        arm = rot @ cable.mount
         rate = np.gradient(arm, 0.5 * self.params.step, axis=0, edge_order=2)
         return arm, rate, np.gradient(rate, 0.5 * self.params.step, axis=0, edge_order=2)
 
-    def _begin(self, lanes: Lanes, mount: Sequence[np.ndarray]) -> np.ndarray:
+    def _begin(self, lanes: Lanes, mount: Sequence[ndarray]) -> ndarray:
         """States from the unknowns at the window's start."""
         unknown = lanes.nuisance
         if self.params.cable is None:
@@ -275,17 +274,15 @@ class FlyerModel(NumericModel):
         length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
         down = self.of_windows(lanes, "direction")
         level = ((0, 0), (0, 1))  # a third component of 0
-        side = np.pad(unknown[:, 6:8], level)
-        direction = down + side - down * np.sum(down * side, 1, keepdims=True)
+        direction = down + across(np.pad(unknown[:, 6:8], level), down)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        swing = np.pad(unknown[:, 8:10], level)
-        swing = swing - direction * np.sum(direction * swing, 1, keepdims=True)
+        swing = across(np.pad(unknown[:, 8:10], level), direction)
         gap = length * direction + mount[0][0]
         rate = length * swing + mount[1][0]
         return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)
 
     def _dynamics(
-        self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray, mount: Sequence[np.ndarray]
+        self, lanes: Lanes, thrust: ndarray, rot: ndarray, mount: Sequence[ndarray]
     ) -> tuple[Slope, Quantities]:
         """Return what gives the derivative of states, and what gives the quantities of laws there,
         by the half step.
@@ -303,17 +300,17 @@ class FlyerModel(NumericModel):
         pulled = self._pulled(lanes, mass, gravity, wind, mount) if p.cable is not None else None
         turning = self._turning(lanes, thrust) if p.torque is not None else None
 
-        def loads_at(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
+        def loads_at(half: int, state: ndarray) -> dict[str, ndarray]:
             loads = {name: push[half] for name, push in latent.items()}
             loads["vehicle force"] = loads["vehicle force"] + force_of(half, state[:, 3:6] - wind)
             return loads
 
-        def hung_at(half: int, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        def hung_at(half: int, state: ndarray) -> tuple[ndarray, ndarray]:
             return pulled(half, state, loads_at(half, state))[2:]
 
         quantities = self._quantities(lanes, thrust.sum(2), hung_at)
 
-        def slope(half: int, state: np.ndarray) -> np.ndarray:
+        def slope(half: int, state: ndarray) -> ndarray:
             vel = state[:, 3:6]
             loads = loads_at(half, state)
             if self.laws:
@@ -330,7 +327,7 @@ class FlyerModel(NumericModel):
 
         return slope, quantities
 
-    def _rise(self, total: np.ndarray) -> np.ndarray:
+    def _rise(self, total: ndarray) -> ndarray:
         """Return the slope of whole thrusts [N], shape (half steps, B), as knots show it [N/s]."""
         knots = np.linspace(0.0, self.params.window, self.knot_count)
         grid = self.params.window * halves(self.steps)
@@ -338,7 +335,7 @@ class FlyerModel(NumericModel):
         slope = np.gradient(at_knots, knots, axis=0)
         return triangles(grid, knots) @ slope
 
-    def _quantities(self, lanes: Lanes, total: np.ndarray, hung_at: Callable) -> Quantities:
+    def _quantities(self, lanes: Lanes, total: ndarray, hung_at: Callable) -> Quantities:
         """Return what gives the quantities of laws by the half step and states.
 
         ``total``: thrust [N], shape (half steps, B); ``hung_at``: gives direction and pull [N] of
@@ -350,7 +347,7 @@ class FlyerModel(NumericModel):
         measured = {name: self.of_windows(lanes, key) for name, key in tables.items()}
         rise = self._rise(total)
 
-        def quantities(half: int, state: np.ndarray) -> dict[str, np.ndarray]:
+        def quantities(half: int, state: ndarray) -> dict[str, ndarray]:
             values = {name: table[:, half + self._spare] for name, table in measured.items()}
             values["time"] = np.zeros(len(state))
             values["thrust"] = total[half]
@@ -368,7 +365,7 @@ class FlyerModel(NumericModel):
 
         return quantities
 
-    def _rotations(self, lanes: Lanes) -> np.ndarray:
+    def _rotations(self, lanes: Lanes) -> ndarray:
         """Return the attitudes of lanes at the half steps, shape (half steps, B, 3, 3)."""
         late = self._spare + self.size_of(lanes, "attitude_delay") / (0.5 * self.params.step)
         position = np.arange(2 * self.steps + 1)[:, None] + late
@@ -379,7 +376,7 @@ class FlyerModel(NumericModel):
         share = (position - index)[..., None, None]
         return before + share * (measured[lane, index + 1] - before)
 
-    def _force(self, lanes: Lanes, thrust: np.ndarray, rot: np.ndarray) -> Slope:
+    def _force(self, lanes: Lanes, thrust: ndarray, rot: ndarray) -> Slope:
         """Return thrust and air's drag on the vehicle [N, world], by its velocity in the air."""
         p = self.params
         total = thrust.sum(2, keepdims=True)
@@ -392,7 +389,7 @@ class FlyerModel(NumericModel):
         leaning = self.of_windows(lanes, "lean")
         turns = np.any(turn) or np.any(lean)
 
-        def force(half: int, air: np.ndarray) -> np.ndarray:
+        def force(half: int, air: ndarray) -> ndarray:
             vel_b = np.einsum("bji,bj->bi", rot[half], air)
             level = vel_b[:, :1] ** 2 + vel_b[:, 1:2] ** 2
             speed = np.sqrt(level + vel_b[:, 2:3] ** 2)
@@ -408,10 +405,10 @@ class FlyerModel(NumericModel):
     def _pulled(
         self,
         lanes: Lanes,
-        mass: np.ndarray,
-        gravity: np.ndarray,
-        wind: np.ndarray,
-        mount: Sequence[np.ndarray],
+        mass: ndarray,
+        gravity: ndarray,
+        wind: ndarray,
+        mount: Sequence[ndarray],
     ) -> Callable:
         """Return what gives accelerations of vehicle and payload, the cable's direction, and what
         it pulls with [N], by the half step, states and loads; it never pushes.
@@ -420,7 +417,7 @@ class FlyerModel(NumericModel):
         payload_drag = self.size_of(lanes, "payload_drag")[:, None]
         reduced = 1.0 / (1.0 / payload + 1.0 / mass)
 
-        def pulled(half: int, state: np.ndarray, loads: Mapping) -> tuple[np.ndarray, ...]:
+        def pulled(half: int, state: ndarray, loads: Mapping) -> tuple[ndarray, ...]:
             arm, rate, acc = (part[half] for part in mount)
             gap = state[:, 6:9] - arm
             gap_rate = state[:, 9:12] - rate
@@ -438,19 +435,19 @@ class FlyerModel(NumericModel):
 
         return pulled
 
-    def _turning(self, lanes: Lanes, thrust: np.ndarray) -> Callable:
+    def _turning(self, lanes: Lanes, thrust: ndarray) -> Callable:
         """Return what gives the angular acceleration from the motors' thrusts and the offset of the
         centre of mass, by the half step, rates and a torque [N m].
         """
         p = self.params.torque
         scale = 1.0 + self.stack(lanes, "inertia_xy", "inertia_xy", "inertia_z")
-        inertia = np.array(p.inertia) * scale
+        inertia = p.inertia * scale
         com_x, com_y = self.stack(lanes, "com_x", "com_y").T
         total = thrust.sum(2)
         lever = np.stack([-com_y * total, com_x * total, 0.0 * total], -1)
         torque = p.of(thrust) + lever
 
-        def turning(half: int, rate: np.ndarray, push: np.ndarray) -> np.ndarray:
+        def turning(half: int, rate: ndarray, push: ndarray) -> ndarray:
             return (torque[half] - cross(rate, inertia * rate) + push) / inertia
 
         return turning
@@ -461,9 +458,7 @@ def in_all(logs: Sequence[Container[str]], *names: str) -> list[str]:
     return [name for name in names if all(name in log for log in logs)]
 
 
-def _late(
-    time: np.ndarray, delays: np.ndarray, grid: np.ndarray, value: np.ndarray, rate: np.ndarray
-) -> np.ndarray:
+def _late(time: ndarray, delays: ndarray, grid: ndarray, value: ndarray, rate: ndarray) -> ndarray:
     """Return what stamps show of lanes that are late, shape (L, N, 3).
 
     ``time``: shape (N,); ``delays``: of the lanes [s], shape (L,); ``value, rate``: of the lanes on
@@ -476,7 +471,7 @@ def _late(
     return out
 
 
-def _products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _products(a: ndarray, b: ndarray) -> ndarray:
     """Inner products of rows, shape (B, 1); of a few rows, ``np.sum`` and ``np.linalg.norm`` take
     several times as long.
     """

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import ConfigError
 from visthrow.config.bounds import Bounded, NotNegative, Positive
@@ -35,14 +36,14 @@ class TorqueParams(Bounded):
     # +1 turns clockwise seen from above; order of the rotors as everywhere
     spin: tuple[float, float, float, float]
 
-    def of(self, thrusts: np.ndarray) -> np.ndarray:
+    def of(self, thrusts: ndarray) -> ndarray:
         """Return the torque of four rotors' thrusts, shape (..., 4), about the middle of them
         [N m], shape (..., 3).
         """
         front_left, front_right, rear_left, rear_right = np.moveaxis(thrusts, -1, 0)
         right_up = front_left + rear_left - front_right - rear_right
         nose_down = rear_left + rear_right - front_left - front_right
-        turn = (self.torque_ratio * thrusts) @ np.array(self.spin)
+        turn = (self.torque_ratio * thrusts) @ self.spin
         return np.stack([self.arm_y * right_up, self.arm_x * nose_down, turn], -1)
 
 
@@ -72,7 +73,7 @@ class QuadrotorParams(Bounded):
         """Return the mass of all that flies [kg]."""
         return self.mass
 
-    def thrust(self, inputs: np.ndarray) -> np.ndarray:
+    def thrust(self, inputs: ndarray) -> ndarray:
         """Return the thrust that the map gives for inputs [N]."""
         return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
 

@@ -6,11 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 from scipy.signal import lfilter
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import cross, matrix_of_quat, vectors_between
+from visthrow.common.rotations import across, cross, matrix_of_quat, vectors_between
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -21,7 +22,7 @@ from visthrow.logs.flightlog import Channel, FlightLog
 FINE = 16
 # noise below which none is believed; of other channels 1e-4
 LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
-Table = tuple[np.ndarray, np.ndarray, np.ndarray]
+Table = tuple[ndarray, ndarray, ndarray]
 """Stamps [s], shape (n,), values, shape (n, C), and their noise, shape (C,)."""
 NEIGHBOUR = "neighbour_pos_w"  # measured position of what may push the vehicle
 _GUESS = 0.25  # first guesses are straight lines through so much of a window [s]
@@ -115,7 +116,7 @@ def covered(channel: Channel, start: float, end: float) -> bool:
     return len(stamps) > 5 and float(np.max(gaps)) < _MOST_MISSING
 
 
-def flies(inputs: np.ndarray, params: QuadrotorParams) -> bool:
+def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
     """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
     thrust = params.thrust(inputs).sum(axis=1)
     return np.min(thrust[len(thrust) // 2 :]) >= _IDLE * params.mass * params.gravity
@@ -126,7 +127,7 @@ def spare(step: float) -> int:
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
-def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.ndarray:
+def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> ndarray:
     """Means of the held commands over fine steps, from one window before the start to its end,
     shape (fine steps, motors).
     """
@@ -144,9 +145,7 @@ def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> np.n
     return np.diff(on_grid(ends, integral, edges), axis=0) / fine
 
 
-def find_acting(
-    time: np.ndarray, values: np.ndarray, delay: float, start: float, end: float
-) -> np.ndarray:
+def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end: float) -> ndarray:
     """Return the numbers of the commands that act between two times and differ from the one before.
 
     ``time``: of the commands, shape (C,); ``values``: shape (C, N); ``delay``: to their acting."""
@@ -156,7 +155,7 @@ def find_acting(
     return np.flatnonzero(during & changed)
 
 
-def without_each(channel: Channel, params: FlyerParams, start: float) -> list[np.ndarray]:
+def without_each(channel: Channel, params: FlyerParams, start: float) -> list[ndarray]:
     """Return a window's held inputs without each command that acts in it: the one before stays."""
     time, values = channel.samples()
     inputs = []
@@ -168,7 +167,7 @@ def without_each(channel: Channel, params: FlyerParams, start: float) -> list[np
     return inputs
 
 
-def _rates(quat: np.ndarray, step: float) -> np.ndarray:
+def _rates(quat: ndarray, step: float) -> ndarray:
     """Return body rates at half steps by the attitudes about them [rad/s], shape (half steps,
     3).
     """
@@ -176,7 +175,7 @@ def _rates(quat: np.ndarray, step: float) -> np.ndarray:
     return np.pad(turn / step, ((1, 1), (0, 0)), mode="edge")
 
 
-def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.ndarray:
+def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
     """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where
     nothing tells it.
 
@@ -202,7 +201,7 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: np.ndarray) -> np.n
     return on_grid(even, turn, times)
 
 
-def _offset(log: FlightLog, attitude: str) -> np.ndarray:
+def _offset(log: FlightLog, attitude: str) -> ndarray:
     """Gyro less the rate of the estimated attitude, in the middle of the flight [rad/s], shape
     (3,).
     """
@@ -210,7 +209,7 @@ def _offset(log: FlightLog, attitude: str) -> np.ndarray:
     return np.median(mean_over(*log["rate_b"].samples(), time, 0.06) - rate, axis=0)
 
 
-def _line(table: Table, start: float) -> np.ndarray:
+def _line(table: Table, start: float) -> ndarray:
     """Return value and slope at the start of a straight line through what follows."""
     time, values, _ = table
     early = time <= max(start + _GUESS, time[min(3, len(time) - 1)])
@@ -218,8 +217,8 @@ def _line(table: Table, start: float) -> np.ndarray:
 
 
 def _guess(
-    tables: Mapping[str, Table], params: FlyerParams, rot: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    tables: Mapping[str, Table], params: FlyerParams, rot: ndarray
+) -> tuple[ndarray, ndarray, ndarray]:
     """Unknowns at the start, their spread, and the cable's direction there.
 
     ``tables``: samples of each channel; ``rot``: attitudes at the start and half a step later,
@@ -236,12 +235,11 @@ def _guess(
         table = tables["payload_pos_w"]
         if len(table[0]) >= 4:
             pos_p, vel_p = _line(table, start)
-            arm, next_arm = rot @ np.array(params.cable.mount)
+            arm, next_arm = rot @ params.cable.mount
             gap = pos_p - pos - arm
             direction = gap / np.linalg.norm(gap)
             arm_rate = (next_arm - arm) / (0.5 * params.step)
-            rate = (vel_p - vel - arm_rate) / params.cable.length
-            swing = rate - direction * np.dot(direction, rate)
+            swing = across((vel_p - vel - arm_rate) / params.cable.length, direction)
         guess += [0.0, 0.0, *swing[:2]]
         spread += [0.1, 0.1, 1.0, 1.0]
     if params.torque is not None:

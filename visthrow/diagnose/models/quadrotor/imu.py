@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.models.numeric import (
     Lanes,
@@ -76,11 +77,11 @@ class ImuModel(FlyerModel):
             stretches.append(self.lay_out(number, "flight", tables, span, data, *begin))
         return stretches
 
-    def knots(self, lanes: Lanes, paths: np.ndarray) -> list[Mapping[str, np.ndarray]]:
+    def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
         """See the base class; none."""
         return [{} for _ in paths]
 
-    def simulate(self, lanes: Lanes) -> np.ndarray:
+    def simulate(self, lanes: Lanes) -> ndarray:
         """See the base class; the state: body rates, and behind them the force along the rotors'
         axis over the mass [m/s^2], with the accelerometer's offset.
         """
@@ -88,7 +89,7 @@ class ImuModel(FlyerModel):
         pushes = self.pushes_at(lanes, halves(self.steps))
         turning = self._turning(lanes, thrust)
 
-        def slope(half: int, rate: np.ndarray) -> np.ndarray:
+        def slope(half: int, rate: ndarray) -> ndarray:
             return turning(half, rate, pushes[half, :, -3:])
 
         rates = lanes.nuisance[:, None, :3].repeat(self.steps + 1, 1)
@@ -107,7 +108,7 @@ def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
     if params.input not in log or "rate_b" not in log:
         return None
     time, inputs = log[params.input].samples()
-    sent = params.torque.of(params.thrust(inputs)) / np.array(params.torque.inertia)
+    sent = params.torque.of(params.thrust(inputs)) / params.torque.inertia
     return relate(Samples(time, sent), derivative(*log["rate_b"].samples(), SMOOTHING))
 
 
