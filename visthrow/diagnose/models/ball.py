@@ -83,7 +83,8 @@ class BallModel(NumericModel):
         drag, linear, top, side, wind_x, wind_y, _, _, clock, _ = lanes.theta.T
         wind = np.stack([wind_x, wind_y, 0.0 * wind_x], 1)
         sideways = self.of_windows(lanes, "across")
-        spin = top[:, None] * sideways + side[:, None] * np.array([0.0, 0.0, 1.0])
+        upright = np.array([0.0, 0.0, 1.0])
+        spin = top[:, None] * sideways + side[:, None] * upright
         push = self.pushes_at(lanes, halves(STEPS))
         gravity = np.array([0.0, 0.0, -self.params.gravity])
         quadratic = (self.params.drag + drag)[:, None]

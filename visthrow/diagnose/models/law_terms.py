@@ -178,7 +178,8 @@ def _in_body(name: str) -> Callable[[KnotValues], ndarray]:
 
 
 def _unit(i: int) -> Callable[[KnotValues], ndarray]:
-    return lambda k: np.tile(np.eye(3)[i], (len(k["time"]), 1))
+    axis = np.eye(3)[i]
+    return lambda k: np.tile(axis, (len(k["time"]), 1))
 
 
 def _slope(k: KnotValues) -> ndarray:

@@ -433,7 +433,10 @@ class NumericModel(Model, ABC):
         middle = getattr(lanes, name)
         above = self._measured(replace(lanes, **{name: middle + moves}))
         below = self._measured(replace(lanes, **{name: middle - moves}))
-        return [(0.5 * (a - b)).T / step for a, b, step in zip(above, below, steps)]
+        slopes = []
+        for higher, lower, step in zip(above, below, steps):
+            slopes.append((0.5 * (higher - lower)).T / step)
+        return slopes
 
 
 def _costs(aims: list[ndarray]) -> ndarray:

@@ -7,7 +7,6 @@ place."""
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from numpy import ndarray
 
 from visthrow.diagnose.models.quadrotor.flyer_windows import find_acting
@@ -64,7 +63,8 @@ def _flown(
         flight = flights.cuts[w].flight
         acts = flights.flights[flight].command_time[numbers] + setting.plant.vehicle.queue.delay
         last = flights.knots[w] - 2  # behind it is the end
-        knot = np.clip((acts - flights.cuts[w].start) // KNOT_SPACING, 0, last).astype(int)
+        before = (acts - flights.cuts[w].start) // KNOT_SPACING
+        knot = before.clip(0, last).astype(int)
         parent = len(lanes)
         parents.append(parent)
         lanes.append(Lane(w, 0, w, keep=first_knot, rough=True))

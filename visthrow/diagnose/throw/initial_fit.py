@@ -290,8 +290,9 @@ def following(
     sd = window.nuisance_sd[free]
     by_state = window.nuisance[:samples, free] * sd * weight[:, None]
     shift = by_state.T @ (weight * (window.effects[:samples] @ change))
+    information = by_state.T @ by_state + np.eye(len(sd))
     moves = np.zeros(len(free))
-    moves[free] = -sd * np.linalg.solve(by_state.T @ by_state + np.eye(len(sd)), shift)
+    moves[free] = -sd * np.linalg.solve(information, shift)
     return moves
 
 

@@ -111,7 +111,9 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
             return None
     noise = np.hypot(highpass_sigma(values), step * UNIFORM)
     # An angle moves three of four numbers of an attitude by its half.
-    sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0) if name == "quat_wb" else np.median(noise)
+    sigma = np.median(noise)
+    if name == "quat_wb":
+        sigma = 2.0 * np.sqrt(np.sum(noise**2) / 3.0)
     return ChannelSamples(time, values, max(float(sigma), LEAST_SIGMA[name]))
 
 
@@ -204,9 +206,11 @@ def _paired(
         rows = at_pos
         attitudes = quat.values[at_quat]
     else:
-        index = np.clip(np.searchsorted(quat.time, pos.time), 1, len(quat.time) - 1)
+        last = len(quat.time) - 1
+        index = np.clip(np.searchsorted(quat.time, pos.time), 1, last)
         close = quat.time[index] - quat.time[index - 1] < BETWEEN
-        rows = np.flatnonzero(close & (pos.time >= quat.time[0]) & (pos.time <= quat.time[-1]))
+        within = (pos.time >= quat.time[0]) & (pos.time <= quat.time[last])
+        rows = np.flatnonzero(close & within)
         attitudes = attitude_at(quat.time, quat.values, pos.time[rows])
     if len(rows) < 5:
         raise DiagnoseError(

@@ -209,8 +209,8 @@ class ReplayedFlights:
         f = self.flights[c.flight]
         vehicle, _, payload, gyro = self.samples[w]
         reach = c.start - LATEST, c.end + LATEST
-        first, last = np.searchsorted(f.command_time, reach) + [-1, 1]
-        commands = np.clip([first, last], 0, len(f.command_time)) + self.first_command[c.flight]
+        bounds = np.searchsorted(f.command_time, reach) + [-1, 1]
+        first, last = bounds.clip(0, len(f.command_time)) + self.first_command[c.flight]
         return {
             "start": c.start,
             "end": c.end,
@@ -219,8 +219,8 @@ class ReplayedFlights:
             "payload": c.payload,
             "latch": f.latch if c.payload == ATTACHED else NEVER,
             "clock_zero": f.start,
-            "command_first": commands[0],
-            "command_last": commands[1],
+            "command_first": first,
+            "command_last": last,
             "vehicle_count": len(vehicle.time),
             "payload_count": len(payload.time),
             "gyro_count": len(gyro.time),
@@ -247,8 +247,9 @@ class ReplayedFlights:
 
         ``seen``: by all lanes; ``first``: number of the lane before."""
         rows = int(self.rows[w])
-        lanes = np.swapaxes(seen[:rows, first : first + 1 + count], 1, 2).reshape(3 * rows, -1)
-        return lanes[:, 1:] - lanes[:, :1]
+        lanes = seen[:rows, first : first + 1 + count]
+        columns = np.swapaxes(lanes, 1, 2).reshape(3 * rows, -1)
+        return columns[:, 1:] - columns[:, :1]
 
     def fly(
         self,
@@ -285,7 +286,8 @@ def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: Channe
     and gyro.
     """
     pairs = np.tile([0, 1], len(vehicle.time))
-    return np.concatenate((pairs, np.repeat([2, 3], [len(payload.time), len(gyro.time)])))
+    others = np.repeat([2, 3], [len(payload.time), len(gyro.time)])
+    return np.concatenate((pairs, others))
 
 
 def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:

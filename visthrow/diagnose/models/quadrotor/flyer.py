@@ -184,8 +184,11 @@ class FlyerModel(NumericModel):
         for i, stretch in enumerate(self.stretches):
             time = np.unique(stretch.latent_time)
             weights = triangles(time, stretch.data["start"] + grid)
-            values = {name: weights @ [m[name][i] for m in moments] for name in names}
-            knots.append(values | {"time": time})
+            values = {}
+            for name in names:
+                values[name] = weights @ [moment[name][i] for moment in moments]
+            values["time"] = time
+            knots.append(values)
         return knots
 
     def _scale(self, lanes: Lanes) -> ndarray:
@@ -297,8 +300,10 @@ class FlyerModel(NumericModel):
         names = [LATENT_BLOCKS[block] for block, _ in self.pushes[::3]]
         latent = dict(zip(names, np.split(pushes, len(names), axis=2)))
         force_of = self._force(lanes, thrust, rot)
-        pulled = self._pulled(lanes, mass, gravity, wind, mount) if p.cable is not None else None
-        turning = self._turning(lanes, thrust) if p.torque is not None else None
+        if p.cable is not None:
+            pulled = self._pulled(lanes, mass, gravity, wind, mount)
+        if p.torque is not None:
+            turning = self._turning(lanes, thrust)
 
         def loads_at(half: int, state: ndarray) -> dict[str, ndarray]:
             loads = {name: push[half] for name, push in latent.items()}
@@ -316,12 +321,12 @@ class FlyerModel(NumericModel):
             if self.laws:
                 for block, load in exerted(self.laws, quantities(half, state)).items():
                     loads[block] = loads.get(block, 0.0) + load
-            if pulled is not None:
+            if p.cable is not None:
                 acc, acc_payload, *_ = pulled(half, state, loads)
                 parts = [vel, acc, state[:, 9:12], acc_payload - acc]
             else:
                 parts = [vel, loads["vehicle force"] / mass + gravity]
-            if turning is not None:
+            if p.torque is not None:
                 parts.append(turning(half, state[:, -3:], loads["vehicle torque"]))
             return np.concatenate(parts, 1)
 

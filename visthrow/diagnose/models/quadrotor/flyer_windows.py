@@ -83,7 +83,8 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
     if NEIGHBOUR in log:
         driving.append(NEIGHBOUR)
     margin = spare(params.step)
-    halves = np.arange(-margin, 2 * round(params.window / params.step) + 1 + margin)
+    steps = round(params.window / params.step)
+    halves = np.arange(-margin, 2 * steps + 1 + margin)
     stretches = []
     for start, tables, common in cut_flying(log, params, model.channels, driving):
         stamps, positions, _ = tables[0]
@@ -111,15 +112,17 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
 
 def covered(channel: Channel, start: float, end: float) -> bool:
     """Whether a channel has no large gap between two times."""
-    stamps = channel.time[channel.valid & (channel.time >= start) & (channel.time <= end)]
-    gaps = np.diff(np.concatenate([[start], stamps, [end]]))
+    during = (channel.time >= start) & (channel.time <= end)
+    stamps = channel.time[channel.valid & during]
+    gaps = np.diff([start, *stamps, end])
     return len(stamps) > 5 and float(np.max(gaps)) < _MOST_MISSING
 
 
 def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
     """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
     thrust = params.thrust(inputs).sum(axis=1)
-    return np.min(thrust[len(thrust) // 2 :]) >= _IDLE * params.mass * params.gravity
+    during = thrust[len(thrust) // 2 :]
+    return np.min(during) >= _IDLE * params.mass * params.gravity
 
 
 def spare(step: float) -> int:
@@ -150,9 +153,10 @@ def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end:
 
     ``time``: of the commands, shape (C,); ``values``: shape (C, N); ``delay``: to their acting."""
     acts = time + delay
-    during = (np.append(acts[1:], np.inf) > start) & (acts < end)
-    changed = np.append(False, np.any(np.diff(values, axis=0) != 0.0, axis=1))
-    return np.flatnonzero(during & changed)
+    replaced = np.append(acts[1:], np.inf)
+    during = (replaced > start) & (acts < end)
+    changed = np.any(np.diff(values, axis=0) != 0.0, axis=1)
+    return np.flatnonzero(during & np.append(False, changed))
 
 
 def without_each(channel: Channel, params: FlyerParams, start: float) -> list[ndarray]:
@@ -193,9 +197,11 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
     share = share - np.median(share, axis=0)
     step = float(np.median(np.diff(time)))
     even = np.arange(time[0], time[-1], step)
+    pushed = on_grid(time, share, even)
     keep = np.exp(-rate * step)
-    tilt = lfilter([1.0 - keep], [1.0, -keep], on_grid(time, share, even), axis=0)
-    turn = cross(np.pad(tilt, ((0, 0), (0, 1))), np.array([0.0, 0.0, 1.0]))
+    tilt = lfilter([1.0 - keep], [1.0, -keep], pushed, axis=0)
+    upright = np.array([0.0, 0.0, 1.0])
+    turn = cross(np.pad(tilt, ((0, 0), (0, 1))), upright)
     if "rate_b" in log and np.any(log["rate_b"].valid):
         turn[:, :2] -= _offset(log, attitude)[:2] / rate
     return on_grid(even, turn, times)
@@ -206,7 +212,8 @@ def _offset(log: FlightLog, attitude: str) -> ndarray:
     (3,).
     """
     time, rate = rates_of(*log[attitude].samples())
-    return np.median(mean_over(*log["rate_b"].samples(), time, 0.06) - rate, axis=0)
+    gyro = mean_over(*log["rate_b"].samples(), time, 0.06)
+    return np.median(gyro - rate, axis=0)
 
 
 def _line(table: Table, start: float) -> ndarray:

@@ -98,7 +98,8 @@ class ImuModel(FlyerModel):
         gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
-        return np.concatenate([rates, (push + lanes.nuisance[:, 3:])[..., None]], 2)
+        shown = push + lanes.nuisance[:, 3:]
+        return np.concatenate([rates, shown[..., None]], 2)
 
 
 def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
