@@ -24,7 +24,7 @@ from visthrow.diagnose.throw.initial_states import (
     rows_of,
     stacked,
 )
-from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation
+from visthrow.diagnose.throw.replay import Lane, ReplayedFlights, Simulation, carried
 
 DAMPING, DAMPING_MOST = (
     1e-3,
@@ -187,6 +187,11 @@ class InitialFit:
         """
         return {fit.number: fit.slopes for fit in self._fits if fit.slopes is not None}
 
+    def settled(self, slopes: Mapping[int, ndarray]) -> States:
+        """States fitted from those that flights through the windows give; see :meth:`fit`."""
+        states, _ = carried(self.flights, self.simulation)
+        return self.fit(states, slopes)
+
     def fit(self, states: States, slopes: Mapping[int, ndarray]) -> States:
         """Fit each window's initial state to its samples; no step that does not help is taken.
 
@@ -218,12 +223,9 @@ class InitialFit:
         """Residuals of windows, of what depends on their initial states; a row of the states for
         each.
         """
-        f = self.flights
         lanes = [Lane(fit.number, 0, row) for row, fit in enumerate(fits)]
-        measured = f.fly(self.simulation, states, lanes, self._shortened).seen
-        return [
-            fit.sensitive * f.residual(measured, fit.number, lane) for lane, fit in enumerate(fits)
-        ]
+        residuals = self.flights.residuals(self.simulation, states, lanes, self._shortened)
+        return [fit.sensitive * residual for fit, residual in zip(fits, residuals)]
 
     def _take_slopes(self, states: States, fits: Sequence[_WindowFit]) -> None:
         """Take the derivatives of windows' samples by their initial states."""

@@ -17,7 +17,9 @@ from sim.kernels.replay.lanes import Recording, Replay, Replayed
 from visthrow.diagnose.likelihood.transfer import to_host
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.initial_states import (
+    MOVED,
     States,
+    directions,
     hover_state,
     measured_state,
     rows_of,
@@ -276,6 +278,17 @@ class ReplayedFlights:
             states, recording or self.recording, columns, KNOT_SPACING, knots
         )
 
+    def residuals(
+        self,
+        simulation: Simulation,
+        states: States,
+        lanes: Sequence[Lane],
+        recording: Recording | None = None,
+    ) -> list[ndarray]:
+        """Fly lanes; returns each one's residual, see :meth:`residual` and :meth:`fly`."""
+        seen = self.fly(simulation, states, lanes, recording).seen
+        return [self.residual(seen, lane.window, i) for i, lane in enumerate(lanes)]
+
     def ended(self, ends: Sequence[float]) -> Recording:
         """The windows that end earlier [s]; what is seen afterwards says nothing."""
         return Recording(self.windows | {"end": np.array(ends)}, self.recording.data)
@@ -332,4 +345,6 @@ def carried(flights: ReplayedFlights, simulation: Simulation) -> tuple[States, S
         flown = flights.fly(simulation, stacked([states[w] for w in windows]), lanes)
         for row, w in enumerate(windows):
             ends[w] = rows_of(flown.ends, np.array([row]))
-    return stacked(states), stacked(ends)
+    begun = stacked(states)
+    begun[MOVED] = np.zeros((len(states), len(directions(setting.plant))))
+    return begun, stacked(ends)

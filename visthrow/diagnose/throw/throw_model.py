@@ -159,11 +159,12 @@ class ThrowModel(Model):
     ) -> States:
         """Take the windows without the time in which ropes were slack; returns initial states."""
         self.flights = self.cut_into(flights, cuts)
-        states, ends = self._settled_throughout(self.setting, self.flights)
+        simulation = self.simulation(self.setting)
+        states, ends = carried(self.flights, simulation)
         without_slack = self._without_slack(ends)
         if without_slack != cuts:
             self.flights = self.cut_into(flights, without_slack)
-            states, _ = self._settled_throughout(self.setting, self.flights)
+            states, _ = carried(self.flights, simulation)
         return states
 
     def _choose(self, concerned: Mapping[str, SettingEffect], names: Iterable[str]) -> None:
@@ -266,8 +267,7 @@ class ThrowModel(Model):
     def _flown(self, setting: Setting, states: States) -> list[ndarray]:
         """Residuals of all windows' replayed samples in a setting."""
         lanes = [Lane(w, 0, w) for w in self._retained]
-        measured = self.flights.fly(self.simulation(setting), states, lanes).seen
-        return [self.flights.residual(measured, w, lane) for lane, w in enumerate(self._retained)]
+        return self.flights.residuals(self.simulation(setting), states, lanes)
 
     def residuals(
         self, theta: Mapping[str, float], linearised: Linearised | None = None
@@ -375,22 +375,13 @@ class ThrowModel(Model):
         """
         setting = self.at(theta)
         flights = self.cut_into(self.flights.flights, cuts)
-        start, _ = self._settled_throughout(setting, flights)
-        return setting, self._initial_fit(setting, flights).fit(start, {})
+        return setting, self._initial_fit(setting, flights).settled({})
 
     def simulation(
         self, *settings: Setting, download: Callable[[wp.array], Any] = downloaded
     ) -> Simulation:
         """Settings ready to be flown in, with this model's steps."""
         return Simulation(settings, self.substep, self.device, download)
-
-    def _settled_throughout(
-        self, setting: Setting, flights: ReplayedFlights
-    ) -> tuple[States, States]:
-        """See :func:`visthrow.diagnose.throw.replay.carried`."""
-        states, ends = carried(flights, self.simulation(setting))
-        states[MOVED] = np.zeros((len(flights.cuts), len(directions(setting.plant))))
-        return states, ends
 
     def _initial_fit(self, setting: Setting, flights: ReplayedFlights) -> InitialFit:
         """Return the fit of initial states in a setting."""
@@ -402,10 +393,9 @@ class ThrowModel(Model):
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting, self.flights)
-        start, _ = self._settled_throughout(setting, self.flights)
         known = [way.place for way in directions(self.setting.plant)]
         alike = [way.place for way in fitter.directions] == known
-        return fitter.fit(start, slopes if alike else {})
+        return fitter.settled(slopes if alike else {})
 
     @staticmethod
     def _step(e: SettingEffect, theta: float) -> float:

@@ -75,7 +75,7 @@ class QuadrotorParams(Bounded):
 
     def thrust(self, inputs: ndarray) -> ndarray:
         """Return the thrust that the map gives for inputs [N]."""
-        return sum(c * inputs**power for power, c in enumerate(self.thrust_map))
+        return np.polynomial.polynomial.polyval(inputs, self.thrust_map)
 
     def __post_init__(self) -> None:
         super().__post_init__()
