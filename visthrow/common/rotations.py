@@ -24,10 +24,10 @@ def cross(a: ndarray, b: ndarray) -> ndarray:
     return a.take(_SUCCESSOR, -1) * b.take(_LAST, -1) - a.take(_LAST, -1) * b.take(_SUCCESSOR, -1)
 
 
-def across(vector: ndarray, axis: ndarray) -> ndarray:
+def normal_part(vector: ndarray, axis: ndarray) -> ndarray:
     """Return what of vectors is normal to unit vectors, both of shape (..., 3)."""
-    along = np.einsum("...i,...i->...", vector, axis)
-    return vector - along[..., None] * axis
+    parallel = np.einsum("...i,...i->...", vector, axis)
+    return vector - parallel[..., None] * axis
 
 
 def matrix_of_quat(quat: ndarray) -> ndarray:

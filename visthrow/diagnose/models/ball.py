@@ -112,10 +112,10 @@ class BallModel(NumericModel):
         rate = path[..., 3:] * (1.0 + clock[:, None, None])
         pos = CubicHermiteSpline(grid, path[..., :3], rate, axis=1)(time)
         first = pos[:, :1]
-        gone = pos - first
+        displacement = pos - first
         tilt = np.stack([tilt_x, tilt_y, 0.0 * tilt_x], 1)
-        gone = gone + cross(tilt[:, None], gone)
-        return (first + gone * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
+        displacement = displacement + cross(tilt[:, None], displacement)
+        return (first + displacement * (1.0 + scale)[:, None, None]).reshape(len(path), -1)
 
 
 def _free(time: ndarray, pos: ndarray, params: BallParams) -> list[tuple[float, float]]:
@@ -130,9 +130,9 @@ def _free(time: ndarray, pos: ndarray, params: BallParams) -> list[tuple[float, 
     falls = np.pad((off < FALLS * params.gravity).astype(int), 1)
     edges = np.flatnonzero(np.diff(falls))
     spans = []
-    for first, behind in edges.reshape(-1, 2):
+    for first, stop in edges.reshape(-1, 2):
         start = stamps[first] + params.edge
-        end = stamps[behind - 1] - params.edge
+        end = stamps[stop - 1] - params.edge
         if end - start >= params.shortest:
             spans.append((start, end))
     return spans

@@ -25,7 +25,7 @@ from numpy import ndarray
 from sim.law_factors import LAW_FACTORS
 from sim.params import LOWEST, SLOWEST, LawParams
 from visthrow.common.errors import ConfigError, suggest
-from visthrow.common.rotations import across, cross, rotate, rotate_back
+from visthrow.common.rotations import cross, normal_part, rotate, rotate_back
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
 Knots = Mapping[str, ndarray]
@@ -224,9 +224,9 @@ DERIVED: dict[str, Callable[[KnotValues], ndarray]] = {
     "unit_y": _unit(1),
     "unit_z": _unit(2),
     "slope": _slope,
-    "swing": lambda k: across(k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]),
+    "swing": lambda k: normal_part(k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]),
     "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
-    "across": lambda k: across(k["vel_w"], k["axis_z"]),
+    "across": lambda k: normal_part(k["vel_w"], k["axis_z"]),
     "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]),
     "vel_b": _in_body("vel_w"),
     "cable_dir_b": _in_body("cable_dir_w"),
@@ -243,7 +243,7 @@ DERIVED: dict[str, Callable[[KnotValues], ndarray]] = {
     "inverse_distance": lambda k: 1.0 / np.maximum(k["|apart|"], LOWEST),
     "neighbour": lambda k: k["apart"] * k["inverse_distance"][:, None],
     "distance_upright": lambda k: k["neighbour"][:, 2],
-    "sideways": lambda k: across(k["cable_dir_w"], k["axis_z"]),
+    "sideways": lambda k: normal_part(k["cable_dir_w"], k["axis_z"]),
 }
 """What :class:`KnotValues` computes of the quantities at the knots."""
 

@@ -123,7 +123,7 @@ def with_direct(
             if kind.differs(nominal, perturbed[k]):
                 columns[:, k] = (kind.predicted(number, perturbed[k]) - plain) / steps[k]
         channel = channels.index(kind.channel)
-        behind = (0, count), (0, 0)
+        padding = (0, count), (0, 0)
         window = replace(
             window,
             time=np.append(window.time, time),
@@ -131,8 +131,8 @@ def with_direct(
             channel=np.append(window.channel, [channel] * count),
             sigma=np.append(window.sigma, [sigma] * count),
             effects=np.vstack((window.effects, columns)),
-            nuisance=np.pad(window.nuisance, behind),
-            latent=np.pad(window.latent, behind),
+            nuisance=np.pad(window.nuisance, padding),
+            latent=np.pad(window.latent, padding),
         )
     return window
 

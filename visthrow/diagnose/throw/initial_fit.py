@@ -103,8 +103,8 @@ class _WindowFit:
         off = np.abs(residual) / self.spread
         if not np.all(off < FARTHEST):
             return np.inf
-        near = np.minimum(off, HUBER)
-        return float(np.sum(near * (off - 0.5 * near)))
+        clipped = np.minimum(off, HUBER)
+        return float(np.sum(clipped * (off - 0.5 * clipped)))
 
     def increment(self, done: ndarray) -> tuple[ndarray, float]:
         """Levenberg-Marquardt step with the vague prior, shape (directions,), and the fall of the

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import ATTACHED, LOOSE, STATE_FIELDS
 from sim.params import GRAVITY, PlantParams, SensingParams, VehicleParams
-from visthrow.common.rotations import across, cross
+from visthrow.common.rotations import cross, normal_part
 from visthrow.diagnose.throw.cutting import Cut
 from visthrow.diagnose.throw.recorded_flight import ChannelSamples, RecordedFlight
 
@@ -151,10 +151,10 @@ def moved_along(states: States, directions: Sequence[Direction], sizes: ndarray)
             frame = _tangents(n[:, -1])[:, axes]
             shapes = np.array([_shape(directions[d].part, n.shape[1]) for d in members])
             displacement = np.einsum("sd,dl,sdx->slx", size, shapes, frame)
-            value = out[field] + across(displacement, n)
+            value = out[field] + normal_part(displacement, n)
             if field == "cable_dir_w":
                 value /= np.linalg.norm(value, axis=-1, keepdims=True)
-                out["cable_vel_w"] = across(states["cable_vel_w"], value)
+                out["cable_vel_w"] = normal_part(states["cable_vel_w"], value)
         else:
             value[:, axes] += size
         out[field] = value
@@ -196,10 +196,10 @@ def _smoothed(
     samples: ChannelSamples, instant: float, before: float, after: float
 ) -> tuple[ndarray, ndarray] | None:
     for reach in (1.0, 2.0, 4.0):
-        near = samples.during(instant - reach * before, instant + reach * after)
-        if len(near.time) >= LEAST_SAMPLES:
-            time = near.time - instant
-            values = near.values
+        chosen = samples.during(instant - reach * before, instant + reach * after)
+        if len(chosen.time) >= LEAST_SAMPLES:
+            time = chosen.time - instant
+            values = chosen.values
             if values.shape[1] == 4:
                 return _smoothed_turn(time, values)
             fit = np.polynomial.polynomial.polyfit(time, values, 2 if len(time) < 12 else 3)
@@ -237,9 +237,9 @@ def measured_state(
     out = {name: value.copy() for name, value in inner.items()}
     x = setting.sensing
     plant = setting.plant
-    shown = time + x.vehicle_delay
-    pos, vel = smoothed(flight.vehicle, shown) or (flight.vehicle.values[0], np.zeros(3))
-    quat, rate = smoothed(flight.attitude, shown) or (flight.attitude.values[0], np.zeros(3))
+    instant = time + x.vehicle_delay
+    pos, vel = smoothed(flight.vehicle, instant) or (flight.vehicle.values[0], np.zeros(3))
+    quat, rate = smoothed(flight.attitude, instant) or (flight.attitude.values[0], np.zeros(3))
     attitude = without_marker(x, Rotation.from_quat(quat))
     rate = Rotation.from_rotvec(x.marker_rotation).apply(rate)
     gyro = flight.gyro and smoothed(flight.gyro, time + x.gyro_delay)

@@ -125,8 +125,8 @@ def _spans(model: Any, number: int) -> tuple[tuple[float, float], tuple[float, f
     if not cuts:
         return None
     slack = [c for c in cuts if not c.retained]
-    near = [c.start for c in slack if c.end > separation - LEAD]
-    end = min([separation - LEAD + HEAD, *near])
+    slack_starts = [c.start for c in slack if c.end > separation - LEAD]
+    end = min([separation - LEAD + HEAD, *slack_starts])
     begin = max(end - HEAD, cuts[0].start)
     last = max([separation - BEFORE, cuts[0].start, *[c.end for c in slack]])
     if end - begin <= SHORTEST or separation - last <= LEAST_TAUT:

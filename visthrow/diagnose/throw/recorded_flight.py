@@ -209,8 +209,8 @@ def _paired(
         last = len(quat.time) - 1
         index = np.clip(np.searchsorted(quat.time, pos.time), 1, last)
         close = quat.time[index] - quat.time[index - 1] < BETWEEN
-        within = (pos.time >= quat.time[0]) & (pos.time <= quat.time[last])
-        rows = np.flatnonzero(close & within)
+        covered = (pos.time >= quat.time[0]) & (pos.time <= quat.time[last])
+        rows = np.flatnonzero(close & covered)
         attitudes = attitude_at(quat.time, quat.values, pos.time[rows])
     if len(rows) < 5:
         raise DiagnoseError(

@@ -179,8 +179,8 @@ class ReplayedFlights:
             stamps = vehicle.time.repeat(2), payload.time, gyro.time
             self.time.append(np.concatenate(stamps).repeat(3))
             measured = np.zeros((len(self._groups[w]), 3))
-            shown = self._groups[w] != 1  # attitudes are measured against themselves
-            measured[shown] = np.concatenate((vehicle.values, payload.values, gyro.values))
+            has_value = self._groups[w] != 1  # attitudes are measured against themselves
+            measured[has_value] = np.concatenate((vehicle.values, payload.values, gyro.values))
             self._measured.append(measured)
 
     def _recorded(self) -> dict[str, ndarray]:
@@ -272,8 +272,8 @@ class ReplayedFlights:
         rough = columns.pop("rough").astype(int)
         fineness = self._fineness[columns["window"], rough]
         columns["substep"] = simulation.steps[columns["plant"], rough] * fineness
-        behind = columns["keep"] + self.knots[columns["window"]]
-        knots = int(np.max(behind[columns["keep"] >= 0], initial=1))
+        ends = columns["keep"] + self.knots[columns["window"]]
+        knots = int(np.max(ends[columns["keep"] >= 0], initial=1))
         return simulation.replay.run(
             states, recording or self.recording, columns, KNOT_SPACING, knots
         )
@@ -299,8 +299,8 @@ def _groups_of(vehicle: ChannelSamples, _, payload: ChannelSamples, gyro: Channe
     and gyro.
     """
     pairs = np.tile([0, 1], len(vehicle.time))
-    others = np.repeat([2, 3], [len(payload.time), len(gyro.time)])
-    return np.concatenate((pairs, others))
+    rest_of_rows = np.repeat([2, 3], [len(payload.time), len(gyro.time)])
+    return np.concatenate((pairs, rest_of_rows))
 
 
 def flown_alike(kind: tuple[int, bool], setting: Setting, second: Setting) -> bool:

@@ -119,8 +119,8 @@ class ThrowModel(Model):
         concerned = effects_for(self.setting, measured, any(hangs), thrown, simpler)
         self._choose(concerned, concerned if only is None else only)
         if silent and plant.vehicle.battery.kind == "sag":
-            other = OTHER_CHARGE if "battery_charge" in self.entries else ""
-            self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + other)
+            note = OTHER_CHARGE if "battery_charge" in self.entries else ""
+            self.notes = (*self.notes, UNKNOWN_CHARGE.format(silent, len(flights)) + note)
         fitter = self._initial_fit(self.setting, self.flights)
         begun = fitter.fit(states, {})
         # states at theta = 0, and the samples' derivatives by them
@@ -134,10 +134,9 @@ class ThrowModel(Model):
     def _cuts_of(self, flights: Sequence[RecordedFlight], hangs: Sequence[bool]) -> list[Cut]:
         """Cut flights into windows, fewer where there are many."""
         release = self.setting.plant.release
-        known = release.lag, release.landing_height
         cuts: list[Cut] = []
         for i, flight in enumerate(flights):
-            cuts += cut(flight, i, *known, hangs[i])
+            cuts += cut(flight, i, release.lag, release.landing_height, hangs[i])
         if not cuts:
             raise DiagnoseError(
                 f"{len(flights)} flights hold no stretch of poses and commands long enough to"
@@ -393,8 +392,8 @@ class ThrowModel(Model):
         if setting == self.setting:
             return states
         fitter = self._initial_fit(setting, self.flights)
-        known = [way.place for way in directions(self.setting.plant)]
-        alike = [way.place for way in fitter.directions] == known
+        places = [way.place for way in directions(self.setting.plant)]
+        alike = [way.place for way in fitter.directions] == places
         return fitter.settled(slopes if alike else {})
 
     @staticmethod
@@ -467,5 +466,10 @@ def _key(theta: Mapping[str, float]) -> frozenset[tuple[str, float]]:
 
 def _measured(flights: Sequence[RecordedFlight], carries: bool) -> list[str]:
     """Return the channels of poses and rates that these flights have."""
-    shown = [True, True, carries and any(f.payload for f in flights), any(f.gyro for f in flights)]
-    return list(compress(REPLAYED, shown))
+    measured = [
+        True,
+        True,
+        carries and any(f.payload for f in flights),
+        any(f.gyro for f in flights),
+    ]
+    return list(compress(REPLAYED, measured))

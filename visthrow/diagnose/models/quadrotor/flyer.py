@@ -15,7 +15,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
 from scipy.signal import lfilter
 
-from visthrow.common.rotations import across, cross
+from visthrow.common.rotations import cross, normal_part
 from visthrow.diagnose.models.catalogue import ModelEffect
 from visthrow.diagnose.models.law_terms import exerted
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
@@ -277,9 +277,9 @@ class FlyerModel(NumericModel):
         length = (self.params.cable.length + self.size_of(lanes, "rope_length"))[:, None]
         down = self.of_windows(lanes, "direction")
         level = ((0, 0), (0, 1))  # a third component of 0
-        direction = down + across(np.pad(unknown[:, 6:8], level), down)
+        direction = down + normal_part(np.pad(unknown[:, 6:8], level), down)
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-        swing = across(np.pad(unknown[:, 8:10], level), direction)
+        swing = normal_part(np.pad(unknown[:, 8:10], level), direction)
         gap = length * direction + mount[0][0]
         rate = length * swing + mount[1][0]
         return np.concatenate((unknown[:, :6], gap, rate, unknown[:, 10:]), 1)

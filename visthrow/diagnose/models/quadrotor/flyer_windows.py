@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import across, cross, matrix_of_quat, vectors_between
+from visthrow.common.rotations import cross, normal_part, matrix_of_quat, vectors_between
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -246,7 +246,7 @@ def _guess(
             gap = pos_p - pos - arm
             direction = gap / np.linalg.norm(gap)
             arm_rate = (next_arm - arm) / (0.5 * params.step)
-            swing = across((vel_p - vel - arm_rate) / params.cable.length, direction)
+            swing = normal_part((vel_p - vel - arm_rate) / params.cable.length, direction)
         guess += [0.0, 0.0, *swing[:2]]
         spread += [0.1, 0.1, 1.0, 1.0]
     if params.torque is not None:

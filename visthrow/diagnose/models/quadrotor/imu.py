@@ -98,8 +98,8 @@ class ImuModel(FlyerModel):
         gust = pushes[:, :, 2]
         gust = gust - gust.mean(0)  # what lasts is the accelerometer's offset, or the map's scale
         push = (thrust.sum(2) + gust)[::2].T / self.params.mass
-        shown = push + lanes.nuisance[:, 3:]
-        return np.concatenate([rates, shown[..., None]], 2)
+        acc = push + lanes.nuisance[:, 3:]
+        return np.concatenate([rates, acc[..., None]], 2)
 
 
 def _turned(log: FlightLog, params: ImuParams) -> Relation | None:
