@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.random import default_rng
 
-from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Priors, covariance
+from visthrow.diagnose.likelihood.evidence import OWN_FLOOR, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.scatter import allowed, between_flights
 
@@ -35,8 +35,9 @@ PRIORS = Priors(
 
 def interval(statistics: Statistics) -> tuple[float, float]:
     """Estimate of the named effect and its deviation."""
-    spread = covariance(statistics.information.sum(0), PRIORS.deviation([0]))
-    size = spread[0] @ statistics.absolute.sum(0)
+    posterior = Posterior.of(statistics, PRIORS)
+    spread = posterior.covariance([0])
+    size = spread[0] @ posterior.score
     unlike, kept = between_flights(statistics, PRIORS, [0], np.array([size, 0.0]))
     more = unlike * kept[0] * allowed(size) ** 2
     return size, np.sqrt(spread[0, 0] + OWN_FLOOR**2 + more)

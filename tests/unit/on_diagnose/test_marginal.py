@@ -13,7 +13,7 @@ from tests.synthetic_diagnosis import GUST, SyntheticModel, catalogue
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import marginal
 from visthrow.diagnose.likelihood import noise_levels as noise
-from visthrow.diagnose.likelihood.evidence import Priors, estimate
+from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.stack import Stack, statistics
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
@@ -187,6 +187,6 @@ def test_estimates_stay_within_their_bounds_to_the_last_digit():
         low = np.where(rng.random(7) < 0.5, 0.0, -rng.uniform(0.0, 1.0, 7))
         high = rng.uniform(0.1, 2.0, 7)
         priors = Priors(np.ones(7), np.full(7, 1e6), low, high, np.ones(7, bool))
-        theta = estimate(information, score, priors, list(range(7)))
+        theta = Posterior(information, score, priors).estimate(range(7))
         worst = max(worst, np.max(low - theta), np.max(theta - high))
     assert worst <= 0.0

@@ -292,9 +292,8 @@ def test_evidence_is_the_integral():
         prior = np.exp(-0.5 * (x / sd) ** 2)
         weight = prior * np.exp(1.7 * x - 0.15 * x**2)
         expected = np.log(np.trapezoid(weight, x) / np.trapezoid(prior, x))
-        assert evidence.log_evidence(information, score, priors, active) == approx(
-            expected, abs=1e-6
-        )
+        posterior = evidence.Posterior(information, score, priors)
+        assert posterior.log_evidence(active) == approx(expected, abs=1e-6)
 
 
 @mark.parametrize("active", [[], [0], [1, 2]])
@@ -303,12 +302,13 @@ def test_gains_are_differences_of_the_evidence(active):
     priors = _priors(count)
     information = _information(count)
     score = information @ np.arange(count)
-    singles = evidence.additions(information, score, priors, active)
-    pairs = evidence.pair_additions(information, score, priors, active)
-    before = evidence.log_evidence(information, score, priors, active)
+    posterior = evidence.Posterior(information, score, priors)
+    singles = posterior.additions(active)
+    pairs = posterior.pair_additions(active)
+    before = posterior.log_evidence(active)
     for i, j in np.ndindex(count, count):
         names = {i, j} - set(active)
-        expected = evidence.log_evidence(information, score, priors, [*active, *names]) - before
+        expected = posterior.log_evidence([*active, *names]) - before
         assert pairs[i, j] == approx(expected if len(names) == 2 else -np.inf)
         if i == j:
             assert singles[i] == approx(expected if names else -np.inf)
@@ -323,8 +323,9 @@ def test_gains_are_numbers_where_information_differs_by_ten_orders(active, seed)
     information = slopes.T @ slopes
     one = np.ones(4)
     priors = Priors(one, 20.0 * one, -50.0 * one, 50.0 * one, one > 0.0)
-    for gains in (evidence.additions, evidence.pair_additions):
-        assert not np.isnan(gains(information, information @ (300.0 * one), priors, active)).any()
+    posterior = evidence.Posterior(information, information @ (300.0 * one), priors)
+    for gains in (posterior.additions, posterior.pair_additions):
+        assert not np.isnan(gains(active)).any()
 
 
 def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds():
@@ -332,9 +333,8 @@ def test_threshold_rises_with_the_number_of_candidates_and_holds_in_null_worlds(
     few, many = (_threshold(count) for count in (4, 400))
     assert few < many
     information, priors, least = _information(40), _priors(40), _threshold(40)
-    best = evidence.additions(
-        information, evidence.null_draws(information, 2000, rng), priors, ()
-    ).max(axis=1)
+    draws = evidence.null_draws(information, 2000, rng)
+    best = evidence.Posterior(information, draws, priors).additions(()).max(axis=1)
     assert np.mean(best > least) < 0.012  # half a per cent, with the scatter of two finite samples
 
 
@@ -375,7 +375,7 @@ def test_a_set_that_was_the_best_before_stays_possible():
     for w in model._windows:  # hardly to be told from it
         w.effects[:, 8] = w.effects[:, 6] + 0.03 * w.effects[:, 3]
     problem = Problem.of(model, model.windows({}), range(14))
-    selector = Selector(problem, linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
+    selector = Selector(linearise(problem, np.zeros(len(EFFECTS))), 5.0, laws=False)
     twin = frozenset(c for c in selector.candidates if c.name == "effect_08")
     selector.run(twin)
     assert [step.named for step in selector.steps] == ["effect_06"]

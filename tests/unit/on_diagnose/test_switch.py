@@ -16,7 +16,7 @@ def test_a_fit_leaves_switches_where_they_are_and_moves_the_others():
     problem = Problem(model, tuple(range(len(model.windows({})))))
     for at in (0.0, 7.0):
         point = linearise(problem, np.where(np.arange(6) == 3, at, 0.0))
-        found = fitted(problem, point, [1, 3])
+        found = fitted(point, [1, 3])
         assert found.theta[3] == at
         assert abs(found.theta[1]) > 2.0
 

@@ -158,10 +158,10 @@ def test_initial_states_follow_the_effects(planted):
     problem = Problem(model, tuple(range(len(windows))))
     nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
     follow, behind = (
-        moved(problem, point, there) for point in (nominal, replace(nominal, about=None))
+        moved(point, there) for point in (nominal, replace(nominal, about=None))
     )
-    assert curvature(problem, nominal, follow) < 0.2 * curvature(problem, nominal, behind)
-    back = moved(problem, follow, np.zeros(1))  # there and back again
+    assert curvature(nominal, follow) < 0.2 * curvature(nominal, behind)
+    back = moved(follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):
         assert_allclose(again.residual, w.residual, atol=1e-9)
 

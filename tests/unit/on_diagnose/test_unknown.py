@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.synthetic_diagnosis import EFFECTS, SyntheticModel, catalogue
 from visthrow.common.rotations import rotate
-from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.models import law_terms as laws
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.reporting.blackbox import ForceTable, table_of, train, unexplained
@@ -246,13 +246,11 @@ def beside_a_law(model: SyntheticModel, active: list[int], *told: laws.Term) -> 
     problem = Problem(model, tuple(range(len(model._windows))))
     point = linearise(problem, np.zeros(len(model.effects)))
     if told:
-        problem, (point,) = terms.extended(
-            problem, [point], [terms.as_effect(term, 0.1, 7.0) for term in told]
-        )
-    columns = [*active, *range(len(model.effects), len(problem.priors.floor))]
-    found = Selector(problem, point, 4.0)
+        (point,) = terms.extended([point], [terms.as_effect(term, 0.1, 7.0) for term in told])
+    columns = [*active, *range(len(model.effects), len(point.theta))]
+    found = Selector(point, 4.0)
     chosen = frozenset(c for c in found.candidates if c.group == ALL and c.columns[0] in columns)
-    found.best = Trial(chosen, candidate(problem, point, columns))
+    found.best = Trial(chosen, candidate(point, columns))
     return found
 
 
@@ -272,12 +270,10 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
         known,
     )
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
-        problem, (point,) = terms.extended(
-            at.problem, [at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)]
-        )
-        scale = problem.priors.floor[-1]
+        (point,) = terms.extended([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
+        scale = point.problem.priors.floor[-1]
         assert point.information[-1, -1] == approx(scale**2 * of.information[i, 0, 0], rel=1e-6)
-        assert point.score[-1] == approx(
+        assert point.posterior.score[-1] == approx(
             scale * of.score[i, 0], rel=1e-5, abs=1e-9 * scale * np.sqrt(of.information[i, 0, 0])
         )
         cross, most = scale * of.cross, scale * np.abs(of.cross).max()
@@ -355,17 +351,21 @@ def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
     term = terms.as_effect(laws.Term("payload force", (), "vel"), 100.0, 0.0)
     effects = (replace(catalogue(1)[0], prior_sd=1.0, floor=1.0), term)
     priors = Priors.of(effects, ("pos_w", "payload_pos_w"))
-    point = SimpleNamespace(information=information, score=score)
+    problem = SimpleNamespace(priors=priors, effects=effects)
+    point = SimpleNamespace(problem=problem, posterior=Posterior(information, score, priors))
     both, name = 0.5 * score @ np.linalg.solve(information, score), 0.5 * score[0] ** 2 / 4.0
     screened = terms.Screen(
         (), np.ones(1), information[1:, 1:, None], score[1:, None], information[1:, None]
     )
-    beside = SimpleNamespace(information=information[:1, :1], score=score[:1])
     known = replace(priors, **{n: getattr(priors, n)[:1] for n in ("floor", "slab", "low", "high")})
+    beside = SimpleNamespace(
+        problem=SimpleNamespace(priors=known),
+        posterior=Posterior(information[:1, :1], score[:1], known),
+    )
     screened.cross = screened.cross[:, :, :1]
-    (nats,) = terms.unsaid(beside, known, [], screened, [0])
+    (nats,) = terms.unsaid(beside, [], screened, [0])
     assert nats == approx(both - name, rel=1e-3)
-    (law,) = terms.laws(SimpleNamespace(priors=priors, effects=effects), point, [0, 1], 5.0)
+    (law,) = terms.laws(point, [0, 1], 5.0)
     covariance = np.linalg.inv(information + np.diag(priors.slab**-2.0))
     assert law.sd == approx(term.floor * covariance[1, 1] ** 0.5)
     assert law.covariance == approx((law.sd**2,))

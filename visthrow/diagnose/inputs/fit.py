@@ -79,7 +79,7 @@ def fit(model: Model, free: Sequence[str]) -> FitResult:
     point = linearise(problem, np.zeros(len(names)), windows=before)
     for _ in range(ROUNDS):
         start = point.theta
-        point = fitted(problem, point, columns)
+        point = fitted(point, columns)
         point = linearise(problem, point.theta, point.noise)
         if np.max(np.abs(point.theta - start)) < 0.5:  # floors
             break

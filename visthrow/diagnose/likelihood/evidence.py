@@ -7,8 +7,7 @@ deviations; a named one has N(0, prior^2) within its bounds (the slab):
     log Z = -1/2 log |1 + D^1/2 I D^1/2| + 1/2 s' (I + D^-1)^-1 s + log of the prior's and
     posterior's mass within the bounds
 
-All functions take information I, shape (K, K), and scores s about theta = 0, shape (K,), or (n, K)
-for n draws at once."""
+with information I and scores s about theta = 0."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -49,6 +48,9 @@ INEXACT = 0.3
 kind of block, of a force against the thrust, of the misfit of a window that begins in a motion that
 nobody knows, of a size that derivatives of elsewhere give.
 """
+
+Sets = Sequence[tuple[tuple[int, ...], float]]
+"""Numbers of the effects of each possible set, and its nats behind the best."""
 
 CALIBRATION_DRAWS = 4000
 CALIBRATION_QUANTILE = 0.995
@@ -108,196 +110,178 @@ def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarra
     return upper + np.log1p(-np.exp(np.minimum(lower - upper, -1e-12)))
 
 
-def covariance(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Posterior covariance (I + D^-1)^-1, shape (K, K)."""
-    inverse = lapack.dpotrs(_factor(information, deviation), np.eye(len(deviation)), lower=1)[0]
-    return inverse * np.outer(deviation, deviation)
+@dataclass(frozen=True)
+class Posterior:
+    """The statistics of flights, with what was believed of the effects before."""
 
+    information: np.ndarray  # I, shape (K, K)
+    score: np.ndarray  # s about theta = 0, shape (K,), or (n, K) for n draws at once
+    priors: Priors
 
-def _factor(information: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.
+    @staticmethod
+    def of(statistics: Statistics, priors: Priors) -> "Posterior":
+        """Return what all flights say together."""
+        information = statistics.information.sum(0)
+        return Posterior(information, statistics.absolute.sum(0), priors)
 
-    Raises DiagnoseError: not positive definite, not finite.
-    """
-    scaled = information * np.outer(deviation, deviation)
-    scaled.flat[:: len(scaled) + 1] += 1.0
-    factor, failed = lapack.dpotrf(scaled, lower=1, clean=0)
-    if failed or not np.isfinite(
-        np.trace(factor)
-    ):  # LAPACK goes on with NaN, which reaches the last row
-        raise DiagnoseError(
-            "the flights' information on the effects is not finite or not positive; the derivatives"
-            " are broken"
-        )
-    return factor
+    def _factor(self, deviation: np.ndarray) -> np.ndarray:
+        """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.
 
+        Raises DiagnoseError: not positive definite, not finite.
+        """
+        scaled = self.information * np.outer(deviation, deviation)
+        scaled.flat[:: len(scaled) + 1] += 1.0
+        factor, failed = lapack.dpotrf(scaled, lower=1, clean=0)
+        # LAPACK goes on with NaN, which reaches the last row
+        if failed or not np.isfinite(np.trace(factor)):
+            raise DiagnoseError(
+                "the flights' information on the effects is not finite or not positive; the"
+                " derivatives are broken"
+            )
+        return factor
 
-def log_evidence(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
-) -> float:
-    """log Z of one set of named effects."""
-    deviation = priors.deviation(active)
-    factor = _factor(information, deviation)
-    half = score * deviation
-    mean = lapack.dpotrs(factor, half, lower=1)[0]
-    value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
-    if len(active):
+    def covariance(self, active: Sequence[int]) -> np.ndarray:
+        """Posterior covariance (I + D^-1)^-1 with these effects named, shape (K, K)."""
+        deviation = self.priors.deviation(active)
+        factor = self._factor(deviation)
+        inverse = lapack.dpotrs(factor, np.eye(len(deviation)), lower=1)[0]
+        return inverse * np.outer(deviation, deviation)
+
+    def mean(self, active: Sequence[int]) -> np.ndarray:
+        """Return the most probable size of every effect, those not named below their floors; shape
+        (K,).
+        """
+        return self.covariance(active) @ self.score
+
+    def log_evidence(self, active: Sequence[int]) -> float:
+        """log Z of one set of named effects."""
         columns = list(active)
-        slab = deviation[columns]
-        inverse = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0]
-        spread = slab * np.sqrt(inverse[columns].diagonal())
-        bounds = priors.low[columns], priors.high[columns]
-        within = _log_mass(slab * mean[columns], spread, *bounds)
-        value += (within - _log_mass(0.0 * slab, slab, *bounds)).sum()
-    return float(value)
+        deviation = self.priors.deviation(columns)
+        factor = self._factor(deviation)
+        half = self.score * deviation
+        mean = lapack.dpotrs(factor, half, lower=1)[0]
+        value = 0.5 * half @ mean - np.log(np.diag(factor)).sum()
+        if columns:
+            slab = deviation[columns]
+            inverse = lapack.dpotrs(factor, np.eye(len(factor))[:, columns], lower=1)[0]
+            spread = slab * np.sqrt(inverse[columns].diagonal())
+            value += self._log_within(columns, slab * mean[columns], spread).sum()
+        return float(value)
 
+    def _log_within(self, sets: Sequence, mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
+        """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
+        priors = self.priors
+        bounds = priors.low[sets], priors.high[sets]
+        slab = priors.slab[sets]
+        return _log_mass(mean, sd, *bounds) - _log_mass(0.0 * slab, slab, *bounds)
 
-def additions(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
-) -> np.ndarray:
-    """Gain of log Z by naming one more effect, for each effect; -inf for those named already or not
-    visible.
+    def additions(self, active: Sequence[int]) -> np.ndarray:
+        """Gain of log Z by naming one more effect, for each effect; -inf for those named already or
+        not visible.
 
-    A change of one prior is a rank-one update, so all candidates and all draws cost one
-    factorisation. ``information``: shape (K, K); ``score``: shape (K,) or (n, K). Returns nats, of
-    the score's shape."""
-    return _naming(information, score, priors, active, np.arange(len(priors.floor))[:, None])
+        A change of one prior is a rank-one update, so all candidates and all draws cost one
+        factorisation. Returns nats, of the score's shape."""
+        return self._naming(active, np.arange(len(self.priors.floor))[:, None])
 
+    def pair_additions(self, active: Sequence[int]) -> np.ndarray:
+        """Return the gain of log Z by naming each pair of effects: two that cancel show no gain
+        alone.
 
-def pair_additions(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
-) -> np.ndarray:
-    """Return the gain of log Z by naming each pair of effects: two that cancel show no gain alone.
+        Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on
+        the diagonal."""
+        size = len(self.score)
+        rows, columns = np.triu_indices(size, 1)
+        gain = np.full((size, size), -np.inf)
+        gain[rows, columns] = self._naming(active, np.stack((rows, columns), axis=1))
+        return np.maximum(gain, gain.T)
 
-    Returns nats, shape (K, K), symmetric; -inf for those named already or not visible, and on the
-    diagonal."""
-    size = len(score)
-    rows, columns = np.triu_indices(size, 1)
-    gain = np.full((size, size), -np.inf)
-    gain[rows, columns] = _naming(
-        information, score, priors, active, np.stack((rows, columns), axis=1)
-    )
-    return np.maximum(gain, gain.T)
+    def _naming(self, active: Sequence[int], sets: np.ndarray) -> np.ndarray:
+        """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their
+        numbers, shape (P, m).
+        """
+        priors = self.priors
+        sigma = self.covariance(active)
+        mean = (self.score @ sigma)[..., sets]
+        change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
+        variance = sigma[sets[:, :, None], sets[:, None]]
+        unit = np.eye(sets.shape[1])
+        taken = np.linalg.inv(variance + unit / change[:, None])
+        wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
+        # A name widens its prior and so the posterior. What comes out narrower is a set with a name
+        # that is there already; it is left out below.
+        wide = np.maximum(variance - variance @ taken @ variance, variance)
+        wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
+        explained = np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
+        log_det = np.linalg.slogdet(unit + change[..., None] * variance)[1]
+        gain = -0.5 * (explained + log_det) - np.log(priors.slab[sets] / SPIKE).sum(1)
+        gain = gain + self._log_within(sets, wide_mean, wide_sd).sum(-1)
+        out = ~priors.visible
+        out[list(active)] = True
+        return np.where(out[sets].any(1), -np.inf, gain)
 
+    def estimate(self, active: Sequence[int]) -> np.ndarray:
+        """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
+        shape (K,).
+        """
+        from scipy.optimize import lsq_linear
 
-def _naming(
-    information: np.ndarray,
-    score: np.ndarray,
-    priors: Priors,
-    active: Sequence[int],
-    sets: np.ndarray,
-) -> np.ndarray:
-    """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their numbers,
-    shape (P, m).
-    """
-    sigma = covariance(information, priors.deviation(active))
-    mean = (score @ sigma)[..., sets]
-    change = (priors.slab**-2.0 - SPIKE**-2.0)[sets]
-    variance = sigma[sets[:, :, None], sets[:, None]]
-    unit = np.eye(sets.shape[1])
-    taken = np.linalg.inv(variance + unit / change[:, None])
-    wide_mean = mean - np.einsum("pij,pjk,...pk->...pi", variance, taken, mean, optimize=True)
-    # A name widens its prior and so the posterior. What comes out narrower is a set with a name
-    # that is there already; it is left out below.
-    wide = np.maximum(variance - variance @ taken @ variance, variance)
-    wide_sd = np.sqrt(wide.diagonal(axis1=1, axis2=2))
-    slab = priors.slab[sets]
-    bounds = priors.low[sets], priors.high[sets]
-    explained = np.einsum("...pi,pij,...pj->...p", mean, taken, mean, optimize=True)
-    log_det = np.linalg.slogdet(unit + change[..., None] * variance)[1]
-    gain = -0.5 * (explained + log_det) - np.log(slab / SPIKE).sum(1)
-    within = _log_mass(wide_mean, wide_sd, *bounds) - _log_mass(0.0 * slab, slab, *bounds)
-    gain = gain + within.sum(-1)
-    out = ~priors.visible
-    out[list(active)] = True
-    return np.where(out[sets].any(1), -np.inf, gain)
-
-
-def estimate(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
-) -> np.ndarray:
-    """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
-    shape (K,).
-    """
-    from scipy.optimize import lsq_linear
-
-    theta = np.zeros(len(score))
-    if len(active):
+        priors = self.priors
         columns = list(active)
-        normal = information[np.ix_(columns, columns)] + np.diag(priors.slab[columns] ** -2.0)
-        factor = np.linalg.cholesky(normal)
-        right = np.linalg.solve(factor, score[columns])
-        bounds = priors.low[columns], priors.high[columns]
-        solution = lsq_linear(factor.T, right, bounds, method="bvls").x
-        theta[columns] = np.clip(solution, *bounds)  # which the solver leaves by rounding
-    return theta
+        theta = np.zeros(len(self.score))
+        if columns:
+            normal = self.information[np.ix_(columns, columns)]
+            factor = np.linalg.cholesky(normal + np.diag(priors.slab[columns] ** -2.0))
+            right = np.linalg.solve(factor, self.score[columns])
+            bounds = priors.low[columns], priors.high[columns]
+            solution = lsq_linear(factor.T, right, bounds, method="bvls").x
+            theta[columns] = np.clip(solution, *bounds)  # which the solver leaves by rounding
+        return theta
 
+    def averaged(self, j: int, sets: Sets) -> tuple[float, float]:
+        """Return mean and deviation of an effect over the possible sets that hold it, all other
+        effects free below their floors, in floors.
+        """
+        estimates = []
+        for members, distance in sets:
+            sigma = self.covariance(members)
+            estimates.append((float(sigma[j] @ self.score), float(sigma[j, j]), np.exp(-distance)))
+        means, variances, weights = np.array(estimates).T
+        mean = np.average(means, weights=weights)
+        variance = np.average(variances + (means - mean) ** 2, weights=weights)
+        return float(mean), float(np.sqrt(variance))
 
-def averaged(
-    information: np.ndarray,
-    score: np.ndarray,
-    priors: Priors,
-    j: int,
-    sets: Sequence[tuple[tuple[int, ...], float]],
-) -> tuple[float, float]:
-    """Return mean and deviation of an effect over the possible sets that hold it, all other effects
-    free below their floors, in floors.
+    def mean_sizes(self, active: Sequence[int], sets: Sets) -> np.ndarray:
+        """Return the means of some effects as :meth:`averaged`, within their bounds, and 0 for all
+        others; in floors, shape (K,).
+        """
+        theta = np.zeros(len(self.score))
+        for j in active:
+            homes = [(members, nats) for members, nats in sets if j in members]
+            mean = self.averaged(j, homes)[0]
+            theta[j] = np.clip(mean, self.priors.low[j], self.priors.high[j])
+        return theta
 
-    ``sets``: effects of each set, and its nats behind."""
-    estimates = []
-    for members, distance in sets:
-        sigma = covariance(information, priors.deviation(members))
-        estimates.append((float(sigma[j] @ score), float(sigma[j, j]), np.exp(-distance)))
-    means, variances, weights = np.array(estimates).T
-    mean = np.average(means, weights=weights)
-    return float(mean), float(np.sqrt(np.average(variances + (means - mean) ** 2, weights=weights)))
+    def certainty(self, theta: np.ndarray, active: Sequence[int]) -> np.ndarray:
+        """Sizes of named effects in the half widths of 95 % intervals to which half a floor is
+        added, in the order of ``active``.
 
+        Above 1 it is more than what may go unnamed.
+        """
+        columns = list(active)
+        variance = np.diag(self.covariance(columns))[columns]
+        return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(variance), SPIKE))
 
-def mean_sizes(
-    information: np.ndarray,
-    score: np.ndarray,
-    priors: Priors,
-    active: Sequence[int],
-    sets: Sequence[tuple[tuple[int, ...], float]],
-) -> np.ndarray:
-    """Return the means of some effects as :func:`averaged`, within their bounds, and 0 for all
-    others; in floors, shape (K,).
-    """
-    theta = np.zeros(len(score))
-    for j in active:
-        homes = [(members, nats) for members, nats in sets if j in members]
-        mean = averaged(information, score, priors, j, homes)[0]
-        theta[j] = np.clip(mean, priors.low[j], priors.high[j])
-    return theta
-
-
-def certainty(
-    information: np.ndarray, theta: np.ndarray, priors: Priors, active: Sequence[int]
-) -> np.ndarray:
-    """Sizes of named effects in the half widths of 95 % intervals to which half a floor is added,
-    in the order of ``active``.
-
-    Above 1 it is more than what may go unnamed.
-    """
-    columns = list(active)
-    spread = np.diag(covariance(information, priors.deviation(columns)))[columns]
-    return np.abs(theta[columns]) / (NORMAL_95 * np.hypot(np.sqrt(spread), SPIKE))
-
-
-def surely_there(
-    information: np.ndarray, score: np.ndarray, priors: Priors, active: Sequence[int]
-) -> list[int]:
-    """Return the named effects that are surely not 0 beside one another; the least certain is left
-    out first.
-    """
-    remaining = list(active)
-    while remaining:
-        theta = estimate(information, score, priors, remaining)
-        sure = certainty(information, theta, priors, remaining)
-        if sure.min() > 1.0:
-            break
-        remaining.pop(int(np.argmin(sure)))
-    return remaining
+    def surely_there(self, active: Sequence[int]) -> list[int]:
+        """Return the named effects that are surely not 0 beside one another; the least certain is
+        left out first.
+        """
+        remaining = list(active)
+        while remaining:
+            sure = self.certainty(self.estimate(remaining), remaining)
+            if sure.min() > 1.0:
+                break
+            remaining.pop(int(np.argmin(sure)))
+        return remaining
 
 
 def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
@@ -322,5 +306,6 @@ def threshold(
     candidates = int(priors.visible.sum())
     if not candidates:
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")
-    best = additions(information, null_draws(information, draws, rng), priors, ()).max(axis=1)
+    null = Posterior(information, null_draws(information, draws, rng), priors)
+    best = null.additions(()).max(axis=1)
     return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates), VERY_STRONG))

@@ -13,7 +13,7 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
-from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance, log_evidence
+from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
@@ -129,22 +129,20 @@ class PlanningGoal:
 
         A member that is already behind by more than a class allows is no truth to plan for.
         """
-        information = self.base.information
-        score = self.base.score
+        base = self.base.posterior
         priors = self.priors
         gaps = []
         remaining = [j for j in self.diagnosis.work.active if j not in pair]
-        evidence = {j: log_evidence(information, score, priors, [*remaining, j]) for j in pair}
+        evidence = {j: base.log_evidence([*remaining, j]) for j in pair}
         for truth, rival in (pair, pair[::-1]):
             if evidence[truth] < evidence[rival] - STRONG:
                 continue
             theta = np.zeros(len(priors.floor))
             for j in [*remaining, truth]:
                 theta[j] = self.diagnosis.findings[j].estimate / priors.floor[j]
-            after = score + new @ theta
-            total = information + new
-            right = log_evidence(total, after, priors, [*remaining, truth])
-            wrong = log_evidence(total, after, priors, [*remaining, rival])
+            after = Posterior(base.information + new, base.score + new @ theta, priors)
+            right = after.log_evidence([*remaining, truth])
+            wrong = after.log_evidence([*remaining, rival])
             gaps.append(right - wrong)
         return min(gaps)
 
@@ -152,11 +150,12 @@ class PlanningGoal:
         """Posterior deviation of each effect that is planned for, if it were named, with more
         information.
         """
-        total = self.base.information + new
+        base = self.base.posterior
+        after = replace(base, information=base.information + new)
         deviations = []
         for j in self.vague:
-            prior = self.priors.deviation([*self.diagnosis.work.active, j])
-            deviations.append(np.sqrt(covariance(total, prior)[j, j]))
+            variance = after.covariance([*self.diagnosis.work.active, j])[j, j]
+            deviations.append(np.sqrt(variance))
         return np.array(deviations)
 
     def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> FlightProposal:
@@ -238,10 +237,9 @@ def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
     effects = narrowed(model.effects, {m.effect: m.sd})
     priors = Priors.of(effects, tuple(model.channels))
     remaining = [k for k in work.active if k not in (j, truth)]
-    information = work.after.information
-    score = work.after.score
-    right = log_evidence(information, score, priors, [*remaining, truth])
-    return right - log_evidence(information, score, priors, [*remaining, j])
+    measured = replace(work.after.posterior, priors=priors)
+    right = measured.log_evidence([*remaining, truth])
+    return right - measured.log_evidence([*remaining, j])
 
 
 def _expected_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:

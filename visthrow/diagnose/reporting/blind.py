@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import STRONG, additions
+from visthrow.diagnose.likelihood.evidence import STRONG, Posterior
 from visthrow.diagnose.select.result import Diagnosis
 
 SIZES = np.geomspace(1.0, 64.0, 13)  # hidden sizes [floors]
@@ -69,7 +69,7 @@ def hide(diagnosis: Diagnosis, *, seed: int = 0, draws: int = DRAWS) -> Blind:
         return small + rng.choice((-1.0, 1.0), (draws, len(score_of))) @ score_of
 
     def named(score: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        gain = additions(information, score, priors, ())
+        gain = Posterior(information, score, priors).additions(())
         return gain, gain.max(axis=1) > diagnosis.threshold
 
     curves = []

@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from visthrow.common.toml_text import tables_beside
-from visthrow.diagnose.likelihood.evidence import covariance
 from visthrow.diagnose.likelihood.forms import readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.model_interface import Window
@@ -229,8 +228,7 @@ def confusion(diagnosis: Diagnosis) -> bytes:
     """
     work = diagnosis.work
     visible = np.flatnonzero(work.problem.priors.visible)
-    prior = work.problem.priors.deviation(visible)
-    sigma = covariance(work.after.information, prior)[np.ix_(visible, visible)]
+    sigma = work.after.posterior.covariance(visible)[np.ix_(visible, visible)]
     deviation = np.sqrt(np.diag(sigma))
     correlation = sigma / np.outer(deviation, deviation)
     others = np.abs(correlation - np.eye(len(visible)))

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim.params import PlantParams
 from visthrow.common.errors import DiagnoseError
-from visthrow.diagnose.likelihood.evidence import VERY_STRONG, estimate, threshold
+from visthrow.diagnose.likelihood.evidence import VERY_STRONG, threshold
 from visthrow.diagnose.likelihood.marginal import finite
 from visthrow.diagnose.likelihood.threads import keep_freed_memory, parallel_map
 from visthrow.diagnose.models.model_interface import Model
@@ -148,17 +148,16 @@ def explain(
                 f"{len(nominal.windows)} windows of {flights} flights; a cause needs"
                 f" {needed:.1f} nats"
             )
-            selection, commands = _selected(Selector(problem, nominal, needed, say, laws), begin)
+            selection, commands = _selected(Selector(nominal, needed, say, laws), begin)
             begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
             untracked = _not_followed(selection) if further else []
             if not untracked:
                 break
         say(f"{len(untracked)} windows are left out, which the simulation does not follow")
-        remaining = [i for i in range(len(problem.kept)) if i not in set(untracked)]
-        problem, nominal = problem.only(remaining), only(nominal, remaining)
+        nominal = only(nominal, sorted({*range(len(nominal.windows))} - {*untracked}))
     diagnosis = held_out.judged(conclude(selection, commands))
     reasons = diagnosis.reasons
-    left_out = len(considered) - len(problem.kept)
+    left_out = len(considered) - len(nominal.windows)
     if left_out:
         reasons += (
             f"{left_out} of {len(considered)} windows are left out, which the simulation does not"
@@ -171,9 +170,9 @@ def _not_followed(selection: Selector) -> list[int]:
     """Return windows that the simulation does not follow with the causes, at their sizes or where
     the derivatives would have them.
     """
-    problem, point, columns = selection.problem, selection.best.point, selection.best.columns
-    goal = estimate(point.information, point.score, problem.priors, columns)
-    leads = moved(problem, point, np.where(problem.switches, point.theta, goal))
+    point = selection.best.point
+    goal = point.posterior.estimate(selection.best.columns)
+    leads = moved(point, np.where(point.problem.switches, point.theta, goal))
     return untracked_windows(point) or (untracked_windows(leads) if leads else [])
 
 
@@ -182,20 +181,20 @@ def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | Non
 
     Lost commands are a candidate that needs a linearisation of its own."""
     plain = selector.run(begin)
-    problem, nominal, needed = plain.problem, plain.nominal, plain.threshold
-    loss = lost_commands.verdict(problem, nominal, (), needed)
+    nominal, needed = plain.nominal, plain.threshold
+    loss = lost_commands.verdict(nominal, (), needed)
     if (loss is None or not loss.found) and plain.best.columns:
-        loss = lost_commands.verdict(problem, plain.best.point, plain.best.columns, needed)
+        loss = lost_commands.verdict(plain.best.point, plain.best.columns, needed)
     if loss is None or not loss.found:
         return plain, None
-    lossy = replace(problem, terms=(), lost=loss.size)
-    start = linearise(lossy, np.zeros(len(problem.model.effects)), nominal.noise)
-    lossy_selection = Selector(lossy, start, needed, plain.progress, plain.laws).run(begin)
+    lossy = replace(nominal.problem, terms=(), lost=loss.size)
+    start = linearise(lossy, np.zeros(len(lossy.effects)), nominal.noise)
+    lossy_selection = Selector(start, needed, plain.progress, plain.laws).run(begin)
     gain = lossy_selection.value - needed - plain.value
     plain.progress(f"commands got lost: {loss.size:.1%} of them, {gain:.1f} nats ahead")
     if gain <= 0.0:
         return plain, None
-    return lossy_selection, lost_commands.sized(lossy, start, loss)
+    return lossy_selection, lost_commands.sized(start, loss)
 
 
 def correct_interface_mistakes(
@@ -251,5 +250,5 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
     for m, of_model, number in zip((model, rival), windows, places):
         problem = Problem.of(m, of_model, [number[key] for key in shared])
         point = linearise(problem, np.zeros(len(m.effects)), windows=of_model)
-        values.append(point.evidence(problem.priors, ()))
+        values.append(point.evidence(()))
     return values[0] - values[1]

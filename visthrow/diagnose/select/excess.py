@@ -15,7 +15,7 @@ from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
+from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
 from visthrow.diagnose.select.result import Level
 
 LANDING = 5e-3
@@ -27,7 +27,7 @@ STEP = 1.4  # factor from one level to the next above the best, until one is too
 MOST_STEPS = 60  # a level that nothing bounds from above ends here
 
 
-def levels(problem: Problem, before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
+def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     """Compare the latent forces of each block and phase with the block's quietest phase, and with
     what would move a landing.
 
@@ -37,7 +37,7 @@ def levels(problem: Problem, before: Point, after: Point, threshold: float) -> t
     threshold = threshold + np.log(max(len(noise.latent_sd), 1))
     stacks = {phase: _stack_of(after, phase) for _, phase in noise.latent_sd}
     limits = {key: _upper_limit(stacks[key[1]], noise, key) for key in noise.latent_sd}
-    floors = floors_of(problem, after)
+    floors = floors_of(after)
     listed = []
     for key in sorted(limits, key=lambda key: key[0]):
         block, phase = key
@@ -61,11 +61,11 @@ def compares_phases(point: Point) -> bool:
     return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
 
 
-def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
+def floors_of(point: Point) -> dict[tuple[int, str], float]:
     """Latent deviation [N or N m] of each block and phase that moves a position by ``LANDING``
     within the median window.
     """
-    positions = positions_of(problem)
+    positions = positions_of(point)
     moves = {}
     for gram, window in zip(point.grams, point.windows):
         positions_moved = window.latent[np.isin(window.channel, positions)]
@@ -77,9 +77,10 @@ def floors_of(problem: Problem, point: Point) -> dict[tuple[int, str], float]:
     return {key: LANDING / median for key, median in medians.items() if median > 0.0}
 
 
-def positions_of(problem: Problem) -> list[int]:
+def positions_of(point: Point) -> list[int]:
     """Return the numbers of the channels that are positions."""
-    return [c for c, name in enumerate(problem.model.channels) if unit_of(name) == "m"]
+    channels = point.problem.model.channels
+    return [c for c, name in enumerate(channels) if unit_of(name) == "m"]
 
 
 def _stack_of(point: Point, phase: str) -> Stack:

@@ -5,15 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import (
-    NORMAL_95,
-    OWN_FLOOR,
-    averaged,
-    covariance,
-)
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, OWN_FLOOR, Sets
 from visthrow.diagnose.models.model_interface import Effect
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.point import Point, Problem
+from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Finding
 from visthrow.diagnose.select.scatter import allowed, unit_suffix
 
@@ -45,29 +40,28 @@ def blank(effect: Effect) -> Finding:
 class Reading:
     """The flights' information and the selected sets, from which each verdict follows."""
 
-    problem: Problem
     point: Point  # with random shares integrated out
     active: Sequence[int]  # effects that are named
     withdrawn: set[int]  # those whose names were withdrawn
-    sets: Sequence[tuple[tuple[int, ...], float]]  # effects of each possible set, its nats behind
+    sets: Sets
     unlike: float  # variance among flights, in what is allowed
 
     def finding(self, j: int) -> Finding:
         """Return the verdict on an effect."""
-        priors, effect = self.problem.priors, self.problem.effects[j]
+        problem, point = self.point.problem, self.point
+        priors, effect = problem.priors, problem.effects[j]
         finding = blank(effect)
         if not priors.visible[j]:
-            missing = tuple(c for c in effect.channels if c not in self.problem.model.channels)
+            missing = tuple(c for c in effect.channels if c not in problem.model.channels)
             sentence = f"{effect.name}: not observable without {', '.join(missing)}."
             return replace(finding, missing=missing, sentence=sentence)
         partners, together = self._class_of(j)
         remaining = [k for k in together if k != j]
         homes = [home for home in self.sets if j in home[0]] if self.active else []
         homes = homes or [((*remaining, j), 0.0)]
-        mean, sd = averaged(self.point.information, self.point.score, priors, j, homes)
+        mean, sd = point.posterior.averaged(j, homes)
         deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
-        evidence = self.point.evidence(priors, [*remaining, j])
-        nats = evidence - self.point.evidence(priors, remaining)
+        nats = point.evidence([*remaining, j]) - point.evidence(remaining)
         finding = replace(finding, sd=deviation, nats=nats)
         if j in self.active or partners:
             differs = float(np.sqrt(self.unlike) * allowed(mean)) * effect.floor
@@ -138,7 +132,7 @@ class Reading:
                 f" {finding.differs:.2g}."
             )
             return replace(finding, verdict=result.FOUND, sentence=sentence)
-        names = [self.problem.effects[k].name for k in members]
+        names = [self.point.problem.effects[k].name for k in members]
         partners = tuple(name for name in names if name != finding.name)
         joint = self._joint(members)
         sentence = (
@@ -152,16 +146,16 @@ class Reading:
         """Return the best known combination of a class: first eigenvector of its members'
         information in prior deviations.
         """
-        priors, point = self.problem.priors, self.point
-        effects = [self.problem.effects[k] for k in members]
-        slab = priors.slab[members]
+        posterior, problem = self.point.posterior, self.point.problem
+        effects = [problem.effects[k] for k in members]
+        slab = problem.priors.slab[members]
         named = [k for k in self.active if k not in members]
-        sigma = covariance(point.information, priors.deviation([*members, *named]))[members]
+        sigma = posterior.covariance([*members, *named])[members]
         precision = np.linalg.inv(sigma[:, members])
         values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
         best, value = vectors[:, -1], values[-1]
-        mean = float(best @ (slab * (precision @ (sigma @ point.score))) / value)
-        coefficients = best / slab / priors.floor[members]
+        mean = float(best @ (slab * (precision @ (sigma @ posterior.score))) / value)
+        coefficients = best / slab / problem.priors.floor[members]
         first = int(np.argmax(np.abs(best)))
         scale, unit = coefficients[first], effects[first].unit
         text = effects[first].name

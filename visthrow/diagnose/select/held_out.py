@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG, mean_sizes
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
     errors,
@@ -66,12 +66,16 @@ class Work:
     report, plan and blind limits.
     """
 
-    problem: Problem
     before: Point
     after: Point
     active: tuple[int, ...]
     crossed: Crossed | None = None  # searches without some of the flights
     candidates: tuple[int, ...] = ()  # that were free when the active effects were sized
+
+    @property
+    def problem(self) -> Problem:
+        """Return the problem of both."""
+        return self.after.problem
 
 
 def groups_of(point: Point) -> tuple[list[int], str]:
@@ -130,7 +134,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
             for s, nats in behind.items()
             if nats < STRONG
         ]
-        trained[fold] = mean_sizes(*linear.total(chosen), priors, written, sets)
+        trained[fold] = linear.total(chosen).mean_sizes(written, sets)
         named.update(columns_of(chosen))
     shares = {effects[j].name: n / len(folds) for j, n in named.items()}
     return Crossed(groups, left_out, statistics, folds, trained, shares)
@@ -364,7 +368,7 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     unexplained = _unexplained(channel_gains(work, groups, none))
     if not unexplained:
         return diagnosis
-    floors = floors_of(work.problem, point)
+    floors = floors_of(point)
     level = max(
         diagnosis.levels,
         key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf),
@@ -485,19 +489,17 @@ def _kind(work: Work, channel: int) -> str:
     return ", ".join(parts)
 
 
-def repeated_share(
-    problem: Problem, point: Point, laws: Sequence[int]
-) -> tuple[float, float, float]:
+def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, float]:
     """Return the part of what laws promise that flights without a say in their coefficients bear
     out beside the names as all flights size them, with its 95 % interval.
 
     ``laws``: numbers of the laws' terms among the effects."""
     statistics = regrouped(point, groups_of(point)[0])
-    count = len(problem.model.effects)
+    count = len(point.problem.model.effects)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
     information = statistics.information[:, laws][:, :, laws]
     score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
-    prior = np.diag(problem.priors.slab[laws] ** -2.0)
+    prior = np.diag(point.problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
     other_information, other_score = total - information, score.sum(0) - score
     trained = np.linalg.solve(other_information, other_score[..., None])[..., 0]

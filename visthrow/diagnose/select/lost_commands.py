@@ -19,10 +19,10 @@ from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
 from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import few_of
-from visthrow.diagnose.likelihood.evidence import Priors, log_evidence
+from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
-from visthrow.diagnose.select.point import Point, Problem
+from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, judged
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
@@ -48,7 +48,6 @@ class CommandStatistics:
 
     @staticmethod
     def of(
-        problem: Problem,
         point: Point,
         windows: Sequence[Window],
         columns: Sequence[np.ndarray],
@@ -68,6 +67,7 @@ class CommandStatistics:
             padded = np.zeros((len(window.residual), longest))
             padded[: len(changes), : changes.shape[1]] = changes
             wide.append(replace(window, effects=np.hstack((window.effects, padded))))
+        problem = point.problem
         floors = np.append(problem.priors.floor, np.ones(longest))
         grams = grams_of(wide, floors, len(problem.model.channels))
         grams = correlated_of(grams, wide, point.noise.correlation_time)
@@ -101,18 +101,17 @@ class CommandStatistics:
             value = 0.5 * float(mean_gain + explained[0, 0] - log_det)
             information = information - explained[1:, 1:]
             score = score - mean @ crossed.sum(0) - explained[1:, 0]
-        return value + log_evidence(information, score, priors, list(active))
+        return value + Posterior(information, score, priors).log_evidence(active)
 
 
-def verdict(
-    problem: Problem, point: Point, active: Sequence[int], threshold: float
-) -> Scatter | None:
+def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | None:
     """Whether commands got lost, beside a set of effects or any that are still missing; None where
     none was, or a model cannot tell.
 
     ``threshold``: nats that a finding needs.
     """
     v = next(v for v in random_effects() if v.name == NAME)
+    problem = point.problem
     priors = problem.priors
     sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
@@ -124,7 +123,7 @@ def verdict(
         if not columns:
             return None
         windows = [point.windows[w] for w in rows]
-        statistics = CommandStatistics.of(problem, point, windows, columns, rows)
+        statistics = CommandStatistics.of(point, windows, columns, rows)
         nats = np.minimum(*(statistics.gain(shares, priors, named) for named in sets))
         if nats.max() <= 0.0:
             return None
@@ -132,15 +131,15 @@ def verdict(
     return judged(v, reach, nats, threshold, count, COMMAND)
 
 
-def sized(problem: Problem, point: Point, scatter: Scatter) -> Scatter:
+def sized(point: Point, scatter: Scatter) -> Scatter:
     """The verdict with the share of those commands of which a window tells by itself whether they
     came, with Jeffreys' interval.
 
-    ``problem``: of a model with lost commands; ``point``: of it, with the noise levels that these
-    leave; ``scatter``: the verdict before."""
-    windows = [point.about.windows[i] for i in problem.kept]
+    ``point``: of a model with lost commands, with the noise levels that these leave; ``scatter``:
+    the verdict before."""
+    windows = [point.about.windows[i] for i in point.problem.kept]
     rows = range(len(windows))
-    statistics = CommandStatistics.of(problem, point, windows, point.commands, rows)
+    statistics = CommandStatistics.of(point, windows, point.commands, rows)
     commands = slice(-statistics.commands, None)
     information = statistics.information[:, commands, commands]
     spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)

@@ -19,13 +19,7 @@ from itertools import combinations
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import (
-    STRONG,
-    Priors,
-    additions,
-    covariance,
-    pair_additions,
-)
+from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import (
     ALL,
@@ -81,7 +75,7 @@ class Linear:
         self._step = min((penalty(frozenset({c})) for c in self.plain), default=0.0)
         self._shares: dict[Names, tuple[dict[Candidate, float], float]] = {}
         self._values: dict[Names, float] = {}
-        self._totals: dict[frozenset, tuple[np.ndarray, np.ndarray]] = {}
+        self._totals: dict[frozenset, Posterior] = {}
         self._added: dict[Names, dict[Names, float]] = {}
 
     def shares(self, chosen: Names) -> tuple[dict[Candidate, float], float]:
@@ -142,12 +136,11 @@ class Linear:
     def _freed(self, chosen: Names) -> Statistics:
         return freed(self.statistics, varies_of(self.shares(chosen)[0], self.days))
 
-    def total(self, chosen: Names) -> tuple[np.ndarray, np.ndarray]:
-        """Return information and score of all flights beside a set's random shares."""
+    def total(self, chosen: Names) -> Posterior:
+        """Return what all flights say beside a set's random shares."""
         shares = frozenset(self.shares(chosen)[0].items())
         if shares not in self._totals:
-            misfit = self._freed(chosen)
-            self._totals[shares] = misfit.information.sum(0), misfit.absolute.sum(0)
+            self._totals[shares] = Posterior.of(self._freed(chosen), self.priors)
         return self._totals[shares]
 
     def added(self, subset: Names) -> dict[Names, float]:
@@ -156,7 +149,7 @@ class Linear:
             base = self.value(subset)
             listed = {subset: base}
             if len(subset) < MOST_NAMES and np.isfinite(base):
-                gain = additions(*self.total(subset), self.priors, columns_of(subset))
+                gain = self.total(subset).additions(columns_of(subset))
                 varying = {j for c in subset if c.group != ALL for j in c.columns}
                 for c in self.plain:
                     new = subset | {c}
@@ -176,8 +169,7 @@ class Linear:
         """
         if not self.random:
             return []
-        information, score = self.total(subset)
-        theta = covariance(information, self.priors.deviation(columns_of(subset))) @ score
+        theta = self.total(subset).mean(columns_of(subset))
         close = {}
         for group, (members, deviation) in self._by_group.items():
             flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
@@ -231,8 +223,8 @@ class Linear:
                 continue
             columns = [c.columns[0] for c in offered]
             price = np.array([self.penalty(subset | {c}) for c in offered]) - self.penalty(subset)
-            alone = additions(*self.total(subset), self.priors, active)[columns] - price
-            both = pair_additions(*self.total(subset), self.priors, active)
+            alone = self.total(subset).additions(active)[columns] - price
+            both = self.total(subset).pair_additions(active)
             worth = both[np.ix_(columns, columns)] - np.add.outer(price, price)
             alone = np.maximum(alone, -1e9)  # of a name that cannot be there, as well as none
             synergy = worth - np.maximum.outer(alone, alone)

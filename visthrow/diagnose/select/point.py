@@ -16,10 +16,8 @@ from visthrow.diagnose.likelihood.correlation import Correlation, correlations, 
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     OWN_FLOOR,
+    Posterior,
     Priors,
-    covariance,
-    estimate,
-    log_evidence,
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect, forces
 from visthrow.diagnose.likelihood.marginal import (
@@ -132,8 +130,9 @@ class Problem:
 
 @dataclass(frozen=True)
 class Point:
-    """Windows and statistics at one theta (in floors, shape (K,))."""
+    """Windows and statistics of a problem at one theta (in floors, shape (K,))."""
 
+    problem: Problem
     theta: np.ndarray
     windows: Sequence[Window]
     grams: Sequence[Gram]  # latents correlated
@@ -149,7 +148,11 @@ class Point:
     commands: Sequence[
         np.ndarray
     ]  # change of each window by each command that did not come, shape (N, T); none: all came
-    device: str  # where the model simulates, and the algebra of all windows with it
+
+    @property
+    def device(self) -> str:
+        """Return where the model simulates, and the algebra of all windows with it."""
+        return self.problem.model.device
 
     @cached_property
     def statistics(self) -> Statistics:
@@ -159,14 +162,14 @@ class Point:
         return freed(self.plain, self.varies)
 
     @cached_property
+    def posterior(self) -> Posterior:
+        """Return what all flights say of the effects."""
+        return Posterior.of(self.statistics, self.problem.priors)
+
+    @property
     def information(self) -> np.ndarray:
         """Return the information of all flights, shape (K, K)."""
-        return self.statistics.information.sum(0)
-
-    @cached_property
-    def score(self) -> np.ndarray:
-        """Return the score of all flights, about theta = 0, shape (K,)."""
-        return self.statistics.absolute.sum(0)
+        return self.posterior.information
 
     def sigma(self, channel: int) -> float:
         """Median of what the model states as a channel's noise, in its unit; NaN where there is no
@@ -175,10 +178,10 @@ class Point:
         sigmas = np.concatenate([w.sigma[w.channel == channel] for w in self.windows])
         return float(np.median(sigmas)) if len(sigmas) else float("nan")
 
-    def evidence(self, priors: Priors, active: Sequence[int]) -> float:
+    def evidence(self, active: Sequence[int]) -> float:
         """log Z of a set of effects, comparable between points with other noise levels."""
-        value = log_evidence(self.information, self.score, priors, list(active))
-        return value - 0.5 * float(self.statistics.absolute_square.sum()) + self.noise.log_prior
+        misfit = 0.5 * float(self.statistics.absolute_square.sum())
+        return self.posterior.log_evidence(active) - misfit + self.noise.log_prior
 
 
 def regathered(point: Point, integrals: stack.Integrals | None = None, **changes: Any) -> Point:
@@ -247,6 +250,7 @@ def linearise(
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
     statistics = _statistics(grams, integrals, noise, position)
     return Point(
+        problem,
         position,
         cleaned,
         grams,
@@ -256,7 +260,6 @@ def linearise(
         integrals,
         linearised,
         commands,
-        device,
     )
 
 
@@ -285,7 +288,10 @@ def only(point: Point, windows: Sequence[int]) -> Point:
     noise = levels.maximised(grams, levels.only(point.noise, grams, windows), point.device)[0]
     kept = [point.windows[w] for w in windows]
     commands = [point.commands[w] for w in windows] if point.commands else []
-    return regathered(point, noise=noise, grams=grams, windows=kept, commands=commands)
+    problem = point.problem.only(windows)
+    return regathered(
+        point, problem=problem, noise=noise, grams=grams, windows=kept, commands=commands
+    )
 
 
 def untracked_windows(point: Point) -> list[int]:
@@ -306,10 +312,11 @@ def untracked_windows(point: Point) -> list[int]:
     return distant.tolist() if len(distant) <= LOST_SHARE * len(misfit) else []
 
 
-def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
+def moved(point: Point, theta: np.ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the
     simulation fails there.
     """
+    problem = point.problem
     theta = problem.possible(theta)
     kinds = problem.switches
     linearised = point.about if np.array_equal(theta[kinds], point.theta[kinds]) else None
@@ -337,48 +344,46 @@ def moved(problem: Problem, point: Point, theta: np.ndarray) -> Point | None:
     )
 
 
-def linearisation_bias(
-    problem: Problem, origin: Point, moved_point: Point, active: Sequence[int]
-) -> np.ndarray:
+def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int]) -> np.ndarray:
     """Return the sizes of all effects that the simulation's distance from its linearisation would
     be taken for, in floors, shape (K,).
 
     ``origin``: where the derivatives were taken; ``moved_point``: a point moved from it, with the
     same derivatives; ``active``: effects that are named."""
-    change = problem.priors.floor * (moved_point.theta - origin.theta)
+    floors = origin.problem.priors.floor
+    change = floors * (moved_point.theta - origin.theta)
     bent = []
     for old, new in zip(origin.windows, moved_point.windows):
         bent.append(new.residual - (old.residual - old.effects @ change))
-    grams = with_residuals(moved_point.grams, moved_point.windows, problem.priors.floor, bent)
+    grams = with_residuals(moved_point.grams, moved_point.windows, floors, bent)
     shares = moved_point.integrals.shares(grams, moved_point.noise)
     total = sum(share.score for share in shares)
-    return covariance(moved_point.information, problem.priors.deviation(list(active))) @ total
+    return moved_point.posterior.covariance(active) @ total
 
 
-def curvature(problem: Problem, origin: Point, moved_point: Point) -> float:
+def curvature(origin: Point, moved_point: Point) -> float:
     """The largest size that :func:`linearisation_bias` says of any effect while none is named."""
-    return float(np.abs(linearisation_bias(problem, origin, moved_point, ())).max(initial=0.0))
+    return float(np.abs(linearisation_bias(origin, moved_point, ())).max(initial=0.0))
 
 
-def with_all_effects_noise(problem: Problem, point: Point) -> Point:
+def with_all_effects_noise(point: Point) -> Point:
     """Return the point with the noise levels that remain when every effect may have its linear
     estimate.
 
     A large missing effect is taken for noise as long as it is not named; these levels show what may
     be hidden under it."""
-    visible = np.flatnonzero(problem.priors.visible & ~problem.switches)
-    return with_noise_at(point, estimate(point.information, point.score, problem.priors, visible))
+    visible = np.flatnonzero(point.problem.priors.visible & ~point.problem.switches)
+    return with_noise_at(point, point.posterior.estimate(visible))
 
 
-def with_floors_noise(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+def with_floors_noise(point: Point, active: Sequence[int]) -> Point:
     """Return the point with the noise levels that remain when every effect has its most probable
     size, those not named below their floors.
 
     What a dozen effects below their floors leave is no gust, but it is nothing that is missing
     either; nor is what an effect that varies has of its own in each flight. ``point``: whose
     derivatives and residuals are taken."""
-    theta = covariance(point.information, problem.priors.deviation(list(active))) @ point.score
-    return with_noise_at(point, theta)
+    return with_noise_at(point, point.posterior.mean(active))
 
 
 def with_noise_at(point: Point, theta: np.ndarray) -> Point:
@@ -409,7 +414,7 @@ def shifted(gram: Gram, change: np.ndarray) -> Gram:
     return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
 
 
-def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+def fitted(point: Point, active: Sequence[int]) -> Point:
     """Gauss-Newton with the derivatives of ``point`` and the simulation's own residuals; a step
     that does not help is halved.
 
@@ -418,62 +423,64 @@ def fitted(problem: Problem, point: Point, active: Sequence[int]) -> Point:
     named = np.isin(np.arange(len(point.theta)), list(active))
     best: Point | None = point
     if np.any(point.theta[~named] != 0.0):
-        best = moved(problem, point, np.where(named, point.theta, 0.0))
+        best = moved(point, np.where(named, point.theta, 0.0))
     if best is None:
         return point
+    kinds = point.problem.switches
     for _ in range(ROUNDS):
-        goal = estimate(best.information, best.score, problem.priors, active)
-        goal[problem.switches] = best.theta[problem.switches]  # no step turns a block into another
-        trial = _step(problem, best, goal)
+        goal = best.posterior.estimate(active)
+        goal[kinds] = best.theta[kinds]  # no step turns a block into another
+        trial = _step(best, goal)
         if trial is None:
             break
         best = trial
-        if predicted_gain(problem, best, active) < 0.05:
+        if predicted_gain(best, active) < 0.05:
             break
     return best
 
 
-def predicted_gain(
-    problem: Problem, point: Point, active: Sequence[int], switches: bool = False
-) -> float:
+def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) -> float:
     """Nats that another step of these effects' sizes would bring by the derivatives, no block
     turned into another; ``switches``: of blocks of another kind as well, to another part of them.
     """
-    remaining = estimate(point.information, point.score, problem.priors, active) - point.theta
+    remaining = point.posterior.estimate(active) - point.theta
     if not switches:
-        remaining[problem.switches] = 0.0
+        remaining[point.problem.switches] = 0.0
     return float(0.5 * remaining @ point.information @ remaining)
 
 
-def _step(problem: Problem, point: Point, goal: np.ndarray) -> Point | None:
+def _step(point: Point, goal: np.ndarray) -> Point | None:
     """The largest part of a step that fits better; None where there is none."""
     share = 1.0
-    while share > 0.1 and np.abs(share * (goal - point.theta)).max() > SMALL_STEP:
-        trial = moved(problem, point, point.theta + share * (goal - point.theta))
-        if trial is not None and _misfit(problem, trial) < _misfit(problem, point):
+    while share > 0.1:
+        change = share * (goal - point.theta)
+        if np.abs(change).max() <= SMALL_STEP:
+            break
+        trial = moved(point, point.theta + change)
+        if trial is not None and _misfit(trial) < _misfit(point):
             return trial
         share /= 2.0
     return None
 
 
-def _misfit(problem: Problem, point: Point) -> float:
-    prior = (point.theta / problem.priors.slab)[point.theta != 0.0]
+def _misfit(point: Point) -> float:
+    prior = (point.theta / point.problem.priors.slab)[point.theta != 0.0]
     return float(point.statistics.square.sum() + prior @ prior)
 
 
-def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
+def candidate(point: Point, active: Sequence[int]) -> Point:
     """Sizes of a set and the noise levels that belong to them, in turn: what gusts held at first
     goes over to the sizes.
 
     ``point``: whose derivatives and noise levels it begins with, and whose kinds of blocks.
     """
-    point = fitted(problem, point, active)
+    point = fitted(point, active)
     point = with_noise_at(point, point.theta)
     for _ in range(TURNS):
-        if predicted_gain(problem, point, active) < TURNED:
+        if predicted_gain(point, active) < TURNED:
             break
         before = point
-        point = fitted(problem, point, active)
+        point = fitted(point, active)
         if np.array_equal(point.theta, before.theta):
             break
         point = with_noise_at(point, point.theta)
@@ -481,7 +488,7 @@ def candidate(problem: Problem, point: Point, active: Sequence[int]) -> Point:
 
 
 def candidates(
-    problem: Problem, points: Sequence[Point], sets: Sequence[Sequence[int]]
+    points: Sequence[Point], sets: Sequence[Sequence[int]]
 ) -> list[Point | DiagnoseError]:
     """Return :func:`candidate` of several sets, or why there is none: side by side where they wait
     for a GPU.
@@ -490,7 +497,7 @@ def candidates(
 
     def simulated(i: int) -> Point | DiagnoseError:
         try:
-            return candidate(problem, *pairs[i])
+            return candidate(*pairs[i])
         except DiagnoseError as error:
             return error
 
@@ -499,13 +506,13 @@ def candidates(
     return run_concurrently(simulated, range(len(pairs)))
 
 
-def switched(problem: Problem, point: Point, active: Sequence[int]) -> np.ndarray | None:
+def switched(point: Point, active: Sequence[int]) -> np.ndarray | None:
     """Return where a set is to be linearised, in floors, if it asks for another kind of block than
     a point flies; else None.
     """
-    off = [j for j in active if problem.switches[j] and point.theta[j] == 0.0]
+    off = [j for j in active if point.problem.switches[j] and point.theta[j] == 0.0]
     if not off:
         return None
     theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
-    theta[off] = 1.0 / problem.priors.floor[off]
+    theta[off] = 1.0 / point.problem.priors.floor[off]
     return theta

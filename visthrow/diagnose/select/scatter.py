@@ -14,7 +14,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 
 from sim.effects.effect import RandomEffect
-from visthrow.diagnose.likelihood.evidence import INEXACT, Priors, log_evidence
+from visthrow.diagnose.likelihood.evidence import INEXACT, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 
 FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
@@ -228,9 +228,8 @@ def between_flights(
 
 def evidence_of(statistics: Statistics, priors: Priors, named: Sequence[int]) -> float:
     """Return log Z of a set of effects, comparable between shares that were integrated out."""
-    total = statistics.information.sum(0), statistics.absolute.sum(0)
     square = float(statistics.absolute_square.sum())
-    return log_evidence(*total, priors, named) - 0.5 * square
+    return Posterior.of(statistics, priors).log_evidence(named) - 0.5 * square
 
 
 def freed(statistics: Statistics, varies: Varies) -> Statistics:

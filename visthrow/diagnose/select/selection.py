@@ -18,8 +18,6 @@ from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
     SPIKE,
     STRONG,
-    certainty,
-    estimate,
 )
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
@@ -78,7 +76,6 @@ class Trial:
 class Selector:
     """A selection under way, and its result."""
 
-    problem: Problem
     nominal: Point
     threshold: float  # [nats]
     progress: Callable[[str], None] = lambda _: None
@@ -98,6 +95,11 @@ class Selector:
         self._followed: set[Names] = set()
         self._every = False  # whether any effect may differ among flights
         self._offer()
+
+    @property
+    def problem(self) -> Problem:
+        """Return the problem, with the terms that were offered so far."""
+        return self.nominal.problem
 
     def _offer(self) -> None:
         problem = self.problem
@@ -197,7 +199,7 @@ class Selector:
         of few causes by those of the model as it stands.
         """
         present, ahead_of = self.best.chosen, {}
-        free = with_all_effects_noise(self.problem, self.best.point)
+        free = with_all_effects_noise(self.best.point)
         places = [(self.best.point, present), (free, present)]
         places += [(self.nominal, NOTHING)] if present else []
         for point, centre in places:
@@ -238,8 +240,7 @@ class Selector:
         of what its sizes are worth that are elsewhere.
         """
         point = self.best.point
-        goal = estimate(point.information, point.score, self.problem.priors, columns_of(chosen))
-        change = goal - point.theta
+        change = point.posterior.estimate(columns_of(chosen)) - point.theta
         nats = 0.5 * float(change @ point.information @ change)
         return min(WINDOW, STRONG + INEXACT * nats)
 
@@ -253,7 +254,7 @@ class Selector:
             for active, (sizes, _) in zip(columns, shares)
         ]
         trials = []
-        simulated = candidates(self.problem, points, columns)
+        simulated = candidates(points, columns)
         for s, outcome, size in zip(sets, simulated, shares):
             if isinstance(outcome, DiagnoseError):
                 self.progress(f"{names_of(s)}: not simulated, {outcome}")
@@ -270,7 +271,7 @@ class Selector:
         """Return the point linearised with the kinds of blocks that a set asks for; once for each
         place in a row.
         """
-        theta = switched(self.problem, point, active)
+        theta = switched(point, active)
         if theta is None:
             return point
         if theta.tobytes() not in self._turned:
@@ -282,8 +283,8 @@ class Selector:
         beyond what the simulation gave.
         """
         point = trial.point
-        evidence = point.evidence(self.problem.priors, trial.columns)
-        promised = predicted_gain(self.problem, point, trial.columns, switches=True)
+        evidence = point.evidence(trial.columns)
+        promised = predicted_gain(point, trial.columns, switches=True)
         return evidence - promised - trial.occam - self.penalty(trial.chosen)
 
     def is_admissible(self, trial: Trial) -> bool:
@@ -291,14 +292,14 @@ class Selector:
         within its bounds in each flight, and matters.
         """
         point, columns, priors = trial.point, trial.columns, self.problem.priors
-        sure = certainty(point.information, point.theta, priors, columns)
+        sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
         sizes = point.theta + own_shares(point.plain, point.theta, point.varies)
         if np.any((sizes < priors.low - 1.0) | (sizes > priors.high + 1.0), where=sizes != 0.0):
             return False  # a share of a flight has the bounds of its effect, to a floor
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
-        return all(terms.moves_landing(self.problem, point, j) for j in laws)
+        return all(terms.moves_landing(point, j) for j in laws)
 
     def _followed_up(self, listed: Mapping[Names, float]) -> list[Trial]:
         """Return the set that promises most of those that kept far less, simulated from derivatives
@@ -319,9 +320,8 @@ class Selector:
             return []
         self._followed.add(chosen)
         active = columns_of(chosen)
-        goal = estimate(point.information, point.score, self.problem.priors, active)
         try:
-            origin = self._linearised(goal, point)
+            origin = self._linearised(point.posterior.estimate(active), point)
         except DiagnoseError as error:
             self.progress(f"{names_of(chosen)}: not followed, {error}")
             return []
@@ -375,7 +375,7 @@ class Selector:
         cheap = self.problem.model.cheap
         if unchanged and not (cheap and np.any(silent)):
             lead_on = not (cheap or last)
-            if lead_on or curvature(self.problem, self.origin, point) < SPIKE:
+            if lead_on or curvature(self.origin, point) < SPIKE:
                 return point
         for _ in range(ROUNDS):
             try:
@@ -383,9 +383,9 @@ class Selector:
             except DiagnoseError as error:
                 self.progress(f"the last derivatives stay: {error}")
                 break
-            before, point = point, fitted(self.problem, self.origin, active)
+            before, point = point, fitted(self.origin, active)
             close = np.abs(point.theta - before.theta).max() <= 0.5
-            if close or curvature(self.problem, self.origin, point) <= SPIKE:
+            if close or curvature(self.origin, point) <= SPIKE:
                 break
         return point
 
@@ -417,13 +417,12 @@ class Selector:
         places += [(self.nominal, columns_of(forms))] if present - forms else []
         shortlist: list[TermEffect] = []
         for point, active in places:
-            shortlist += terms.shortlist(self.problem, point, active, strongest, self.threshold)
+            shortlist += terms.shortlist(point, active, strongest, self.threshold)
         shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())
         if not shortlist:
             return False
         points = {id(p): p for p in (self.nominal, self.origin, self.best.point)}
-        self.problem, wide = terms.extended(self.problem, list(points.values()), shortlist)
-        widened = dict(zip(points, wide))
+        widened = dict(zip(points, terms.extended(list(points.values()), shortlist)))
         self.best = replace(self.best, point=widened[id(self.best.point)])
         self.nominal, self.origin = widened[id(self.nominal)], widened[id(self.origin)]
         self._offer()

@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from visthrow.diagnose.likelihood.evidence import STRONG, Priors, covariance
+from visthrow.diagnose.likelihood.evidence import STRONG
 from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
 from visthrow.diagnose.likelihood.marginal import (
     LatentStatistics,
@@ -38,7 +38,6 @@ from visthrow.diagnose.select.excess import LANDING, positions_of
 from visthrow.diagnose.select.point import (
     UNKNOWN_RATIO,
     Point,
-    Problem,
     regathered,
     with_shares,
     with_terms,
@@ -198,12 +197,12 @@ def _hats(
 
 
 def gains(
-    point: Point, priors: Priors, active: Sequence[int], screened: Screen, reach: float
+    point: Point, active: Sequence[int], screened: Screen, reach: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach``
     strong at the knots.
     """
-    information, score = _conditional(point, priors.deviation(list(active)), screened)
+    information, score = _conditional(point, active, screened)
     prior = reach / np.maximum(screened.size, 1e-12 * screened.size.max() + 1e-300)
     variance = prior[:, None] ** 2
     precision = np.eye(score.shape[1]) + variance[:, None] * information
@@ -214,19 +213,19 @@ def gains(
 
 
 def _conditional(
-    point: Point, deviation: np.ndarray, screened: Screen
+    point: Point, active: Sequence[int], screened: Screen
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Information and score of each term, of what effects of these prior deviations leave."""
-    sigma = covariance(point.information, deviation)
+    """Information and score of each term, of what a set of names leaves."""
+    sigma = point.posterior.covariance(active)
     known = np.einsum("tik,kl,tjl->tij", screened.cross, sigma, screened.cross, optimize=True)
     information = screened.information - known
     diagonal = np.einsum("tii->ti", information)  # a view
     np.maximum(diagonal, 0.0, out=diagonal)
-    return information, screened.score - screened.cross @ (sigma @ point.score)
+    return information, screened.score - screened.cross @ (sigma @ point.posterior.score)
 
 
 def best_curves(
-    problem: Problem, point: Point, active: Sequence[int], strongest: Mapping[str, float]
+    point: Point, active: Sequence[int], strongest: Mapping[str, float]
 ) -> dict[str, tuple[float, str]]:
     """Return the nats that the best curve of each block brings beside a set of names, less the log
     of how many were tried, and its formula; none of a block that the windows carry no knots for.
@@ -245,7 +244,7 @@ def best_curves(
         screened = screen(calm, parts, block, values, curves=True)
         if screened is None:
             continue
-        gain, _ = gains(calm, problem.priors, active, screened, UNKNOWN_RATIO * force)
+        gain, _ = gains(calm, active, screened, UNKNOWN_RATIO * force)
         best = int(np.argmax(gain))
         scalar, vector = screened.terms[best].parts
         formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
@@ -254,28 +253,28 @@ def best_curves(
 
 
 def unsaid(
-    point: Point, priors: Priors, active: Sequence[int], screened: Screen, causes: Sequence[int]
+    point: Point, active: Sequence[int], screened: Screen, causes: Sequence[int]
 ) -> np.ndarray:
     """Nats of each screened term that no single cause explains, whatever its size, beside a set of
     names; shape (T,).
 
     A term has neither bounds nor a usual size. It must not take the place of a cause that says the
     same only because the cause lies at its bound, or is larger than was expected."""
-    deviation = priors.deviation(list(active))
-    sigma = covariance(point.information, deviation)
-    information, score = _conditional(point, deviation, screened)
+    deviation = point.problem.priors.deviation(active)
+    sigma = point.posterior.covariance(active)
+    information, score = _conditional(point, active, screened)
     information, score = information[:, 0, 0], score[:, 0]
-    shared, mean = (screened.cross[:, 0] @ sigma)[:, causes], (sigma @ point.score)[causes]
+    shared = (screened.cross[:, 0] @ sigma)[:, causes]
+    mean = (sigma @ point.posterior.score)[causes]
     spread = np.maximum(deviation**2 - sigma.diagonal(), SAME * deviation**2)[causes]
     alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
     left = score[:, None] - shared * mean / spread
     return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
-def extended(
-    problem: Problem, points: Sequence[Point], terms: Sequence[TermEffect]
-) -> tuple[Problem, list[Point]]:
-    """The problem and points of it with more terms as effects, at 0; nothing is simulated again."""
+def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point]:
+    """Points of one problem with more terms as effects, at 0; nothing is simulated again."""
+    problem = points[0].problem
     wide = replace(problem, terms=(*problem.terms, *terms))
     channels, none = len(problem.model.channels), np.zeros(len(terms))
     widened = []
@@ -284,16 +283,17 @@ def extended(
         grams = grams_of(windows, wide.priors.floor, channels)
         grams = correlated_of(grams, windows, point.noise.correlation_time)
         theta = np.append(point.theta, none)
-        widened.append(regathered(point, theta=theta, windows=windows, grams=grams))
-    return wide, widened
+        widened.append(regathered(point, problem=wide, theta=theta, windows=windows, grams=grams))
+    return widened
 
 
-def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:
-    """The problem and a point of it without its terms, whose shares are left out of the residuals
-    where they are not 0.
+def without_laws(point: Point) -> Point:
+    """The point of its problem without terms, whose shares are left out of the residuals where they
+    are not 0.
     """
+    problem = point.problem
     if not problem.terms:
-        return problem, point
+        return point
     plain = replace(problem, terms=())
     count = len(problem.model.effects)
     windows = [replace(w, effects=w.effects[:, :count]) for w in point.windows]
@@ -302,11 +302,11 @@ def without_laws(problem: Problem, point: Point) -> tuple[Problem, Point]:
         kept = slice(gram.nuisances + gram.latents + count)
         inner, cross = gram.inner[:, kept, kept], gram.cross[:, kept]
         grams.append(replace(gram, inner=inner, cross=cross))
-    return plain, regathered(point, theta=point.theta[:count], windows=windows, grams=grams)
+    theta = point.theta[:count]
+    return regathered(point, problem=plain, theta=theta, windows=windows, grams=grams)
 
 
 def shortlist(
-    problem: Problem,
     point: Point,
     active: Sequence[int],
     strongest: Mapping[str, float],
@@ -317,8 +317,8 @@ def shortlist(
 
     ``strongest``: latent force of each block where the model stood alone [N or N m]; ``threshold``:
     nats that a term must bring beyond its price."""
-    priors = problem.priors
-    causes = np.flatnonzero(priors.visible[: len(problem.model.effects)])
+    problem = point.problem
+    causes = np.flatnonzero(problem.priors.visible[: len(problem.model.effects)])
     calm, parts = with_capped_gusts(point)
     values = [KnotValues(window.knots) for window in point.windows]
     screens = {}
@@ -331,8 +331,8 @@ def shortlist(
     present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     ranked: list[tuple[float, Term, float]] = []
     for block, screened in screens.items():
-        gain, prior = gains(calm, priors, active, screened, UNKNOWN_RATIO * strongest[block])
-        gain[unsaid(calm, priors, active, screened, causes) < LAW] = -np.inf
+        gain, prior = gains(calm, active, screened, UNKNOWN_RATIO * strongest[block])
+        gain[unsaid(calm, active, screened, causes) < LAW] = -np.inf
         # of terms that say the same in other words in these flights, the simplest comes first
         for i in np.unique(np.round(gain, 3), return_index=True)[1]:
             term = screened.terms[i]
@@ -376,10 +376,10 @@ def strongest_forces(point: Point) -> dict[str, float]:
     return strongest if all(w.knots for w in point.windows) else {}
 
 
-def moves_landing(problem: Problem, point: Point, j: int) -> bool:
+def moves_landing(point: Point, j: int) -> bool:
     """Whether an effect moves a position by ``LANDING`` within the median window of a phase."""
-    positions = positions_of(problem)
-    size = point.theta[j] * problem.priors.floor[j]
+    positions = positions_of(point)
+    size = point.theta[j] * point.problem.priors.floor[j]
     moves: dict[str, list[float]] = {}
     for window in point.windows:
         moved = size * window.effects[np.isin(window.channel, positions), j]
@@ -388,12 +388,13 @@ def moves_landing(problem: Problem, point: Point, j: int) -> bool:
     return any(np.median(distances) > LANDING for distances in moves.values())
 
 
-def laws(problem: Problem, point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
+def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
-    sigma = covariance(point.information, problem.priors.deviation(list(active)))
-    mean = sigma @ point.score
-    columns = [j for j in active if isinstance(problem.effects[j], TermEffect)]
-    effects = [problem.effects[j] for j in columns]
+    sigma = point.posterior.covariance(active)
+    mean = sigma @ point.posterior.score
+    every = point.problem.effects
+    columns = [j for j in active if isinstance(every[j], TermEffect)]
+    effects = [every[j] for j in columns]
     floor = np.array([e.floor for e in effects])
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
     sizes = mean[columns] * floor

@@ -14,9 +14,6 @@ from visthrow.diagnose.likelihood.evidence import (
     CALIBRATION_QUANTILE,
     INEXACT,
     OWN_FLOOR,
-    covariance,
-    mean_sizes,
-    surely_there,
 )
 from visthrow.diagnose.likelihood.marginal import TAIL, Statistics
 from visthrow.diagnose.models.model_interface import Model, Window
@@ -38,7 +35,6 @@ from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.point import (
     SMALL_STEP,
     Point,
-    Problem,
     moved,
     with_floors_noise,
     with_noise_at,
@@ -61,37 +57,37 @@ from visthrow.diagnose.select.selection import Selector
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
-    model, point = selection.problem.model, selection.best.point
+    model, point = selection.nominal.problem.model, selection.best.point
     scatter, varies = random_shares_of(selection)
     if varies or point.varies:
         point = with_noise_at(replace(point, varies=varies), point.theta)
         selection.best = replace(selection.best, point=point)
     if commands:
         scatter = (*scatter, commands)
-    calm = with_floors_noise(selection.problem, point, selection.best.columns)
-    block_levels = levels(selection.problem, selection.nominal, calm, selection.threshold)
+    calm = with_floors_noise(point, selection.best.columns)
+    block_levels = levels(selection.nominal, calm, selection.threshold)
     overall, block, reasons, withdrawn = _overall(selection, block_levels, scatter)
     explanations: list[tuple[Law, ...]] = []
     if overall == result.UNKNOWN:
         explanations, unrepeated = _explanations(selection)
         reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
-    problem, point = terms.without_laws(selection.problem, point)
-    nominal = terms.without_laws(selection.problem, selection.nominal)[1]
+    point = terms.without_laws(point)
+    nominal = terms.without_laws(selection.nominal)
+    problem = point.problem
     active = [j for j in selection.names if j not in withdrawn]
     if selection.names and not active:
         point = nominal
     statistics = point.plain
     if not laws_of(selection.best.chosen):
-        statistics = _about_means(problem, point, active, varies)
+        statistics = _about_means(point, active, varies)
     shared_point = replace(point, plain=freed(statistics, varies), varies=Varies())
     varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
     sized = tuple(sorted({*active, *varying}))
-    total = shared_point.information, shared_point.score
-    sizes = mean_sizes(*total, problem.priors, sized, [(sized, 0.0)])
+    sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
     means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
     sets = _sets_of(selection)
-    reading = Reading(problem, shared_point, active, withdrawn, sets, unlike)
+    reading = Reading(shared_point, active, withdrawn, sets, unlike)
     findings = tuple(reading.finding(j) for j in range(len(model.effects)))
     named = [findings[j] for j in active]
     window = []
@@ -103,7 +99,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         tuple(reasons),
         findings,
         theta={f.name: f.estimate for f in named},
-        covariance=_covariance(problem, shared_point, named, active, mean_part),
+        covariance=_covariance(shared_point, named, active, mean_part),
         threshold=selection.threshold,
         steps=tuple(selection.steps),
         sets=tuple(window),
@@ -117,7 +113,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         flights=len(point.plain.flights),
         windows=len(point.windows),
         samples=int(point.statistics.samples.sum()),
-        work=Work(problem, nominal, point if active else nominal, tuple(active)),
+        work=Work(nominal, point if active else nominal, tuple(active)),
     )
 
 
@@ -127,7 +123,6 @@ def _with_means(scatter: Scatter, means: Mapping[str, float]) -> Scatter:
 
 
 def _covariance(
-    problem: Problem,
     point: Point,
     named: Sequence[Finding],
     active: Sequence[int],
@@ -138,7 +133,7 @@ def _covariance(
 
     ``mean_part``: share of the variance between flights that the mean keeps, shape (K,)."""
     columns = list(active)
-    sigma = covariance(point.information, problem.priors.deviation(columns))
+    sigma = point.posterior.covariance(columns)
     spread = sigma[np.ix_(columns, columns)] + OWN_FLOOR**2 * np.eye(len(columns))
     scale = np.array([f.sd for f in named]) / np.sqrt(np.diag(spread))
     differs = np.array([f.differs for f in named])
@@ -163,7 +158,7 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
             continue
         statistics, named = best.point.plain, best.chosen
         if c in random and len(c.columns) == 1:
-            statistics = _straight(problem, best.point, best.columns, c.columns[0])
+            statistics = _straight(best.point, best.columns, c.columns[0])
         if c not in random:
             named |= {
                 o for o in selection.candidates if o.group == ALL and {*o.columns} & {*c.columns}
@@ -202,24 +197,22 @@ def share_verdict(
     return judged(replace(effect, name=c.name), reach, nats, needed, count, c.group)
 
 
-def _straight(problem: Problem, point: Point, active: Sequence[int], j: int) -> Statistics:
+def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
     named = np.isin(np.arange(len(point.theta)), list(active))
     theta = np.where(named, point.theta, 0.0)
 
     def simulate(position: np.ndarray) -> Statistics | None:
-        moved_point = moved(problem, point, position)
+        moved_point = moved(point, position)
         return None if moved_point is None else moved_point.plain
 
-    return relinearised_per_flight(point.plain, theta, problem.priors, j, simulate)
+    return relinearised_per_flight(point.plain, theta, point.problem.priors, j, simulate)
 
 
-def _about_means(
-    problem: Problem, point: Point, active: Sequence[int], varies: Varies
-) -> Statistics:
+def _about_means(point: Point, active: Sequence[int], varies: Varies) -> Statistics:
     """Return what the flights say of the means of effects that vary."""
     statistics = point.plain
     for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
-        statistics = _straight(problem, replace(point, plain=statistics), active, j)
+        statistics = _straight(replace(point, plain=statistics), active, j)
     return statistics
 
 
@@ -238,7 +231,7 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
     """Return the laws of the set, then others one by one in their place, best first, where flights
     without a say in their coefficients repeat them; else none, and why.
     """
-    best, problem = selection.best, selection.problem
+    best = selection.best
     if not laws_of(best.chosen):
         return [], ""
     names = frozenset(c for c in best.chosen if not c.law)
@@ -252,9 +245,9 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
     repeated = []
     for chosen in (best.chosen, *(s for s in ranked if value[s] > 0.0)):
         columns = [c.columns[0] for c in laws_of(chosen)]
-        share, low, high = repeated_share(problem, best.point, columns)
+        share, low, high = repeated_share(best.point, columns)
         if low > 0.0:
-            repeated.append(terms.laws(problem, best.point, columns_of(chosen), value[chosen]))
+            repeated.append(terms.laws(best.point, columns_of(chosen), value[chosen]))
         elif chosen == best.chosen:  # none in place of a better one
             return [], (
                 "a formula explains these flights, but those that are left out do not repeat it:"
@@ -266,7 +259,7 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
 def _law(selection: Selector) -> tuple[set[int], str]:
     """Return the names that are withdrawn beside the set's laws, and the reason for the laws."""
     best = selection.best
-    laws_of_set = terms.laws(selection.problem, best.point, best.columns, 0.0)
+    laws_of_set = terms.laws(best.point, best.columns, 0.0)
     text = " and ".join(
         f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
         for law in laws_of_set
@@ -288,9 +281,7 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
         if {selection.block_of(j), residual_block} & blocks:
             in_block.add(j)
     columns = [j for j in best.columns if j not in in_block]
-    priors = selection.problem.priors
-    sure = surely_there(best.point.information, best.point.score, priors, columns)
-    return set(names) - set(sure)
+    return set(names) - set(best.point.posterior.surely_there(columns))
 
 
 def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
@@ -427,7 +418,7 @@ def _misshapen(selection: Selector) -> dict[str, str]:
     problem, best, by_block = selection.problem, selection.best, _by_block(selection)
     strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
     in_blocks = {block: strongest[block] for block in by_block if block in strongest}
-    curves = terms.best_curves(problem, best.point, best.columns, in_blocks)
+    curves = terms.best_curves(best.point, best.columns, in_blocks)
     reasons = {}
     for block, (nats, formula) in curves.items():
         if nats > selection.threshold:
