@@ -62,8 +62,9 @@ def _built(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
     try:
         built: T = _schema.build(schema, tree)
     except ConfigError as error:
-        changed = f" (with {', '.join(overrides)})" if overrides else ""
-        raise ConfigError(f"{error}{changed}") from None
+        if not overrides:
+            raise
+        raise ConfigError(f"{error} (with {', '.join(overrides)})") from None
     return built
 
 

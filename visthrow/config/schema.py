@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Any, Literal, Union
 
-from visthrow.common.errors import ConfigError, suggest
+from visthrow.common.errors import ConfigError, UnknownKeyError, suggest
 
 NONE_WORD = "none"  # TOML has no null: this string stands for None wherever a field is optional
 # names what lies under a file (another file) or under a table among like ones (a sibling)
@@ -147,7 +147,9 @@ def _build_dataclass(schema: type, node: Leaf | ConfigTable, path: str) -> Any:
     unset = dataclasses.MISSING
     for key, item in node.items.items():
         if key not in types_of:
-            fail(item.source, _join(path, key), f"unknown key; {suggest(key, types_of)}")
+            place = _join(path, key)
+            message = f"{item.source}: {place}: unknown key; {suggest(key, types_of)}"
+            raise UnknownKeyError(message, place)
     required = [
         f.name
         for f in dataclasses.fields(schema)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
-from pytest import mark
+from pytest import approx, mark
 
 from tests.synthetic_diagnosis import EFFECTS as MADE_UP
 from tests.synthetic_diagnosis import SyntheticModel
@@ -16,7 +16,7 @@ from visthrow.diagnose.apply import patch
 from visthrow.diagnose.likelihood.evidence import Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select import diagnose_flights, result, verdicts
-from visthrow.diagnose.select.candidates import NOTHING, random_shares, shared
+from visthrow.diagnose.select.candidates import NOTHING, Candidate, random_shares, shared
 from visthrow.diagnose.select.occam import Linear, window
 from visthrow.diagnose.select.scatter import (
     DAY,
@@ -45,6 +45,21 @@ def chosen_of(statistics, days=()):
         for c, size in linear.shares(best)[0].items()
     }
     return best, sizes
+
+
+def test_shares_that_change_one_column_keep_their_deviations():
+    """Of two that concern the same effect, the later one's prior was taken for both."""
+    found = flights(default_rng(0), release_lag=0.02)
+    narrow, wide = (
+        Candidate(f"lag_{sd}", (0, 1), FLIGHT, deviations=(sd, sd)) for sd in (0.01, 10.0)
+    )
+    alone = Linear(found, PRIORS, [narrow], lambda _: 0.0)
+    both = Linear(found, PRIORS, [narrow, wide], lambda _: 0.0)
+    theta = np.zeros(len(NAMES))
+    (expected,) = alone._promises(FLIGHT, [narrow], theta)
+    narrow_promise, wide_promise = both._promises(FLIGHT, [narrow, wide], theta)
+    assert narrow_promise == approx(expected)
+    assert wide_promise > narrow_promise + 1.0
 
 
 def flights(rng, count=10, **deviation):

@@ -157,9 +157,7 @@ def test_initial_states_follow_the_effects(planted):
     windows = model.windows({})
     problem = Problem(model, tuple(range(len(windows))))
     nominal, there = linearise(problem, np.zeros(1), windows=windows), np.array([15.0])
-    follow, behind = (
-        moved(point, there) for point in (nominal, replace(nominal, about=None))
-    )
+    follow, behind = (moved(point, there) for point in (nominal, replace(nominal, about=None)))
     assert curvature(nominal, follow) < 0.2 * curvature(nominal, behind)
     back = moved(follow, np.zeros(1))  # there and back again
     for w, again in zip(nominal.windows, back.windows):

@@ -238,6 +238,24 @@ def test_a_name_of_another_form_than_the_truth_is_withdrawn(kind, size):
     assert "F = f(v_z)" in diagnosis.reasons[0]
 
 
+def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch):
+    """The first by name was, however little the names leave in it."""
+    curves = {"payload force": (9.0, "F_p = f(v)"), "vehicle force": (90.0, "F = f(v_z)")}
+    selection = SimpleNamespace(
+        problem=SimpleNamespace(effects=EFFECTS),
+        best=SimpleNamespace(point=None, columns=[1, 3]),
+        nominal=None,
+        laws=True,
+        threshold=5.0,
+    )
+    monkeypatch.setattr(verdicts, "_by_block", lambda _: {block: [1] for block in curves})
+    monkeypatch.setattr(terms, "strongest_forces", lambda _: dict.fromkeys(curves, 1.0))
+    monkeypatch.setattr(terms, "best_curves", lambda *_: curves)
+    block, reason = verdicts._misshapen(selection)
+    assert block == "vehicle force"
+    assert "F = f(v_z), with any function f, explains 90 nats" in reason
+
+
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
 
 

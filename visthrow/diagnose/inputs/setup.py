@@ -9,7 +9,7 @@ from typing import Any
 
 from sim.params import LawParams
 from visthrow import config
-from visthrow.common.errors import ConfigError
+from visthrow.common.errors import ConfigError, UnknownKeyError
 from visthrow.diagnose.models.ball import BallModel, BallParams
 from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
@@ -99,14 +99,13 @@ def load(name: str | Path | None) -> Setup:
         return Setup("")
     try:
         return config.load(Setup, config.find("diagnose", str(name)))
-    except ConfigError as error:
-        for table in EXAMPLES:
-            if f" {table}: unknown key" in str(error):
-                raise ConfigError(
-                    f"{name}: the model [{table}] is a program of the repository now; copy"
-                    f" examples/{table} and change its numbers"
-                ) from None
-        raise
+    except UnknownKeyError as error:
+        if error.key not in EXAMPLES:
+            raise
+        raise ConfigError(
+            f"{name}: the model [{error.key}] is a program of the repository now; copy"
+            f" examples/{error.key} and change its numbers"
+        ) from None
 
 
 def known(name: str | Path | None, plant: str | None = None) -> KnownVehicle:

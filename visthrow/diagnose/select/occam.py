@@ -14,7 +14,6 @@ Source: Madigan and Raftery 1994 (Occam's window); Raftery 1995.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import cached_property
 from itertools import combinations
 
 import numpy as np
@@ -33,6 +32,7 @@ from visthrow.diagnose.select.candidates import (
 from visthrow.diagnose.select.scatter import (
     COARSE,
     DAY,
+    FLIGHT,
     REACH,
     by_day,
     evidence_of,
@@ -170,36 +170,30 @@ class Linear:
         if not self.random:
             return []
         theta = self.total(subset).mean(columns_of(subset))
-        close = {}
-        for group, (members, deviation) in self._by_group.items():
-            flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
-            precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
-            misfit = (flights.absolute - flights.information @ theta) ** 2 / precision
-            sizes = np.ones(1) if group == EVENT else REACH[::COARSE]
-            part = precision * (sizes[:, None, None] * deviation) ** 2
-            gain = 0.5 * (misfit * part / (1.0 + part) - np.log1p(part))
-            if group == EVENT:
-                row = {flight: f for f, flight in enumerate(flights.flights.tolist())}
-                rows = [row[c.flight] for c in members]
-                nats = gain[0, rows, [c.columns[0] for c in members]]
-            else:
-                whole = gain.sum(1)
-                nats = np.array([whole[:, list(c.columns)].sum(1).max() for c in members])
-            promise = nats - [c.penalty for c in members]
-            for i in np.flatnonzero(promise > self._step - STRONG).tolist():
-                if members[i] not in subset:
-                    close[members[i]] = promise[i]
-        return sorted(close, key=close.get, reverse=True)[:RANDOM_TRIED]
+        promised: dict[Candidate, float] = {}
+        for group in (FLIGHT, DAY, EVENT):
+            members = [c for c in self.random if c.group == group and c not in subset]
+            if members:
+                promised |= zip(members, self._promises(group, members, theta))
+        close = [c for c, nats in promised.items() if nats > self._step - STRONG]
+        return sorted(close, key=promised.get, reverse=True)[:RANDOM_TRIED]
 
-    @cached_property
-    def _by_group(self) -> dict[str, tuple[list[Candidate], np.ndarray]]:
-        """Random shares of each group, with the deviation of each effect, shape (K,)."""
-        groups: dict[str, tuple[list[Candidate], np.ndarray]] = {}
-        for c in self.random:
-            members, deviation = groups.setdefault(c.group, ([], np.zeros(len(self.priors.floor))))
-            members.append(c)
-            deviation[list(c.columns)] = c.deviations
-        return groups
+    def _promises(self, group: str, members: Sequence[Candidate], theta: np.ndarray) -> list[float]:
+        """Return the nats that random shares of one group promise beside these sizes [floors]."""
+        flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
+        precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)
+        misfit = (flights.absolute - flights.information @ theta) ** 2 / precision
+        counts = [len(c.columns) for c in members]
+        columns = [j for c in members for j in c.columns]
+        deviations = [sd for c in members for sd in c.deviations]
+        sizes = np.ones(1) if group == EVENT else REACH[::COARSE]
+        part = precision[:, columns] * np.multiply.outer(sizes, deviations)[:, None] ** 2
+        gain = 0.5 * (misfit[:, columns] * part / (1.0 + part) - np.log1p(part))
+        if group == EVENT:
+            gain *= flights.flights[:, None] == [c.flight for c in members]
+        begins = np.cumsum(counts) - counts
+        nats = np.add.reduceat(gain.sum(1), begins, axis=1).max(0)
+        return (nats - [c.penalty for c in members]).tolist()
 
     def neighbours(self, chosen: Names, centre: Names) -> dict[Names, float]:
         """Return sets one step away, with their values, and no more than ``MOST_NEW`` candidates

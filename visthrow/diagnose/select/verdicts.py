@@ -365,7 +365,8 @@ def _overall(
         names = ", ".join(selection.problem.effects[j].name for j in parts)
         reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
         return result.UNKNOWN, block, [*reasons, reason], set(parts)
-    for block, reason in _misshapen(selection).items():
+    block, reason = _misshapen(selection)
+    if block:
         return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
     if excessive:
         worst = max(excessive, key=lambda level: level.nats)
@@ -411,23 +412,23 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
     return crowded
 
 
-def _misshapen(selection: Selector) -> dict[str, str]:
-    """Return the blocks in which some function of one quantity explains what the names there leave,
-    and the reason: their form is another.
+def _misshapen(selection: Selector) -> tuple[str, str]:
+    """Return the block in which some function of one quantity explains most of what the names there
+    leave, and the reason: their form is another; both empty where none explains enough.
     """
     problem, best, by_block = selection.problem, selection.best, _by_block(selection)
     strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
     in_blocks = {block: strongest[block] for block in by_block if block in strongest}
     curves = terms.best_curves(best.point, best.columns, in_blocks)
-    reasons = {}
-    for block, (nats, formula) in curves.items():
-        if nats > selection.threshold:
-            names = ", ".join(problem.effects[j].name for j in by_block[block])
-            reasons[block] = (
-                f"{formula}, with any function f, explains {nats:.0f} nats that are left beside"
-                f" {names}; the form is another"
-            )
-    return reasons
+    block = max(curves, key=curves.get, default="")
+    nats, formula = curves.get(block, (0.0, ""))
+    if nats <= selection.threshold:
+        return "", ""
+    names = ", ".join(problem.effects[j].name for j in by_block[block])
+    return block, (
+        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names};"
+        " the form is another"
+    )
 
 
 def _excess(level: Level) -> str:
