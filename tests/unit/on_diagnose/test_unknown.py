@@ -280,13 +280,8 @@ def test_all_terms_at_once_say_what_each_says_as_an_effect(block):
     at = beside_a_law(
         SyntheticModel(effects=catalogue(4), law="speed", law_size=0.2, throws=4), [1]
     )
-    known = [laws.KnotValues(w.knots) for w in at.best.point.windows]
-    of = terms.screen(
-        at.best.point,
-        terms.statistics(at.best.point.grams, at.best.point.noise, "cpu"),
-        block,
-        known,
-    )
+    parts = terms.statistics(at.best.point.grams, at.best.point.noise, "cpu")
+    of = terms.Survey(at.best.point, parts, []).screen(block)
     for i in (0, 7, len(of.terms) // 2, len(of.terms) - 1):
         (point,) = terms.extended([at.best.point], [terms.as_effect(of.terms[i], 1.0, 0.0)])
         scale = point.problem.priors.floor[-1]
@@ -376,12 +371,10 @@ def test_nats_of_a_term_beside_a_name_and_its_size_are_those_of_two_numbers():
         (), np.ones(1), information[1:, 1:, None], score[1:, None], information[1:, None]
     )
     known = replace(priors, **{n: getattr(priors, n)[:1] for n in ("floor", "slab", "low", "high")})
-    beside = SimpleNamespace(
-        problem=SimpleNamespace(priors=known),
-        posterior=Posterior(information[:1, :1], score[:1], known),
-    )
+    posterior = Posterior(information[:1, :1], score[:1], known)
+    beside = SimpleNamespace(posterior=posterior, windows=())
     screened.cross = screened.cross[:, :, :1]
-    (nats,) = terms.unsaid(beside, [], screened, [0])
+    (nats,) = terms.Survey(beside, [], []).unsaid(screened, [0])
     assert nats == approx(both - name, rel=1e-3)
     (law,) = terms.laws(point, [0, 1], 5.0)
     covariance = np.linalg.inv(information + np.diag(priors.slab**-2.0))

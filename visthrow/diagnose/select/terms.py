@@ -7,7 +7,7 @@ screened at once without a simulation: a window needs A' G' V^-1 G A alone, with
 effects of the problem (:attr:`visthrow.diagnose.select.point.Problem.terms`) and are weighed like
 any other."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
@@ -124,47 +124,95 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     return replace(point, noise=noise, grams=grams, plain=plain, varies=Varies()), parts
 
 
-def screen(
-    point: Point,
-    parts: Sequence[LatentStatistics],
-    block: str,
-    quantities: Sequence[KnotValues],
-    curves: bool = False,
-) -> Screen | None:
-    """Gather what each term of a block says, or each curve; None where the windows carry no knots
-    for any.
-    """
-    carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
-    names = [set(point.windows[w].knots) for w in carriers]
-    shared = tuple(sorted(set.intersection(*names))) if names else ()
-    terms = _terms(block, shared) if "time" in shared else ()
-    if not terms:
-        return None
-    latent_block = LATENT_BLOCKS.index(level_block(block))
-    pieces = partial(_proportional, terms)
-    if curves:
-        terms = tuple(term for term in terms if len(term.factors) == 1)
-        pieces = partial(_hats, terms, _places(terms, [quantities[w] for w in carriers]))
+class Survey:
+    """What windows say of forces at their knots beside a set of names."""
 
-    def in_window(w: int) -> tuple[np.ndarray, ...]:
-        """Square, information, score and cross information of all terms."""
-        part, transfer = parts[w], through_latents(point.windows[w], quantities[w], block)
-        values = pieces(quantities[w])
+    def __init__(self, point: Point, parts: Sequence[LatentStatistics], active: Sequence[int]):
+        """Keep a point and the statistics of its windows; ``active``: the names."""
+        posterior = point.posterior
+        self.point = point
+        self.parts = parts
+        self.knots = [KnotValues(window.knots) for window in point.windows]
+        self.deviation = posterior.priors.deviation(active)
+        self.sigma = posterior.covariance(active)
+        self.mean = self.sigma @ posterior.score
+
+    def screen(self, block: str, curves: bool = False) -> Screen | None:
+        """Gather what each term of a block says, or each curve; None where the windows carry no
+        knots for any.
+        """
+        point = self.point
+        carriers = [w for w, gram in enumerate(point.grams) if carries(gram.latent_block, block)]
+        names = [set(point.windows[w].knots) for w in carriers]
+        shared = tuple(sorted(set.intersection(*names))) if names else ()
+        terms = _terms(block, shared) if "time" in shared else ()
+        if not terms:
+            return None
+        values_of = partial(_proportional, terms)
+        if curves:
+            terms = tuple(term for term in terms if len(term.factors) == 1)
+            values_of = partial(_hats, terms, _places(terms, [self.knots[w] for w in carriers]))
+        parts = parallel_map(lambda w: self._in_window(w, block, values_of), carriers)
+        square, knots, information, score, cross = map(sum, zip(*parts))
+        return Screen(terms, np.sqrt(square / max(knots, 1)), information, score, cross)
+
+    def _in_window(
+        self, w: int, block: str, values_of: Callable[[KnotValues], np.ndarray]
+    ) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray]:
+        """Square, number of knots, information, score and cross information of all terms."""
+        part = self.parts[w]
+        transfer = through_latents(self.point.windows[w], self.knots[w], block)
+        values = values_of(self.knots[w])
         count, columns = values.shape[2:]
         values = values.reshape(transfer.shape[1], -1)
-        exerted = transfer[point.grams[w].latent_block == latent_block] @ values
+        latent_block = self.point.grams[w].latent_block
+        acting = latent_block == LATENT_BLOCKS.index(level_block(block))
+        exerted = transfer[acting] @ values
         square = (exerted**2).sum(0).reshape(count, columns).sum(1)
         loads = transfer @ values
         informed = (part.latent_information @ loads).reshape(-1, count, columns)
-        score = (part.latent_score + part.latent_effects @ point.theta) @ loads
+        score = (part.latent_score + part.latent_effects @ self.point.theta) @ loads
         cross = (loads.T @ part.latent_effects).reshape(count, columns, -1)
-        loads = loads.reshape(informed.shape)
-        information = np.einsum("lti,ltj->tij", loads, informed)
-        return square, information, score.reshape(count, columns), cross
+        information = np.einsum("lti,ltj->tij", loads.reshape(informed.shape), informed)
+        return square, int(acting.sum()) // 3, information, score.reshape(count, columns), cross
 
-    square, information, score, cross = map(sum, zip(*parallel_map(in_window, carriers)))
-    count = sum(int((point.grams[w].latent_block == latent_block).sum()) // 3 for w in carriers)
-    return Screen(terms, np.sqrt(square / max(count, 1)), information, score, cross)
+    def _left(self, screened: Screen) -> tuple[np.ndarray, np.ndarray]:
+        """Information and score of each term, of what the names leave."""
+        cross = screened.cross
+        known = np.einsum("tik,kl,tjl->tij", cross, self.sigma, cross, optimize=True)
+        information = screened.information - known
+        diagonal = np.einsum("tii->ti", information)  # a view
+        np.maximum(diagonal, 0.0, out=diagonal)
+        return information, screened.score - cross @ self.mean
+
+    def gains(self, screened: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
+        """Nats of each term beside the names, and its prior deviation, which makes it ``reach``
+        strong at the knots.
+        """
+        information, score = self._left(screened)
+        size, most = screened.size, screened.size.max()
+        prior = reach / np.maximum(size, 1e-12 * most + 1e-300)
+        variance = prior[:, None] ** 2
+        precision = np.eye(score.shape[1]) + variance[:, None] * information
+        sizes = np.linalg.solve(precision, (variance * score)[..., None])[..., 0]
+        gain = 0.5 * ((score * sizes).sum(1) - np.linalg.slogdet(precision)[1])
+        gain[size <= 1e-9 * most] = -np.inf
+        return gain, prior
+
+    def unsaid(self, screened: Screen, causes: Sequence[int]) -> np.ndarray:
+        """Nats of each screened term that no single cause explains, whatever its size, beside the
+        names; shape (T,).
+
+        A term has neither bounds nor a usual size. It must not take the place of a cause that says
+        the same only because the cause lies at its bound, or is larger than was expected."""
+        information, score = self._left(screened)
+        information, score = information[:, 0, 0], score[:, 0]
+        shared = (screened.cross[:, 0] @ self.sigma)[:, causes]
+        variance = self.deviation**2
+        spread = np.maximum(variance - self.sigma.diagonal(), SAME * variance)[causes]
+        alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
+        left = score[:, None] - shared * self.mean[causes] / spread
+        return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
 def _proportional(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
@@ -196,34 +244,6 @@ def _hats(
     return np.stack(columns, axis=2)
 
 
-def gains(
-    point: Point, active: Sequence[int], screened: Screen, reach: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Nats of each term beside a set of names, and its prior deviation, which makes it ``reach``
-    strong at the knots.
-    """
-    information, score = _conditional(point, active, screened)
-    prior = reach / np.maximum(screened.size, 1e-12 * screened.size.max() + 1e-300)
-    variance = prior[:, None] ** 2
-    precision = np.eye(score.shape[1]) + variance[:, None] * information
-    explained = (score * np.linalg.solve(precision, (variance * score)[..., None])[..., 0]).sum(1)
-    gain = 0.5 * (explained - np.linalg.slogdet(precision)[1])
-    gain[screened.size <= 1e-9 * screened.size.max()] = -np.inf
-    return gain, prior
-
-
-def _conditional(
-    point: Point, active: Sequence[int], screened: Screen
-) -> tuple[np.ndarray, np.ndarray]:
-    """Information and score of each term, of what a set of names leaves."""
-    sigma = point.posterior.covariance(active)
-    known = np.einsum("tik,kl,tjl->tij", screened.cross, sigma, screened.cross, optimize=True)
-    information = screened.information - known
-    diagonal = np.einsum("tii->ti", information)  # a view
-    np.maximum(diagonal, 0.0, out=diagonal)
-    return information, screened.score - screened.cross @ (sigma @ point.posterior.score)
-
-
 def best_curves(
     point: Point, active: Sequence[int], strongest: Mapping[str, float]
 ) -> dict[str, tuple[float, str]]:
@@ -237,39 +257,18 @@ def best_curves(
     N m]; the prior deviation of f v is ``UNKNOWN_RATIO`` of it at each place."""
     if not strongest:
         return {}
-    calm, parts = with_capped_gusts(point)
-    values = [KnotValues(window.knots) for window in point.windows]
+    survey = Survey(*with_capped_gusts(point), active)
     curves = {}
     for block, force in strongest.items():
-        screened = screen(calm, parts, block, values, curves=True)
+        screened = survey.screen(block, curves=True)
         if screened is None:
             continue
-        gain, _ = gains(calm, active, screened, UNKNOWN_RATIO * force)
+        gain, _ = survey.gains(screened, UNKNOWN_RATIO * force)
         best = int(np.argmax(gain))
         scalar, vector = screened.terms[best].parts
         formula = f"{SYMBOLS[block]} = f({scalar.symbol}) {vector.symbol}"
         curves[block] = float(gain[best] - np.log(len(gain))), formula
     return curves
-
-
-def unsaid(
-    point: Point, active: Sequence[int], screened: Screen, causes: Sequence[int]
-) -> np.ndarray:
-    """Nats of each screened term that no single cause explains, whatever its size, beside a set of
-    names; shape (T,).
-
-    A term has neither bounds nor a usual size. It must not take the place of a cause that says the
-    same only because the cause lies at its bound, or is larger than was expected."""
-    deviation = point.problem.priors.deviation(active)
-    sigma = point.posterior.covariance(active)
-    information, score = _conditional(point, active, screened)
-    information, score = information[:, 0, 0], score[:, 0]
-    shared = (screened.cross[:, 0] @ sigma)[:, causes]
-    mean = (sigma @ point.posterior.score)[causes]
-    spread = np.maximum(deviation**2 - sigma.diagonal(), SAME * deviation**2)[causes]
-    alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
-    left = score[:, None] - shared * mean / spread
-    return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
 def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point]:
@@ -319,11 +318,10 @@ def shortlist(
     nats that a term must bring beyond its price."""
     problem = point.problem
     causes = np.flatnonzero(problem.priors.visible[: len(problem.model.effects)])
-    calm, parts = with_capped_gusts(point)
-    values = [KnotValues(window.knots) for window in point.windows]
+    survey = Survey(*with_capped_gusts(point), active)
     screens = {}
     for block in strongest:
-        screened = screen(calm, parts, block, values)
+        screened = survey.screen(block)
         if screened is not None:
             screens[block] = screened
     depths = [term.depth for screened in screens.values() for term in screened.terms]
@@ -331,8 +329,8 @@ def shortlist(
     present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
     ranked: list[tuple[float, Term, float]] = []
     for block, screened in screens.items():
-        gain, prior = gains(calm, active, screened, UNKNOWN_RATIO * strongest[block])
-        gain[unsaid(calm, active, screened, causes) < LAW] = -np.inf
+        gain, prior = survey.gains(screened, UNKNOWN_RATIO * strongest[block])
+        gain[survey.unsaid(screened, causes) < LAW] = -np.inf
         # of terms that say the same in other words in these flights, the simplest comes first
         for i in np.unique(np.round(gain, 3), return_index=True)[1]:
             term = screened.terms[i]
@@ -392,24 +390,13 @@ def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     """The terms of a set with coefficients and deviations; ``nats`` is what they bring."""
     sigma = point.posterior.covariance(active)
     mean = sigma @ point.posterior.score
-    every = point.problem.effects
-    columns = [j for j in active if isinstance(every[j], TermEffect)]
-    effects = [every[j] for j in columns]
-    floor = np.array([e.floor for e in effects])
+    effects = point.problem.effects
+    columns = [j for j in active if isinstance(effects[j], TermEffect)]
+    floor = np.array([effects[j].floor for j in columns])
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
-    sizes = mean[columns] * floor
     found = []
-    for i, term in enumerate(e.term for e in effects):
-        law = Law(
-            term.formula,
-            term.block,
-            term.factors,
-            term.vector,
-            float(sizes[i]),
-            float(np.sqrt(spread[i, i])),
-            term.unit,
-            float(nats),
-            tuple(spread[i].tolist()),
-        )
-        found.append(law)
+    for j, size, row, variance in zip(columns, mean[columns] * floor, spread, spread.diagonal()):
+        term, sd = effects[j].term, float(np.sqrt(variance))
+        head = term.formula, term.block, term.factors, term.vector
+        found.append(Law(*head, float(size), sd, term.unit, float(nats), tuple(row.tolist())))
     return tuple(found)
