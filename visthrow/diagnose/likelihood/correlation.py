@@ -67,9 +67,11 @@ class Correlation:
     def at_lag(self, lag: np.ndarray) -> np.ndarray:
         """Correlation of samples ``lag`` [s] apart."""
         x = np.abs(lag) / self.time
-        return self.share * np.exp(-x) * (1.0 + x if self.order == 2 else 1.0) + (
-            1.0 - self.share
-        ) * (lag == 0.0)
+        kernel = np.exp(-x)
+        if self.order == 2:
+            kernel = kernel * (1.0 + x)
+        white = 1.0 - self.share
+        return self.share * kernel + white * (lag == 0.0)
 
 
 def components(window: Window, channel: int) -> np.ndarray | None:
@@ -77,10 +79,12 @@ def components(window: Window, channel: int) -> np.ndarray | None:
     stamps differ by component.
     """
     rows = np.flatnonzero(window.channel == channel)
-    stamps, counts = np.unique(window.time[rows], return_counts=True)
+    time = window.time[rows]
+    stamps, counts = np.unique(time, return_counts=True)
     if len(stamps) < 4 or np.any(counts != counts[0]):
         return None
-    return rows[np.argsort(window.time[rows], kind="stable")].reshape(len(stamps), counts[0])
+    in_order = rows[np.argsort(time, kind="stable")]
+    return in_order.reshape(len(stamps), counts[0])
 
 
 def with_correlations(
@@ -89,11 +93,9 @@ def with_correlations(
     """Tell windows of the correlations of their channels' noise; ``windows``: of white noise;
     ``correlations_of``: of channels, by number.
     """
-    return (
-        parallel_map(partial(_with_correlation, correlations_of=correlations_of), windows)
-        if correlations_of
-        else list(windows)
-    )
+    if not correlations_of:
+        return list(windows)
+    return parallel_map(partial(_with_correlation, correlations_of=correlations_of), windows)
 
 
 def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]) -> Window:
@@ -101,10 +103,12 @@ def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]
     sigma = window.sigma.copy()
     for channel, correlation in correlations_of.items():
         rows = components(window, channel)
-        if rows is not None:
-            time = window.time[rows[:, 0]]
-            factors.append((rows, np.linalg.cholesky(correlation.at_lag(time[:, None] - time))))
-            sigma[rows] *= correlation.scale
+        if rows is None:
+            continue
+        time = window.time[rows[:, 0]]
+        alike = correlation.at_lag(time[:, None] - time)
+        factors.append((rows, np.linalg.cholesky(alike)))
+        sigma[rows] *= correlation.scale
     return replace(window, sigma=sigma, correlated=tuple(factors))
 
 
@@ -117,12 +121,13 @@ def correlations(
     model's channels. Returns channel -> its noise, where that is surely not white."""
     free = [_with_free_effects(window, slabs) for window in few_of(windows)]
     bare = parallel_map(partial(hidden_gram, channels=channels), free)
-    residuals = parallel_map(residual_after_fit, free, noise.widely_fitted(free, bare, "cpu"))
-    suspects = {
-        c: scale for c in range(channels) if (scale := _suspected(free, residuals, c)) is not None
-    }
+    fits = noise.widely_fitted(free, bare, "cpu")
+    residuals = parallel_map(residual_after_fit, free, fits)
     correlations_of: dict[int, Correlation] = {}
-    for channel, scale in suspects.items():
+    for channel in range(channels):
+        scale = _suspected(free, residuals, channel)
+        if scale is None:
+            continue
         best, nats = _climbed(free, channels, correlations_of, channel, scale)
         if nats > VERY_STRONG:
             correlations_of[channel] = best
@@ -131,18 +136,16 @@ def correlations(
 
 def few_of(items: Sequence[T]) -> list[T]:
     """Some of them, spread evenly."""
-    return [items[i] for i in np.unique(np.linspace(0, len(items) - 1, LOOKED_AT).astype(int))]
+    places = np.linspace(0, len(items) - 1, LOOKED_AT).astype(int)
+    return [items[i] for i in np.unique(places)]
 
 
 def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
     """A window in which every effect may have a size of its own."""
     states = np.hstack((window.nuisance, window.effects))
-    return replace(
-        window,
-        nuisance=states,
-        nuisance_sd=np.append(window.nuisance_sd, slabs),
-        effects=window.effects[:, :0],
-    )
+    deviations = np.append(window.nuisance_sd, slabs)
+    none = window.effects[:, :0]
+    return replace(window, nuisance=states, nuisance_sd=deviations, effects=none)
 
 
 def _suspected(
@@ -151,23 +154,21 @@ def _suspected(
     """Deviation of what is left of a channel, in that which is stated; None where its neighbours
     are hardly correlated.
     """
-    parts = [
-        r[rows] / w.sigma[rows]
-        for w, r in zip(windows, residuals)
-        if (rows := components(w, channel)) is not None
-    ]
+    parts = []
+    for window, residual in zip(windows, residuals):
+        rows = components(window, channel)
+        if rows is not None:
+            parts.append(residual[rows] / window.sigma[rows])
     if not parts:
         return None
-    distant = (
-        noise.HUBER
-        * noise.MAD_TO_SIGMA
-        * np.median(np.abs(np.concatenate([p.ravel() for p in parts])))
-    )
-    parts = [np.clip(p, -distant, distant) for p in parts]
-    square = sum(float((p**2).sum()) for p in parts)
-    if sum(float((p[1:] * p[:-1]).sum()) for p in parts) < SUSPECT * square:
+    together = np.concatenate([part.ravel() for part in parts])
+    distant = noise.HUBER * noise.MAD_TO_SIGMA * np.median(np.abs(together))
+    parts = [np.clip(part, -distant, distant) for part in parts]
+    square = sum(float((part**2).sum()) for part in parts)
+    neighbours = sum(float((part[1:] * part[:-1]).sum()) for part in parts)
+    if neighbours < SUSPECT * square:
         return None
-    return float(np.sqrt(square / sum(p.size for p in parts)))
+    return float(np.sqrt(square / len(together)))
 
 
 def _climbed(
@@ -180,8 +181,8 @@ def _climbed(
     """The likeliest correlation of a channel beside those known, uphill over a grid, and its nats
     above white noise.
     """
-    stamps = [np.unique(w.time[w.channel == channel]) for w in windows]
-    period = float(np.median(np.concatenate([np.diff(stamps_of) for stamps_of in stamps])))
+    steps = [np.diff(np.unique(w.time[w.channel == channel])) for w in windows]
+    period = float(np.median(np.concatenate(steps)))
     scores: dict[tuple[int, int, int], tuple[float, Correlation]] = {}
     levels: noise.Noise | None = None
     times = int(np.searchsorted(PERIODS * period, LONGEST))
@@ -197,13 +198,13 @@ def _climbed(
             scores[place] = value, replace(guess, scale=scale * levels.scale[channel])
         return scores[place][0]
 
-    best = max(
-        ((min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)), key=tried
-    )
+    begins = [(min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)]
+    best = max(begins, key=tried)
     for stride in STRIDES:
-        while tried(
-            better := max(_neighbours(best, stride, times), key=tried, default=best)
-        ) > tried(best):
+        while True:
+            better = max(_neighbours(best, stride, times), key=tried, default=best)
+            if tried(better) <= tried(best):
+                break
             best = better
     if best[0] == times - 1:  # it would last for still longer
         return scores[best][1], 0.0
@@ -222,7 +223,8 @@ def _neighbours(place: tuple[int, int, int], stride: int, times: int) -> list[tu
     time, share, order = place
     neighbours = [(time + step, share, order) for step in (-stride, stride)]
     if stride == STRIDES[0]:
-        neighbours += [(time, share - 1, order), (time, share + 1, order), (time, share, 3 - order)]
+        neighbours += [(time, share + step, order) for step in (-1, 1)]
+        neighbours.append((time, share, 3 - order))
     return [p for p in neighbours if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
 
 

@@ -82,11 +82,13 @@ def errors(
     sums = np.zeros((3, len(names), channels, len(HORIZONS)))
     for window, f, residual in zip(windows, row, residuals):
         innovation, expected, horizon = predicted(window, noise, residual)
-        predicts = horizon >= 0
-        sums_of = np.zeros((3, channels, len(HORIZONS)))
-        for total, values in zip(sums_of, (innovation**2, np.ones_like(innovation), expected)):
-            np.add.at(total, (window.channel[predicts], horizon[predicts]), values[predicts])
-        sums_of[2] = np.where(sums_of[2] > FAR_ABOVE * sums_of[0], sums_of[0], sums_of[2])
+        ahead = horizon >= 0
+        place = window.channel[ahead], horizon[ahead]
+        square, count, floor = sums_of = np.zeros((3, channels, len(HORIZONS)))
+        np.add.at(square, place, innovation[ahead] ** 2)
+        np.add.at(count, place, 1.0)
+        np.add.at(floor, place, expected[ahead])
+        sums_of[2] = np.where(floor > FAR_ABOVE * square, square, floor)
         sums[:, f] += sums_of
     return Errors(*sums)
 
@@ -111,23 +113,22 @@ def predicted(
     off = (residual.T / sigma).T
     begin = window.time.min()
     length = np.ptp(window.time)
-    fits = states.shape[1] > 0
-    horizon_time = window.time - begin - (min(HEAD * length, HEAD_SECONDS) if fits else 0.0)
-    head = (horizon_time <= 0.0) & fits
+    count = states.shape[1]
+    head_seconds = min(HEAD * length, HEAD_SECONDS) if count else 0.0
+    horizon_time = window.time - begin - head_seconds
+    head = (horizon_time <= 0.0) & (count > 0)
     weighted = (states[head] / scale[head, None] ** 2).T
-    spread = np.linalg.inv(weighted @ states[head] + np.eye(states.shape[1]))
-    innovation = off - states @ (spread @ (weighted @ off[head]))
+    spread = np.linalg.inv(weighted @ states[head] + np.eye(count))
+    gain = spread @ weighted
+    innovation = off - states @ (gain @ off[head])
     if window.correlated:
         root = _root(window, scale)
-        expected = ((root - states @ (spread @ (weighted @ root[head]))) ** 2).sum(1) + (
-            (states @ spread) ** 2
-        ).sum(1)
+        left = root - states @ (gain @ root[head])
+        expected = (left**2).sum(1) + ((states @ spread) ** 2).sum(1)
     else:  # what that is where noise is white
         expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)
-    horizon = np.where(
-        head, -1, np.minimum(np.searchsorted(HORIZONS, horizon_time), len(HORIZONS) - 1)
-    )
-    return innovation, expected, horizon
+    nearest = np.minimum(np.searchsorted(HORIZONS, horizon_time), len(HORIZONS) - 1)
+    return innovation, expected, np.where(head, -1, nearest)
 
 
 def _root(window: Window, scale: np.ndarray) -> np.ndarray:

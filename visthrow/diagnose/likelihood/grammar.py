@@ -40,11 +40,10 @@ def through_latents(window: Window, quantities: KnotValues, block: str) -> np.nd
     if block != JOINT:
         return _hats(window, quantities["time"], block)
     units = np.eye(size).reshape(-1, 3, size)
-    shares = loads(block, quantities, units)
-    return sum(
-        _hats(window, quantities["time"], name) @ values.reshape(size, size)
-        for name, values in shares.items()
-    )
+    total = np.zeros((len(window.latent_block), size))
+    for name, values in loads(block, quantities, units).items():
+        total += _hats(window, quantities["time"], name) @ values.reshape(size, size)
+    return total
 
 
 def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:

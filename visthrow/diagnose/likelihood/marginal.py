@@ -90,7 +90,8 @@ class Noise:
         distribution; 0 where all are 1.
         """
         square = self.share**2
-        return float(-0.5 * TAIL * (np.log(square) + 1.0 / square - 1.0).sum())
+        nats = np.log(square) + 1.0 / square - 1.0
+        return float(-0.5 * TAIL * nats.sum())
 
 
 @dataclass(frozen=True)
@@ -114,11 +115,8 @@ class Statistics:
     @cached_property
     def absolute_square(self) -> np.ndarray:
         """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
-        return (
-            self.square
-            + 2.0 * self.score @ self.theta
-            + (self.information @ self.theta) @ self.theta
-        )
+        curved = self.information @ self.theta
+        return self.square + 2.0 * self.score @ self.theta + curved @ self.theta
 
     def only(self, keep: np.ndarray) -> "Statistics":
         """Return the statistics of some flights; ``keep`` is a mask or indices into ``flights``."""
@@ -135,7 +133,8 @@ class Statistics:
 def columns(window: Window, floors: np.ndarray) -> np.ndarray:
     """The columns [X, G, S] of a window as :class:`Gram` scales them, shape (N, P)."""
     latent = window.latent if window.latent.size else np.zeros((len(window.residual), 0))
-    return np.hstack((window.nuisance * window.nuisance_sd, latent, window.effects * floors))
+    states = window.nuisance * window.nuisance_sd
+    return np.hstack((states, latent, window.effects * floors))
 
 
 def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
@@ -167,15 +166,17 @@ def whitened(window: Window, values: np.ndarray) -> np.ndarray:
     """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
     for rows, factor in window.correlated:
         group = values[rows].reshape(len(rows), -1)
-        values[rows] = lapack.dtrtrs(factor, group, lower=1)[0].reshape(*rows.shape, -1)
+        white = lapack.dtrtrs(factor, group, lower=1)[0]
+        values[rows] = white.reshape(*rows.shape, -1)
     return values
 
 
 def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
     z = whitened(window, z / window.sigma[:, None])
     r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
-    inner = np.zeros((channels, z.shape[1], z.shape[1]))
-    cross = np.zeros((channels, z.shape[1]))
+    size = z.shape[1]
+    inner = np.zeros((channels, size, size))
+    cross = np.zeros((channels, size))
     square = np.zeros(channels)
     for c in np.unique(window.channel):
         rows = window.channel == c
@@ -184,12 +185,12 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         inner[c] = white.T @ white
         cross[c] = residual @ white
         square[c] = residual @ residual
-    count = np.bincount(window.channel, minlength=len(square)).astype(float)
+    count = np.bincount(window.channel, minlength=channels).astype(float)
     blocks = np.asarray(window.latent_block, dtype=int)
     states = window.nuisance.shape[1]
-    turned = sum(
-        rows.shape[1] * float(np.log(np.diag(factor)).sum()) for rows, factor in window.correlated
-    )
+    log_sigma = float(np.log(window.sigma).sum())
+    for rows, factor in window.correlated:
+        log_sigma += rows.shape[1] * float(np.log(np.diag(factor)).sum())
     return Gram(
         window.flight,
         window.phase,
@@ -201,14 +202,16 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
         blocks,
         np.eye(len(blocks)),
         _information_by_block(inner, states, blocks),
-        float(np.log(window.sigma).sum()) + turned,
+        log_sigma,
     )
 
 
 def _information_by_block(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
     """See :class:`Gram`, with ``begin`` the first latent column."""
-    squares = np.diagonal(inner, axis1=1, axis2=2)[:, begin : begin + len(blocks)].sum(0)
-    return {int(block): float(np.median(squares[blocks == block])) for block in np.unique(blocks)}
+    squares = np.diagonal(inner, axis1=1, axis2=2).sum(0)[begin : begin + len(blocks)]
+    return {
+        block: float(np.median(squares[blocks == block])) for block in np.unique(blocks).tolist()
+    }
 
 
 def check(window: Window, effects: int, channels: int) -> None:
@@ -240,10 +243,8 @@ def check(window: Window, effects: int, channels: int) -> None:
 
 def finite(window: Window) -> bool:
     """Whether a window was simulated."""
-    return all(
-        np.all(np.isfinite(a))
-        for a in (window.residual, window.effects, window.nuisance, window.latent)
-    )
+    arrays = window.residual, window.effects, window.nuisance, window.latent
+    return all(np.all(np.isfinite(array)) for array in arrays)
 
 
 def correlated(gram: Gram, window: Window, time: float) -> Gram:
@@ -256,16 +257,17 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
         return gram
     factor = knot_factor(window, time)
     knots = len(factor)
-    groups = gram.latents // len(factor)
+    groups = gram.latents // knots
     part = slice(gram.nuisances, gram.nuisances + gram.latents)
     channels, size = gram.cross.shape
     inner = gram.inner.copy()
-    inner[:, part] = (factor.T @ inner[:, part].reshape(channels, groups, knots, size)).reshape(
-        channels, -1, size
-    )
-    inner[:, :, part] = (inner[:, :, part].reshape(-1, knots) @ factor).reshape(channels, size, -1)
+    rows = factor.T @ inner[:, part].reshape(channels, groups, knots, size)
+    inner[:, part] = rows.reshape(channels, -1, size)
+    columns_of = inner[:, :, part].reshape(-1, knots) @ factor
+    inner[:, :, part] = columns_of.reshape(channels, size, -1)
     cross = gram.cross.copy()
-    cross[:, part] = (cross[:, part].reshape(-1, knots) @ factor).reshape(channels, -1)
+    turned = cross[:, part].reshape(-1, knots) @ factor
+    cross[:, part] = turned.reshape(channels, -1)
     visibility = _information_by_block(inner, gram.nuisances, gram.latent_block)
     whole = np.kron(np.eye(groups), factor)
     return replace(gram, inner=inner, cross=cross, factor=whole, visibility=visibility)
@@ -277,8 +279,10 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
     """
     group = window.latent_block.astype(int) * 3 + window.latent_axis.astype(int)
     knots = _knots(group, window.latent_time)
-    lag = np.abs(window.latent_time[:knots, None] - window.latent_time[:knots])
-    alike = np.where(group[:knots, None] == group[:knots], np.exp(-lag / time), 0.0)
+    stamps = window.latent_time[:knots]
+    members = group[:knots]
+    lag = np.abs(stamps[:, None] - stamps)
+    alike = np.where(members[:, None] == members, np.exp(-lag / time), 0.0)
     return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
 
 
@@ -291,7 +295,8 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
         return len(group)
     groups = group.reshape(-1, count)
     times = time.reshape(-1, count)
-    return count if np.all(groups == groups[:, :1]) and np.all(times == times[0]) else len(group)
+    alike = np.all(groups == groups[:, :1]) and np.all(times == times[0])
+    return count if alike else len(group)
 
 
 def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Gram]:
@@ -318,17 +323,17 @@ def with_residual(gram: Gram, window: Window, residual: np.ndarray, floors: np.n
     """Return a Gram matrix of the same derivatives with the residuals of another size of the
     effects.
     """
-    weighted = np.zeros((len(residual), len(gram.count)))
+    count = len(residual)
+    channels = len(gram.count)
     white = whitened(window, (residual / window.sigma)[:, None])[:, 0]
-    weighted[np.arange(len(residual)), window.channel] = _unwhitened(window, white) / window.sigma
+    weighted = np.zeros((count, channels))
+    weighted[np.arange(count), window.channel] = _unwhitened(window, white) / window.sigma
     by_state = (window.nuisance.T @ weighted).T * window.nuisance_sd
-    by_latent = (
-        (window.latent.T @ weighted).T @ gram.factor
-        if gram.latents
-        else np.zeros((len(gram.count), 0))
-    )
+    by_latent = np.zeros((channels, 0))
+    if gram.latents:
+        by_latent = (window.latent.T @ weighted).T @ gram.factor
     by_effect = (window.effects.T @ weighted).T * floors
-    square = np.bincount(window.channel, white**2, len(gram.count))
+    square = np.bincount(window.channel, white**2, channels)
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 
 
@@ -346,7 +351,9 @@ def residual_after_fit(window: Window, fit: np.ndarray) -> np.ndarray:
     """
     states = window.nuisance.shape[1]
     residual = window.residual - window.nuisance @ (window.nuisance_sd * fit[:states])
-    return residual - window.latent @ fit[states:] if len(fit) > states else residual
+    if len(fit) > states:
+        residual = residual - window.latent @ fit[states:]
+    return residual
 
 
 @dataclass(frozen=True)
@@ -378,16 +385,18 @@ def gather(
     size = len(theta)
     information = np.zeros((len(flights), size, size))
     samples = np.zeros(len(flights))
-    total = np.zeros(size)
+    squares = np.zeros(size)
     for i, gram, part in zip(row, grams, parts):
         information[i] += part.information
         samples[i] += gram.count.sum()
-        total += np.diagonal(gram.inner, axis1=1, axis2=2)[:, gram.cross.shape[1] - size :].sum(0)
-    silent = np.diagonal(information.sum(0)) < ROUNDING * total
+        begin = gram.cross.shape[1] - size
+        squares += np.diagonal(gram.inner, axis1=1, axis2=2)[:, begin:].sum(0)
+    silent = np.diagonal(information.sum(0)) < ROUNDING * squares
     information[:, silent] = 0.0
     information[:, :, silent] = 0.0
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(information.sum(0)), 1e-300))
-    lowest = np.linalg.eigvalsh(information.sum(0) * np.outer(scale, scale)).min() if size else 0.0
+    total = information.sum(0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(total), 1e-300))
+    lowest = np.linalg.eigvalsh(total * np.outer(scale, scale)).min(initial=0.0)
     if lowest < -NEGATIVE:
         raise DiagnoseError(
             f"information has the eigenvalue {lowest:.1e} relative to its diagonal; the derivatives"

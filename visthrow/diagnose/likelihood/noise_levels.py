@@ -106,10 +106,10 @@ def _likeliest(windows: Sequence[Window], grams: Sequence[Gram], device: str) ->
     best = len(CORRELATION_TIMES) // 2
     likely(best, None)
     for way in (-1, 1):
-        while (
-            0 <= best + way < len(CORRELATION_TIMES)
-            and likely(best + way, levels_of[best][0]) > levels_of[best][1]
-        ):
+        while 0 <= best + way < len(CORRELATION_TIMES):
+            noise, nats = levels_of[best]
+            if likely(best + way, noise) <= nats:
+                break
             best += way
     return levels_of[best][0]
 
@@ -126,12 +126,8 @@ def roughly(grams: Sequence[Gram], start: Noise | None = None) -> tuple[Noise, f
     """
     guess = _first_guess(grams)
     if start is not None:
-        guess = replace(
-            start,
-            latent_sd={
-                key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()
-            },
-        )
+        levels = {key: start.latent_sd.get(key, level) for key, level in guess.latent_sd.items()}
+        guess = replace(start, latent_sd=levels)
     return maximised(grams, guess, "cpu", ROUGHLY_NATS)
 
 
@@ -142,13 +138,11 @@ def _first_guess(grams: Sequence[Gram]) -> Noise:
     for gram in grams:
         for block, information in gram.visibility.items():
             if information > 0.0:  # else these forces show nowhere in the window
-                visible.setdefault((block, gram.phase), []).append(1.0 / np.sqrt(information))
-    return Noise(
-        scale,
-        {key: float(np.median(v)) for key, v in visible.items()},
-        CORRELATION_TIMES[0],
-        np.ones((len(grams), len(LATENT_BLOCKS))),
-    )
+                levels = visible.setdefault((block, gram.phase), [])
+                levels.append(1.0 / np.sqrt(information))
+    medians = {key: float(np.median(levels)) for key, levels in visible.items()}
+    share = np.ones((len(grams), len(LATENT_BLOCKS)))
+    return Noise(scale, medians, CORRELATION_TIMES[0], share)
 
 
 @dataclass(frozen=True)
@@ -183,55 +177,54 @@ class _Layout:
         measured = np.flatnonzero(samples > 0)
         blocks = len(LATENT_BLOCKS)
         width = blocks + len(samples)
-        shares = len(keys) + np.arange(len(pairs))
+        first_scale = len(keys) + len(pairs)
+        shares = np.arange(len(keys), first_scale)
         levels = pairs @ [width, 1]
-        scales = blocks + measured + width * np.arange(len(grams))[:, None]
-        scale_parameters = np.tile(len(keys) + len(pairs) + np.arange(len(measured)), len(grams))
-        parameters = np.concatenate((phases, shares, scale_parameters))
-        places = np.concatenate((levels, levels, scales.ravel()))
-        moves = csr_array(
-            (np.ones(len(places)), (parameters, places)),
-            shape=(len(keys) + len(pairs) + len(measured), width * len(grams)),
-        )
+        places_of_scales = blocks + measured + width * np.arange(len(grams))[:, None]
+        scales = first_scale + np.tile(np.arange(len(measured)), len(grams))
+        parameters = np.concatenate((phases, shares, scales))
+        places = np.concatenate((levels, levels, places_of_scales.ravel()))
+        shape = first_scale + len(measured), width * len(grams)
+        moves = csr_array((np.ones(len(places)), (parameters, places)), shape=shape)
         return _Layout(keys, pairs, phases, measured, moves)
+
+    @property
+    def shares(self) -> slice:
+        """Return the place of the windows' shares among the parameters."""
+        first = len(self.keys)
+        return slice(first, first + len(self.pairs))
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return window and block of each share."""
+        return tuple(self.pairs.T)
 
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
-        shared = [noise.latent_sd[key] for key in self.keys]
-        return np.log(
-            np.concatenate((shared, noise.share[tuple(self.pairs.T)], noise.scale[self.measured]))
-        )
+        levels = [noise.latent_sd[key] for key in self.keys]
+        return np.log(np.concatenate((levels, noise.share[self.places], noise.scale[self.measured])))
 
     def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""
-        first = len(self.keys)
-        last = len(self.keys) + len(self.pairs)
+        sizes = np.exp(x)
+        shares = self.shares
         share = noise.share.copy()
         scale = noise.scale.copy()
-        share[tuple(self.pairs.T)] = np.exp(x[first:last])
-        scale[self.measured] = np.exp(x[last:])
-        return replace(
-            noise,
-            scale=scale,
-            share=share,
-            latent_sd=dict(zip(self.keys, np.exp(x[:first]).tolist())),
-        )
+        share[self.places] = sizes[shares]
+        scale[self.measured] = sizes[shares.stop :]
+        levels = dict(zip(self.keys, sizes.tolist()))
+        return replace(noise, scale=scale, share=share, latent_sd=levels)
 
     def limits(self, grams: Sequence[Gram]) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest values of the parameters."""
         guess = _first_guess(grams).latent_sd
         visible = np.log([guess[key] for key in self.keys])
-        sizes = len(self.pairs), len(self.measured)
-        bounds = (
-            (
-                np.log(low) + visible,
-                np.full(sizes[0], np.log(share)),
-                np.full(sizes[1], np.log(scale)),
-            )
-            for low, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS)
-        )
-        low, high = map(np.concatenate, bounds)
-        return low, high
+        limits = []
+        for level, share, scale in zip((LEVEL_LOW, LEVEL_HIGH), SHARE_BOUNDS, SCALE_BOUNDS):
+            shares = np.full(len(self.pairs), np.log(share))
+            scales = np.full(len(self.measured), np.log(scale))
+            limits.append(np.concatenate((np.log(level) + visible, shares, scales)))
+        return tuple(limits)
 
 
 def maximised(
@@ -284,11 +277,9 @@ def _scoring_step(
     shows in no likelihood's logarithm, but its own step is finite. A window's variance takes the
     steps of its phase's level and of its share together."""
     diagonal = np.diag(curvature)
-    free = (
-        (diagonal > 0.0)
-        & ~((x <= low + STALLED) & (slope < 0.0))
-        & ~((x >= high - STALLED) & (slope > 0.0))
-    )
+    at_low = (x <= low + STALLED) & (slope < 0.0)
+    at_high = (x >= high - STALLED) & (slope > 0.0)
+    free = (diagonal > 0.0) & ~at_low & ~at_high
     step = np.zeros_like(x)
     if not np.any(free):
         return step, 0.0
@@ -297,12 +288,15 @@ def _scoring_step(
     part /= size[:, None]
     part /= size
     part.flat[:: len(part) + 1] += 1e-6
-    _, solution, indefinite = lapack.dposv(part, slope[free] / size, lower=1)
-    step[free] = (np.linalg.solve(part, slope[free] / size) if indefinite else solution) / size
+    right = slope[free] / size
+    _, solution, indefinite = lapack.dposv(part, right, lower=1)
+    if indefinite:
+        solution = np.linalg.solve(part, right)
+    step[free] = solution / size
     promised = float(slope @ step)
-    shares = slice(len(layout.keys), len(layout.keys) + len(layout.pairs))
     turned = _logarithms(step)
-    turned[shares] = _logarithms(step[shares] + step[layout.phases]) - turned[layout.phases]
+    whole = step[layout.shares] + step[layout.phases]
+    turned[layout.shares] = _logarithms(whole) - turned[layout.phases]
     return np.clip(x + turned, low, high) - x, promised
 
 
@@ -322,10 +316,10 @@ def _likelihood(
     curved = bsr_array((curvatures, windows[:-1], windows))
     slope = layout.moves @ slopes.ravel()
     curvature = (layout.moves @ curved @ layout.moves.T).toarray()
-    place = len(layout.keys) + np.arange(len(layout.pairs))
-    inverse = noise.share[tuple(layout.pairs.T)] ** -2.0
-    slope[place] += TAIL * (inverse - 1.0)
-    curvature[place, place] += 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
+    inverse = noise.share[layout.places] ** -2.0
+    slope[layout.shares] += TAIL * (inverse - 1.0)
+    diagonal = np.einsum("ii->i", curvature)  # a view
+    diagonal[layout.shares] += 2.0 * TAIL * np.clip(inverse, *PRIOR_CURVATURE)
     return noise.log_prior + float(values.sum()), slope, curvature
 
 
@@ -345,15 +339,15 @@ def without_outliers(
         where = "cpu" if cleaning else device  # few are looked at once more
         fits = widely_fitted(starts, bare, where)
         residuals = parallel_map(residual_after_fit, starts, fits)
-        distances = {
-            w: _outlier_distances(windows[w], residual)
-            for w, residual in zip(windows_left, residuals)
-        }
-        windows_left = [w for w in windows_left if np.any(distances[w] > 1.0)]
+        looked_at = windows_left
+        windows_left = []
+        for w, residual in zip(looked_at, residuals):
+            distance = _outlier_distances(windows[w], residual)
+            if np.any(distance > 1.0):
+                sigmas[w] = windows[w].sigma * np.maximum(distance, 1.0)
+                windows_left.append(w)
         if not windows_left:
             break
-        for w in windows_left:
-            sigmas[w] = windows[w].sigma * np.maximum(distances[w], 1.0)
         starts = [replace(windows[w], sigma=sigmas[w]) for w in windows_left]
         bare = parallel_map(partial(hidden_gram, channels=len(grams[0].count)), starts)
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
@@ -370,9 +364,11 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
         for (block, _), level in _first_guess([gram]).latent_sd.items():
             row[block] = WIDE * level
     levels = {(block, gram.phase): 1.0 for gram in bare for block in gram.visibility}
-    fits = Stack(shaped, device).fitted(Noise(np.ones(len(bare[0].count)), levels, time, share))
+    noise = Noise(np.ones(len(bare[0].count)), levels, time, share)
+    fits = Stack(shaped, device).fitted(noise)
     for fit, gram in zip(fits, shaped):
-        fit[gram.nuisances :] = gram.factor @ fit[gram.nuisances :]
+        latents = fit[gram.nuisances :]
+        fit[gram.nuisances :] = gram.factor @ latents
     return fits
 
 
@@ -384,8 +380,7 @@ def _outlier_distances(window: Window, residual: np.ndarray) -> np.ndarray:
 
 def _mended(window: Window, sigma: np.ndarray) -> Window:
     """The window with other sigmas, where these differ in a few samples."""
-    return (
-        replace(window, sigma=sigma)
-        if 0.0 < (sigma > window.sigma).mean() <= HUBER_SHARE
-        else window
-    )
+    share = (sigma > window.sigma).mean()
+    if 0.0 < share <= HUBER_SHARE:
+        return replace(window, sigma=sigma)
+    return window

@@ -121,7 +121,8 @@ def explain(
     worlds that the threshold is calibrated on; ``laws``: whether to look for laws outside the
     catalogue where it does not suffice. Returns one verdict for every effect, and one overall.
     Raises DiagnoseError: the model gives no window, or contradicts itself."""
-    begun, say = time.monotonic(), progress or (lambda _: None)
+    begun = time.monotonic()
+    say = progress or (lambda _: None)
     keep_freed_memory()
     windows = model.windows({})
     if not windows:
@@ -138,7 +139,8 @@ def explain(
             f" {correlation.share:.1%} of its variance"
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
-    begin, commands = NOTHING, None
+    begin = NOTHING
+    commands = None
     for further in range(2 * ROUNDS, -1, -1):
         untracked = untracked_windows(nominal) if further else []  # the worst hide others
         if not untracked:
@@ -181,7 +183,8 @@ def _selected(selector: Selector, begin: Names) -> tuple[Selector, Scatter | Non
 
     Lost commands are a candidate that needs a linearisation of its own."""
     plain = selector.run(begin)
-    nominal, needed = plain.nominal, plain.threshold
+    nominal = plain.nominal
+    needed = plain.threshold
     loss = lost_commands.verdict(nominal, (), needed)
     if (loss is None or not loss.found) and plain.best.columns:
         loss = lost_commands.verdict(plain.best.point, plain.best.columns, needed)

@@ -49,7 +49,8 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
             stack = stacks[phase]
             nats = _likelihood(stack, noise, key, level) - _likelihood(stack, noise, key, most)
         earlier = before.noise.latent_sd.get(key, float("nan"))
-        name, excessive = LATENT_BLOCKS[block], bool(nats > threshold)
+        name = LATENT_BLOCKS[block]
+        excessive = bool(nats > threshold)
         listed.append(Level(name, phase, earlier, level, quiet, float(nats), excessive))
     return tuple(listed)
 

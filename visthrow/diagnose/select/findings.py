@@ -48,8 +48,10 @@ class Reading:
 
     def finding(self, j: int) -> Finding:
         """Return the verdict on an effect."""
-        problem, point = self.point.problem, self.point
-        priors, effect = problem.priors, problem.effects[j]
+        problem = self.point.problem
+        point = self.point
+        priors = problem.priors
+        effect = problem.effects[j]
         finding = blank(effect)
         if not priors.visible[j]:
             missing = tuple(c for c in effect.channels if c not in problem.model.channels)
@@ -146,18 +148,21 @@ class Reading:
         """Return the best known combination of a class: first eigenvector of its members'
         information in prior deviations.
         """
-        posterior, problem = self.point.posterior, self.point.problem
+        posterior = self.point.posterior
+        problem = self.point.problem
         effects = [problem.effects[k] for k in members]
         slab = problem.priors.slab[members]
         named = [k for k in self.active if k not in members]
         sigma = posterior.covariance([*members, *named])[members]
         precision = np.linalg.inv(sigma[:, members])
         values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
-        best, value = vectors[:, -1], values[-1]
+        best = vectors[:, -1]
+        value = values[-1]
         mean = float(best @ (slab * (precision @ (sigma @ posterior.score))) / value)
         coefficients = best / slab / problem.priors.floor[members]
         first = int(np.argmax(np.abs(best)))
-        scale, unit = coefficients[first], effects[first].unit
+        scale = coefficients[first]
+        unit = effects[first].unit
         text = effects[first].name
         for i, effect in enumerate(effects):
             if i != first:

@@ -110,7 +110,8 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     statistics = freed(regrouped(point, groups), point.varies.by_flight)
     count = len(statistics.flights)
     folds = [np.arange(count)[k::MOST_FOLDS] for k in range(min(count, MOST_FOLDS))]
-    trained, named = np.zeros((count, len(priors.floor))), Counter()
+    trained = np.zeros((count, len(priors.floor)))
+    named = Counter()
     offered = shared(effects)
     selected = frozenset(offered[j] for j in work.active)
 
@@ -173,7 +174,8 @@ def channel_gains(
 
     ``groups``: what is left out together, of each window; ``trained``: sizes in floors that the
     others gave, shape (F, K); ``box``: squared errors of a black box, shape (F, C, H)."""
-    before, after = work.before, work.after
+    before = work.before
+    after = work.after
     names = work.problem.model.channels
     row = np.unique(groups, return_inverse=True)[1]
     change = (after.theta - trained)[row] * work.problem.priors.floor
@@ -285,7 +287,8 @@ def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
     do not find again.
     """
     uncompared = not compares_phases(diagnosis.work.after)
-    names, flights = list(diagnosis.theta), f"held-out {measured.left_out}"
+    names = list(diagnosis.theta)
+    flights = f"held-out {measured.left_out}"
     text = ", ".join(names)
     borne = share_text(measured.share, measured.low, measured.high)
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
@@ -391,7 +394,8 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     """
     if not doubt.names:
         return diagnosis
-    work, names = diagnosis.work, set(doubt.names)
+    work = diagnosis.work
+    names = set(doubt.names)
     remaining = [name for name in diagnosis.theta if name not in names]
     removed = names.union(*(diagnosis[name].partners for name in names)) - set(remaining)
     findings = []
@@ -463,8 +467,10 @@ def _kind(work: Work, channel: int) -> str:
     """Return where a channel's remaining error lies: in an axis, in a flight, or growing with the
     time in the flight.
     """
-    point, windows = work.after, [w for w in work.after.windows if np.any(w.channel == channel)]
-    by_axis, by_flight = np.zeros(3), Counter()
+    point = work.after
+    windows = [w for w in work.after.windows if np.any(w.channel == channel)]
+    by_axis = np.zeros(3)
+    by_flight = Counter()
     halves: dict[bool, list[float]] = {False: [], True: []}  # of the flights
     middle = {}
     for flight in {w.flight for w in windows}:
@@ -501,7 +507,8 @@ def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, flo
     score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
     prior = np.diag(point.problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
-    other_information, other_score = total - information, score.sum(0) - score
+    other_information = total - information
+    other_score = score.sum(0) - score
     trained = np.linalg.solve(other_information, other_score[..., None])[..., 0]
     none = np.zeros(len(laws))
     part = replace(statistics, information=information, score=score, theta=none)

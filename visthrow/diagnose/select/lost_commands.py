@@ -84,13 +84,16 @@ class CommandStatistics:
         return np.array(evidence[1:]) - evidence[0]
 
     def _evidence(self, share: float, priors: Priors, active: Sequence[int]) -> float:
-        effects, commands = slice(0, -self.commands), slice(-self.commands, None)
+        effects = slice(0, -self.commands)
+        commands = slice(-self.commands, None)
         information = self.information[:, effects, effects].sum(0)
         score = self.score[:, effects].sum(0)
         value = 0.0
         if share > 0.0:
-            variance, mean = share * (1.0 - share), np.full(self.commands, share)
-            inner, unit = self.information[:, commands, commands], np.eye(self.commands)
+            variance = share * (1.0 - share)
+            mean = np.full(self.commands, share)
+            inner = self.information[:, commands, commands]
+            unit = np.eye(self.commands)
             crossed = self.information[:, commands, effects]
             remaining = self.score[:, commands] - inner @ mean
             right = np.concatenate((remaining[..., None], crossed), axis=2)

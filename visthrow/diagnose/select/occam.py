@@ -128,7 +128,8 @@ class Linear:
             penalty = self.penalty(chosen)
             self._values[chosen] = -np.inf
             if np.isfinite(penalty):
-                active, occam = columns_of(chosen), self.shares(chosen)[1]
+                active = columns_of(chosen)
+                occam = self.shares(chosen)[1]
                 whole = evidence_of(self._freed(chosen), self.priors, active)
                 self._values[chosen] = whole - occam - penalty
         return self._values[chosen]
@@ -212,7 +213,8 @@ class Linear:
         listed: dict[Names, float] = {}
         for subset in (chosen - set(g) for n in range(3) for g in combinations(chosen, n)):
             offered = [c for c in self.plain if c not in subset and not c.law]
-            base, active = self.value(subset), columns_of(subset)
+            base = self.value(subset)
+            active = columns_of(subset)
             if len(subset) + 2 > MOST_NAMES or len(offered) < 2 or not np.isfinite(base):
                 continue
             columns = [c.columns[0] for c in offered]

@@ -218,7 +218,8 @@ def linearise(
     ``theta``: in floors, shape (K,); ``start``: noise levels to start from; ``windows``: what the
     model gave there, if it was asked already; ``varies``: effects that differ among flights."""
     theta = problem.possible(theta)
-    sizes, channels = problem.sizes(theta), len(problem.model.channels)
+    sizes = problem.sizes(theta)
+    channels = len(problem.model.channels)
     flown = problem.flown(theta)
     windows = (flown or problem.model).windows(sizes) if windows is None else windows
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
@@ -301,7 +302,8 @@ def untracked_windows(point: Point) -> list[int]:
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
     lost, but something is missing."""
     grams = with_shares(point, point.theta)
-    shares, log_dets = point.integrals.shares(grams, point.noise), point.integrals.log_dets
+    shares = point.integrals.shares(grams, point.noise)
+    log_dets = point.integrals.log_dets
     misfit = []
     for share, log_det, gram in zip(shares, log_dets, grams):
         misfit.append((share.square - log_det) / max(gram.count.sum(), 1.0))

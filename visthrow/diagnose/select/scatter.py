@@ -17,7 +17,9 @@ from sim.effects.effect import RandomEffect
 from visthrow.diagnose.likelihood.evidence import INEXACT, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 
-FLIGHT, DAY, COMMAND = "flight", "day", "command"  # what has a share of its own
+FLIGHT = "flight"  # what has a share of its own
+DAY = "day"
+COMMAND = "command"
 EVENT = "event"  # one flight alone has one
 REACH = np.geomspace(0.02, 6.0, 25)
 """Deviations that are tried, in their prior's."""
@@ -267,7 +269,8 @@ def integrated(
     ``deviation``: number of each effect, and the shares' deviation in floors, of all rows or of
     each, shape (F,)."""
     for j, size in deviation:
-        column, score = statistics.information[:, :, j], statistics.score
+        column = statistics.information[:, :, j]
+        score = statistics.score
         diagonal = column[:, j]
         part = size**2 / (1.0 + size**2 * diagonal)
         explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
@@ -305,7 +308,8 @@ def _shares(
     statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, np.ndarray]
 ) -> np.ndarray:
     """Return the most probable shares of each row, beside its sizes ``theta`` (F, K)."""
-    shares, columns = np.zeros(statistics.score.shape), list(deviation)
+    shares = np.zeros(statistics.score.shape)
+    columns = list(deviation)
     if columns:
         change = theta - statistics.theta
         score = statistics.score - np.einsum("fij,fj->fi", statistics.information, change)

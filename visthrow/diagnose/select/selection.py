@@ -167,7 +167,9 @@ class Selector:
         """Simulate the best sets, and go over to the one that is worth most; False where the set
         that is there stays.
         """
-        listed, leads, least = self._listed(), {}, -np.inf
+        listed = self._listed()
+        leads = {}
+        least = -np.inf
         near: list[Trial] = []  # a trial's matrices are large: others are forgotten
         better: list[Trial] = []
         while shortlist := self._short(listed, leads, least):
@@ -198,7 +200,8 @@ class Selector:
         the statistics: of where it is, of noise levels that leave every effect its size, and sets
         of few causes by those of the model as it stands.
         """
-        present, ahead_of = self.best.chosen, {}
+        present = self.best.chosen
+        ahead_of = {}
         free = with_all_effects_noise(self.best.point)
         places = [(self.best.point, present), (free, present)]
         places += [(self.nominal, NOTHING)] if present else []
@@ -246,7 +249,8 @@ class Selector:
 
     def _tried(self, point: Point, sets: Iterable[Names]) -> list[Trial]:
         """Simulate sets from a point."""
-        sets, linear = list(sets), self.linear(point)
+        sets = list(sets)
+        linear = self.linear(point)
         shares = [linear.shares(s) for s in sets]
         columns = [columns_of(s) for s in sets]
         points = [
@@ -291,7 +295,9 @@ class Selector:
         """Tell whether every member of a set is surely there, whatever half a floor of it is, lies
         within its bounds in each flight, and matters.
         """
-        point, columns, priors = trial.point, trial.columns, self.problem.priors
+        point = trial.point
+        columns = trial.columns
+        priors = self.problem.priors
         sure = point.posterior.certainty(point.theta, columns)
         if np.any(sure <= 1.0):
             return False
@@ -308,7 +314,8 @@ class Selector:
 
         A rope that whips forgets its initial state within a window; what was fitted for another
         rope explains nothing. New states alone are no gain."""
-        kinds, point = self.problem.switches, self.best.point
+        kinds = self.problem.switches
+        point = self.best.point
         promising = [
             s
             for s, nats in listed.items()
@@ -339,7 +346,8 @@ class Selector:
         where these still hold. Sets that were judged by derivatives from elsewhere may be tried
         again.
         """
-        origin, chosen = self.origin, self.best.chosen
+        origin = self.origin
+        chosen = self.best.chosen
         if chosen in self._settled_sets:
             return False
         self._settled_sets.add(chosen)
@@ -383,7 +391,8 @@ class Selector:
             except DiagnoseError as error:
                 self.progress(f"the last derivatives stay: {error}")
                 break
-            before, point = point, fitted(self.origin, active)
+            before = point
+            point = fitted(self.origin, active)
             close = np.abs(point.theta - before.theta).max() <= 0.5
             if close or curvature(self.origin, point) <= SPIKE:
                 break
@@ -424,7 +433,8 @@ class Selector:
         points = {id(p): p for p in (self.nominal, self.origin, self.best.point)}
         widened = dict(zip(points, terms.extended(list(points.values()), shortlist)))
         self.best = replace(self.best, point=widened[id(self.best.point)])
-        self.nominal, self.origin = widened[id(self.nominal)], widened[id(self.origin)]
+        self.nominal = widened[id(self.nominal)]
+        self.origin = widened[id(self.origin)]
         self._offer()
         return True
 

@@ -190,7 +190,8 @@ class Survey:
         strong at the knots.
         """
         information, score = self._left(screened)
-        size, most = screened.size, screened.size.max()
+        size = screened.size
+        most = screened.size.max()
         prior = reach / np.maximum(size, 1e-12 * most + 1e-300)
         variance = prior[:, None] ** 2
         precision = np.eye(score.shape[1]) + variance[:, None] * information
@@ -206,7 +207,8 @@ class Survey:
         A term has neither bounds nor a usual size. It must not take the place of a cause that says
         the same only because the cause lies at its bound, or is larger than was expected."""
         information, score = self._left(screened)
-        information, score = information[:, 0, 0], score[:, 0]
+        information = information[:, 0, 0]
+        score = score[:, 0]
         shared = (screened.cross[:, 0] @ self.sigma)[:, causes]
         variance = self.deviation**2
         spread = np.maximum(variance - self.sigma.diagonal(), SAME * variance)[causes]
@@ -275,7 +277,8 @@ def extended(points: Sequence[Point], terms: Sequence[TermEffect]) -> list[Point
     """Points of one problem with more terms as effects, at 0; nothing is simulated again."""
     problem = points[0].problem
     wide = replace(problem, terms=(*problem.terms, *terms))
-    channels, none = len(problem.model.channels), np.zeros(len(terms))
+    channels = len(problem.model.channels)
+    none = np.zeros(len(terms))
     widened = []
     for point in points:
         windows = parallel_map(lambda w: with_terms(w, terms, none), point.windows)
@@ -299,7 +302,8 @@ def without_laws(point: Point) -> Point:
     grams = []
     for gram in point.grams:
         kept = slice(gram.nuisances + gram.latents + count)
-        inner, cross = gram.inner[:, kept, kept], gram.cross[:, kept]
+        inner = gram.inner[:, kept, kept]
+        cross = gram.cross[:, kept]
         grams.append(replace(gram, inner=inner, cross=cross))
     theta = point.theta[:count]
     return regathered(point, problem=plain, theta=theta, windows=windows, grams=grams)
@@ -396,7 +400,8 @@ def laws(point: Point, active: Sequence[int], nats: float) -> tuple[Law, ...]:
     spread = sigma[np.ix_(columns, columns)] * np.outer(floor, floor)
     found = []
     for j, size, row, variance in zip(columns, mean[columns] * floor, spread, spread.diagonal()):
-        term, sd = effects[j].term, float(np.sqrt(variance))
+        term = effects[j].term
+        sd = float(np.sqrt(variance))
         head = term.formula, term.block, term.factors, term.vector
         found.append(Law(*head, float(size), sd, term.unit, float(nats), tuple(row.tolist())))
     return tuple(found)

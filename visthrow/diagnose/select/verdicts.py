@@ -57,7 +57,8 @@ from visthrow.diagnose.select.selection import Selector
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
-    model, point = selection.nominal.problem.model, selection.best.point
+    model = selection.nominal.problem.model
+    point = selection.best.point
     scatter, varies = random_shares_of(selection)
     if varies or point.varies:
         point = with_noise_at(replace(point, varies=varies), point.theta)
@@ -147,16 +148,20 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
 
     All flights may share any size of an effect that varies; flights far from the mean are simulated
     again at their own size."""
-    best, problem, priors = selection.best, selection.problem, selection.problem.priors
+    best = selection.best
+    problem = selection.problem
+    priors = selection.problem.priors
     random = {c for c in best.chosen if c.group not in (ALL, EVENT)}
     selected = {c.name for c in random}
     catalogue = {v.name: v for v in random_effects()}
-    verdicts, shares = [], dict(best.shares)
+    verdicts = []
+    shares = dict(best.shares)
     for c in selection.candidates:
         unselected = c.name in catalogue and c.group != DAY and c.name not in selected
         if not (c in random or unselected):
             continue
-        statistics, named = best.point.plain, best.chosen
+        statistics = best.point.plain
+        named = best.chosen
         if c in random and len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
         if c not in random:
@@ -193,7 +198,8 @@ def share_verdict(
     flights = by_day(linear.statistics, linear.days) if c.group == DAY else linear.statistics
     informative = (flights.information[:, c.columns, c.columns] > 0.0).any(axis=1)
     count = int(informative.sum())
-    reach, needed = sizes * effect.prior_sd, threshold + c.penalty
+    reach = sizes * effect.prior_sd
+    needed = threshold + c.penalty
     return judged(replace(effect, name=c.name), reach, nats, needed, count, c.group)
 
 
@@ -273,7 +279,8 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
 
     A name acts in a block by its column or by what the other names cannot stand in for, as two
     delays that differ by a force. What is not sure without those is such a part too."""
-    best, names = selection.best, selection.names
+    best = selection.best
+    names = selection.names
     in_block = set()
     for j in names:
         remaining = [k for k in names if k != j]
@@ -338,7 +345,8 @@ def _overall(
     """Return the overall verdict, the block of an unknown effect, reasons, and the names that are
     withdrawn for it.
     """
-    point, active = selection.best.point, selection.best.columns
+    point = selection.best.point
+    active = selection.best.columns
     strong = too_strong(point, INEXACT)
     if strong:  # what no missing cause explains: the channels do not belong together
         reason = (
@@ -416,7 +424,9 @@ def _misshapen(selection: Selector) -> tuple[str, str]:
     """Return the block in which some function of one quantity explains most of what the names there
     leave, and the reason: their form is another; both empty where none explains enough.
     """
-    problem, best, by_block = selection.problem, selection.best, _by_block(selection)
+    problem = selection.problem
+    best = selection.best
+    by_block = _by_block(selection)
     strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
     in_blocks = {block: strongest[block] for block in by_block if block in strongest}
     curves = terms.best_curves(best.point, best.columns, in_blocks)
@@ -453,7 +463,8 @@ def _on_bound(selection: Selector, j: int) -> bool:
     """Whether an estimate lies on its bound and the flights push it on by more than the
     threshold.
     """
-    point, priors = selection.best.point, selection.problem.priors
+    point = selection.best.point
+    priors = selection.problem.priors
     nearest = min(abs(point.theta[j] - bound[j]) for bound in (priors.low, priors.high))
     push = point.statistics.score[:, j].sum()
     if nearest >= SMALL_STEP or push * point.theta[j] <= 0.0:
