@@ -16,7 +16,7 @@ from visthrow.common.errors import DiagnoseError
 from visthrow.common.storage import write_json
 from visthrow.diagnose.inputs import measures
 from visthrow.diagnose.likelihood import forms
-from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.planning import fly_manoeuvres, manoeuvres, plan
 from visthrow.diagnose.reporting import blind, explain_cli, gain
 from visthrow.diagnose.reporting import diagnosis_report as report
@@ -159,7 +159,8 @@ def test_a_name_needs_three_flights_that_tell_of_it(telling, repeats):
     flights = np.zeros((4, 1, 1))
     flights[:telling] = 10.1
     goal.base = SimpleNamespace(
-        information=flights.sum(0), statistics=SimpleNamespace(information=flights)
+        posterior=Posterior(flights.sum(0), np.zeros(1), goal.priors),
+        statistics=SimpleNamespace(information=flights),
     )
     assert goal.settled(np.full((1, 1), 100.0)) == ([(0,)], repeats)
 

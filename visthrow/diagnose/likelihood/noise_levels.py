@@ -202,7 +202,9 @@ class _Layout:
     def pack(self, noise: Noise) -> np.ndarray:
         """Logarithms of all levels, shape (P,)."""
         levels = [noise.latent_sd[key] for key in self.keys]
-        return np.log(np.concatenate((levels, noise.share[self.places], noise.scale[self.measured])))
+        return np.log(
+            np.concatenate((levels, noise.share[self.places], noise.scale[self.measured]))
+        )
 
     def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""

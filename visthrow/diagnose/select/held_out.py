@@ -82,11 +82,10 @@ def groups_of(point: Point) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
     if len(set(flights)) >= PARTS or len(flights) < PARTS:
         return flights, "flights"
-    order = {f: [i for i, g in enumerate(flights) if g == f] for f in set(flights)}
     groups = []
     for i, flight in enumerate(flights):
-        windows = order[flight]
-        groups.append(flight * PARTS + PARTS * windows.index(i) // len(windows))
+        part = PARTS * flights[:i].count(flight) // flights.count(flight)
+        groups.append(flight * PARTS + part)
     return groups, "parts of flights"
 
 
@@ -130,11 +129,10 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
         written = [j for j in columns_of(chosen) if j not in work.candidates]
         value = linear.value(chosen)
         behind = {s: value - v for s, v in window_sets.items()} | {chosen: 0.0}
-        sets = [
-            ((*columns_of(s), *work.candidates), nats)
-            for s, nats in behind.items()
-            if nats < STRONG
-        ]
+        sets = []
+        for possible, nats in behind.items():
+            if nats < STRONG:
+                sets.append(((*columns_of(possible), *work.candidates), nats))
         trained[fold] = linear.total(chosen).mean_sizes(written, sets)
         named.update(columns_of(chosen))
     shares = {effects[j].name: n / len(folds) for j, n in named.items()}
@@ -152,19 +150,22 @@ def borne_out(
     that of the flights' scatter (Student, over flights that can tell), or of this chance where it
     is wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
     sizes that all flights gave, shape (K,)."""
-    promised = 0.5 * np.einsum("i,fij,j->f", theta, statistics.information, theta)
-    quadratic = np.einsum("fi,fij,fj->f", trained, statistics.information, trained)
+    information = statistics.information
+    promised = 0.5 * np.einsum("i,fij,j->f", theta, information, theta)
+    quadratic = np.einsum("fi,fij,fj->f", trained, information, trained)
     brought = np.einsum("fi,fi->f", trained, statistics.absolute) - 0.5 * quadratic
     total = promised.sum()
     if total <= 0.0:
-        return 0.0, float("nan"), float("nan")
-    value = brought.sum() / total
+        return 0.0, np.nan, np.nan
+    value = float(brought.sum() / total)
     n = int((promised > TELLING * promised.mean()).sum())
     if n < 2:
-        return float(value), float("nan"), float("nan")
-    scatter = np.sqrt(n / (n - 1.0) * ((brought - value * promised) ** 2).sum()) / total
-    reach = max(stdtrit(n - 1, 0.975) * scatter, NORMAL_95 * np.sqrt(2.0 / total))
-    return float(value), float(value - reach), float(value + reach)
+        return value, np.nan, np.nan
+    square = ((brought - value * promised) ** 2).sum()
+    scatter = np.sqrt(n / (n - 1.0) * square) / total
+    chance = NORMAL_95 * np.sqrt(2.0 / total)
+    reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
+    return value, value - reach, value + reach
 
 
 def channel_gains(
@@ -183,44 +184,32 @@ def channel_gains(
     plain = [w.residual for w in before.windows]
     left = errors(after.windows, groups, after.noise, named, len(names))
     earlier = errors(before.windows, groups, after.noise, plain, len(names)).square
-    # squares before, after, of noise alone, and of the black box, shape (F, C, H) each
-    squares = [earlier, left.square, left.floor]
-    squares += [] if box is None else [box]
+    if box is None:
+        box = np.full_like(earlier, np.nan)
+    # before, after, of noise alone, and of the black box, shape (4, F, C, H)
+    squares = np.stack((earlier, left.square, left.floor, box))
     gains = []
     for c, name in enumerate(names):
         count = left.count[:, c].sum(0)
         if count.sum() > 0:
-            of_channel = [square[:, c] for square in squares]
-            gains.append(_channel(name, after.sigma(c), count, of_channel))
+            gains.append(_channel(name, after.sigma(c), count, squares[:, :, c]))
     return tuple(gains)
 
 
-def _channel(
-    name: str, sigma: float, count: np.ndarray, squares: Sequence[np.ndarray]
-) -> ChannelGain:
-    """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums by
-    flight and horizon, shape (F, H) each.
+def _channel(name: str, sigma: float, count: np.ndarray, squares: np.ndarray) -> ChannelGain:
+    """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums
+    before, after, of noise alone and of the black box by flight and horizon, shape (4, F, H).
     """
-    totals = [square.sum() for square in squares]
-    before, after, floor, *box = sigma * np.sqrt(np.maximum(totals, 0.0) / count.sum())
-    value, low, high = jackknifed(squares[0].sum(1), squares[1].sum(1))
+    by_flight = squares.sum(2)
+    by_horizon = np.maximum(squares.sum(1), 0.0)
+    totals = np.maximum(by_flight.sum(1), 0.0)
+    before, after, floor, box = (sigma * np.sqrt(totals / count.sum())).tolist()
+    value, low, high = jackknifed(by_flight[0], by_flight[1])
     measured = count > 0
-    curves = [np.array(HORIZONS)[measured]]
-    for square in squares[:3]:
-        left = np.maximum(square.sum(0)[measured], 0.0)
-        curves.append(np.sqrt(left / count[measured]))
-    return ChannelGain(
-        name,
-        unit_of(name),
-        float(before),
-        float(after),
-        float(min(floor, after)),
-        float(box[0]) if box else float("nan"),
-        value,
-        low,
-        high,
-        tuple(map(tuple, np.transpose(curves).tolist())),
-    )
+    curves = np.sqrt(by_horizon[:3, measured] / count[measured])
+    rows = np.vstack((np.array(HORIZONS)[measured], curves)).T.tolist()
+    errors_of = before, after, min(floor, after), box
+    return ChannelGain(name, unit_of(name), *errors_of, value, low, high, tuple(map(tuple, rows)))
 
 
 def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
@@ -231,15 +220,17 @@ def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, flo
     Source: Efron and Tibshirani 1993, ch. 11, on the logarithm of the ratio; Student's quantile.
     """
     n = len(before)
-    if before.sum() <= 0.0 or after.sum() <= 0.0:
-        return 0.0, float("nan"), float("nan")
-    value = np.log(after.sum() / before.sum())
-    if n < 2:
-        return float(1.0 - np.exp(0.5 * value)), float("nan"), float("nan")
-    with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
-        without = np.log((after.sum() - after) / (before.sum() - before))
-    variance = (n - 1.0) / n * ((without - without.mean()) ** 2).sum()
-    reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt(variance)
+    old = before.sum()
+    new = after.sum()
+    if old <= 0.0 or new <= 0.0:
+        return 0.0, np.nan, np.nan
+    value = np.log(new / old)
+    reach = np.nan
+    if n > 1:
+        with np.errstate(divide="ignore", invalid="ignore"):  # one group may hold everything
+            without = np.log((new - after) / (old - before))
+        variance = (n - 1.0) / n * ((without - without.mean()) ** 2).sum()
+        reach = 0.5 * stdtrit(n - 1, 0.975) * np.sqrt(variance)
     return tuple(float(1.0 - np.exp(0.5 * value + side)) for side in (0.0, reach, -reach))
 
 
@@ -330,11 +321,8 @@ def _explained(diagnosis: Diagnosis) -> Diagnosis:
 def _known(diagnosis: Diagnosis) -> str:
     """Return how many causes are named, and what held-out flights show beyond the noise."""
     text = f"{len(diagnosis.theta)} named"
-    candidates = {
-        frozenset((f.name, *f.partners))
-        for f in diagnosis.findings
-        if f.verdict == result.CANDIDATE
-    }
+    unsure = [f for f in diagnosis.findings if f.verdict == result.CANDIDATE]
+    candidates = {frozenset((f.name, *f.partners)) for f in unsure}
     if candidates:
         text += f", {len(candidates)} candidate{'s' if len(candidates) > 1 else ''} besides"
     gains = diagnosis.held_out.channels
@@ -372,15 +360,15 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     if not unexplained:
         return diagnosis
     floors = floors_of(point)
-    level = max(
-        diagnosis.levels,
-        key=lambda v: v.after / floors.get((LATENT_BLOCKS.index(v.block), v.phase), np.inf),
-        default=None,
-    )
+    block = ""
+    strongest = 0.0
+    for level in diagnosis.levels:
+        floor = floors.get((LATENT_BLOCKS.index(level.block), level.phase), np.inf)
+        if not block or level.after / floor > strongest:
+            block = level.block
+            strongest = level.after / floor
     reasons = tuple(_remaining(c, work) for c in unexplained)
-    return replace(
-        diagnosis, overall=result.UNKNOWN, block=level.block if level else "", reasons=reasons
-    )
+    return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=reasons)
 
 
 def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
@@ -409,18 +397,19 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     rows = [row for row, name in enumerate(diagnosis.theta) if name in remaining]
     spread = np.array(diagnosis.covariance)[np.ix_(rows, rows)]
     numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
+    work = replace(
+        work,
+        after=work.after if remaining else work.before,
+        active=tuple(numbers[name] for name in remaining),
+        crossed=None,
+        candidates=(*work.candidates, *(numbers[name] for name in doubt.names)),
+    )
     left = replace(
         diagnosis,
         findings=tuple(findings),
         theta={name: diagnosis.theta[name] for name in remaining},
         covariance=tuple(map(tuple, spread.tolist())),
-        work=replace(
-            work,
-            after=work.after if remaining else work.before,
-            active=tuple(numbers[name] for name in remaining),
-            crossed=None,
-            candidates=(*work.candidates, *(numbers[name] for name in doubt.names)),
-        ),
+        work=work,
     )
     if remaining:
         return left
@@ -472,10 +461,9 @@ def _kind(work: Work, channel: int) -> str:
     by_axis = np.zeros(3)
     by_flight = Counter()
     halves: dict[bool, list[float]] = {False: [], True: []}  # of the flights
-    middle = {}
-    for flight in {w.flight for w in windows}:
-        times = [w.time.mean() for w in windows if w.flight == flight]
-        middle[flight] = 0.5 * (min(times) + max(times))
+    times: dict[int, list[float]] = {}
+    for window in windows:
+        times.setdefault(window.flight, []).append(window.time.mean())
     for window in windows:
         rows = window.channel == channel
         innovation, _, horizon = predicted(window, point.noise, window.residual)
@@ -483,7 +471,9 @@ def _kind(work: Work, channel: int) -> str:
         if components(window, channel) is not None and len(square) % 3 == 0:
             by_axis += square.reshape(-1, 3).sum(0)
         by_flight[window.flight] += float(square.sum())
-        halves[bool(window.time.mean() > middle[window.flight])] += square.tolist()
+        of_flight = times[window.flight]
+        middle = 0.5 * (min(of_flight) + max(of_flight))
+        halves[bool(window.time.mean() > middle)] += square.tolist()
     parts = []
     if by_axis.max(initial=0.0) > MOSTLY * by_axis.sum() > 0.0:
         parts.append(f"mostly along {'xyz'[int(by_axis.argmax())]}")
@@ -503,8 +493,9 @@ def repeated_share(point: Point, laws: Sequence[int]) -> tuple[float, float, flo
     statistics = regrouped(point, groups_of(point)[0])
     count = len(point.problem.model.effects)
     names = np.where(np.arange(len(point.theta)) < count, point.theta, 0.0)
-    information = statistics.information[:, laws][:, :, laws]
-    score = statistics.absolute[:, laws] - statistics.information[:, laws] @ names
+    rows = statistics.information[:, laws]
+    information = rows[:, :, laws]
+    score = statistics.absolute[:, laws] - rows @ names
     prior = np.diag(point.problem.priors.slab[laws] ** -2.0)
     total = information.sum(0) + prior
     other_information = total - information

@@ -60,10 +60,8 @@ class Scatter:
     @property
     def sentence(self) -> str:
         """For people."""
-        size = (
-            f"{self.name} = {self.size:.3g}{unit_suffix(self.unit)}"
-            f" (95 %: {self.low:.3g} to {self.high:.3g})"
-        )
+        unit = unit_suffix(self.unit)
+        size = f"{self.name} = {self.size:.3g}{unit} (95 %: {self.low:.3g} to {self.high:.3g})"
         drifts = "drifts, a value for each day. " if self.by == DAY else ""
         return f"{drifts}{self.cause}: {size}, {self.nats:.0f} nats from {self.flights} {self.by}s."
 
@@ -87,8 +85,10 @@ class Varies:
     @property
     def by_flight(self) -> "Varies":
         """Return the same as if every flight were a day."""
-        shares = self.shares.items()
-        return Varies((), {(j, FLIGHT if who == DAY else who): size for (j, who), size in shares})
+        shares = {}
+        for (j, who), size in self.shares.items():
+            shares[j, FLIGHT if who == DAY else who] = size
+        return Varies((), shares)
 
     def of(self, statistics: Statistics) -> Iterator[tuple[int, np.ndarray]]:
         """Yield effects with the deviation of each flight's share, shape (F,)."""
@@ -110,24 +110,28 @@ def relinearised_per_flight(
     ``theta``: estimated sizes, in floors; ``simulate``: simulates the flights at other sizes, in
     floors, or returns None where that fails.
     """
-    shift = (statistics.information @ (theta - statistics.theta))[:, j]
-    diagonal = np.maximum(statistics.information[:, j, j], 1e-300)
-    flown = np.flatnonzero(statistics.information[:, j, j] > 0.0)
-    reach = np.abs((statistics.score[:, j] - shift) / diagonal)[flown].max(initial=0.0)
+    column = statistics.information[:, j]
+    misfit = statistics.score[:, j] - column @ (theta - statistics.theta)
+    flown = np.flatnonzero(column[:, j] > 0.0)
+    reach = np.abs(misfit[flown] / column[flown, j]).max(initial=0.0)
     if reach < FAR_FLOORS:
         return statistics
     unit = np.eye(len(theta))[j]
-    places = np.unique(np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])) - theta[j]
-    simulated = {size: simulate(theta + size * unit) for size in places.tolist()}
-    simulated = {size: part for size, part in simulated.items() if part is not None}
+    places = np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])
+    simulated = {}
+    for size in (np.unique(places) - theta[j]).tolist():
+        part = simulate(theta + size * unit)
+        if part is not None:
+            simulated[size] = part
     if len(simulated) < len(SIZES) // 2:
         return statistics
     sizes = list(simulated)
-    scores = np.stack([part.score for part in simulated.values()])
+    scores = np.stack([part.score for part in simulated.values()], axis=1)
     score = statistics.score.copy()
     for f in flown:
-        best = np.interp(0.0, -scores[:, f, j], sizes)
-        misfit = [np.interp(best, sizes, column) for column in scores[:, f].T]
+        scores_of = scores[f]
+        best = np.interp(0.0, -scores_of[:, j], sizes)
+        misfit = [np.interp(best, sizes, column) for column in scores_of.T]
         change = theta + best * unit - statistics.theta
         score[f] = misfit + statistics.information[f] @ change
     return replace(statistics, score=score)
@@ -152,9 +156,10 @@ def over_deviations(
     best = value.max()
     density = np.exp(value - best - 0.5 * size**2) * np.sqrt(2.0 / np.pi)
     mass = density * np.gradient(size)
-    share = np.cumsum(mass) / mass.sum()
-    low, high = (float(size[np.searchsorted(share, q)]) for q in (0.025, 0.975))
-    return float(size[np.argmax(density)]), (low, high), float(np.log(mass.sum()) + best)
+    total = mass.sum()
+    ends = np.searchsorted(np.cumsum(mass) / total, (0.025, 0.975))
+    mode = float(size[np.argmax(density)])
+    return mode, tuple(size[ends].tolist()), float(np.log(total) + best)
 
 
 def judged(
@@ -175,7 +180,7 @@ def judged(
         group: what has shares.
     """
     mode, (low, high), evidence = over_deviations(reach / v.prior_sd, nats, none=0.0)
-    mode, low, high = (v.prior_sd * size for size in (mode, low, high))
+    mode *= v.prior_sd
     return Scatter(
         v.name,
         v.cause,
@@ -185,8 +190,8 @@ def judged(
         tuple(v.of),
         evidence > threshold and mode > v.floor,
         mode,
-        low,
-        high,
+        v.prior_sd * low,
+        v.prior_sd * high,
         v.floor,
         evidence,
         flights,
@@ -220,8 +225,8 @@ def between_flights(
     sd = {j: allowed(theta[j]) for j in active}
     nats = []
     for u in REACH:
-        varies = Varies((), {(j, FLIGHT): u * size for j, size in sd.items()})
-        nats.append(evidence_of(freed(statistics, varies), priors, active))
+        unlike = integrated(statistics, [(j, u * size) for j, size in sd.items()])
+        nats.append(evidence_of(unlike, priors, active))
     value = np.array(nats) - max(nats)
     weight = REACH * np.exp(value - 0.5 * REACH**2)  # steps of u grow with u
     variance = float(weight @ REACH**2 / weight.sum())
@@ -251,14 +256,11 @@ def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
     names, row = np.unique([days[f] for f in statistics.flights.tolist()], return_inverse=True)
     member = (row == np.arange(len(names))[:, None]).astype(float)
     information = np.tensordot(member, statistics.information, 1)
-    return replace(
-        statistics,
-        flights=names,
-        information=information,
-        score=member @ statistics.score,
-        square=member @ statistics.square,
-        samples=member @ statistics.samples,
-    )
+    score = member @ statistics.score
+    square = member @ statistics.square
+    samples = member @ statistics.samples
+    theta = statistics.theta
+    return Statistics(names, information, score, square, samples, theta)
 
 
 def integrated(
@@ -271,16 +273,14 @@ def integrated(
     for j, size in deviation:
         column = statistics.information[:, :, j]
         score = statistics.score
-        diagonal = column[:, j]
-        part = size**2 / (1.0 + size**2 * diagonal)
+        scaled = size**2 * column[:, j]
+        part = size**2 / (1.0 + scaled)
         explained = (part[:, None] * column)[:, :, None] * column[:, None, :]
+        information = np.subtract(statistics.information, explained, out=explained)
         known = part * score[:, j]
-        statistics = replace(
-            statistics,
-            information=np.subtract(statistics.information, explained, out=explained),
-            score=score - known[:, None] * column,
-            square=statistics.square - known * score[:, j] + np.log1p(size**2 * diagonal),
-        )
+        square = statistics.square - known * score[:, j] + np.log1p(scaled)
+        left = score - known[:, None] * column
+        statistics = replace(statistics, information=information, score=left, square=square)
     return statistics
 
 
@@ -297,7 +297,8 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
         row = np.searchsorted(by_days.flights, days)
         count = len(by_days.flights)
         drifts = {j: np.full(count, size) for j, size in varies.drifts.items()}
-        positions = positions + _shares(by_days, np.tile(theta, (count, 1)), drifts)[row]
+        shares = _shares(by_days, np.tile(theta, (count, 1)), drifts)
+        positions = positions + shares[row]
     sizes: dict[int, np.ndarray] = {}
     for j, size in varies.of(statistics):
         sizes[j] = np.hypot(sizes.get(j, 0.0), size)
@@ -311,11 +312,12 @@ def _shares(
     shares = np.zeros(statistics.score.shape)
     columns = list(deviation)
     if columns:
-        change = theta - statistics.theta
-        score = statistics.score - np.einsum("fij,fj->fi", statistics.information, change)
+        information = statistics.information[:, columns]
+        known = np.einsum("fij,fj->fi", information, theta - statistics.theta)
+        score = statistics.score[:, columns] - known
         root = np.stack([deviation[j] for j in columns], axis=1)
-        block = statistics.information[:, columns][:, :, columns] * root[:, :, None] * root[:, None]
+        block = information[:, :, columns] * root[:, :, None] * root[:, None]
         precision = np.eye(len(columns)) + block
-        scaled = np.linalg.solve(precision, (root * score[:, columns])[..., None])
+        scaled = np.linalg.solve(precision, (root * score)[..., None])
         shares[:, columns] = root * scaled[..., 0]
     return shares

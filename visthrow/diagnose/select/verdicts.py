@@ -91,6 +91,8 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     reading = Reading(shared_point, active, withdrawn, sets, unlike)
     findings = tuple(reading.finding(j) for j in range(len(model.effects)))
     named = [findings[j] for j in active]
+    theta = {f.name: f.estimate for f in named}
+    spread = _covariance(shared_point, named, active, mean_part)
     window = []
     for trial, nats in selection.window:
         window.append((tuple(sorted(c.name for c in trial.chosen)), nats))
@@ -99,9 +101,9 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         block,
         tuple(reasons),
         findings,
-        theta={f.name: f.estimate for f in named},
-        covariance=_covariance(shared_point, named, active, mean_part),
-        threshold=selection.threshold,
+        theta,
+        spread,
+        selection.threshold,
         steps=tuple(selection.steps),
         sets=tuple(window),
         levels=block_levels,
@@ -165,9 +167,8 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
         if c in random and len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
         if c not in random:
-            named |= {
-                o for o in selection.candidates if o.group == ALL and {*o.columns} & {*c.columns}
-            }
+            alike = [o for o in selection.candidates if {*o.columns} & {*c.columns}]
+            named |= {o for o in alike if o.group == ALL}
         fixed_shares = {o: size for o, size in best.shares.items() if o != c}
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
@@ -243,10 +244,8 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
     names = frozenset(c for c in best.chosen if not c.law)
     linear = selection.linear(best.point)
     plain = linear.value(names)
-    value = {best.chosen: linear.value(best.chosen) - plain}
-    for c in selection.candidates:
-        if c.law:
-            value[names | {c}] = linear.value(names | {c}) - plain
+    sets = [best.chosen, *(names | {c} for c in laws_of(selection.candidates))]
+    value = {chosen: linear.value(chosen) - plain for chosen in sets}
     ranked = sorted(value.keys() - {best.chosen}, key=value.get, reverse=True)
     repeated = []
     for chosen in (best.chosen, *(s for s in ranked if value[s] > 0.0)):
@@ -284,7 +283,7 @@ def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
     in_block = set()
     for j in names:
         remaining = [k for k in names if k != j]
-        residual_block = acts_on(best.point, [j], free_effects=remaining)[0]
+        (residual_block,) = acts_on(best.point, [j], free_effects=remaining)
         if {selection.block_of(j), residual_block} & blocks:
             in_block.add(j)
     columns = [j for j in best.columns if j not in in_block]
@@ -411,10 +410,10 @@ def _crowded(selection: Selector) -> dict[str, list[int]]:
     which the flights hardly tell some apart, with these names: parts of it are likelier.
     """
     crowded = {}
+    law = selection.threshold + terms.LAW
     for block, members in _by_block(selection).items():
         part = selection.best.point.information[np.ix_(members, members)]
         unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
-        law = selection.threshold + terms.LAW
         if len(members) * selection.threshold > law and unlike.min() < 0.5:
             crowded[block] = members
     return crowded
@@ -465,8 +464,9 @@ def _on_bound(selection: Selector, j: int) -> bool:
     """
     point = selection.best.point
     priors = selection.problem.priors
-    nearest = min(abs(point.theta[j] - bound[j]) for bound in (priors.low, priors.high))
+    size = point.theta[j]
+    nearest = min(abs(size - priors.low[j]), abs(size - priors.high[j]))
     push = point.statistics.score[:, j].sum()
-    if nearest >= SMALL_STEP or push * point.theta[j] <= 0.0:
+    if nearest >= SMALL_STEP or push * size <= 0.0:
         return False
     return bool(0.5 * push**2 / point.information[j, j] > selection.threshold)
