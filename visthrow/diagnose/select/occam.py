@@ -85,7 +85,8 @@ class Linear:
         if chosen not in self._shares:
             listed: dict[Candidate, float] = {}
             occam = 0.0
-            for c in sorted((c for c in chosen if c.group != ALL), key=lambda c: c.name):
+            random = [c for c in chosen if c.group != ALL]
+            for c in sorted(random, key=lambda c: c.name):
                 listed[c], bonus = self._deviation(chosen, listed, c)
                 occam += bonus
             self._shares[chosen] = listed, occam
@@ -113,8 +114,8 @@ class Linear:
         """
         sizes = np.unique(np.maximum(sizes, min(c.floors, REACH[-1] / 2.0)))
         active = columns_of(chosen)
-        flights = {share: size for share, size in fixed.items() if share.group != DAY}
         days = {share: size for share, size in fixed.items() if share.group == DAY}
+        flights = {share: size for share, size in fixed.items() if share not in days}
         statistics = freed(self.statistics, varies_of(flights, self.days))
         nats = []
         for shares in (days, *({**days, c: size} for size in sizes.tolist())):
@@ -126,12 +127,12 @@ class Linear:
         """Return the value of a set."""
         if chosen not in self._values:
             penalty = self.penalty(chosen)
-            self._values[chosen] = -np.inf
+            value = -np.inf
             if np.isfinite(penalty):
-                active = columns_of(chosen)
                 occam = self.shares(chosen)[1]
-                whole = evidence_of(self._freed(chosen), self.priors, active)
-                self._values[chosen] = whole - occam - penalty
+                whole = evidence_of(self._freed(chosen), self.priors, columns_of(chosen))
+                value = whole - occam - penalty
+            self._values[chosen] = value
         return self._values[chosen]
 
     def _freed(self, chosen: Names) -> Statistics:
@@ -150,17 +151,20 @@ class Linear:
             base = self.value(subset)
             listed = {subset: base}
             if len(subset) < MOST_NAMES and np.isfinite(base):
-                gain = self.total(subset).additions(columns_of(subset))
+                gain = self.total(subset).additions(columns_of(subset)).tolist()
+                price = self.penalty(subset)
                 varying = {j for c in subset if c.group != ALL for j in c.columns}
                 for c in self.plain:
                     new = subset | {c}
-                    if c.columns[0] in varying:  # whose shares are others about a mean
+                    (j,) = c.columns
+                    if j in varying:  # whose shares are others about a mean
                         listed[new] = self.value(new)
-                    elif gain[c.columns[0]] > self._step - WINDOW:
+                    elif gain[j] > self._step - WINDOW:
                         self._shares.setdefault(new, self.shares(subset))
-                        cost = self.penalty(new) - self.penalty(subset)
-                        listed[new] = base + float(gain[c.columns[0]]) - cost
-                listed |= {subset | {c}: self.value(subset | {c}) for c in self._may_vary(subset)}
+                        listed[new] = base + gain[j] - (self.penalty(new) - price)
+                for c in self._may_vary(subset):
+                    new = subset | {c}
+                    listed[new] = self.value(new)
             self._added[subset] = listed
         return self._added[subset]
 
@@ -202,8 +206,10 @@ class Linear:
         """
         listed = {}
         for subset in (chosen, *(chosen - {c} for c in chosen)):
-            full = len(subset - centre) >= MOST_NEW
-            listed |= {subset: self.value(subset)} if full else self.added(subset)
+            if len(subset - centre) < MOST_NEW:
+                listed |= self.added(subset)
+            else:
+                listed[subset] = self.value(subset)
         return listed
 
     def pairs(self, chosen: Names) -> dict[Names, float]:
@@ -218,10 +224,12 @@ class Linear:
             if len(subset) + 2 > MOST_NAMES or len(offered) < 2 or not np.isfinite(base):
                 continue
             columns = [c.columns[0] for c in offered]
-            price = np.array([self.penalty(subset | {c}) for c in offered]) - self.penalty(subset)
-            alone = self.total(subset).additions(active)[columns] - price
-            both = self.total(subset).pair_additions(active)
-            worth = both[np.ix_(columns, columns)] - np.add.outer(price, price)
+            prices = [self.penalty(subset | {c}) for c in offered]
+            price = np.array(prices) - self.penalty(subset)
+            posterior = self.total(subset)
+            alone = posterior.additions(active)[columns] - price
+            both = posterior.pair_additions(active)[np.ix_(columns, columns)]
+            worth = both - np.add.outer(price, price)
             alone = np.maximum(alone, -1e9)  # of a name that cannot be there, as well as none
             synergy = worth - np.maximum.outer(alone, alone)
             synergy[np.tril_indices(len(columns))] = -np.inf

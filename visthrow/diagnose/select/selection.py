@@ -103,9 +103,11 @@ class Selector:
 
     def _offer(self) -> None:
         problem = self.problem
-        self.candidates = shared(problem.effects) + random_shares(
-            problem.model.effects, problem.priors, self.nominal.plain, problem.days, self._every
+        flown = self.nominal.plain
+        random = random_shares(
+            problem.model.effects, problem.priors, flown, problem.days, self._every
         )
+        self.candidates = shared(problem.effects) + random
         self._linear.clear()
 
     @cached_property
@@ -136,11 +138,10 @@ class Selector:
 
     def linear(self, point: Point) -> Linear:
         """Return the values of sets by the statistics of a point."""
-        problem = self.problem
+        priors = self.problem.priors
+        days = self.problem.days
         if id(point) not in self._linear:
-            linear = Linear(
-                point.plain, problem.priors, self.candidates, self.penalty, problem.days
-            )
+            linear = Linear(point.plain, priors, self.candidates, self.penalty, days)
             self._linear[id(point)] = point, linear
         return self._linear[id(point)][1]
 
@@ -174,25 +175,25 @@ class Selector:
         better: list[Trial] = []
         while shortlist := self._short(listed, leads, least):
             tried = self._tried(self.best.point, shortlist)
-            leads |= dict.fromkeys(shortlist, -np.inf) | {t.chosen: t.lead for t in tried}
+            leads |= dict.fromkeys(shortlist, -np.inf)
+            leads |= {t.chosen: t.lead for t in tried}
             near += [t for t in tried if t.lead > -STRONG and self.is_admissible(t)]
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
             if better:
-                least = max(*(t.lead for t in better), max(listed.values()) - WINDOW)
+                best = max(t.lead for t in better)
+                least = max(best, max(listed.values()) - WINDOW)
         better = better or self._followed_up(listed)
         if better:
             top = max(better, key=lambda t: t.lead)
             self._record(top, leads, listed)
             self._go(top)
             return True
-        close = list(near)
-        close += [  # sets that were the best before
-            Trial(s, self.best.point, lead=nats)
-            for s, nats in self._simulated.items()
-            if s in self._visited - {self.best.chosen} and nats > -STRONG
-        ]
-        close.sort(key=lambda t: -t.lead)
-        self.window = [(self.best, 0.0), *((t, -t.lead) for t in close)]
+        earlier = self._visited - {self.best.chosen}
+        for chosen, nats in self._simulated.items():  # sets that were the best before
+            if chosen in earlier and nats > -STRONG:
+                near.append(Trial(chosen, self.best.point, lead=nats))
+        near.sort(key=lambda t: -t.lead)
+        self.window = [(self.best, 0.0), *((t, -t.lead) for t in near)]
         return False
 
     def _listed(self) -> dict[Names, float]:
@@ -223,15 +224,18 @@ class Selector:
 
         A move is expected to fall short of what derivatives promise as its parts did."""
         done = set(tried) | self._visited
-        done |= {s for s, nats in self._simulated.items() if nats < -WINDOW}
         present = self.best.chosen
-        shortfalls = [
-            (s ^ present, listed[s] - n) for s, n in self._simulated.items() if s in listed
-        ]
+        shortfalls: dict[Names, float] = {}
+        for simulated, nats in self._simulated.items():
+            if nats < -WINDOW:
+                done.add(simulated)
+            if simulated in listed:
+                shortfalls[simulated ^ present] = listed[simulated] - nats
         expected = {}
         for chosen, promised in listed.items():
             if chosen not in done:
-                parts = (nats for part, nats in shortfalls if part < chosen ^ present)
+                move = chosen ^ present
+                parts = (nats for part, nats in shortfalls.items() if part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
         margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
@@ -253,17 +257,16 @@ class Selector:
         linear = self.linear(point)
         shares = [linear.shares(s) for s in sets]
         columns = [columns_of(s) for s in sets]
-        points = [
-            replace(self._with_blocks(point, active), varies=varies_of(sizes, self.problem.days))
-            for active, (sizes, _) in zip(columns, shares)
-        ]
+        begins = []
+        for active, (sizes, _) in zip(columns, shares):
+            varies = varies_of(sizes, self.problem.days)
+            begins.append(replace(self._with_blocks(point, active), varies=varies))
         trials = []
-        simulated = candidates(points, columns)
-        for s, outcome, size in zip(sets, simulated, shares):
+        for s, outcome, (sizes, occam) in zip(sets, candidates(begins, columns), shares):
             if isinstance(outcome, DiagnoseError):
                 self.progress(f"{names_of(s)}: not simulated, {outcome}")
                 continue
-            trial = Trial(s, outcome, *size)
+            trial = Trial(s, outcome, sizes, occam)
             trial = replace(trial, lead=self._value(trial) - self.value)
             # what may not be named gains nothing
             nats = trial.lead if self.is_admissible(trial) else min(trial.lead, 0.0)
@@ -302,7 +305,8 @@ class Selector:
         if np.any(sure <= 1.0):
             return False
         sizes = point.theta + own_shares(point.plain, point.theta, point.varies)
-        if np.any((sizes < priors.low - 1.0) | (sizes > priors.high + 1.0), where=sizes != 0.0):
+        outside = (sizes < priors.low - 1.0) | (sizes > priors.high + 1.0)
+        if np.any(outside & (sizes != 0.0)):
             return False  # a share of a flight has the bounds of its effect, to a floor
         laws = [j for j in columns if isinstance(self.problem.effects[j], TermEffect)]
         return all(terms.moves_landing(point, j) for j in laws)
@@ -316,13 +320,12 @@ class Selector:
         rope explains nothing. New states alone are no gain."""
         kinds = self.problem.switches
         point = self.best.point
-        promising = [
-            s
-            for s, nats in listed.items()
-            if nats > max(0.0, self._simulated.get(s, np.inf) + STRONG)
-            and not kinds[columns_of(s)].any()
-        ]
-        chosen = max({*promising} - self._followed, key=listed.get, default=NOTHING)
+        promising = []
+        for s in listed.keys() - self._followed:
+            kept = self._simulated.get(s, np.inf)
+            if listed[s] > max(0.0, kept + STRONG) and not kinds[columns_of(s)].any():
+                promising.append(s)
+        chosen = max(promising, key=listed.get, default=NOTHING)
         if not chosen:
             return []
         self._followed.add(chosen)
@@ -378,9 +381,10 @@ class Selector:
         sets, and step on where that moved the optimum.
         """
         kinds = self.problem.switches
-        unchanged = np.array_equal(self.origin.theta[kinds] != 0.0, point.theta[kinds] != 0.0)
-        silent = self.problem.priors.visible & (np.diag(self.origin.information) <= 0.0)
         cheap = self.problem.model.cheap
+        before = self.origin.theta[kinds] != 0.0
+        unchanged = np.array_equal(before, point.theta[kinds] != 0.0)
+        silent = self.problem.priors.visible & (np.diag(self.origin.information) <= 0.0)
         if unchanged and not (cheap and np.any(silent)):
             lead_on = not (cheap or last)
             if lead_on or curvature(self.origin, point) < SPIKE:
