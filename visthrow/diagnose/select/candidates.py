@@ -69,11 +69,12 @@ def random_shares(
         all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
-    groups = [(FLIGHT, flown)]
+    groups = {FLIGHT: flown}
     if days:
         day_of = np.array([days[f] for f in statistics.flights.tolist()])
         by_day = np.array([flown[day_of == day].any(0) for day in np.unique(day_of)])
-        groups += [(DAY, by_day)] if 1 < len(by_day) < len(flown) else []
+        if 1 < len(by_day) < len(flown):
+            groups[DAY] = by_day
     offered = []
     for effect, penalty in _varying(effects):
         named = effect.name not in effect.of
@@ -82,7 +83,7 @@ def random_shares(
         columns = [j for j, e in enumerate(effects) if e.name in effect.of and priors.visible[j]]
         deviations = tuple(float(effect.prior_sd / priors.floor[j]) for j in columns)
         floors = effect.floor / effect.prior_sd
-        for group, informative in groups:
+        for group, informative in groups.items():
             if columns and informative[:, columns].any(1).sum() > 1:
                 candidate = Candidate(
                     effect.name if named else f"{effect.name}_by_{group}",

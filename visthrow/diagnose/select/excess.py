@@ -42,11 +42,11 @@ def levels(before: Point, after: Point, threshold: float) -> tuple[Level, ...]:
     for key in sorted(limits, key=lambda key: key[0]):
         block, phase = key
         level = noise.latent_sd[key]
+        stack = stacks[phase]
         quiet = min(limit for (b, _), limit in limits.items() if b == block)
         most = max(UNKNOWN_RATIO * quiet, floors.get(key, 0.0))
         nats = 0.0
         if level > most:
-            stack = stacks[phase]
             nats = _likelihood(stack, noise, key, level) - _likelihood(stack, noise, key, most)
         earlier = before.noise.latent_sd.get(key, float("nan"))
         name = LATENT_BLOCKS[block]
@@ -59,7 +59,8 @@ def compares_phases(point: Point) -> bool:
     """Whether latent forces of a calm phase tell what gusts are: else what is left is held to the
     sensors' noise.
     """
-    return max(Counter(block for block, _ in point.noise.latent_sd).values(), default=0) > 1
+    phases = Counter(block for block, _ in point.noise.latent_sd)
+    return max(phases.values(), default=0) > 1
 
 
 def floors_of(point: Point) -> dict[tuple[int, str], float]:
@@ -69,11 +70,13 @@ def floors_of(point: Point) -> dict[tuple[int, str], float]:
     positions = positions_of(point)
     moves = {}
     for gram, window in zip(point.grams, point.windows):
-        positions_moved = window.latent[np.isin(window.channel, positions)]
-        for block in np.unique(gram.latent_block) if len(positions_moved) else ():
-            reach = positions_moved @ gram.factor[:, gram.latent_block == block]
+        rows = np.isin(window.channel, positions)
+        if not rows.any():
+            continue
+        for block in np.unique(gram.latent_block).tolist():
+            reach = window.latent[rows] @ gram.factor[:, gram.latent_block == block]
             distance = float(np.sqrt((reach**2).sum(1).max()))
-            moves.setdefault((int(block), gram.phase), []).append(distance)
+            moves.setdefault((block, gram.phase), []).append(distance)
     medians = {key: float(np.median(distances)) for key, distances in moves.items()}
     return {key: LANDING / median for key, median in medians.items() if median > 0.0}
 
@@ -119,29 +122,29 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
     for gram in point.grams:
         inner = np.tensordot(weight, gram.inner, 1)
         size = gram.nuisances + gram.latents
-        unit = np.eye(len(inner))
-        free = unit[:, [*range(gram.nuisances), *(size + k for k in free_effects)]]
+        free = [*range(gram.nuisances), *(size + k for k in free_effects)]
         columns = size + np.asarray(effects, dtype=int)
-        latents = unit[:, gram.nuisances : size]
         known = _explained(inner, free, columns)
         total += inner[columns, columns] - known
         for block in np.unique(gram.latent_block):
-            basis = np.hstack((free, latents[:, gram.latent_block == block]))
-            by_block[LATENT_BLOCKS[block]] += _explained(inner, basis, columns) - known
+            latents = gram.nuisances + np.flatnonzero(gram.latent_block == block)
+            explained = _explained(inner, [*free, *latents], columns)
+            by_block[LATENT_BLOCKS[block]] += explained - known
     blocks = []
-    for i in range(len(effects)):
-        best = max(by_block, key=lambda name: by_block[name][i])
-        blocks.append(best if by_block[best][i] > 0.5 * total[i] > 0.0 else "")
+    for i, whole in enumerate(total):
+        parts = {name: explained[i] for name, explained in by_block.items()}
+        best = max(parts, key=parts.get)
+        blocks.append(best if parts[best] > 0.5 * whole > 0.0 else "")
     return blocks
 
 
-def _explained(inner: np.ndarray, basis: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """Parts of columns' squares that combinations of all columns explain.
+def _explained(inner: np.ndarray, basis: Sequence[int], columns: np.ndarray) -> np.ndarray:
+    """Parts of columns' squares that other columns explain.
 
-    ``inner``: inner products of all, shape (P, P); ``basis``: the combinations, shape (P, m).
+    ``inner``: inner products of all, shape (P, P); ``basis``: numbers of the others.
     """
-    normal = basis.T @ inner @ basis
-    right = basis.T @ inner[:, columns]
+    normal = inner[np.ix_(basis, basis)]
+    right = inner[np.ix_(basis, columns)]
     normal += np.diag(1e-9 * np.diag(normal) + 1e-12)
     return np.sum(right * np.linalg.solve(normal, right), axis=0)
 
@@ -156,7 +159,8 @@ def too_strong(point: Point, share: float) -> tuple[str, ...]:
         if len(thrust):
             of_phase = thrusts.setdefault(window.phase, [])
             of_phase.append(float(np.median(np.abs(thrust))))
-    weight = max((float(np.median(of_phase)) for of_phase in thrusts.values()), default=np.inf)
+    medians = [float(np.median(of_phase)) for of_phase in thrusts.values()]
+    weight = max(medians, default=np.inf)
     block = LATENT_BLOCKS.index("vehicle force")
     strong = []
     for (b, phase), level in point.noise.latent_sd.items():

@@ -69,8 +69,9 @@ class Reading:
             differs = float(np.sqrt(self.unlike) * allowed(mean)) * effect.floor
             named = replace(finding, differs=differs)
             return self._named(named, mean, sorted({j, *partners}))
+        size = mean * effect.floor
         reach = NORMAL_95 * deviation
-        ends = np.clip([mean * effect.floor - reach, mean * effect.floor + reach], *effect.bounds)
+        ends = np.clip([size - reach, size + reach], *effect.bounds)
         low, high = (ends + 0.0).tolist()  # no -0
         finding = replace(finding, low=low, high=high)
         if j in self.withdrawn:
@@ -89,7 +90,7 @@ class Reading:
         finding = result.bounded(finding)
         if low < high:
             return finding
-        comparison = "less" if mean * effect.floor < low else "more"
+        comparison = "less" if size < low else "more"
         text = (
             f"{effect.name}: on its bound of {low:.3g}{unit}; these flights ask for {comparison}"
             " than is possible."
@@ -106,7 +107,8 @@ class Reading:
         alike = [members for members, _ in self.sets if len(members) == len(active)]
         for home in active:
             rivals = [members for members in alike if home not in members]
-            partners = {home}.union(*rivals) - ({*active} - {home})
+            others = {*active} - {home}
+            partners = {home}.union(*rivals) - others
             if j in partners and len(partners) > 1:
                 together = active if j == home else next(m for m in rivals if j in m)
                 return tuple(sorted(partners - {j})), tuple(together)
@@ -155,10 +157,12 @@ class Reading:
         named = [k for k in self.active if k not in members]
         sigma = posterior.covariance([*members, *named])[members]
         precision = np.linalg.inv(sigma[:, members])
-        values, vectors = np.linalg.eigh(precision * np.outer(slab, slab) - np.eye(len(slab)))
+        gained = precision * np.outer(slab, slab) - np.eye(len(slab))
+        values, vectors = np.linalg.eigh(gained)
         best = vectors[:, -1]
         value = values[-1]
-        mean = float(best @ (slab * (precision @ (sigma @ posterior.score))) / value)
+        score = precision @ (sigma @ posterior.score)
+        mean = float(best @ (slab * score) / value)
         coefficients = best / slab / problem.priors.floor[members]
         first = int(np.argmax(np.abs(best)))
         scale = coefficients[first]

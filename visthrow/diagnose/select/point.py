@@ -124,8 +124,10 @@ class Problem:
         """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
         alone = self._within_bounds(theta)
         together = self.model.possible(alone)
-        cut = [together.get(e.name, 0.0) - alone.get(e.name, 0.0) for e in self.model.effects]
-        return theta + np.pad(cut, (0, len(self.terms))) / self.priors.floor
+        cut = np.zeros(len(theta))
+        for j, effect in enumerate(self.model.effects):
+            cut[j] = together.get(effect.name, 0.0) - alone.get(effect.name, 0.0)
+        return theta + cut / self.priors.floor
 
 
 @dataclass(frozen=True)
@@ -237,27 +239,27 @@ def linearise(
         extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     device = problem.model.device
     floors = problem.priors.floor
-    first = grams_of(extended, floors, channels)
-    cleaned = levels.without_outliers(extended, first, device)
+    raw = grams_of(extended, floors, channels)
+    cleaned = levels.without_outliers(extended, raw, device)
     mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]
-    recomputed = dict(zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)))
-    raw = [recomputed.get(w, gram) for w, gram in enumerate(first)]
+    for w, gram in zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)):
+        raw[w] = gram
     noise, grams = levels.fit(cleaned, raw, start, device)
     integrals = stack.integrals(grams, noise, device)
-    position = np.array(theta, dtype=float)
     plain = cleaned
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
-    statistics = _statistics(grams, integrals, noise, position)
+    statistics = _statistics(grams, integrals, noise, theta)
+    varies = varies or Varies(problem.days)
     return Point(
         problem,
-        position,
+        theta,
         cleaned,
         grams,
         noise,
         statistics,
-        varies or Varies(problem.days),
+        varies,
         integrals,
         linearised,
         commands,
@@ -303,15 +305,15 @@ def untracked_windows(point: Point) -> list[int]:
     lost, but something is missing."""
     grams = with_shares(point, point.theta)
     shares = point.integrals.shares(grams, point.noise)
-    log_dets = point.integrals.log_dets
-    misfit = []
-    for share, log_det, gram in zip(shares, log_dets, grams):
-        misfit.append((share.square - log_det) / max(gram.count.sum(), 1.0))
+    squares = np.array([share.square for share in shares]) - point.integrals.log_dets
+    misfit = squares / [max(gram.count.sum(), 1.0) for gram in grams]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
     # what an unknown motion does is no effect's doing
     limit = min((1.0 + INEXACT) * np.median(misfit), UNKNOWN_RATIO)
-    distant = np.flatnonzero(np.array(misfit) > np.where(shaken, limit, UNKNOWN_RATIO))
-    return distant.tolist() if len(distant) <= LOST_SHARE * len(misfit) else []
+    distant = np.flatnonzero(misfit > np.where(shaken, limit, UNKNOWN_RATIO))
+    if len(distant) > LOST_SHARE * len(misfit):
+        return []
+    return distant.tolist()
 
 
 def moved(point: Point, theta: np.ndarray) -> Point | None:
@@ -401,18 +403,18 @@ def with_shares(point: Point, theta: np.ndarray) -> list[Gram]:
     shares beside it.
     """
     shares = own_shares(point.plain, theta, point.varies) + theta - point.theta
-    row = {flight: f for f, flight in enumerate(point.plain.flights.tolist())}
     if not shares.any():
         return list(point.grams)
-    moves = [shares[row[window.flight]] for window in point.windows]
-    return [shifted(gram, move) for gram, move in zip(point.grams, moves)]
+    row = np.searchsorted(point.plain.flights, [gram.flight for gram in point.grams])
+    return [shifted(gram, change) for gram, change in zip(point.grams, shares[row])]
 
 
 def shifted(gram: Gram, change: np.ndarray) -> Gram:
     """Inner products of r - S change."""
     begin = gram.nuisances + gram.latents
     part = gram.inner[:, :, begin:] @ change
-    square = gram.square - 2.0 * gram.cross[:, begin:] @ change + part[:, begin:] @ change
+    mixed = gram.cross[:, begin:] @ change
+    square = gram.square - 2.0 * mixed + part[:, begin:] @ change
     return replace(gram, cross=gram.cross - part, square=np.maximum(square, 0.0))
 
 
@@ -512,9 +514,12 @@ def switched(point: Point, active: Sequence[int]) -> np.ndarray | None:
     """Return where a set is to be linearised, in floors, if it asks for another kind of block than
     a point flies; else None.
     """
-    off = [j for j in active if point.problem.switches[j] and point.theta[j] == 0.0]
+    kinds = point.problem.switches
+    off = [j for j in active if kinds[j] and point.theta[j] == 0.0]
     if not off:
         return None
-    theta = np.where(np.isin(np.arange(len(point.theta)), list(active)), point.theta, 0.0)
+    columns = list(active)
+    theta = np.zeros(len(point.theta))
+    theta[columns] = point.theta[columns]
     theta[off] = 1.0 / point.problem.priors.floor[off]
     return theta
