@@ -78,19 +78,16 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
 
 
 def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:
-    latents = gram.latents
+    latents = slice(gram.latents)
+    effects = slice(gram.latents, None)
     whole = share.information
-    inverse = (
-        lapack.dtrtri(gram.factor, lower=1)[0] if latents else gram.factor
-    )  # from unit latents to knots
-    return LatentStatistics(
-        whole[latents:, latents:],
-        share.score[latents:],
-        share.square,
-        inverse.T @ whole[:latents, :latents] @ inverse,
-        inverse.T @ share.score[:latents],
-        inverse.T @ whole[:latents, latents:],
-    )
+    # from unit latents to knots
+    inverse = lapack.dtrtri(gram.factor, lower=1)[0] if gram.latents else gram.factor
+    plain = whole[effects, effects], share.score[effects], share.square
+    information = inverse.T @ whole[latents, latents] @ inverse
+    score = inverse.T @ share.score[latents]
+    cross = inverse.T @ whole[latents, effects]
+    return LatentStatistics(*plain, information, score, cross)
 
 
 class Stack:
@@ -109,11 +106,10 @@ class Stack:
         self._sizes = [gram.nuisances + gram.latents for gram in grams]
         order = sorted(range(len(grams)), key=self._sizes.__getitem__)
         self._order = [order[first : first + size] for first in range(0, len(order), size)]
-        self._batches = parallel_map(
-            lambda members: self._padded([grams[w] for w in members], rows[members]), self._order
-        )
+        parts = [[grams[w] for w in members] for members in self._order]
+        self._batches = parallel_map(self._padded, parts, [rows[m] for m in self._order])
 
-    def _padded(self, grams: Sequence[Gram], windows: np.ndarray) -> _Batch:
+    def _padded(self, grams: list[Gram], windows: np.ndarray) -> _Batch:
         sizes = [gram.nuisances + gram.latents for gram in grams]
         count = len(grams)
         channels = len(grams[0].count)
@@ -122,28 +118,31 @@ class Stack:
         member = np.zeros((count, n, BLOCKS))
         initial = np.zeros((count, n))
         for w, (gram, size) in enumerate(zip(grams, sizes)):
+            latents = np.arange(gram.nuisances, size)
             cross[w, :, :size] = gram.cross[:, :size]
-            member[w, np.arange(gram.nuisances, size), gram.latent_block] = 1.0
+            member[w, latents, gram.latent_block] = 1.0
             initial[w, : gram.nuisances] = 1.0
-        square, counts = (
-            np.stack([getattr(gram, name) for gram in grams]) for name in ("square", "count")
-        )
+        square = np.stack([gram.square for gram in grams])
+        counts = np.stack([gram.count for gram in grams])
         log_sigma = np.array([gram.log_sigma for gram in grams])
-        arrays = [
-            torch.from_numpy(a).to(self.device)
-            for a in (cross, square, counts, log_sigma, member, initial)
-        ]
+        arrays = cross, square, counts, log_sigma, member, initial
+        tensors = [torch.from_numpy(array).to(self.device) for array in arrays]
         parts = [gram.inner[:, :size, :size] for gram, size in zip(grams, sizes)]
         hidden = side_by_side(parts, (channels, n, n), self.device)
-        return _Batch(windows, list(grams), hidden, *arrays)
+        return _Batch(windows, grams, hidden, *tensors)
 
     def values(self, noise: Noise) -> np.ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
         Raises DiagnoseError: the normal equations are not positive definite, which only broken
         derivatives can cause."""
-        parts = self._of_batches(lambda batch: (_solved(_shape(batch, noise), batch)[1],))
-        return np.array(_by_window(self._order, [values for (values,) in parts]))
+
+        def solve(batch: _Batch) -> tuple[torch.Tensor]:
+            _, value = _solved(_shape(batch, noise), batch)
+            return (value,)
+
+        parts = [values for (values,) in self._of_batches(solve)]
+        return np.array(_by_window(self._order, parts))
 
     def fitted(self, noise: Noise) -> list[np.ndarray]:
         """Most probable initial state and unit latent forces of each window, shape (D + L,).
@@ -153,10 +152,11 @@ class Stack:
 
         def fit(batch: _Batch) -> tuple[torch.Tensor]:
             shape = _shape(batch, noise)
-            return (shape.level * _solved(shape, batch)[0],)
+            mean, _ = _solved(shape, batch)
+            return (shape.level * mean,)
 
-        rows = _by_window(self._order, [rows for (rows,) in self._of_batches(fit)])
-        return [row[:size] for row, size in zip(rows, self._sizes)]
+        parts = [rows for (rows,) in self._of_batches(fit)]
+        return [row[:size] for row, size in zip(_by_window(self._order, parts), self._sizes)]
 
     def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
@@ -179,22 +179,24 @@ class Stack:
 
 def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> list[T]:
     """Return values of batches in the order of their windows."""
-    values = {w: value for members, part in zip(order, parts) for w, value in zip(members, part)}
+    values = {}
+    for members, part in zip(order, parts):
+        values |= zip(members, part)
     return [values[w] for w in sorted(values)]
 
 
 def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
     """Deviation of each window's latent forces by block, shape (W, B)."""
-    levels = [
-        [noise.latent_sd.get((block, gram.phase), 0.0) for block in range(BLOCKS)]
-        for gram in batch.grams
-    ]
-    return np.array(levels) * noise.share[batch.windows]
+    levels = np.zeros((len(batch.grams), BLOCKS))
+    for row, gram in zip(levels, batch.grams):
+        row[:] = [noise.latent_sd.get((block, gram.phase), 0.0) for block in range(BLOCKS)]
+    return levels * noise.share[batch.windows]
 
 
 def _shape(batch: _Batch, noise: Noise) -> _Shape:
     by_block = batch.square.new_tensor(_levels(batch, noise))
-    level = batch.initial + (batch.member @ by_block[:, :, None])[..., 0]
+    latent_level = batch.member @ by_block[:, :, None]
+    level = batch.initial + latent_level[..., 0]
     scale = batch.square.new_tensor(noise.scale)
     weight = scale**-2.0
     normal = _weighed(weight, batch.hidden)
@@ -208,12 +210,11 @@ def _shape(batch: _Batch, noise: Noise) -> _Shape:
         normal.diagonal(dim1=1, dim2=2).mul_(1.0 + ROUNDING * (failed[:, None] > 0))
         factor, failed = torch.linalg.cholesky_ex(normal)
         if torch.any(failed):
-            w = int(torch.nonzero(failed)[0, 0])
-            where = f"window of flight {batch.grams[w].flight}, phase {batch.grams[w].phase}"
+            gram = batch.grams[int(torch.nonzero(failed)[0, 0])]
+            where = f"window of flight {gram.flight}, phase {gram.phase}"
             raise DiagnoseError(f"{where}: the normal equations are singular")
-    log_det = 2.0 * (
-        factor.diagonal(dim1=1, dim2=2).log().sum(-1) + batch.log_sigma + batch.count @ scale.log()
-    )
+    log_diagonal = factor.diagonal(dim1=1, dim2=2).log().sum(-1)
+    log_det = 2.0 * (log_diagonal + batch.log_sigma + batch.count @ scale.log())
     return _Shape(weight, level, factor, log_det)
 
 
@@ -221,31 +222,30 @@ def _solved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the mean of [b, a] in prior deviations under a batch's residuals, shape (W, n), and
     their log-likelihood but for the powers of 2 pi, shape (W,).
     """
-    right = (shape.level * (shape.weight @ batch.cross))[:, :, None]
-    projected = torch.linalg.solve_triangular(shape.factor, right, upper=False)
-    mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)[..., 0]
-    square = batch.square @ shape.weight - projected.square().sum((1, 2))
-    return mean, -0.5 * (square + shape.log_det)
+    right = shape.level * (shape.weight @ batch.cross)
+    projected = torch.linalg.solve_triangular(shape.factor, right[:, :, None], upper=False)
+    mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)
+    explained = projected.square().sum((1, 2))
+    square = batch.square @ shape.weight - explained
+    return mean[..., 0], -0.5 * (square + shape.log_det)
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one
     by one.
     """
-    if not factor.is_cuda:
-        return torch.cholesky_inverse(
-            factor
-        ).mT  # it comes by columns, beside all else by rows; it is symmetric
-    factor_inverse = torch.linalg.solve_triangular(
-        factor, torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device), upper=False
-    )
+    if not factor.is_cuda:  # it comes by columns, beside all else by rows; it is symmetric
+        return torch.cholesky_inverse(factor).mT
+    unit = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
+    factor_inverse = torch.linalg.solve_triangular(factor, unit, upper=False)
     return factor_inverse.mT @ factor_inverse
 
 
 def _weighed(weight: torch.Tensor, inner: torch.Tensor) -> torch.Tensor:
     """Sum over the channels, shape (W, i, j)."""
     count, channels, *shape = inner.shape
-    return (weight @ inner.reshape(count, channels, -1)).reshape(count, *shape)
+    total = weight @ inner.reshape(count, channels, -1)
+    return total.reshape(count, *shape)
 
 
 def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -257,27 +257,22 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     count, channels = batch.count.shape
     in_blocks = batch.member.mT
     scaled = covariance * shape.level[:, :, None] * shape.level[:, None]
-    spread = (batch.hidden * scaled[:, None]).sum(
-        (2, 3)
-    )  # as products of matrices they take ten times as long on a GPU
+    # as products of matrices they take ten times as long on a GPU
+    spread = (batch.hidden * scaled[:, None]).sum((2, 3))
     # Degrees of freedom that the columns take from each channel; rounding of huge derivatives is
     # kept from taking others.
     taken = torch.minimum(torch.clamp(shape.weight * spread, min=0.0), batch.count)
     squared = covariance.square_()
-    shared = (in_blocks @ (variance - squared.sum(-1))[:, :, None])[..., 0]
+    shared = in_blocks @ (variance - squared.sum(-1))[:, :, None]
     squared.diagonal(dim1=1, dim2=2).copy_((1.0 - variance) ** 2)
+    part = taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300)
+    mixed = 2.0 * shared * part[:, None]
+    remaining = torch.clamp(batch.count - taken, min=0.0)
     curvature = shape.level.new_zeros(count, BLOCKS + channels, BLOCKS + channels)
     curvature[:, :BLOCKS, :BLOCKS] = 2.0 * in_blocks @ squared @ batch.member
-    mixed = (
-        2.0
-        * shared[:, :, None]
-        * (taken / torch.clamp(taken.sum(-1, keepdim=True), min=1e-300))[:, None]
-    )
     curvature[:, :BLOCKS, BLOCKS:] = mixed
     curvature[:, BLOCKS:, :BLOCKS] = mixed.mT
-    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(
-        2.0 * torch.clamp(batch.count - taken, min=0.0)
-    )
+    curvature[:, BLOCKS:, BLOCKS:].diagonal(dim1=1, dim2=2).copy_(2.0 * remaining)
     return variance, spread, curvature
 
 
@@ -286,11 +281,14 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
     shape = _shape(batch, noise)
     variance, spread, curvature = _curved(shape, batch)
     mean, value = _solved(shape, batch)
-    by_block = (batch.member.mT @ (variance + mean**2 - 1.0)[:, :, None])[..., 0]
-    moved = shape.level * mean
-    bent = ((moved[:, None, None] @ batch.hidden)[:, :, 0] @ moved[:, :, None])[..., 0]
-    square = batch.square - 2.0 * (batch.cross @ moved[:, :, None])[..., 0] + bent + spread
-    return value, torch.cat((by_block, square * shape.weight - batch.count), -1), curvature
+    excess = variance + mean**2 - 1.0
+    by_block = batch.member.mT @ excess[:, :, None]
+    moved = (shape.level * mean)[:, :, None]
+    bent = (moved.mT[:, None] @ batch.hidden)[:, :, 0] @ moved
+    fitted = bent - 2.0 * (batch.cross @ moved)
+    square = batch.square + fitted[..., 0] + spread
+    by_scale = square * shape.weight - batch.count
+    return value, torch.cat((by_block[..., 0], by_scale), -1), curvature
 
 
 @dataclass(frozen=True)
@@ -316,19 +314,15 @@ class _Integrated:
             effects[w, kept_columns] = cross[len(cross) - len(kept_columns) :]
         right = self.shape.level * torch.from_numpy(hidden).to(self.half.device)
         projected = torch.linalg.solve_triangular(self.shape.factor, right[:, :, None], upper=False)
-        results = (
-            (self.half.transpose(1, 2) @ projected)[..., 0],
-            self.shape.log_det - projected.square().sum((1, 2)),
-        )
-        explained, taken = all_to_host(results)
-        return [
-            WindowStatistics(
-                information, score[kept_columns], float(weight @ gram.square + square_of)
-            )
-            for gram, kept_columns, information, score, square_of in zip(
-                grams, self.own_columns, self.information, effects - explained, taken
-            )
-        ]
+        explained = self.half.mT @ projected
+        square = self.shape.log_det - projected.square().sum((1, 2))
+        explained, square = all_to_host((explained[..., 0], square))
+        results = []
+        for w, gram in enumerate(grams):
+            score = (effects[w] - explained[w])[self.own_columns[w]]
+            whole = float(weight @ gram.square + square[w])
+            results.append(WindowStatistics(self.information[w], score, whole))
+        return results
 
 
 class Integrals:
@@ -372,19 +366,21 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
         device = str(batch.square.device)
         return _weighed(shape.weight, side_by_side(parts, (channels, height, width), device))
 
-    right = weighed([products[:, :size, size:] for products, size in zip(inner, sizes)], n)
-    effects = weighed([products[:, size:, size:] for products, size in zip(inner, sizes)], width)
+    right = weighed([part[:, :size, size:] for part, size in zip(inner, sizes)], n)
+    effects = weighed([part[:, size:, size:] for part, size in zip(inner, sizes)], width)
     if latents:
         hidden = _weighed(shape.weight, batch.hidden)
-        effects = torch.cat((torch.cat((hidden, right), 2), torch.cat((right.mT, effects), 2)), 1)
-        right = effects[:, :n]
-    half = torch.linalg.solve_triangular(shape.factor, shape.level[:, :, None] * right, upper=False)
+        above = torch.cat((hidden, right), 2)
+        below = torch.cat((right.mT, effects), 2)
+        right = above
+        effects = torch.cat((above, below), 1)
+    scaled = shape.level[:, :, None] * right
+    half = torch.linalg.solve_triangular(shape.factor, scaled, upper=False)
     reduced = effects - half.mT @ half
     whole = (0.5 * (reduced + reduced.mT)).cpu().numpy()
     columns = [np.arange(width)] * len(sizes)
     if latents:
-        columns = [
-            np.r_[gram.nuisances : size, n : n + width] for gram, size in zip(batch.grams, sizes)
-        ]
+        begins = [gram.nuisances for gram in batch.grams]
+        columns = [np.r_[begin:size, n : n + width] for begin, size in zip(begins, sizes)]
     information = [values[np.ix_(rows, rows)] for values, rows in zip(whole, columns)]
     return _Integrated(columns, shape, half, information)

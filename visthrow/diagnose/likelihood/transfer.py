@@ -14,7 +14,8 @@ def to_host(tensor: torch.Tensor) -> np.ndarray:
     """A tensor's values."""
     if not tensor.is_cuda:
         return tensor.numpy()
-    return torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True).copy_(tensor).numpy()
+    pinned = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
+    return pinned.copy_(tensor).numpy()
 
 
 def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
@@ -23,10 +24,9 @@ def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
     """
     if not tensors or not tensors[0].is_cuda:
         return [tensor.numpy() for tensor in tensors]
-    parts = np.split(
-        to_host(torch.cat([tensor.flatten() for tensor in tensors])),
-        np.cumsum([t.numel() for t in tensors])[:-1],
-    )
+    values = to_host(torch.cat([tensor.flatten() for tensor in tensors]))
+    ends = np.cumsum([tensor.numel() for tensor in tensors])
+    parts = np.split(values, ends[:-1])
     return [part.reshape(tensor.shape) for part, tensor in zip(parts, tensors)]
 
 
