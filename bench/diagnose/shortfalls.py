@@ -27,9 +27,8 @@ def shortfalls(model: Model, sizes: Sequence[Mapping[str, float]]) -> tuple[list
     squares = []
     for windows, grams in zip(told, raw):
         shaped = correlated_of(grams, windows, noise.correlation_time)
-        squares.append(
-            sum(share.square for share in integrals(shaped, noise).shares(shaped, noise))
-        )
+        shares = integrals(shaped, noise).shares(shaped)
+        squares.append(sum(share.square for share in shares))
     return [float(0.5 * (square - squares[-1])) for square in squares], sum(
         len(w.residual) for w in told[-1]
     )

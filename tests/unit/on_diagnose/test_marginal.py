@@ -27,9 +27,7 @@ def likelihood(gram, levels, window):
 
 def alone(gram, levels, window, latents=False):
     """What a window says by itself."""
-    return (
-        Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram], levels)[0]
-    )
+    return Stack([gram], windows=[window]).integrals(levels, latents=latents).shares([gram])[0]
 
 
 @fixture(scope="module")
@@ -72,7 +70,7 @@ def test_information_and_score_are_those_of_the_dense_covariance(fitted):
 
 def test_windows_say_the_same_in_one_batch_and_alone(fitted):
     _, _, _, levels, grams = fitted
-    together = Stack(grams).integrals(levels, latents=True).shares(grams, levels)
+    together = Stack(grams).integrals(levels, latents=True).shares(grams)
     for w, (gram, share) in enumerate(zip(grams, together)):
         by_itself = alone(gram, levels, w, latents=True)
         for name in ("information", "score", "square"):

@@ -19,6 +19,8 @@ from visthrow.diagnose.likelihood.marginal import (
     Noise,
     Statistics,
     WindowStatistics,
+    gather,
+    rescored,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
@@ -74,7 +76,7 @@ def statistics(grams: Sequence[Gram], noise: Noise, device: str = "cpu") -> list
     were effects.
     """
     whole = integrals(grams, noise, device, latents=True)
-    return parallel_map(_of_latents, whole.shares(grams, noise), grams)
+    return parallel_map(_of_latents, whole.shares(grams), grams)
 
 
 def _of_latents(share: WindowStatistics, gram: Gram) -> LatentStatistics:
@@ -297,13 +299,14 @@ class _Integrated:
 
     own_columns: list[np.ndarray]  # which of the J columns are a window's own
     shape: _Shape
+    weight: np.ndarray  # of the channels, shape (C,)
     # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     half: torch.Tensor
     information: list[np.ndarray]  # of each window
 
-    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
+    def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
-        weight = noise.scale**-2.0
+        weight = self.weight
         count, n, columns = self.half.shape
         hidden = np.zeros((count, n))
         effects = np.zeros((count, columns))
@@ -326,13 +329,9 @@ class _Integrated:
 
 
 class Integrals:
-    """The part of windows' statistics that no residual changes; it stays where it was calculated.
+    """The part of windows' statistics that no residual changes, where it was calculated."""
 
-    Attributes:
-        gathered: by flights with some residuals, once it was asked for.
-    """
-
-    gathered: Statistics | None = None
+    _gathered: Statistics | None = None  # by flights with some residuals, once it was asked for
 
     def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
         """Keep it; ``order``: numbers of each batch's windows."""
@@ -344,15 +343,23 @@ class Integrals:
         """Return the log determinant of each window's V."""
         return _by_window(self._order, [part.shape.log_det.tolist() for part in self._parts])
 
-    def shares(self, grams: Sequence[Gram], noise: Noise) -> list[WindowStatistics]:
-        """Return the windows' statistics with the residuals of grams of the same derivatives;
-        ``noise`` is what they were integrated with.
-        """
-        parts = [
-            part.shares([grams[w] for w in members], noise)
-            for members, part in zip(self._order, self._parts)
-        ]
+    def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
+        """Return the windows' statistics with the residuals of grams of the same derivatives."""
+        parts = []
+        for members, part in zip(self._order, self._parts):
+            parts.append(part.shares([grams[w] for w in members]))
         return _by_window(self._order, parts)
+
+    def statistics(self, grams: Sequence[Gram], theta: np.ndarray) -> Statistics:
+        """Return the statistics of flights with the residuals of grams of the same derivatives.
+
+        ``theta``: where these residuals are, in floors, shape (K,). Raises DiagnoseError: as
+        :func:`~visthrow.diagnose.likelihood.marginal.gather`."""
+        shares = self.shares(grams)
+        if self._gathered is not None:
+            return rescored(self._gathered, grams, shares, theta)
+        self._gathered = gather(grams, shares, theta)
+        return self._gathered
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
@@ -383,4 +390,4 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
         begins = [gram.nuisances for gram in batch.grams]
         columns = [np.r_[begin:size, n : n + width] for begin, size in zip(begins, sizes)]
     information = [values[np.ix_(rows, rows)] for values, rows in zip(whole, columns)]
-    return _Integrated(columns, shape, half, information)
+    return _Integrated(columns, shape, noise.scale**-2.0, half, information)

@@ -90,7 +90,7 @@ def groups_of(point: Point) -> tuple[list[int], str]:
 
 
 def regrouped(point: Point, groups: Sequence[int]) -> Statistics:
-    parts = point.integrals.shares(point.grams, point.noise)
+    parts = point.integrals.shares(point.grams)
     grams = [replace(gram, flight=g) for gram, g in zip(point.grams, groups)]
     return gather(grams, parts, point.theta)
 

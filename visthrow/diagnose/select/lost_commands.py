@@ -72,7 +72,7 @@ class CommandStatistics:
         grams = grams_of(wide, floors, len(problem.model.channels))
         grams = correlated_of(grams, wide, point.noise.correlation_time)
         noise = levels.only(point.noise, grams, rows)
-        shares = stack.integrals(grams, noise, point.device).shares(grams, noise)
+        shares = stack.integrals(grams, noise, point.device).shares(grams)
         information = np.array([share.information for share in shares])
         score = np.array([share.score for share in shares])
         score += information[:, :, : len(point.theta)] @ point.theta

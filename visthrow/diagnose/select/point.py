@@ -24,9 +24,7 @@ from visthrow.diagnose.likelihood.marginal import (
     Gram,
     Noise,
     Statistics,
-    gather,
     grams_of,
-    rescored,
     with_residuals,
 )
 from visthrow.diagnose.likelihood.threads import parallel_map, run_concurrently
@@ -194,18 +192,8 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
     changed = replace(point, **changes)
     if integrals is None:
         integrals = stack.integrals(changed.grams, changed.noise, changed.device)
-    plain = _statistics(changed.grams, integrals, changed.noise, changed.theta)
+    plain = integrals.statistics(changed.grams, changed.theta)
     return replace(changed, integrals=integrals, plain=plain)
-
-
-def _statistics(
-    grams: Sequence[Gram], integrals: stack.Integrals, noise: Noise, theta: np.ndarray
-) -> Statistics:
-    shares = integrals.shares(grams, noise)
-    if integrals.gathered is not None:
-        return rescored(integrals.gathered, grams, shares, theta)
-    integrals.gathered = gather(grams, shares, theta)
-    return integrals.gathered
 
 
 def linearise(
@@ -250,7 +238,7 @@ def linearise(
     if extended is not windows_of:
         plain = [replace(o, sigma=w.sigma) for w, o in zip(cleaned, windows_of)]
     linearised = Linearised(sizes, dict(zip(problem.kept, plain)))
-    statistics = _statistics(grams, integrals, noise, theta)
+    statistics = integrals.statistics(grams, theta)
     varies = varies or Varies(problem.days)
     return Point(
         problem,
@@ -304,7 +292,7 @@ def untracked_windows(point: Point) -> list[int]:
     What they say of an effect is chance: their derivatives hold nowhere. Where many are so, none is
     lost, but something is missing."""
     grams = with_shares(point, point.theta)
-    shares = point.integrals.shares(grams, point.noise)
+    shares = point.integrals.shares(grams)
     squares = np.array([share.square for share in shares]) - point.integrals.log_dets
     misfit = squares / [max(gram.count.sum(), 1.0) for gram in grams]
     shaken = np.array([window.shaken for window in point.windows], dtype=bool)
@@ -360,7 +348,7 @@ def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int])
     for old, new in zip(origin.windows, moved_point.windows):
         bent.append(new.residual - (old.residual - old.effects @ change))
     grams = with_residuals(moved_point.grams, moved_point.windows, floors, bent)
-    shares = moved_point.integrals.shares(grams, moved_point.noise)
+    shares = moved_point.integrals.shares(grams)
     total = sum(share.score for share in shares)
     return moved_point.posterior.covariance(active) @ total
 
