@@ -9,7 +9,6 @@ deviations; a named one has N(0, prior^2) within its bounds (the slab):
 
 with information I and scores s about theta = 0."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -74,13 +73,14 @@ class Priors:
         Raises DiagnoseError: a floor or prior is not above 0, or bounds do not hold 0.
         """
         for e in effects:
-            if not (e.floor > 0.0 and e.prior_sd > 0.0 and e.bounds[0] <= 0.0 <= e.bounds[1]):
+            low, high = e.bounds
+            if not (e.floor > 0.0 and e.prior_sd > 0.0 and low <= 0.0 <= high):
                 raise DiagnoseError(
                     f"effect '{e.name}' has floor {e.floor}, prior_sd {e.prior_sd}, bounds"
                     f" {e.bounds}; expected both above 0, and bounds about 0"
                 )
-        counts = Counter(e.name for e in effects)
-        twice = sorted(name for name, count in counts.items() if count > 1)
+        names = [e.name for e in effects]
+        twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise DiagnoseError(f"two effects share a name: {', '.join(twice)}")
         floor = np.array([e.floor for e in effects], dtype=float)
@@ -290,8 +290,9 @@ def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) ->
     """
     values, vectors = np.linalg.eigh(information)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    unnamed = SPIKE * rng.standard_normal((draws, len(information)))
-    return rng.standard_normal((draws, len(information))) @ root.T + unnamed @ information
+    shape = draws, len(information)
+    unnamed = SPIKE * rng.standard_normal(shape)
+    return rng.standard_normal(shape) @ root.T + unnamed @ information
 
 
 def threshold(
@@ -303,9 +304,10 @@ def threshold(
     The null worlds have these flights' information, noise as fitted, and of every effect what may
     go unnamed."""
     information = statistics.information.sum(0)
-    candidates = int(priors.visible.sum())
+    candidates = np.count_nonzero(priors.visible)
     if not candidates:
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")
     null = Posterior(information, null_draws(information, draws, rng), priors)
     best = null.additions(()).max(axis=1)
-    return float(max(np.quantile(best, CALIBRATION_QUANTILE), np.log(candidates), VERY_STRONG))
+    quantile = np.quantile(best, CALIBRATION_QUANTILE)
+    return float(max(quantile, np.log(candidates), VERY_STRONG))

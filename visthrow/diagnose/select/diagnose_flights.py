@@ -81,15 +81,14 @@ def diagnose(
         laws=laws,
         progress=lambda line: say(f"  {line}"),
     )
-    missing = len(flights) - len({*without, *refused, *copied}) - diagnosis.flights
+    left_out = {*without, *refused, *copied}
+    missing = len(flights) - len(left_out) - diagnosis.flights
     if missing > 0:
         notes.insert(0, f"{missing} of {len(flights)} flights have no window in this answer")
-    notes += [
-        f"check: {log.name}: {row.text}"
-        for log in checked
-        for row in log.rows
-        if (row.topic, row.verdict) == ("thrust", "warn")
-    ]
+    for log in checked:
+        for row in log.rows:
+            if (row.topic, row.verdict) == ("thrust", "warn"):
+                notes.append(f"check: {log.name}: {row.text}")
     notes += [
         f"check, overruled or of a channel that the model does not read: {text}" for text in unread
     ]
@@ -244,11 +243,15 @@ def log_bayes_factor(model: Model, rival: Model) -> float:
     windows = [m.windows({}) for m in (model, rival)]
     places = []
     for of_model in windows:
-        finite_ones = {i: w for i, w in enumerate(of_model) if finite(w)}
-        places.append({(w.flight, w.time[0], len(w.time)): i for i, w in finite_ones.items()})
+        number = {}
+        for i, window in enumerate(of_model):
+            if finite(window):
+                number[window.flight, window.time[0], len(window.time)] = i
+        places.append(number)
     shared = sorted(places[0].keys() & places[1].keys())
-    if 2 * len(places[1]) < len(windows[1]) or not shared:  # the other fails in most
-        return np.inf if 2 * len(places[0]) >= len(windows[0]) else -np.inf
+    followed, rival_followed = (2 * len(n) >= len(of) for n, of in zip(places, windows))
+    if not rival_followed or not shared:  # the other fails in most
+        return np.inf if followed else -np.inf
     values = []
     for m, of_model, number in zip((model, rival), windows, places):
         problem = Problem.of(m, of_model, [number[key] for key in shared])

@@ -95,11 +95,12 @@ class CommandStatistics:
             inner = self.information[:, commands, commands]
             unit = np.eye(self.commands)
             crossed = self.information[:, commands, effects]
-            remaining = self.score[:, commands] - inner @ mean
+            came = self.score[:, commands]
+            remaining = came - inner @ mean
             right = np.concatenate((remaining[..., None], crossed), axis=2)
-            explained = np.linalg.solve(inner + unit / variance, right)
-            explained = (right.transpose(0, 2, 1) @ explained).sum(0)
-            mean_gain = mean @ (self.score[:, commands] + remaining).sum(0)
+            solved = np.linalg.solve(inner + unit / variance, right)
+            explained = (right.transpose(0, 2, 1) @ solved).sum(0)
+            mean_gain = mean @ (came + remaining).sum(0)
             log_det = np.linalg.slogdet(unit + variance * inner)[1].sum()
             value = 0.5 * float(mean_gain + explained[0, 0] - log_det)
             information = information - explained[1:, 1:]
@@ -118,8 +119,8 @@ def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | 
     priors = problem.priors
     sizes = problem.sizes(point.theta)
     reach = REACH * v.prior_sd
-    causes = np.flatnonzero(priors.visible & ~problem.switches)
-    sets = active, causes[causes < len(problem.model.effects)].tolist()
+    graded = priors.visible & ~problem.switches
+    sets = active, np.flatnonzero(graded[: len(problem.model.effects)]).tolist()
     numbers = range(len(problem.kept))
     for rows, shares in ((few_of(numbers), reach[::STRIDE]), (numbers, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
@@ -148,7 +149,8 @@ def sized(point: Point, scatter: Scatter) -> Scatter:
     spread = np.linalg.inv(information + np.eye(statistics.commands) / EITHER**2)
     score = statistics.score[:, commands] - EITHER * information.sum(2)  # from half way
     off = (spread @ score[..., None])[..., 0]
-    clear = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)) < 0.5 * EITHER
+    variance = np.diagonal(spread, axis1=1, axis2=2)
+    clear = np.sqrt(variance) < 0.5 * EITHER
     count = np.count_nonzero(clear)
     if not count:
         return scatter

@@ -115,9 +115,8 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
     for block in {block for block, _ in levels}:  # the least of a phase with few windows may be any
         of_phases = [level for (b, _), level in levels.items() if b == block]
         limits[block] = UNKNOWN_RATIO * np.percentile(of_phases, 50, method="lower")
-    noise = replace(
-        point.noise, latent_sd={key: min(level, limits[key[0]]) for key, level in levels.items()}
-    )
+    capped = {key: min(level, limits[key[0]]) for key, level in levels.items()}
+    noise = replace(point.noise, latent_sd=capped)
     grams = with_shares(point, point.theta)
     parts = statistics(grams, noise, point.device)
     plain = gather(grams, parts, point.theta)
@@ -239,10 +238,10 @@ def _hats(
     number = np.arange(PIECES)
     columns = []
     for term in terms:
-        scalar, vector = (factor.read(values) for factor in term.parts)
-        place = np.interp(scalar, places[term.factors[0]], number)
+        scalar, vector = term.parts
+        place = np.interp(scalar.read(values), places[term.factors[0]], number)
         hats = np.maximum(1.0 - np.abs(place[:, None] - number), 0.0)
-        columns.append(vector[:, :, None] * hats[:, None])
+        columns.append(vector.read(values)[:, :, None] * hats[:, None])
     return np.stack(columns, axis=2)
 
 
@@ -329,14 +328,18 @@ def shortlist(
         if screened is not None:
             screens[block] = screened
     depths = [term.depth for screened in screens.values() for term in screened.terms]
-    price = {depth: float(np.log(sum(d <= depth for d in depths))) for depth in set(depths)}
-    present = {e.term for e in problem.effects if isinstance(e, TermEffect)}
+    price = {}
+    for depth in set(depths):
+        simpler = sum(d <= depth for d in depths)
+        price[depth] = float(np.log(simpler))
+    present = {e.term for e in problem.terms}
     ranked: list[tuple[float, Term, float]] = []
     for block, screened in screens.items():
         gain, prior = survey.gains(screened, UNKNOWN_RATIO * strongest[block])
         gain[survey.unsaid(screened, causes) < LAW] = -np.inf
         # of terms that say the same in other words in these flights, the simplest comes first
-        for i in np.unique(np.round(gain, 3), return_index=True)[1]:
+        _, first = np.unique(np.round(gain, 3), return_index=True)
+        for i in first:
             term = screened.terms[i]
             nats = float(gain[i]) - price[term.depth]
             if nats > threshold and term not in present:
@@ -384,8 +387,8 @@ def moves_landing(point: Point, j: int) -> bool:
     size = point.theta[j] * point.problem.priors.floor[j]
     moves: dict[str, list[float]] = {}
     for window in point.windows:
-        moved = size * window.effects[np.isin(window.channel, positions), j]
-        distance = np.abs(moved).max(initial=0.0)
+        rows = np.isin(window.channel, positions)
+        distance = np.abs(size * window.effects[rows, j]).max(initial=0.0)
         moves.setdefault(window.phase, []).append(distance)
     return any(np.median(distances) > LANDING for distances in moves.values())
 
