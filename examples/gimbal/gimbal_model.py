@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 from visthrow.common.errors import LogError
 from visthrow.common.rotations import cross, matrix_of_quat
 from visthrow.config.bounds import Bounded, Positive
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, take_samples
-from visthrow.logs.check.relations import on_grid
+from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch, on_grid, take_samples
 from visthrow.logs.flightlog import FlightLog
 
 CHANNEL = "marker_pos_c"

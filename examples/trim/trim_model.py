@@ -11,10 +11,14 @@ from pathlib import Path
 import numpy as np
 
 from visthrow.config.bounds import Bounded, NotNegative, Positive
-from visthrow.diagnose.models.law_terms import exerted
-from visthrow.diagnose.models.numeric import Lanes, NumericModel, Stretch
-from visthrow.diagnose.models.thrust_map import command_of
-from visthrow.logs.check.relations import derivative
+from visthrow.diagnose.models.numeric import (
+    Lanes,
+    NumericModel,
+    Stretch,
+    command_of,
+    derivative,
+    exerted,
+)
 from visthrow.logs.flightlog import FlightLog
 
 

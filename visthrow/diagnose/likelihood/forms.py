@@ -119,11 +119,11 @@ def predicted(
     head = (horizon_time <= 0.0) & (count > 0)
     weighted = (states[head] / scale[head, None] ** 2).T
     spread = np.linalg.inv(weighted @ states[head] + np.eye(count))
-    gain = spread @ weighted
-    innovation = off - states @ (gain @ off[head])
+    fit = spread @ (weighted @ off[head])
+    innovation = off - states @ fit
     if window.correlated:
         root = _root(window, scale)
-        left = root - states @ (gain @ root[head])
+        left = root - states @ (spread @ (weighted @ root[head]))
         expected = (left**2).sum(1) + ((states @ spread) ** 2).sum(1)
     else:  # what that is where noise is white
         expected = scale**2 + np.einsum("nd,de,ne->n", states, spread, states, optimize=True)

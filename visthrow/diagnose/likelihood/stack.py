@@ -287,8 +287,8 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
     by_block = batch.member.mT @ excess[:, :, None]
     moved = (shape.level * mean)[:, :, None]
     bent = (moved.mT[:, None] @ batch.hidden)[:, :, 0] @ moved
-    fitted = bent - 2.0 * (batch.cross @ moved)
-    square = batch.square + fitted[..., 0] + spread
+    mixed = batch.cross @ moved
+    square = batch.square - 2.0 * mixed[..., 0] + bent[..., 0] + spread
     by_scale = square * shape.weight - batch.count
     return value, torch.cat((by_block[..., 0], by_scale), -1), curvature
 

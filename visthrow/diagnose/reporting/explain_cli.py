@@ -1,12 +1,17 @@
 """``visthrow diagnose explain``: what the model gets wrong about measured flights."""
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from visthrow.diagnose.inputs import model_arguments as opening
 from visthrow.diagnose.select.result import INCONSISTENT, OUT_OF_DOMAIN, Diagnosis
+
+if TYPE_CHECKING:
+    from visthrow.diagnose.models.model_interface import Model
+    from visthrow.diagnose.reporting.gain import Gain
+    from visthrow.logs.flightlog import FlightLog
 
 # exit status where no cause can be named: the data contradict themselves, or the simulation does
 # not follow them
@@ -57,7 +62,7 @@ def _tested(
     extensions, by that with all that was found, and of noise alone; print them.
     """
     from visthrow.diagnose.likelihood.forms import readable, unit_of
-    from visthrow.diagnose.models.law_terms import term_of
+    from visthrow.diagnose.models.law_terms import Term
     from visthrow.diagnose.reporting.gain import on_others
     from visthrow.diagnose.select.diagnose_flights import refused_of
     from visthrow.logs.check.run import check, contradictions
@@ -68,7 +73,9 @@ def _tested(
     after = test_flights.model
     before = after.plain()
     if diagnosis.explanations:
-        laws = [term_of(law).law(law.coefficient) for law in diagnosis.explanations[0]]
+        laws = []
+        for law in diagnosis.explanations[0]:
+            laws.append(Term(law.block, law.factors, law.vector).law(law.coefficient))
         after = after.with_laws(laws)
     refused = refused_of(checked, test_flights.known)
     tested = on_others(before, after, diagnosis.expected, diagnosis, refused)
@@ -79,12 +86,12 @@ def _tested(
     )
     for channel, channel_errors in tested.errors.items():
         factor, unit = readable(unit_of(channel))
-        before, after, floor = (factor * x for x in channel_errors)
+        plain, named, floor = (factor * x for x in channel_errors)
         won = ""
-        if before > floor:
-            won = f", {(before - after) / (before - floor):.0%} of what is above it"
+        if plain > floor:
+            won = f", {(plain - named) / (plain - floor):.0%} of what is above it"
         print(
-            f"on the tested flights, {channel}: {before:.3g} -> {after:.3g} {unit}, noise alone"
+            f"on the tested flights, {channel}: {plain:.3g} -> {named:.3g} {unit}, noise alone"
             f" {floor:.3g}{won}"
         )
     return tested.errors
@@ -92,13 +99,13 @@ def _tested(
 
 def write_report(
     folder: Path,
-    diagnosis,
-    model,
-    logs,
+    diagnosis: Diagnosis,
+    model: "Model",
+    logs: "Sequence[FlightLog]",
     seed: int,
     limits: bool = True,
     made_with: Mapping[str, Any] | None = None,
-):
+) -> "Gain | None":
     """Print the summary, write JSON, page, pictures and recording; returns the gain on held-out
     flights.
 
@@ -111,9 +118,9 @@ def write_report(
     from visthrow.diagnose.select import result
     from visthrow.view import page
 
-    measured = gain.measure(diagnosis, seed=seed)
-    if not measured.channels:  # windows of one sample have nothing ahead that could be predicted
-        measured = None
+    gained = gain.measure(diagnosis, seed=seed)
+    # windows of one sample have nothing ahead that could be predicted
+    measured = gained if gained.channels else None
     hidden = blind.hide(diagnosis, seed=seed) if limits else None
     steps = model.step_error()
     origin = provenance.collect()
