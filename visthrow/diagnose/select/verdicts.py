@@ -78,10 +78,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     active = [j for j in selection.names if j not in withdrawn]
     if selection.names and not active:
         point = nominal
-    statistics = point.plain
-    if not laws_of(selection.best.chosen):
-        statistics = _about_means(point, active, varies)
-    shared_point = replace(point, plain=freed(statistics, varies), varies=Varies())
+    shared_point = _about_means(point, () if laws_of(selection.best.chosen) else active, varies)
     varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
     sized = tuple(sorted({*active, *varying}))
     sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
@@ -93,9 +90,6 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     named = [findings[j] for j in active]
     theta = {f.name: f.estimate for f in named}
     spread = _covariance(shared_point, named, active, mean_part)
-    window = []
-    for trial, nats in selection.window:
-        window.append((tuple(sorted(c.name for c in trial.chosen)), nats))
     return Diagnosis(
         overall,
         block,
@@ -105,7 +99,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         spread,
         selection.threshold,
         steps=tuple(selection.steps),
-        sets=tuple(window),
+        sets=_named_sets(selection),
         levels=block_levels,
         laws=_different(explanations),
         events=_events(selection, point),
@@ -215,12 +209,20 @@ def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
     return relinearised_per_flight(point.plain, theta, point.problem.priors, j, simulate)
 
 
-def _about_means(point: Point, active: Sequence[int], varies: Varies) -> Statistics:
-    """Return what the flights say of the means of effects that vary."""
+def _about_means(point: Point, active: Sequence[int], varies: Varies) -> Point:
+    """Return the point of what flights share, about the means of named effects that vary."""
     statistics = point.plain
     for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
         statistics = _straight(replace(point, plain=statistics), active, j)
-    return statistics
+    return replace(point, plain=freed(statistics, varies), varies=Varies())
+
+
+def _named_sets(selection: Selector) -> tuple[tuple[tuple[str, ...], float], ...]:
+    """Return the names of each possible set, and its nats behind."""
+    sets = []
+    for trial, nats in selection.window:
+        sets.append((tuple(sorted(c.name for c in trial.chosen)), nats))
+    return tuple(sets)
 
 
 def _sets_of(selection: Selector) -> list[tuple[tuple[int, ...], float]]:
