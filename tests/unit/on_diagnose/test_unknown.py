@@ -251,9 +251,10 @@ def test_of_misshapen_blocks_the_one_with_most_evidence_is_reported(monkeypatch)
     monkeypatch.setattr(verdicts, "_by_block", lambda _: {block: [1] for block in curves})
     monkeypatch.setattr(terms, "strongest_forces", lambda _: dict.fromkeys(curves, 1.0))
     monkeypatch.setattr(terms, "best_curves", lambda *_: curves)
-    block, reason = verdicts._misshapen(selection)
+    monkeypatch.setattr(verdicts, "_parts_of", lambda *_: {1})
+    _, block, reasons, _ = verdicts._misshapen(selection, [])
     assert block == "vehicle force"
-    assert "F = f(v_z), with any function f, explains 90 nats" in reason
+    assert "F = f(v_z), with any function f, explains 90 nats" in reasons[0]
 
 
 DRAG = laws.Term("vehicle force", ("speed",), "vel")
@@ -302,7 +303,7 @@ def test_names_in_the_block_of_a_law_are_withdrawn_and_others_stay():
         DRAG,
     )
     assert acts_on(at.best.point, at.names) == ["vehicle force", "payload force"]
-    assert verdicts._law(at)[0] == {3}
+    assert verdicts._law(at, [])[3] == {3}
 
 
 def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
@@ -317,7 +318,7 @@ def test_names_that_differ_by_a_force_in_the_block_of_a_law_are_withdrawn():
     assert [acts_on(at.best.point, [j], free_effects=[14 - j])[0] for j in at.names] == [
         "vehicle force"
     ] * 2
-    assert verdicts._law(at)[0] == {6, 8}
+    assert verdicts._law(at, [])[3] == {6, 8}
 
 
 def test_a_law_of_the_vehicle_may_turn_it_as_well():
@@ -332,7 +333,7 @@ def test_a_law_of_the_vehicle_may_turn_it_as_well():
 
 def test_what_was_named_for_a_withdrawn_name_alone_goes_with_it():
     model = SyntheticModel(law="speed", law_size=0.02, truth={"effect_03": 15.0}, seed=3)
-    assert verdicts._law(beside_a_law(model, [3, 6], DRAG))[0] == {3, 6}
+    assert verdicts._law(beside_a_law(model, [3, 6], DRAG), [])[3] == {3, 6}
 
 
 def test_the_table_takes_up_what_no_name_explains():

@@ -69,12 +69,7 @@ def random_shares(
         all_effects: whether of every effect, not of the catalogue's random effects alone.
     """
     flown = statistics.information.diagonal(axis1=1, axis2=2)[:, : len(effects)] > 0.0
-    groups = {FLIGHT: flown}
-    if days:
-        day_of = np.array([days[f] for f in statistics.flights.tolist()])
-        by_day = np.array([flown[day_of == day].any(0) for day in np.unique(day_of)])
-        if 1 < len(by_day) < len(flown):
-            groups[DAY] = by_day
+    groups = _informative(flown, [days[f] for f in statistics.flights.tolist()] if days else [])
     offered = []
     for effect, penalty in _varying(effects):
         named = effect.name not in effect.of
@@ -96,6 +91,18 @@ def random_shares(
                 )
                 offered.append(candidate)
     return offered + _events(effects, priors, statistics.flights, flown)
+
+
+def _informative(flown: np.ndarray, days: Sequence[int]) -> dict[str, np.ndarray]:
+    """Return which flights, and which days where there are several, say something of each effect.
+
+    ``flown``: of each flight, shape (F, K), bool; ``days``: of each flight, or none."""
+    groups = {FLIGHT: flown}
+    day_of = np.array(days)
+    by_day = [flown[day_of == day].any(0) for day in np.unique(day_of)]
+    if 1 < len(by_day) < len(flown):
+        groups[DAY] = np.array(by_day)
+    return groups
 
 
 def _varying(effects: Sequence[Effect]) -> Iterable[tuple[RandomEffect, float]]:

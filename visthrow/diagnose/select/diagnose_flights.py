@@ -16,6 +16,7 @@ from visthrow.diagnose.select import held_out, lost_commands
 from visthrow.diagnose.select.candidates import ALL, NOTHING, Names
 from visthrow.diagnose.select.point import (
     ROUNDS,
+    Point,
     Problem,
     linearise,
     moved,
@@ -74,27 +75,34 @@ def diagnose(
     notes = [*model.notes, *(f"left out: {reason}" for reason in reasons)]
     for note in notes:
         say(f"  {note}")
+    left_out = {*without, *refused, *copied}
     diagnosis = explain(
         model,
         seed=seed,
-        without=(*without, *refused, *copied),
+        without=tuple(left_out),
         laws=laws,
         progress=lambda line: say(f"  {line}"),
     )
-    left_out = {*without, *refused, *copied}
     missing = len(flights) - len(left_out) - diagnosis.flights
     if missing > 0:
         notes.insert(0, f"{missing} of {len(flights)} flights have no window in this answer")
-    for log in checked:
-        for row in log.rows:
-            if (row.topic, row.verdict) == ("thrust", "warn"):
-                notes.append(f"check: {log.name}: {row.text}")
+    notes += _thrust_warnings(checked)
     notes += [
         f"check, overruled or of a channel that the model does not read: {text}" for text in unread
     ]
     if (why := model.lawless) and diagnosis.overall in (UNKNOWN, IN_PART):
         notes.append(f"no law outside the catalogue is looked for: {why}")
     return replace(diagnosis, reasons=(*diagnosis.reasons, *notes), duplicates=copied)
+
+
+def _thrust_warnings(checked: Sequence[Checked]) -> list[str]:
+    """Return what the checks warn of about the thrust of each log."""
+    warnings = []
+    for log in checked:
+        for row in log.rows:
+            if (row.topic, row.verdict) == ("thrust", "warn"):
+                warnings.append(f"check: {log.name}: {row.text}")
+    return warnings
 
 
 def refused_of(
@@ -138,17 +146,30 @@ def explain(
             f" {correlation.share:.1%} of its variance"
         )
     nominal = linearise(problem, np.zeros(len(model.effects)), windows=windows)
+    selection, commands = _searched(nominal, seed, say, laws)
+    diagnosis = held_out.judged(conclude(selection, commands))
+    reasons = diagnosis.reasons
+    left_out = len(considered) - len(selection.nominal.windows)
+    if left_out:
+        reasons += (
+            f"{left_out} of {len(considered)} windows are left out, which the simulation does not"
+            " follow: a cause that acts in these alone does not show",
+        )
+    return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
+
+
+def _searched(
+    nominal: Point, seed: int, say: Callable[[str], None], laws: bool
+) -> tuple[Selector, Scatter | None]:
+    """Select causes of the windows that the simulation follows, and lost commands."""
     begin = NOTHING
-    commands = None
+    priors = nominal.problem.priors
     for further in range(2 * ROUNDS, -1, -1):
         untracked = untracked_windows(nominal) if further else []  # the worst hide others
         if not untracked:
-            needed = threshold(nominal.statistics, problem.priors, np.random.default_rng(seed))
-            flights = len(nominal.plain.flights)
-            say(
-                f"{len(nominal.windows)} windows of {flights} flights; a cause needs"
-                f" {needed:.1f} nats"
-            )
+            needed = threshold(nominal.statistics, priors, np.random.default_rng(seed))
+            count = f"{len(nominal.windows)} windows of {len(nominal.plain.flights)} flights"
+            say(f"{count}; a cause needs {needed:.1f} nats")
             selection, commands = _selected(Selector(nominal, needed, say, laws), begin)
             begin = frozenset(c for c in selection.best.chosen if c.group == ALL and not c.law)
             untracked = _not_followed(selection) if further else []
@@ -156,15 +177,7 @@ def explain(
                 break
         say(f"{len(untracked)} windows are left out, which the simulation does not follow")
         nominal = only(nominal, sorted({*range(len(nominal.windows))} - {*untracked}))
-    diagnosis = held_out.judged(conclude(selection, commands))
-    reasons = diagnosis.reasons
-    left_out = len(considered) - len(nominal.windows)
-    if left_out:
-        reasons += (
-            f"{left_out} of {len(considered)} windows are left out, which the simulation does not"
-            " follow: a cause that acts in these alone does not show",
-        )
-    return replace(diagnosis, reasons=reasons, seconds=time.monotonic() - begun, seed=seed)
+    return selection, commands
 
 
 def _not_followed(selection: Selector) -> list[int]:

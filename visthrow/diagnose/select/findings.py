@@ -36,6 +36,13 @@ def blank(effect: Effect) -> Finding:
     )
 
 
+def _unobservable(effect: Effect, channels: Sequence[str]) -> Finding:
+    """Return the finding on an effect of which channels are missing."""
+    missing = tuple(c for c in effect.channels if c not in channels)
+    sentence = f"{effect.name}: not observable without {', '.join(missing)}."
+    return replace(blank(effect), missing=missing, sentence=sentence)
+
+
 @dataclass(frozen=True)
 class Reading:
     """The flights' information and the selected sets, from which each verdict follows."""
@@ -52,11 +59,8 @@ class Reading:
         point = self.point
         priors = problem.priors
         effect = problem.effects[j]
-        finding = blank(effect)
         if not priors.visible[j]:
-            missing = tuple(c for c in effect.channels if c not in problem.model.channels)
-            sentence = f"{effect.name}: not observable without {', '.join(missing)}."
-            return replace(finding, missing=missing, sentence=sentence)
+            return _unobservable(effect, problem.model.channels)
         partners, together = self._class_of(j)
         remaining = [k for k in together if k != j]
         homes = [home for home in self.sets if j in home[0]] if self.active else []
@@ -64,7 +68,7 @@ class Reading:
         mean, sd = point.posterior.averaged(j, homes)
         deviation = float(np.hypot(sd, OWN_FLOOR)) * effect.floor
         nats = point.evidence([*remaining, j]) - point.evidence(remaining)
-        finding = replace(finding, sd=deviation, nats=nats)
+        finding = replace(blank(effect), sd=deviation, nats=nats)
         if j in self.active or partners:
             differs = float(np.sqrt(self.unlike) * allowed(mean)) * effect.floor
             named = replace(finding, differs=differs)

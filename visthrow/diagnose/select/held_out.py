@@ -31,7 +31,7 @@ from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
-from visthrow.diagnose.select.result import ChannelGain, Diagnosis, HeldOut
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
 from visthrow.diagnose.select.scatter import freed
 
 MOST_FOLDS = 12
@@ -278,26 +278,50 @@ def _doubt(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
     do not find again.
     """
     uncompared = not compares_phases(diagnosis.work.after)
-    names = list(diagnosis.theta)
-    flights = f"held-out {measured.left_out}"
-    text = ", ".join(names)
-    borne = share_text(measured.share, measured.low, measured.high)
+    return (
+        _harm(diagnosis, measured, uncompared)
+        or _no_confirmation(diagnosis, measured, uncompared)
+        or _disagreement(diagnosis, measured)
+    )
+
+
+def _harm(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | None:
+    """Return the doubt where held-out flights are explained worse with the names.
+
+    ``uncompared``: whether no calm phase tells what gusts are."""
     harmed = [c for c in measured.channels if uncompared and c.high < 0.0]
-    if measured.share <= 0.0 or harmed:
-        how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or borne
-        why = "held-out flights are explained worse with it"
-        reason = f"{flights} are explained worse with {text} ({how}); withdrawn"
-        return Doubt(names, result.NOT_IDENTIFIABLE, why, reason)
+    if measured.share > 0.0 and not harmed:
+        return None
+    borne = share_text(measured.share, measured.low, measured.high)
+    how = ", ".join(f"{c.channel} by {-100 * c.gain:.0f} %" for c in harmed) or borne
+    names = ", ".join(diagnosis.theta)
+    reason = f"held-out {measured.left_out} are explained worse with {names} ({how}); withdrawn"
+    why = "held-out flights are explained worse with it"
+    return Doubt(diagnosis.named, result.NOT_IDENTIFIABLE, why, reason)
+
+
+def _no_confirmation(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) -> Doubt | None:
+    """Return the doubt where held-out flights do not bear out the names, or no channel's error
+    falls.
+    """
     falls = [c.low if uncompared else c.gain for c in measured.channels]
     fallen = not falls or any(fall > 0.0 for fall in falls)
-    if not (measured.low > 0.0 and fallen):
-        failed = _no_gain(measured) if measured.low > 0.0 else borne
-        reason = f"{flights} do not confirm {text} ({failed})"
-        if np.isnan(measured.low) or measured.folds < PARTS:
-            reason += f"; {_one_more(diagnosis, names)}"
-        return Doubt(names, why="held-out flights do not confirm it", reason=reason)
+    if measured.low > 0.0 and fallen:
+        return None
+    failed = share_text(measured.share, measured.low, measured.high)
+    if measured.low > 0.0:
+        failed = _no_gain(measured)
+    names = ", ".join(diagnosis.theta)
+    reason = f"held-out {measured.left_out} do not confirm {names} ({failed})"
+    if np.isnan(measured.low) or measured.folds < PARTS:
+        reason += f"; {_one_more(diagnosis, diagnosis.named)}"
+    return Doubt(diagnosis.named, why="held-out flights do not confirm it", reason=reason)
+
+
+def _disagreement(diagnosis: Diagnosis, measured: HeldOut) -> Doubt:
+    """Return the doubt about names that searches without some flights do not find again."""
     unsure = []
-    for name in names:  # what names one of a class names it
+    for name in diagnosis.theta:  # what names one of a class names it
         alike = (name, *diagnosis[name].partners)
         if sum(measured.named_in.get(member, 0.0) for member in alike) < FIRM + 1e-9:
             unsure.append(name)
@@ -383,17 +407,7 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     if not doubt.names:
         return diagnosis
     work = diagnosis.work
-    names = set(doubt.names)
-    remaining = [name for name in diagnosis.theta if name not in names]
-    removed = names.union(*(diagnosis[name].partners for name in names)) - set(remaining)
-    findings = []
-    for f in diagnosis.findings:
-        if f.name in removed and f.verdict in (result.FOUND, result.CLASS):
-            sentence = f"{f.sentence} But {doubt.why}."
-            f = replace(f, verdict=doubt.verdict, sentence=sentence)
-        if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
-            f = result.bounded(f)
-        findings.append(f)
+    remaining = [name for name in diagnosis.theta if name not in doubt.names]
     rows = [row for row, name in enumerate(diagnosis.theta) if name in remaining]
     spread = np.array(diagnosis.covariance)[np.ix_(rows, rows)]
     numbers = {e.name: j for j, e in enumerate(work.problem.effects)}
@@ -406,7 +420,7 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     )
     left = replace(
         diagnosis,
-        findings=tuple(findings),
+        findings=_doubted(diagnosis, doubt, remaining),
         theta={name: diagnosis.theta[name] for name in remaining},
         covariance=tuple(map(tuple, spread.tolist())),
         work=work,
@@ -418,6 +432,23 @@ def _withdrawn(diagnosis: Diagnosis, doubt: Doubt) -> Diagnosis:
     earlier = diagnosis.reasons if diagnosis.overall == result.UNKNOWN else ()
     reasons = (doubt.reason, *earlier)
     return replace(left, overall=result.UNKNOWN, block=block, reasons=reasons)
+
+
+def _doubted(diagnosis: Diagnosis, doubt: Doubt, remaining: Sequence[str]) -> tuple[Finding, ...]:
+    """Return the findings with another verdict on doubted names and the members of their classes;
+    ``remaining``: other names.
+    """
+    partners = [diagnosis[name].partners for name in doubt.names]
+    removed = set(doubt.names).union(*partners) - set(remaining)
+    findings = []
+    for f in diagnosis.findings:
+        if f.name in removed and f.verdict in (result.FOUND, result.CLASS):
+            sentence = f"{f.sentence} But {doubt.why}."
+            f = replace(f, verdict=doubt.verdict, sentence=sentence)
+        if f.name in removed and f.verdict == result.CANDIDATE and f.nats <= 0.0:
+            f = result.bounded(f)
+        findings.append(f)
+    return tuple(findings)
 
 
 def share_text(share: float, low: float, high: float) -> str:

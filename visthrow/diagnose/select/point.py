@@ -209,16 +209,11 @@ def linearise(
     model gave there, if it was asked already; ``varies``: effects that differ among flights."""
     theta = problem.possible(theta)
     sizes = problem.sizes(theta)
-    channels = len(problem.model.channels)
     flown = problem.flown(theta)
-    windows = (flown or problem.model).windows(sizes) if windows is None else windows
+    if windows is None:
+        windows = (flown or problem.model).windows(sizes)
     windows_of = with_correlations([windows[i] for i in problem.kept], problem.correlated)
-    commands = []
-    if problem.lost:
-        changes = problem.model.without_commands(sizes, problem.kept)
-        for change, window in zip(changes, windows_of):
-            behind = len(window.residual) - len(change)  # nothing behind replayed samples
-            commands.append(np.pad(change, ((0, behind), (0, 0))))
+    commands = _commands(problem, sizes, windows_of) if problem.lost else []
     extended = windows_of
     if problem.terms:
         sizes_of = theta if flown is None else 0.0 * theta
@@ -226,12 +221,7 @@ def linearise(
     if commands:
         extended = [_losing(w, c, problem.lost) for w, c in zip(extended, commands)]
     device = problem.model.device
-    floors = problem.priors.floor
-    raw = grams_of(extended, floors, channels)
-    cleaned = levels.without_outliers(extended, raw, device)
-    mended = [w for w in range(len(cleaned)) if cleaned[w] is not extended[w]]
-    for w, gram in zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)):
-        raw[w] = gram
+    cleaned, raw = _cleaned(problem, extended)
     noise, grams = levels.fit(cleaned, raw, start, device)
     integrals = stack.integrals(grams, noise, device)
     plain = cleaned
@@ -252,6 +242,29 @@ def linearise(
         linearised,
         commands,
     )
+
+
+def _commands(
+    problem: Problem, sizes: Mapping[str, float], windows: Sequence[Window]
+) -> list[np.ndarray]:
+    """Return the change of each window by each command that did not come, shape (N, T) each."""
+    commands = []
+    for change, window in zip(problem.model.without_commands(sizes, problem.kept), windows):
+        behind = len(window.residual) - len(change)  # nothing behind replayed samples
+        commands.append(np.pad(change, ((0, behind), (0, 0))))
+    return commands
+
+
+def _cleaned(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window], list[Gram]]:
+    """Return windows in which outliers weigh less, and their inner products."""
+    floors = problem.priors.floor
+    channels = len(problem.model.channels)
+    grams = grams_of(windows, floors, channels)
+    cleaned = levels.without_outliers(windows, grams, problem.model.device)
+    mended = [w for w in range(len(cleaned)) if cleaned[w] is not windows[w]]
+    for w, gram in zip(mended, grams_of([cleaned[w] for w in mended], floors, channels)):
+        grams[w] = gram
+    return cleaned, grams
 
 
 def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -> Window:

@@ -83,6 +83,11 @@ class Varies:
         return {j: size for (j, who), size in self.shares.items() if who == DAY}
 
     @property
+    def columns(self) -> set[int]:
+        """Return the effects that have a share in every flight, or on every day."""
+        return {j for j, who in self.shares if who in (FLIGHT, DAY)}
+
+    @property
     def by_flight(self) -> "Varies":
         """Return the same as if every flight were a day."""
         shares = {}

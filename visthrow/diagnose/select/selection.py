@@ -183,18 +183,24 @@ class Selector:
                 best = max(t.lead for t in better)
                 least = max(best, max(listed.values()) - WINDOW)
         better = better or self._followed_up(listed)
-        if better:
-            top = max(better, key=lambda t: t.lead)
-            self._record(top, leads, listed)
-            self._go(top)
-            return True
+        if not better:
+            self._keep(near)
+            return False
+        top = max(better, key=lambda t: t.lead)
+        self._record(top, leads, listed)
+        self._go(top)
+        return True
+
+    def _keep(self, near: list[Trial]) -> None:
+        """Keep the sets that are possible beside the best: trials, and those that were the best
+        before.
+        """
         earlier = self._visited - {self.best.chosen}
-        for chosen, nats in self._simulated.items():  # sets that were the best before
+        for chosen, nats in self._simulated.items():
             if chosen in earlier and nats > -STRONG:
                 near.append(Trial(chosen, self.best.point, lead=nats))
         near.sort(key=lambda t: -t.lead)
         self.window = [(self.best, 0.0), *((t, -t.lead) for t in near)]
-        return False
 
     def _listed(self) -> dict[Names, float]:
         """Return sets near the best, with the nats by which they are ahead of the present one by

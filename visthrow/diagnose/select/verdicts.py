@@ -2,7 +2,7 @@
 words.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -54,15 +54,15 @@ from visthrow.diagnose.select.scatter import (
 )
 from visthrow.diagnose.select.selection import Selector
 
+Answer = tuple[str, str, list[str], set[int]]
+"""Overall verdict, block of an unknown effect, reasons, and names that are withdrawn for it."""
+
 
 def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     """Turn a finished selection into verdicts; ``commands``: the verdict on lost ones."""
     model = selection.nominal.problem.model
-    point = selection.best.point
     scatter, varies = random_shares_of(selection)
-    if varies or point.varies:
-        point = with_noise_at(replace(point, varies=varies), point.theta)
-        selection.best = replace(selection.best, point=point)
+    point = _varied(selection, varies)
     if commands:
         scatter = (*scatter, commands)
     calm = with_floors_noise(point, selection.best.columns)
@@ -79,8 +79,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     if selection.names and not active:
         point = nominal
     shared_point = _about_means(point, () if laws_of(selection.best.chosen) else active, varies)
-    varying = {j for j, who in varies.shares if who in (FLIGHT, DAY)}
-    sized = tuple(sorted({*active, *varying}))
+    sized = tuple(sorted({*active, *varies.columns}))
     sizes = shared_point.posterior.mean_sizes(sized, [(sized, 0.0)])
     means = {problem.effects[j].name: float(sizes[j] * problem.priors.floor[j]) for j in sized}
     unlike, mean_part = between_flights(shared_point.statistics, problem.priors, active, sizes)
@@ -104,7 +103,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         laws=_different(explanations),
         events=_events(selection, point),
         sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
-        scatter=tuple(_with_means(s, means) for s in scatter),
+        scatter=_with_means(scatter, means),
         mistakes=tuple(model.mistakes),
         explanations=tuple(explanations),
         flights=len(point.plain.flights),
@@ -114,9 +113,22 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     )
 
 
-def _with_means(scatter: Scatter, means: Mapping[str, float]) -> Scatter:
-    """Return a verdict on what varies with the means of its effects in these flights."""
-    return replace(scatter, mean={name: means[name] for name in scatter.of if name in means})
+def _varied(selection: Selector, varies: Varies) -> Point:
+    """Give the best point these random shares, and return it."""
+    point = selection.best.point
+    if varies or point.varies:
+        point = with_noise_at(replace(point, varies=varies), point.theta)
+        selection.best = replace(selection.best, point=point)
+    return point
+
+
+def _with_means(scatter: Sequence[Scatter], means: Mapping[str, float]) -> tuple[Scatter, ...]:
+    """Return verdicts on what varies with the means of their effects in these flights."""
+    verdicts = []
+    for s in scatter:
+        mean = {name: means[name] for name in s.of if name in means}
+        verdicts.append(replace(s, mean=mean))
+    return tuple(verdicts)
 
 
 def _covariance(
@@ -147,30 +159,39 @@ def random_shares_of(selection: Selector) -> tuple[tuple[Scatter, ...], Varies]:
     best = selection.best
     problem = selection.problem
     priors = selection.problem.priors
-    random = {c for c in best.chosen if c.group not in (ALL, EVENT)}
-    selected = {c.name for c in random}
     catalogue = {v.name: v for v in random_effects()}
     verdicts = []
     shares = dict(best.shares)
-    for c in selection.candidates:
-        unselected = c.name in catalogue and c.group != DAY and c.name not in selected
-        if not (c in random or unselected):
-            continue
+    for c in _asked_after(selection, catalogue.keys()):
+        usual = c not in best.chosen
         statistics = best.point.plain
-        named = best.chosen
-        if c in random and len(c.columns) == 1:
+        beside = best.chosen
+        if usual:
+            beside |= _means_of(selection, c)
+        elif len(c.columns) == 1:
             statistics = _straight(best.point, best.columns, c.columns[0])
-        if c not in random:
-            alike = [o for o in selection.candidates if {*o.columns} & {*c.columns}]
-            named |= {o for o in alike if o.group == ALL}
         fixed_shares = {o: size for o, size in best.shares.items() if o != c}
         linear = Linear(statistics, priors, (), lambda _: 0.0, problem.days)
         effect = catalogue.get(c.name) or as_random(problem.effects[c.columns[0]])
-        verdict = share_verdict(linear, c, named, fixed_shares, effect, selection.threshold)
-        verdicts.append(replace(verdict, found=c in random))
-        if c in random:
+        verdict = share_verdict(linear, c, beside, fixed_shares, effect, selection.threshold)
+        verdicts.append(replace(verdict, found=not usual))
+        if not usual:
             shares[c] = max(verdict.size, verdict.floor) / effect.prior_sd
     return tuple(verdicts), varies_of(shares, problem.days)
+
+
+def _asked_after(selection: Selector, usual: Set[str]) -> list[Candidate]:
+    """Return the random shares that were selected, and the usual ones, by name, that were not."""
+    varying = [c for c in selection.candidates if c.group in (FLIGHT, DAY)]
+    selected = [c for c in varying if c in selection.best.chosen]
+    others = usual - {c.name for c in selected}
+    return [c for c in varying if c in selected or (c.group == FLIGHT and c.name in others)]
+
+
+def _means_of(selection: Selector, random: Candidate) -> set[Candidate]:
+    """Return the candidates for the sizes that all flights share of what a random share changes."""
+    shared_sizes = [c for c in selection.candidates if c.group == ALL]
+    return {c for c in shared_sizes if {*c.columns} & {*random.columns}}
 
 
 def share_verdict(
@@ -212,7 +233,7 @@ def _straight(point: Point, active: Sequence[int], j: int) -> Statistics:
 def _about_means(point: Point, active: Sequence[int], varies: Varies) -> Point:
     """Return the point of what flights share, about the means of named effects that vary."""
     statistics = point.plain
-    for j in sorted({j for j, who in varies.shares if who in (FLIGHT, DAY)} & set(active)):
+    for j in sorted(varies.columns & set(active)):
         statistics = _straight(replace(point, plain=statistics), active, j)
     return replace(point, plain=freed(statistics, varies), varies=Varies())
 
@@ -261,18 +282,6 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
                 f" {share_text(share, low, high)}"
             )
     return repeated, ""
-
-
-def _law(selection: Selector) -> tuple[set[int], str]:
-    """Return the names that are withdrawn beside the set's laws, and the reason for the laws."""
-    best = selection.best
-    laws_of_set = terms.laws(best.point, best.columns, 0.0)
-    text = " and ".join(
-        f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit_suffix(law.unit)}"
-        for law in laws_of_set
-    )
-    blocks = terms.acts_in(c.law for c in laws_of(best.chosen))
-    return _parts_of(selection, blocks), f"{text} explains what no cause of the catalogue does"
 
 
 def _parts_of(selection: Selector, blocks: set[str]) -> set[int]:
@@ -342,55 +351,136 @@ def out_of_domain(model: Model, windows: Sequence[Window], usable: int, seed: in
 
 def _overall(
     selection: Selector, block_levels: Sequence[Level], scatter: Sequence[Scatter]
-) -> tuple[str, str, list[str], set[int]]:
-    """Return the overall verdict, the block of an unknown effect, reasons, and the names that are
-    withdrawn for it.
-    """
-    point = selection.best.point
-    active = selection.best.columns
-    strong = too_strong(point, INEXACT)
-    if strong:  # what no missing cause explains: the channels do not belong together
-        reason = (
-            f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are"
-            f" missing in the phases {', '.join(strong)}: commands and poses, units or axes do not"
-            " belong together"
-        )
-        return result.INCONSISTENT, "", [reason], set(active)
+) -> Answer:
+    """Return the answer to all flights, by the first of these reasons that holds."""
     excessive = [level for level in block_levels if level.excessive]
     reasons = [_excess(level) for level in excessive]
-    laws = laws_of(selection.best.chosen)
-    if laws:
-        unnamed, law_text = _law(selection)
-        return result.UNKNOWN, laws[0].law, [law_text, *reasons], unnamed
+    return (
+        _contradiction(selection)
+        or _law(selection, reasons)
+        or _outside_bounds(selection, reasons)
+        or _crowded(selection, reasons)
+        or _misshapen(selection, reasons)
+        or _left_over(selection, excessive, reasons)
+        or _unlike(scatter)
+        or _explained(selection, scatter)
+    )
+
+
+def _contradiction(selection: Selector) -> Answer | None:
+    """Return the answer where forces are missing that no cause explains: the channels do not belong
+    together.
+    """
+    strong = too_strong(selection.best.point, INEXACT)
+    if not strong:
+        return None
+    reason = (
+        f"after everything the catalogue can do, forces above {INEXACT:.0%} of the thrust are"
+        f" missing in the phases {', '.join(strong)}: commands and poses, units or axes do not"
+        " belong together"
+    )
+    return result.INCONSISTENT, "", [reason], set(selection.best.columns)
+
+
+def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
+    """Return the answer where laws were selected."""
+    best = selection.best
+    forms = laws_of(best.chosen)
+    if not forms:
+        return None
+    texts = []
+    for law in terms.laws(best.point, best.columns, 0.0):
+        unit = unit_suffix(law.unit)
+        texts.append(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit}")
+    reason = f"{' and '.join(texts)} explains what no cause of the catalogue does"
+    blocks = terms.acts_in(c.law for c in forms)
+    return result.UNKNOWN, forms[0].law, [reason, *reasons], _parts_of(selection, blocks)
+
+
+def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | None:
+    """Return the answer where the flights push an estimate beyond its bound."""
+    active = selection.best.columns
     stuck = [j for j in active if _on_bound(selection, j)]
-    if stuck:
-        names = ", ".join(selection.problem.effects[j].name for j in stuck)
-        reasons.append(
-            f"{names} would have to lie outside what is physically possible; the form is another"
-        )
-        block = selection.block_of(stuck[0]) or selection.problem.effects[stuck[0]].block
-        return result.UNKNOWN, block, reasons, set(active)
-    for block, parts in _crowded(selection).items():
-        names = ", ".join(selection.problem.effects[j].name for j in parts)
-        reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
-        return result.UNKNOWN, block, [*reasons, reason], set(parts)
-    block, reason = _misshapen(selection)
-    if block:
-        return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
-    if excessive:
-        worst = max(excessive, key=lambda level: level.nats)
-        return result.UNKNOWN, worst.block, reasons, _withdrawn(selection, excessive)
+    if not stuck:
+        return None
+    effects = [selection.problem.effects[j] for j in stuck]
+    names = ", ".join(effect.name for effect in effects)
+    reason = f"{names} would have to lie outside what is physically possible; the form is another"
+    block = selection.block_of(stuck[0]) or effects[0].block
+    return result.UNKNOWN, block, [*reasons, reason], set(active)
+
+
+def _crowded(selection: Selector, reasons: Sequence[str]) -> Answer | None:
+    """Return the answer where the names in a block cost more together than a law that nobody wrote
+    down, and the flights hardly tell some apart: parts of it are likelier.
+    """
+    law = selection.threshold + terms.LAW
+    for block, members in _by_block(selection).items():
+        part = selection.best.point.information[np.ix_(members, members)]
+        unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
+        if len(members) * selection.threshold > law and unlike.min() < 0.5:
+            names = ", ".join(selection.problem.effects[j].name for j in members)
+            reason = f"{names} act in the {block} and some hardly differ: another law is likelier"
+            return result.UNKNOWN, block, [*reasons, reason], set(members)
+    return None
+
+
+def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
+    """Return the answer where some function of one quantity explains what the names in a block
+    leave: their form is another. Of several blocks, it is the one with most evidence.
+    """
+    best = selection.best
+    by_block = _by_block(selection)
+    strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
+    in_blocks = {block: strongest[block] for block in by_block if block in strongest}
+    curves = terms.best_curves(best.point, best.columns, in_blocks)
+    block = max(curves, key=curves.get, default="")
+    nats, formula = curves.get(block, (0.0, ""))
+    if nats <= selection.threshold:
+        return None
+    names = ", ".join(selection.problem.effects[j].name for j in by_block[block])
+    reason = (
+        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names};"
+        " the form is another"
+    )
+    return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
+
+
+def _left_over(
+    selection: Selector, excessive: Sequence[Level], reasons: list[str]
+) -> Answer | None:
+    """Return the answer where latent forces are excessive; names that act in a block and leave it
+    as it was are withdrawn.
+    """
+    if not excessive:
+        return None
+    worst = max(excessive, key=lambda level: level.nats)
+    eased = {level.block: level.after < 0.5 * level.before for level in excessive}
+    withdrawn = set()
+    for j in selection.best.columns:
+        if not eased.get(selection.block_of(j), True):
+            withdrawn.add(j)
+    return result.UNKNOWN, worst.block, reasons, withdrawn
+
+
+def _unlike(scatter: Sequence[Scatter]) -> Answer | None:
+    """Return the answer where flights differ in several things that usually do not vary."""
     catalogue = {v.name for v in random_effects()}
     forms = [s for s in scatter if s.found and s.name not in catalogue]
-    if len(forms) > 1:
-        names = ", ".join(s.name for s in forms)
-        reason = f"flights differ in {names} at once; the form is another"
-        return result.UNKNOWN, forms[0].block, [reason], set()
-    besides = [m.name for m in selection.problem.model.mistakes]
-    besides += [s.name for s in scatter if s.found]
-    if active:
+    if len(forms) < 2:
+        return None
+    names = ", ".join(s.name for s in forms)
+    reason = f"flights differ in {names} at once; the form is another"
+    return result.UNKNOWN, forms[0].block, [reason], set()
+
+
+def _explained(selection: Selector, scatter: Sequence[Scatter]) -> Answer:
+    """Return the answer where nothing is missing."""
+    if selection.best.columns:
         return result.KNOWN, "", [], set()  # held-out flights give the reason
     nothing = f"no effect exceeds {selection.threshold:.1f} nats, and no residual above the noise"
+    besides = [m.name for m in selection.problem.model.mistakes]
+    besides += [s.name for s in scatter if s.found]
     if besides:
         return result.KNOWN, "", [f"besides {' and '.join(besides)}, {nothing}"], set()
     return result.NO_EFFECT, "", [nothing], set()
@@ -407,57 +497,12 @@ def _by_block(selection: Selector) -> dict[str, list[int]]:
     return blocks
 
 
-def _crowded(selection: Selector) -> dict[str, list[int]]:
-    """Return the blocks whose names cost more together than a law that nobody wrote down, and of
-    which the flights hardly tell some apart, with these names: parts of it are likelier.
-    """
-    crowded = {}
-    law = selection.threshold + terms.LAW
-    for block, members in _by_block(selection).items():
-        part = selection.best.point.information[np.ix_(members, members)]
-        unlike = 1.0 / (np.diag(part) * np.diag(np.linalg.pinv(part)))
-        if len(members) * selection.threshold > law and unlike.min() < 0.5:
-            crowded[block] = members
-    return crowded
-
-
-def _misshapen(selection: Selector) -> tuple[str, str]:
-    """Return the block in which some function of one quantity explains most of what the names there
-    leave, and the reason: their form is another; both empty where none explains enough.
-    """
-    problem = selection.problem
-    best = selection.best
-    by_block = _by_block(selection)
-    strongest = terms.strongest_forces(selection.nominal) if selection.laws else {}
-    in_blocks = {block: strongest[block] for block in by_block if block in strongest}
-    curves = terms.best_curves(best.point, best.columns, in_blocks)
-    block = max(curves, key=curves.get, default="")
-    nats, formula = curves.get(block, (0.0, ""))
-    if nats <= selection.threshold:
-        return "", ""
-    names = ", ".join(problem.effects[j].name for j in by_block[block])
-    return block, (
-        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names};"
-        " the form is another"
-    )
-
-
 def _excess(level: Level) -> str:
     unit = "N m" if "torque" in level.block else "N"
     return (
         f"{level.block} in phase {level.phase}: {level.after:.2g} {unit} remain,"
         f" {level.after / level.quiet:.1f} times the quietest phase ({level.nats:.0f} nats)"
     )
-
-
-def _withdrawn(selection: Selector, excessive: Sequence[Level]) -> set[int]:
-    """Return names that act in the unknown effect's block, and leave it as it was."""
-    eased = {level.block: level.after < 0.5 * level.before for level in excessive}
-    withdrawn = set()
-    for j in selection.best.columns:
-        if not eased.get(selection.block_of(j), True):
-            withdrawn.add(j)
-    return withdrawn
 
 
 def _on_bound(selection: Selector, j: int) -> bool:
