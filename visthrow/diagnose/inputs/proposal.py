@@ -246,8 +246,7 @@ def _carried(log: FlightLog) -> float | None:
     """
     if (mass := thrust_checks.mass_of(log)) is not None or "thrust_command" not in log:
         return mass
-    total = log["thrust_command"].samples()[1]
-    usual = _usual(total) if len(total) else 0.0
+    usual = _usual(log["thrust_command"].samples().values)
     return usual / physics.GRAVITY if usual > 0.0 else None
 
 

@@ -208,22 +208,24 @@ def designed(base: Manoeuvre, limits: Limits, numbers: np.ndarray) -> Manoeuvre:
     )
 
 
-@dataclass(frozen=True)
+@dataclass
 class Design:
-    """A designed manoeuvre with its worth.
+    """A search for the sweeps over a manoeuvre, and the best that can be flown."""
 
-    Attributes:
-        start: expected nats a second of the manoeuvre that it began with.
-        rate: the same of what was found.
-    """
-
+    aim: PlanningGoal
     base: Manoeuvre
-    manoeuvre: Manoeuvre
-    numbers: np.ndarray
-    information: np.ndarray
-    start: float
-    rate: float
-    flights: int  # simulated
+    simulate: Simulate
+    limits: Limits
+    numbers: np.ndarray | None = None  # of the best; None where none can be flown
+    information: np.ndarray | None = None  # of the best
+    rate: float = -np.inf  # expected nats a second of the best
+    start: float = np.nan  # the same of the manoeuvre that it began with
+    flights: int = 0  # simulated
+
+    @property
+    def manoeuvre(self) -> Manoeuvre:
+        """The best manoeuvre."""
+        return designed(self.base, self.limits, self.numbers)
 
     def record(self) -> dict[str, Any]:
         """For JSON."""
@@ -235,6 +237,27 @@ class Design:
             "flights": self.flights,
             "numbers": dict(zip(NUMBERS, self.numbers.tolist())),
         }
+
+    def costs(self, columns: np.ndarray) -> np.ndarray:
+        """Less for more expected nats a second; of what would be aborted, more than of all others
+        and the more the nearer to a crash.
+
+        ``columns``: designs, shape (numbers, n).
+        """
+        self.flights += columns.shape[1]
+        simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])
+        return np.array([self._cost(x, s) for x, s in zip(columns.T, simulated)])
+
+    def _cost(self, x: np.ndarray, simulated: Simulated) -> float:
+        if simulated.model is None:
+            return ABORTED * simulated.used
+        information = self.aim.information(simulated.model)
+        rate = self.aim.nats(information) / self.base.seconds
+        if rate > self.rate:
+            self.rate = rate
+            self.numbers = x.copy()
+            self.information = information
+        return -rate
 
 
 def optimise(
@@ -255,13 +278,14 @@ def optimise(
     count = len(NUMBERS)
     points = qmc.Sobol(count, seed=seed).random(SCATTERED)
     scattered = START + SCATTER_SHARE * (points - START)
-    search = _Search(aim, base, simulate, limits)
-    start = -float(search.costs(START[:, None])[0])
+    design = Design(aim, base, simulate, limits)
+    design.start = -float(design.costs(START[:, None])[0])
 
     def generation(columns: np.ndarray) -> np.ndarray:
-        costs = search.costs(columns)
-        best = f"{search.best[0]:.3g} nats a second" if search.best else "nothing that can be flown"
-        progress(f"{search.flights} simulated flights: {best}")
+        costs = design.costs(columns)
+        flown = design.numbers is not None
+        best = f"{design.rate:.3g} nats a second" if flown else "nothing that can be flown"
+        progress(f"{design.flights} simulated flights: {best}")
         return costs
 
     differential_evolution(
@@ -277,39 +301,4 @@ def optimise(
         polish=False,
         seed=seed,
     )
-    if search.best is None:
-        return None
-    rate, numbers, information = search.best
-    manoeuvre = designed(base, limits, numbers)
-    return Design(base, manoeuvre, numbers, information, start, rate, search.flights)
-
-
-@dataclass
-class _Search:
-    """The cost of designs, and the best that can be flown."""
-
-    aim: PlanningGoal
-    base: Manoeuvre
-    simulate: Simulate
-    limits: Limits
-    best: tuple[float, np.ndarray, np.ndarray] | None = None  # rate, numbers, information
-    flights: int = 0
-
-    def costs(self, columns: np.ndarray) -> np.ndarray:
-        """Less for more expected nats a second; of what would be aborted, more than of all others
-        and the more the nearer to a crash.
-
-        ``columns``: designs, shape (numbers, n).
-        """
-        self.flights += columns.shape[1]
-        simulated = self.simulate([designed(self.base, self.limits, x) for x in columns.T])
-        return np.array([self._cost(x, s) for x, s in zip(columns.T, simulated)])
-
-    def _cost(self, x: np.ndarray, simulated: Simulated) -> float:
-        if simulated.model is None:
-            return ABORTED * simulated.used
-        information = self.aim.information(simulated.model)
-        rate = self.aim.nats(information) / self.base.seconds
-        if self.best is None or rate > self.best[0]:
-            self.best = rate, x.copy(), information
-        return -rate
+    return None if design.numbers is None else design
