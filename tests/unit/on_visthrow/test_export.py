@@ -12,7 +12,7 @@ from tests.commands import run_command
 from visthrow.cli.gymnasium_env import SingleThrowEnv, ThrowVectorEnv
 from visthrow.onboard.policy import Policy, find_policy
 
-THROWS, STEPS = 100, 10
+THROWS, STEPS = 100, 5
 """Throws side by side, each with its memory carried on."""
 TOLERANCE = 1e-5
 """float32 sums in another order; actions are of the size of 1."""
