@@ -26,17 +26,17 @@ def command_from_action(action: Array, max_thrust: float | Tensor, max_rate: Arr
     """Command of a clipped action.
 
     Args:
-        action: normalised, shape (..., E, 5) or (..., E, 4); noise may carry it slightly past 1
-            and is clipped again.
+        action: normalised, shape (E, 5) or (E, 4); noise may carry it slightly past 1 and is
+            clipped again.
         max_thrust: collective thrust at +1 [N]; one for all, or shape (E, 1).
         max_rate: body rates at +-1 [rad/s], shape (3,).
 
     Returns:
-        Collective thrust [N] and body rates [rad/s], shape (..., E, 4).
+        Collective thrust [N] and body rates [rad/s], shape (E, 4).
     """
-    bounded = action[..., :COMMANDS].clip(-1.0, 1.0)
-    throttle = 0.5 * (bounded[..., :1] + 1.0)
-    parts = [max_thrust * throttle * throttle, bounded[..., 1:] * max_rate]
+    bounded = action[:, :COMMANDS].clip(-1.0, 1.0)
+    throttle = 0.5 * (bounded[:, :1] + 1.0)
+    parts = [max_thrust * throttle * throttle, bounded[:, 1:] * max_rate]
     return library(action).concatenate(parts, -1)
 
 

@@ -12,6 +12,5 @@ survival S[k] = prod_(j < k) (1 - h[j]),
 On a schedule the width falls and the value of h becomes the latch's, 0 or 1, while its slope stays
 the sigmoid's: what is differentiated is then what is flown, and the width is that of a kernel
 estimate of how many releases a change moves. Soft barriers stand before the bounds, where rewards
-have no slope, before a slack rope, which the vehicle does not move, and before commands that the
-motors cannot follow. Derivatives run backward through surrogate and network, and decay by a factor
-each step."""
+have no slope, and before a slack rope, which the vehicle does not move. Derivatives run backward
+through surrogate and network, and decay by a factor each step."""

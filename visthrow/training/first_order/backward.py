@@ -30,6 +30,7 @@ class BackwardParams:
 
     response: wp.array(dtype=wp.vec4)
     force: wp.array(dtype=float)
+    tension: wp.array(dtype=float)
     mass: wp.array(dtype=float)
     load_mass: wp.array(dtype=float)
     mount: wp.array(dtype=wp.vec3)
@@ -113,7 +114,7 @@ def advance(
     along = wp.dot(n, u)
     swing = (wp.dot(u, u) - along * along) / wp.length(arm)
     reduced = mass * load_mass / (mass + load_mass)
-    rod = reduced * (swing - wp.dot(n, f) / mass)
+    rod = reduced * (p.tension[1] * swing - p.tension[0] / mass * wp.dot(n, f))
     load_gain = (x.load_vel[k + 1, e] - load_vel) / dt + GRAVITY * up
     pull = number_at(-load_mass * wp.dot(n, load_gain), rod)
     tension = wp.where(pull > TAUT * GRAVITY * load_mass, pull, 0.0) * n
@@ -216,9 +217,11 @@ class Layers:
             tensor[: len(flown)].flatten(0, 1)[rows]
             for tensor in (self._obs, self.by_action * shares[:, None])
         )
-        self._network.zero_grad()
+        weights = list(self._network.mlp.parameters())
         with torch.enable_grad():
-            self._decide(obs).backward(by_action)
+            action = self._decide(obs)
+        for weight, gradient in zip(weights, torch.autograd.grad(action, weights, by_action)):
+            weight.grad = gradient
 
 
 def _picked(mask: Tensor) -> Tensor | slice:

@@ -20,7 +20,7 @@ from visthrow.onboard.policy import Policy
 from visthrow.task import Experiment, rewards
 from visthrow.training.env import ThrowEnv
 from visthrow.training.first_order.backward import BackwardParams, Layers, step
-from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit, lagged_rows
+from visthrow.training.first_order.surrogate import STATES, Course, FlightBatch, fit
 from visthrow.training.ppo.algorithm import Algorithm
 from visthrow.training.ppo.network import MuonAdam, Network, averaged, cosine_rate
 from visthrow.training.ranks import Ranks
@@ -186,26 +186,6 @@ class FirstOrder(Algorithm):
         gain = (x.load_vel[1:] - x.load_vel[:-1]) / self.experiment.sim.control_period
         return -(rope * gain).sum(-1) / GRAVITY - rope[..., 2]
 
-    def _missed(self, action: Tensor) -> Tensor:
-        """Return the square of what the vehicle's thrust, in weights, and rates, in full rates,
-        differ by from what the commands ask, for each step, shape (T, E).
-
-        Where motors come to their limits, the response does not follow the commands as it was
-        fitted."""
-        flights = self.flights
-        T = len(action)
-        max_rate = self.env.max_rate
-        wanted = act.command_from_action(action, self.experiment.task.action.max_thrust, max_rate)
-        command = flights.x["command"][:T] + (wanted - wanted.detach())
-        given = flights.x["response"][: T + 1]
-        weights = self.surrogate["response"]
-        k, rows = lagged_rows(given, command, len(weights) - 2)
-        difference = given[k + 1] - (rows * weights).sum(-2)
-        weight = GRAVITY * (flights.mass + flights.load_mass)[:, None]
-        unit = torch.cat([weight, max_rate.expand(len(weight), -1)], -1)
-        missed = (difference / unit).square().sum(-1)
-        return torch.nn.functional.pad(missed, (0, 0, T - len(k), 0))
-
     def _carrying(self, x: SimpleNamespace) -> Tensor:
         """Rewards of each step while carrying, barriers included, shape (T, E)."""
         task = self.experiment.task
@@ -231,8 +211,7 @@ class FirstOrder(Algorithm):
             upright - math.cos(math.radians(bounds.tilt_deg)) - UPRIGHT,
             SLACK * (self._pull(x) - PULL),
         ]
-        within = sum(gap.clamp(max=0.0).square() for gap in margins)
-        barrier = BARRIER * (within + SLACK**2 * self._missed(x.action))
+        barrier = BARRIER * sum(gap.clamp(max=0.0).square() for gap in margins)
         moving = rewards.kinetic(p, x.vel[1:], rate, x.load_vel[1:])
         time = rewards.carry_time(p, self.experiment.sim.control_period)
         return moving + acting + time - barrier
@@ -388,9 +367,11 @@ class FirstOrder(Algorithm):
         )
 
     def state_dict(self) -> dict:
-        return super().state_dict() | {"adapting": self._adapting}
+        return super().state_dict() | {"adapting": self._adapting, "surrogate": self.surrogate}
 
     def load_state_dict(self, saved: dict, own_throws: bool = True) -> None:
         super().load_state_dict(saved, own_throws)
         if saved["adapting"]:
             self._adapt()
+        for name, value in saved["surrogate"].items():
+            self.surrogate[name].copy_(value)

@@ -5,16 +5,16 @@ The simulator flies; every value below is the simulator's own, and the surrogate
 derivative at that point. With the response ``y = (thrust, body rates)``, commands u, vehicle p, v,
 R, payload q, s and the control period dt:
 
-    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j]
+    y[k+1] = A0 y[k] + A1 y[k-1] + sum_j B_j u[k-j] + c
     R[k+1] = R[k] exp(dt (w[k] + w[k+1]) / 2)
     f      = kappa F z - R diag(drag) R^T v
-    T      = mu (-n.f / M + |u_perp|^2 / l)
+    T      = mu (-a n.f / M + b |u_perp|^2 / l)
     v[k+1] = v + dt (f / M + g + T n / M),  s[k+1] = s + dt (g - T n / m),  mu = M m / (M + m)
 
 The first line holds for each channel: controller, motors and queue. F and z are mean thrust and
 mean body z of the step, u = s - v, n and l are those of the rope as a taut, massless rod,
-and positions by the trapezoid. A0, A1, B, kappa and drag are fitted to flights of the simulator
-under random commands by linear least squares;
+and positions by the trapezoid. A0, A1, B, c, kappa, drag, a and b are fitted to flights of the
+simulator under random commands by linear least squares;
 :mod:`visthrow.training.first_order.backward` has the derivatives."""
 
 from collections.abc import Callable
@@ -153,8 +153,8 @@ class FlightBatch:
 def fit(flights: FlightBatch) -> dict[str, Tensor]:
     """Fit to random flights:
 
-    ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), and ``force``, kappa and drag [N s/m],
-    shape (4,).
+    ``response``, rows A0, A1, B_0, ..., shape (2 + D, 4), ``force``, kappa and drag [N s/m], shape
+    (4,), and ``tension``, a and b.
     """
     env = flights.env
     period = env.cfg.sim.control_period
@@ -172,9 +172,12 @@ def fit(flights: FlightBatch) -> dict[str, Tensor]:
         flights.fly(act)
         parts.append(_regressors(flights, lags, period))
     rows = {name: torch.cat([part[name] for part in parts]).double() for name in parts[0]}
-    response = [_solve(rows["lagged"][..., c], rows["next"][:, c]) for c in range(4)]
+    response = [_solve(rows["lagged"][..., c], rows["next"][:, c])[:-1] for c in range(4)]
     force = _solve(rows["push"].flatten(0, 1), rows["momentum"].flatten())
-    found = {"response": torch.stack(response, -1), "force": force}
+    pulled = -(rows["along"] * (rows["push"] @ force)).sum(-1) / rows["mass"]
+    pulls = torch.stack([pulled, rows["swing"]], -1) * rows["reduced"][:, None]
+    tension = _solve(pulls, rows["tension"])
+    found = {"response": torch.stack(response, -1), "force": force, "tension": tension}
     return {name: value.float().contiguous() for name, value in found.items()}
 
 
@@ -186,23 +189,17 @@ def _solve(features: Tensor, target: Tensor) -> Tensor:
     return torch.linalg.solve(scaled.mT @ scaled + ridge, scaled.mT @ target) / scale
 
 
-def lagged_rows(response: Tensor, command: Tensor, lags: int) -> tuple[Tensor, Tensor]:
-    """Steps k, shape (K,), whose response follows from what is stated here, and what it is linear
-    in: y[k], y[k-1], u[k], ..., shape (K, E, 2 + lags, 4).
-    """
-    k = torch.arange(max(lags - 1, 1), len(response) - 1, device=response.device)
-    rows = [response[k], response[k - 1], *(command[k - j] for j in range(lags))]
-    return k, torch.stack(rows, -2)
-
-
 def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Tensor]:
-    """Rows of the two regressions from the whole steps of flights."""
+    """Rows of the three regressions from the whole steps of flights; those of the tension count
+    where the rope is taut.
+    """
     f = flights.x
     mass = flights.mass
     load_mass = flights.load_mass
+    k = torch.arange(max(lags - 1, 1), len(f["pos"]) - 1, device=mass.device)
     rot = ob.rotation_from_quat(f["quat"])
     y = f["response"]
-    k, lagged = lagged_rows(y, f["command"], lags)
+    lagged = [y[k], y[k - 1], *(f["command"][k - j] for j in range(lags)), torch.ones_like(y[k])]
     thrusts = y[k, :, :1] + y[k + 1, :, :1]
     axes = rot[k].unbind(-1)
     thrust_w = 0.25 * thrusts * (axes[2] + rot[k + 1, :, :, 2])
@@ -213,10 +210,23 @@ def _regressors(flights: FlightBatch, lags: int, period: float) -> dict[str, Ten
     load_force = load_mass[:, None] * (load_gain + gravity)
     gain = (f["vel"][k + 1] - vel) / period
     momentum = mass[:, None] * (gain + gravity) + load_force
+    arm = f["load_pos"] - f["pos"] - (rot @ flights.mount[:, :, None]).squeeze(-1)
+    arm, u = (0.5 * (path[k] + path[k + 1]) for path in (arm, f["load_vel"] - f["vel"]))
+    length = arm.norm(dim=-1)
+    n = arm / length[..., None]
+    tension = -(n * load_force).sum(-1)
+    taut = tension > TAUT * GRAVITY * load_mass
+    along = (n * u).sum(-1, keepdim=True) * n
+    swing = (u - along).square().sum(-1) / length
     rows = {
         "next": y[k + 1],
-        "lagged": lagged,
+        "lagged": torch.stack(lagged, -2),
         "push": torch.stack([thrust_w, *drag], -1),
         "momentum": momentum,
+        "along": n,
+        "mass": mass.expand_as(tension),
+        "reduced": taut * mass * load_mass / (mass + load_mass),
+        "swing": swing,
+        "tension": tension * taut,
     }
     return {name: row[k[:, None] < flights.steps] for name, row in rows.items()}
