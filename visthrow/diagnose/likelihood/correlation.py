@@ -22,6 +22,7 @@ from functools import partial
 from typing import TypeVar
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood import noise_levels as noise
 from visthrow.diagnose.likelihood.evidence import VERY_STRONG
@@ -64,7 +65,7 @@ class Correlation:
     order: int  # of the filter: 1 or 2
     scale: float = 1.0  # of the deviation that is stated
 
-    def at_lag(self, lag: np.ndarray) -> np.ndarray:
+    def at_lag(self, lag: ndarray) -> ndarray:
         """Correlation of samples ``lag`` [s] apart."""
         x = np.abs(lag) / self.time
         kernel = np.exp(-x)
@@ -74,7 +75,7 @@ class Correlation:
         return self.share * kernel + white * (lag == 0.0)
 
 
-def components(window: Window, channel: int) -> np.ndarray | None:
+def components(window: Window, channel: int) -> ndarray | None:
     """Rows of a channel's samples, shape (stamps, components), in the order of time; None where
     stamps differ by component.
     """
@@ -113,7 +114,7 @@ def _with_correlation(window: Window, correlations_of: Mapping[int, Correlation]
 
 
 def correlations(
-    windows: Sequence[Window], slabs: np.ndarray, channels: int
+    windows: Sequence[Window], slabs: ndarray, channels: int
 ) -> dict[int, Correlation]:
     """Estimate which channels' noise is correlated, and how.
 
@@ -140,7 +141,7 @@ def few_of(items: Sequence[T]) -> list[T]:
     return [items[i] for i in np.unique(places)]
 
 
-def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
+def _with_free_effects(window: Window, slabs: ndarray) -> Window:
     """A window in which every effect may have a size of its own."""
     states = np.hstack((window.nuisance, window.effects))
     deviations = np.append(window.nuisance_sd, slabs)
@@ -149,7 +150,7 @@ def _with_free_effects(window: Window, slabs: np.ndarray) -> Window:
 
 
 def _suspected(
-    windows: Sequence[Window], residuals: Sequence[np.ndarray], channel: int
+    windows: Sequence[Window], residuals: Sequence[ndarray], channel: int
 ) -> float | None:
     """Deviation of what is left of a channel, in that which is stated; None where its neighbours
     are hardly correlated.

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 from scipy.linalg import lapack
 from scipy.special import log_ndtr
 
@@ -59,12 +60,12 @@ CALIBRATION_QUANTILE = 0.995
 class Priors:
     """Prior beliefs about each effect, in floors; arrays of shape (K,)."""
 
-    floor: np.ndarray  # in the effects' units
-    slab: np.ndarray  # deviation of a named effect
+    floor: ndarray  # in the effects' units
+    slab: ndarray  # deviation of a named effect
     # of a named effect; another kind of block is there as a whole, but for its form
-    low: np.ndarray
-    high: np.ndarray
-    visible: np.ndarray  # bool: all its channels are there
+    low: ndarray
+    high: ndarray
+    visible: ndarray  # bool: all its channels are there
 
     @staticmethod
     def of(effects: Sequence[Effect], channels: Sequence[str]) -> "Priors":
@@ -92,14 +93,14 @@ class Priors:
         visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
         return Priors(floor, np.maximum(slab, 1.5), bounds[:, 0], bounds[:, 1], visible)
 
-    def deviation(self, active: Sequence[int]) -> np.ndarray:
+    def deviation(self, active: Sequence[int]) -> ndarray:
         """Prior deviations with these effects named, shape (K,)."""
         spread = np.full(len(self.floor), SPIKE)
         spread[list(active)] = self.slab[list(active)]
         return spread
 
 
-def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+def _log_mass(mean: ndarray, sd: ndarray, low: ndarray, high: ndarray) -> ndarray:
     """Logarithm of a normal distribution's mass within bounds, accurate far in the tails."""
     a = (low - mean) / sd
     b = (high - mean) / sd
@@ -114,8 +115,8 @@ def _log_mass(mean: np.ndarray, sd: np.ndarray, low: np.ndarray, high: np.ndarra
 class Posterior:
     """The statistics of flights, with what was believed of the effects before."""
 
-    information: np.ndarray  # I, shape (K, K)
-    score: np.ndarray  # s about theta = 0, shape (K,), or (n, K) for n draws at once
+    information: ndarray  # I, shape (K, K)
+    score: ndarray  # s about theta = 0, shape (K,), or (n, K) for n draws at once
     priors: Priors
 
     @staticmethod
@@ -124,7 +125,7 @@ class Posterior:
         information = statistics.information.sum(0)
         return Posterior(information, statistics.absolute.sum(0), priors)
 
-    def _factor(self, deviation: np.ndarray) -> np.ndarray:
+    def _factor(self, deviation: ndarray) -> ndarray:
         """Lower Cholesky factor of 1 + D^1/2 I D^1/2; anything above the diagonal.
 
         Raises DiagnoseError: not positive definite, not finite.
@@ -140,14 +141,14 @@ class Posterior:
             )
         return factor
 
-    def covariance(self, active: Sequence[int]) -> np.ndarray:
+    def covariance(self, active: Sequence[int]) -> ndarray:
         """Posterior covariance (I + D^-1)^-1 with these effects named, shape (K, K)."""
         deviation = self.priors.deviation(active)
         factor = self._factor(deviation)
         inverse = lapack.dpotrs(factor, np.eye(len(deviation)), lower=1)[0]
         return inverse * np.outer(deviation, deviation)
 
-    def mean(self, active: Sequence[int]) -> np.ndarray:
+    def mean(self, active: Sequence[int]) -> ndarray:
         """Return the most probable size of every effect, those not named below their floors; shape
         (K,).
         """
@@ -168,14 +169,14 @@ class Posterior:
             value += self._log_within(columns, slab * mean[columns], spread).sum()
         return float(value)
 
-    def _log_within(self, sets: Sequence, mean: np.ndarray, sd: np.ndarray) -> np.ndarray:
+    def _log_within(self, sets: Sequence, mean: ndarray, sd: ndarray) -> ndarray:
         """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
         priors = self.priors
         bounds = priors.low[sets], priors.high[sets]
         slab = priors.slab[sets]
         return _log_mass(mean, sd, *bounds) - _log_mass(0.0 * slab, slab, *bounds)
 
-    def additions(self, active: Sequence[int]) -> np.ndarray:
+    def additions(self, active: Sequence[int]) -> ndarray:
         """Gain of log Z by naming one more effect, for each effect; -inf for those named already or
         not visible.
 
@@ -183,7 +184,7 @@ class Posterior:
         factorisation. Returns nats, of the score's shape."""
         return self._naming(active, np.arange(len(self.priors.floor))[:, None])
 
-    def pair_additions(self, active: Sequence[int]) -> np.ndarray:
+    def pair_additions(self, active: Sequence[int]) -> ndarray:
         """Return the gain of log Z by naming each pair of effects: two that cancel show no gain
         alone.
 
@@ -195,7 +196,7 @@ class Posterior:
         gain[rows, columns] = self._naming(active, np.stack((rows, columns), axis=1))
         return np.maximum(gain, gain.T)
 
-    def _naming(self, active: Sequence[int], sets: np.ndarray) -> np.ndarray:
+    def _naming(self, active: Sequence[int], sets: ndarray) -> ndarray:
         """Gain of log Z by naming several effects more, for P sets of them; ``sets``: their
         numbers, shape (P, m).
         """
@@ -219,7 +220,7 @@ class Posterior:
         out[list(active)] = True
         return np.where(out[sets].any(1), -np.inf, gain)
 
-    def estimate(self, active: Sequence[int]) -> np.ndarray:
+    def estimate(self, active: Sequence[int]) -> ndarray:
         """Most probable sizes of the named effects within their bounds, all others at 0; in floors,
         shape (K,).
         """
@@ -250,7 +251,7 @@ class Posterior:
         variance = np.average(variances + (means - mean) ** 2, weights=weights)
         return float(mean), float(np.sqrt(variance))
 
-    def mean_sizes(self, active: Sequence[int], sets: Sets) -> np.ndarray:
+    def mean_sizes(self, active: Sequence[int], sets: Sets) -> ndarray:
         """Return the means of some effects as :meth:`averaged`, within their bounds, and 0 for all
         others; in floors, shape (K,).
         """
@@ -261,7 +262,7 @@ class Posterior:
             theta[j] = np.clip(mean, self.priors.low[j], self.priors.high[j])
         return theta
 
-    def certainty(self, theta: np.ndarray, active: Sequence[int]) -> np.ndarray:
+    def certainty(self, theta: ndarray, active: Sequence[int]) -> ndarray:
         """Sizes of named effects in the half widths of 95 % intervals to which half a floor is
         added, in the order of ``active``.
 
@@ -284,7 +285,7 @@ class Posterior:
         return remaining
 
 
-def null_draws(information: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+def null_draws(information: ndarray, draws: int, rng: np.random.Generator) -> ndarray:
     """Scores of worlds in which nothing is wrong but what may go unnamed, every effect drawn from
     its spike, shape (draws, K).
     """

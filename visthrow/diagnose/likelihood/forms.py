@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.model_interface import Window
@@ -56,18 +57,18 @@ class Errors:
     (F, C, H) each.
     """
 
-    square: np.ndarray  # of what is left, in sigmas
-    count: np.ndarray  # of samples
+    square: ndarray  # of what is left, in sigmas
+    count: ndarray  # of samples
     # squares expected of sensor noise and of the initial state's uncertainty alone; of a window in
     # which that is far more than is left, as of a state that the head hardly tells, what is left
-    floor: np.ndarray
+    floor: ndarray
 
 
 def errors(
     windows: Sequence[Window],
     groups: Sequence[int],
     noise: Noise,
-    residuals: Sequence[np.ndarray],
+    residuals: Sequence[ndarray],
     channels: int,
 ) -> Errors:
     """Predict each window's end from its head and add up what is left.
@@ -93,9 +94,7 @@ def errors(
     return Errors(*sums)
 
 
-def predicted(
-    window: Window, noise: Noise, residual: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def predicted(window: Window, noise: Noise, residual: ndarray) -> tuple[ndarray, ndarray, ndarray]:
     """Predict the end of a window from its head.
 
     Returns what is left after the fit of the initial state in sigmas, of the residual's shape, the
@@ -131,7 +130,7 @@ def predicted(
     return innovation, expected, np.where(head, -1, nearest)
 
 
-def _root(window: Window, scale: np.ndarray) -> np.ndarray:
+def _root(window: Window, scale: ndarray) -> ndarray:
     """Square root of the covariance of a window's noise in sigmas, shape (N, N)."""
     root = np.diag(scale)
     for rows, factor in window.correlated:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from numpy import ndarray
 from scipy.interpolate import CubicSpline
 
 from sim.effects.effect import Effect
@@ -17,7 +18,7 @@ FINE = 8  # points between two knots at which a curve is looked at
 
 
 @lru_cache(maxsize=64)
-def between(count: int) -> np.ndarray:
+def between(count: int) -> ndarray:
     """Coefficients of hats at the knots that come nearest to the smooth curve through values at the
     knots, shape (k, k).
 
@@ -31,7 +32,7 @@ def between(count: int) -> np.ndarray:
     return np.linalg.lstsq(hats, curve, rcond=None)[0]
 
 
-def through_latents(window: Window, quantities: KnotValues, block: str) -> np.ndarray:
+def through_latents(window: Window, quantities: KnotValues, block: str) -> ndarray:
     """Latent-force coefficients that what a block exerts at the knots stands for.
 
     Returns shape (L, 3 k): by component i at knot j in column 3 j + i; of other latent blocks 0.
@@ -46,7 +47,7 @@ def through_latents(window: Window, quantities: KnotValues, block: str) -> np.nd
     return total
 
 
-def _hats(window: Window, time: np.ndarray, block: str) -> np.ndarray:
+def _hats(window: Window, time: ndarray, block: str) -> ndarray:
     """Return the interpolation weights of one latent block."""
     out = np.zeros((len(window.latent_block), len(time), 3))
     rows = np.flatnonzero(window.latent_block == LATENT_BLOCKS.index(block))
@@ -66,7 +67,7 @@ class TermEffect(Effect):
         """Accept any bounds: a coefficient has none."""
 
 
-def forces(window: Window, effects: Sequence[TermEffect]) -> np.ndarray:
+def forces(window: Window, effects: Sequence[TermEffect]) -> ndarray:
     """Latent forces at a window's knots that a coefficient of 1 of each term stands for, shape (L,
     T).
     """

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
+from numpy import ndarray
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
@@ -55,14 +56,14 @@ class Gram:
 
     flight: int
     phase: str
-    count: np.ndarray  # samples of each of the model's C channels, shape (C,)
-    inner: np.ndarray  # Z' Z / sigma^2, shape (C, P, P)
-    cross: np.ndarray  # Z' r / sigma^2, shape (C, P)
-    square: np.ndarray  # r' r / sigma^2, shape (C,)
+    count: ndarray  # samples of each of the model's C channels, shape (C,)
+    inner: ndarray  # Z' Z / sigma^2, shape (C, P, P)
+    cross: ndarray  # Z' r / sigma^2, shape (C, P)
+    square: ndarray  # r' r / sigma^2, shape (C,)
     nuisances: int
-    latent_block: np.ndarray  # shape (L,)
+    latent_block: ndarray  # shape (L,)
     # what stands between unit latents and knots: G_used = G @ factor, shape (L, L)
-    factor: np.ndarray
+    factor: ndarray
     visibility: Mapping[
         int, float
     ]  # latent block -> median inner product of its columns with themselves
@@ -78,11 +79,11 @@ class Gram:
 class Noise:
     """Levels of sensor noise and latent forces."""
 
-    scale: np.ndarray  # of each channel's sigma, shape (C,)
+    scale: ndarray  # of each channel's sigma, shape (C,)
     latent_sd: Mapping[tuple[int, str], float]  # (block, phase) -> deviation [N, N m, N]
     correlation_time: float  # of the latent forces [s]
     # latent deviation of each window and block in its phase's, shape (windows, 3)
-    share: np.ndarray
+    share: ndarray
 
     @property
     def log_prior(self) -> float:
@@ -100,25 +101,25 @@ class Statistics:
     ``theta``.
     """
 
-    flights: np.ndarray  # their numbers, shape (F,)
-    information: np.ndarray  # S' V^-1 S, shape (F, K, K)
-    score: np.ndarray  # S' V^-1 r, shape (F, K)
-    square: np.ndarray  # r' V^-1 r + log det V, shape (F,)
-    samples: np.ndarray  # shape (F,)
-    theta: np.ndarray  # shape (K,)
+    flights: ndarray  # their numbers, shape (F,)
+    information: ndarray  # S' V^-1 S, shape (F, K, K)
+    score: ndarray  # S' V^-1 r, shape (F, K)
+    square: ndarray  # r' V^-1 r + log det V, shape (F,)
+    samples: ndarray  # shape (F,)
+    theta: ndarray  # shape (K,)
 
     @cached_property
-    def absolute(self) -> np.ndarray:
+    def absolute(self) -> ndarray:
         """Scores about theta = 0, shape (F, K)."""
         return self.score + self.information @ self.theta
 
     @cached_property
-    def absolute_square(self) -> np.ndarray:
+    def absolute_square(self) -> ndarray:
         """``square`` of the residuals extrapolated to theta = 0, shape (F,)."""
         curved = self.information @ self.theta
         return self.square + 2.0 * self.score @ self.theta + curved @ self.theta
 
-    def only(self, keep: np.ndarray) -> "Statistics":
+    def only(self, keep: ndarray) -> "Statistics":
         """Return the statistics of some flights; ``keep`` is a mask or indices into ``flights``."""
         return replace(
             self,
@@ -130,14 +131,14 @@ class Statistics:
         )
 
 
-def columns(window: Window, floors: np.ndarray) -> np.ndarray:
+def columns(window: Window, floors: ndarray) -> ndarray:
     """The columns [X, G, S] of a window as :class:`Gram` scales them, shape (N, P)."""
     latent = window.latent if window.latent.size else np.zeros((len(window.residual), 0))
     states = window.nuisance * window.nuisance_sd
     return np.hstack((states, latent, window.effects * floors))
 
 
-def gram_of(window: Window, floors: np.ndarray, channels: int) -> Gram:
+def gram_of(window: Window, floors: ndarray, channels: int) -> Gram:
     """Reduce a window to its inner products.
 
     ``window``: with finite residuals and derivatives; ``floors``: of the effects, shape (K,);
@@ -162,7 +163,7 @@ def without_effects(gram: Gram) -> Gram:
     return replace(gram, inner=inner, cross=gram.cross[:, :size])
 
 
-def whitened(window: Window, values: np.ndarray) -> np.ndarray:
+def whitened(window: Window, values: ndarray) -> ndarray:
     """Columns in sigmas, shape (N, P), turned into some whose noise is white, in place."""
     for rows, factor in window.correlated:
         group = values[rows].reshape(len(rows), -1)
@@ -171,7 +172,7 @@ def whitened(window: Window, values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
+def _inner_products(window: Window, z: ndarray, channels: int) -> Gram:
     z = whitened(window, z / window.sigma[:, None])
     r = whitened(window, (window.residual / window.sigma)[:, None])[:, 0]
     size = z.shape[1]
@@ -206,7 +207,7 @@ def _inner_products(window: Window, z: np.ndarray, channels: int) -> Gram:
     )
 
 
-def _information_by_block(inner: np.ndarray, begin: int, blocks: np.ndarray) -> dict[int, float]:
+def _information_by_block(inner: ndarray, begin: int, blocks: ndarray) -> dict[int, float]:
     """See :class:`Gram`, with ``begin`` the first latent column."""
     squares = np.diagonal(inner, axis1=1, axis2=2).sum(0)[begin : begin + len(blocks)]
     return {
@@ -273,7 +274,7 @@ def correlated(gram: Gram, window: Window, time: float) -> Gram:
     return replace(gram, inner=inner, cross=cross, factor=whole, visibility=visibility)
 
 
-def knot_factor(window: Window, time: float) -> np.ndarray:
+def knot_factor(window: Window, time: float) -> ndarray:
     """Cholesky factor of the latents of one group of a window, which is that of all others; see
     :func:`correlated`.
     """
@@ -286,7 +287,7 @@ def knot_factor(window: Window, time: float) -> np.ndarray:
     return np.linalg.cholesky(alike + 1e-9 * np.eye(knots))
 
 
-def _knots(group: np.ndarray, time: np.ndarray) -> int:
+def _knots(group: ndarray, time: ndarray) -> int:
     """Knots of groups that follow one another with the same ones each; where they do not, all
     latents are one.
     """
@@ -299,7 +300,7 @@ def _knots(group: np.ndarray, time: np.ndarray) -> int:
     return count if alike else len(group)
 
 
-def grams_of(windows: Sequence[Window], floors: np.ndarray, channels: int) -> list[Gram]:
+def grams_of(windows: Sequence[Window], floors: ndarray, channels: int) -> list[Gram]:
     """Reduce windows to their inner products, see :func:`gram_of`."""
     return parallel_map(partial(gram_of, floors=floors, channels=channels), windows)
 
@@ -312,14 +313,14 @@ def correlated_of(grams: Sequence[Gram], windows: Sequence[Window], time: float)
 def with_residuals(
     grams: Sequence[Gram],
     windows: Sequence[Window],
-    floors: np.ndarray,
-    residuals: Sequence[np.ndarray],
+    floors: ndarray,
+    residuals: Sequence[ndarray],
 ) -> list[Gram]:
     """Return Gram matrices with other residuals, see :func:`with_residual`."""
     return parallel_map(partial(with_residual, floors=floors), grams, windows, residuals)
 
 
-def with_residual(gram: Gram, window: Window, residual: np.ndarray, floors: np.ndarray) -> Gram:
+def with_residual(gram: Gram, window: Window, residual: ndarray, floors: ndarray) -> Gram:
     """Return a Gram matrix of the same derivatives with the residuals of another size of the
     effects.
     """
@@ -337,7 +338,7 @@ def with_residual(gram: Gram, window: Window, residual: np.ndarray, floors: np.n
     return replace(gram, cross=np.hstack((by_state, by_latent, by_effect)), square=square)
 
 
-def _unwhitened(window: Window, white: np.ndarray) -> np.ndarray:
+def _unwhitened(window: Window, white: ndarray) -> ndarray:
     """Transpose of :func:`whitened`, of one column, shape (N,)."""
     out = white.copy()
     for rows, factor in window.correlated:
@@ -345,7 +346,7 @@ def _unwhitened(window: Window, white: np.ndarray) -> np.ndarray:
     return out
 
 
-def residual_after_fit(window: Window, fit: np.ndarray) -> np.ndarray:
+def residual_after_fit(window: Window, fit: ndarray) -> ndarray:
     """Return the residual after a fit of initial state in prior deviations and latents at the
     knots, shape (D + L,); shape (N,).
     """
@@ -360,8 +361,8 @@ def residual_after_fit(window: Window, fit: np.ndarray) -> np.ndarray:
 class WindowStatistics:
     """One window's share of :class:`Statistics`."""
 
-    information: np.ndarray  # shape (K, K)
-    score: np.ndarray  # shape (K,)
+    information: ndarray  # shape (K, K)
+    score: ndarray  # shape (K,)
     square: float
 
 
@@ -369,14 +370,12 @@ class WindowStatistics:
 class LatentStatistics(WindowStatistics):
     """A window's statistics, with those of its latent forces as if they were effects."""
 
-    latent_information: np.ndarray  # G' V^-1 G, shape (L, L)
-    latent_score: np.ndarray  # G' V^-1 r, shape (L,)
-    latent_effects: np.ndarray  # G' V^-1 S, shape (L, K)
+    latent_information: ndarray  # G' V^-1 G, shape (L, L)
+    latent_score: ndarray  # G' V^-1 r, shape (L,)
+    latent_effects: ndarray  # G' V^-1 S, shape (L, K)
 
 
-def gather(
-    grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: np.ndarray
-) -> Statistics:
+def gather(grams: Sequence[Gram], parts: Sequence[WindowStatistics], theta: ndarray) -> Statistics:
     """Add up windows by flight.
 
     ``theta``: linearisation point in floors, shape (K,). Raises DiagnoseError: information came out
@@ -415,7 +414,7 @@ def rescored(
     statistics: Statistics,
     grams: Sequence[Gram],
     parts: Sequence[WindowStatistics],
-    theta: np.ndarray,
+    theta: ndarray,
 ) -> Statistics:
     """Return statistics of windows with other residuals: their information stays.
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
+from numpy import ndarray
 from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csr_array
 
@@ -152,9 +153,9 @@ class _Layout:
     """
 
     keys: tuple[tuple[int, str], ...]  # (block, phase)
-    pairs: np.ndarray  # (window, block) of each share, shape (S, 2)
-    phases: np.ndarray  # of each share, the number of its phase's level, shape (S,)
-    measured: np.ndarray  # channels with samples
+    pairs: ndarray  # (window, block) of each share, shape (S, 2)
+    phases: ndarray  # of each share, the number of its phase's level, shape (S,)
+    measured: ndarray  # channels with samples
     # 1 where a parameter moves a window's own level of a block, or scale of a channel; shape
     # (P, W (B + C))
     moves: csr_array
@@ -195,18 +196,18 @@ class _Layout:
         return slice(first, first + len(self.pairs))
 
     @property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
+    def places(self) -> tuple[ndarray, ndarray]:
         """Return window and block of each share."""
         return tuple(self.pairs.T)
 
-    def pack(self, noise: Noise) -> np.ndarray:
+    def pack(self, noise: Noise) -> ndarray:
         """Logarithms of all levels, shape (P,)."""
         levels = [noise.latent_sd[key] for key in self.keys]
         return np.log(
             np.concatenate((levels, noise.share[self.places], noise.scale[self.measured]))
         )
 
-    def unpack(self, x: np.ndarray, noise: Noise) -> Noise:
+    def unpack(self, x: ndarray, noise: Noise) -> Noise:
         """The levels; ``noise`` tells all others."""
         sizes = np.exp(x)
         shares = self.shares
@@ -217,7 +218,7 @@ class _Layout:
         levels = dict(zip(self.keys, sizes.tolist()))
         return replace(noise, scale=scale, share=share, latent_sd=levels)
 
-    def limits(self, grams: Sequence[Gram]) -> tuple[np.ndarray, np.ndarray]:
+    def limits(self, grams: Sequence[Gram]) -> tuple[ndarray, ndarray]:
         """Lowest and highest values of the parameters."""
         guess = _first_guess(grams).latent_sd
         visible = np.log([guess[key] for key in self.keys])
@@ -242,7 +243,7 @@ def maximised(
     low, high = layout.limits(grams)
     x = np.clip(layout.pack(noise), low, high)
 
-    def look(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    def look(x: ndarray) -> tuple[float, ndarray, ndarray]:
         return _likelihood(stack, layout.unpack(x, noise), layout)
 
     value, slope, curvature = look(x)
@@ -266,12 +267,12 @@ def maximised(
 
 def _scoring_step(
     layout: _Layout,
-    x: np.ndarray,
-    slope: np.ndarray,
-    curvature: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
-) -> tuple[np.ndarray, float]:
+    x: ndarray,
+    slope: ndarray,
+    curvature: ndarray,
+    low: ndarray,
+    high: ndarray,
+) -> tuple[ndarray, float]:
     """Fisher's step of the variances within the limits, as logarithms of levels, and the nats that
     it promises.
 
@@ -302,14 +303,12 @@ def _scoring_step(
     return np.clip(x + turned, low, high) - x, promised
 
 
-def _logarithms(step: np.ndarray) -> np.ndarray:
+def _logarithms(step: ndarray) -> ndarray:
     """Changes of levels' logarithms by steps of their variances, which are linear in small ones."""
     return 0.5 * np.log1p(np.maximum(2.0 * step, np.expm1(-2.0 * LONGEST_FALL)))
 
 
-def _likelihood(
-    stack: Stack, noise: Noise, layout: _Layout
-) -> tuple[float, np.ndarray, np.ndarray]:
+def _likelihood(stack: Stack, noise: Noise, layout: _Layout) -> tuple[float, ndarray, ndarray]:
     """Log-likelihood with the prior of the windows' shares, its gradient by the parameters, and its
     expected curvature.
     """
@@ -355,7 +354,7 @@ def without_outliers(
     return [_mended(window, sigma) for window, sigma in zip(windows, sigmas)]
 
 
-def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[np.ndarray]:
+def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) -> list[ndarray]:
     """Initial states in prior deviations and latents at the knots that explain most, with wide
     priors of the latents.
     """
@@ -374,13 +373,13 @@ def widely_fitted(windows: Sequence[Window], bare: Sequence[Gram], device: str) 
     return fits
 
 
-def _outlier_distances(window: Window, residual: np.ndarray) -> np.ndarray:
+def _outlier_distances(window: Window, residual: ndarray) -> ndarray:
     """Return how far samples lie outside, in the distance at which they are far, shape (N,)."""
     normal = np.abs(residual) / window.sigma
     return normal / (HUBER * np.maximum(1.0, MAD_TO_SIGMA * np.median(normal)))
 
 
-def _mended(window: Window, sigma: np.ndarray) -> Window:
+def _mended(window: Window, sigma: ndarray) -> Window:
     """The window with other sigmas, where these differ in a few samples."""
     share = (sigma > window.sigma).mean()
     if 0.0 < share <= HUBER_SHARE:

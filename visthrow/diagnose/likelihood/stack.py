@@ -10,6 +10,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from numpy import ndarray
 from scipy.linalg import lapack
 
 from visthrow.common.errors import DiagnoseError
@@ -40,7 +41,7 @@ BLOCKS = len(LATENT_BLOCKS)
 class _Batch:
     """W windows, of n columns [X, G] at most; padded columns are 0."""
 
-    windows: np.ndarray  # rows of the noise's shares, shape (W,)
+    windows: ndarray  # rows of the noise's shares, shape (W,)
     grams: list[Gram]
     hidden: torch.Tensor  # inner products of the columns, shape (W, C, n, n)
     cross: torch.Tensor  # shape (W, C, n)
@@ -111,7 +112,7 @@ class Stack:
         parts = [[grams[w] for w in members] for members in self._order]
         self._batches = parallel_map(self._padded, parts, [rows[m] for m in self._order])
 
-    def _padded(self, grams: list[Gram], windows: np.ndarray) -> _Batch:
+    def _padded(self, grams: list[Gram], windows: ndarray) -> _Batch:
         sizes = [gram.nuisances + gram.latents for gram in grams]
         count = len(grams)
         channels = len(grams[0].count)
@@ -133,7 +134,7 @@ class Stack:
         hidden = side_by_side(parts, (channels, n, n), self.device)
         return _Batch(windows, grams, hidden, *tensors)
 
-    def values(self, noise: Noise) -> np.ndarray:
+    def values(self, noise: Noise) -> ndarray:
         """Log-likelihood of each window's residuals, but for the powers of 2 pi, shape (W,).
 
         Raises DiagnoseError: the normal equations are not positive definite, which only broken
@@ -146,7 +147,7 @@ class Stack:
         parts = [values for (values,) in self._of_batches(solve)]
         return np.array(_by_window(self._order, parts))
 
-    def fitted(self, noise: Noise) -> list[np.ndarray]:
+    def fitted(self, noise: Noise) -> list[ndarray]:
         """Most probable initial state and unit latent forces of each window, shape (D + L,).
 
         Raises DiagnoseError: as :meth:`values`.
@@ -160,7 +161,7 @@ class Stack:
         parts = [rows for (rows,) in self._of_batches(fit)]
         return [row[:size] for row, size in zip(_by_window(self._order, parts), self._sizes)]
 
-    def look(self, noise: Noise) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def look(self, noise: Noise) -> tuple[ndarray, ndarray, ndarray]:
         """Log-likelihood, its gradient and expected curvature by the logarithms of the windows' own
         levels.
 
@@ -175,7 +176,7 @@ class Stack:
         parts = parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches)
         return Integrals(self._order, parts)
 
-    def _of_batches(self, function) -> list[tuple[np.ndarray, ...]]:
+    def _of_batches(self, function) -> list[tuple[ndarray, ...]]:
         return parallel_map(lambda batch: tuple(all_to_host(function(batch))), self._batches)
 
 
@@ -187,7 +188,7 @@ def _by_window(order: Sequence[Sequence[int]], parts: Sequence[Sequence[T]]) -> 
     return [values[w] for w in sorted(values)]
 
 
-def _levels(batch: _Batch, noise: Noise) -> np.ndarray:
+def _levels(batch: _Batch, noise: Noise) -> ndarray:
     """Deviation of each window's latent forces by block, shape (W, B)."""
     levels = np.zeros((len(batch.grams), BLOCKS))
     for row, gram in zip(levels, batch.grams):
@@ -297,12 +298,12 @@ def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, to
 class _Integrated:
     """The remainder of the last J columns of a batch."""
 
-    own_columns: list[np.ndarray]  # which of the J columns are a window's own
+    own_columns: list[ndarray]  # which of the J columns are a window's own
     shape: _Shape
-    weight: np.ndarray  # of the channels, shape (C,)
+    weight: ndarray  # of the channels, shape (C,)
     # L^-1 P^1/2 U' W times the columns, with L of the posterior's precision, shape (W, n, J)
     half: torch.Tensor
-    information: list[np.ndarray]  # of each window
+    information: list[ndarray]  # of each window
 
     def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
@@ -350,7 +351,7 @@ class Integrals:
             parts.append(part.shares([grams[w] for w in members]))
         return _by_window(self._order, parts)
 
-    def statistics(self, grams: Sequence[Gram], theta: np.ndarray) -> Statistics:
+    def statistics(self, grams: Sequence[Gram], theta: ndarray) -> Statistics:
         """Return the statistics of flights with the residuals of grams of the same derivatives.
 
         ``theta``: where these residuals are, in floors, shape (K,). Raises DiagnoseError: as
@@ -369,7 +370,7 @@ def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
     inner = [gram.inner for gram in batch.grams]
     width = len(batch.grams[0].inner[0]) - sizes[0]
 
-    def weighed(parts: Sequence[np.ndarray], height: int) -> torch.Tensor:
+    def weighed(parts: Sequence[ndarray], height: int) -> torch.Tensor:
         device = str(batch.square.device)
         return _weighed(shape.weight, side_by_side(parts, (channels, height, width), device))
 

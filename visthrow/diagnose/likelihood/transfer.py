@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.threads import parallel_map
 
 
-def to_host(tensor: torch.Tensor) -> np.ndarray:
+def to_host(tensor: torch.Tensor) -> ndarray:
     """A tensor's values."""
     if not tensor.is_cuda:
         return tensor.numpy()
@@ -18,7 +19,7 @@ def to_host(tensor: torch.Tensor) -> np.ndarray:
     return pinned.copy_(tensor).numpy()
 
 
-def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
+def all_to_host(tensors: Sequence[torch.Tensor]) -> list[ndarray]:
     """Values of several tensors of one kind, from a GPU in one piece: each wait for one gives
     Python away to other threads.
     """
@@ -30,14 +31,14 @@ def all_to_host(tensors: Sequence[torch.Tensor]) -> list[np.ndarray]:
     return [part.reshape(tensor.shape) for part, tensor in zip(parts, tensors)]
 
 
-def side_by_side(parts: Sequence[np.ndarray], shape: tuple[int, ...], device: str) -> torch.Tensor:
+def side_by_side(parts: Sequence[ndarray], shape: tuple[int, ...], device: str) -> torch.Tensor:
     """Arrays one beside the other on a device, each padded with zeros to one shape; shape (arrays,
     *shape).
     """
     pinned = device.startswith("cuda")
     out = torch.zeros((len(parts), *shape), dtype=torch.float64, pin_memory=pinned)
 
-    def lay(row: np.ndarray, part: np.ndarray) -> None:
+    def lay(row: ndarray, part: ndarray) -> None:
         row[tuple(map(slice, part.shape))] = part
 
     each = map if device == "cpu" else parallel_map  # a CPU's batches are laid on all cores already

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
 
 from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
@@ -93,7 +94,7 @@ def random_shares(
     return offered + _events(effects, priors, statistics.flights, flown)
 
 
-def _informative(flown: np.ndarray, days: Sequence[int]) -> dict[str, np.ndarray]:
+def _informative(flown: ndarray, days: Sequence[int]) -> dict[str, ndarray]:
     """Return which flights, and which days where there are several, say something of each effect.
 
     ``flown``: of each flight, shape (F, K), bool; ``days``: of each flight, or none."""
@@ -134,7 +135,7 @@ def as_random(effect: Effect) -> RandomEffect:
 
 
 def _events(
-    effects: Sequence[Effect], priors: Priors, flights: np.ndarray, flown: np.ndarray
+    effects: Sequence[Effect], priors: Priors, flights: ndarray, flown: ndarray
 ) -> list[Candidate]:
     """Return each effect in each flight alone."""
     penalty = float(np.log(max(flown.size, 1)))

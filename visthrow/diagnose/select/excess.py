@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import NORMAL_95
 from visthrow.diagnose.likelihood.forms import unit_of
@@ -138,7 +139,7 @@ def acts_on(point: Point, effects: Sequence[int], *, free_effects: Sequence[int]
     return blocks
 
 
-def _explained(inner: np.ndarray, basis: Sequence[int], columns: np.ndarray) -> np.ndarray:
+def _explained(inner: ndarray, basis: Sequence[int], columns: ndarray) -> ndarray:
     """Parts of columns' squares that other columns explain.
 
     ``inner``: inner products of all, shape (P, P); ``basis``: numbers of the others.

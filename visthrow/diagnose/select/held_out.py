@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy import ndarray
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
@@ -55,8 +56,8 @@ class Crossed:
     groups: list[int]  # of each window
     left_out: str  # what the groups are
     statistics: Statistics  # by group
-    folds: list[np.ndarray]  # rows of the statistics that are left out together
-    trained: np.ndarray  # sizes in floors that the others gave, shape (F, K)
+    folds: list[ndarray]  # rows of the statistics that are left out together
+    trained: ndarray  # sizes in floors that the others gave, shape (F, K)
     named: Mapping[str, float]  # effect -> share of the folds that named it
 
 
@@ -140,7 +141,7 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
 
 
 def borne_out(
-    statistics: Statistics, trained: np.ndarray, theta: np.ndarray
+    statistics: Statistics, trained: ndarray, theta: ndarray
 ) -> tuple[float, float, float]:
     """Return the part of what names promise on held-out flights that they bring there, with a 95 %
     interval.
@@ -169,7 +170,7 @@ def borne_out(
 
 
 def channel_gains(
-    work: Work, groups: Sequence[int], trained: np.ndarray, box: np.ndarray | None = None
+    work: Work, groups: Sequence[int], trained: ndarray, box: ndarray | None = None
 ) -> tuple[ChannelGain, ...]:
     """Prediction errors on held-out flights of every measured channel.
 
@@ -196,7 +197,7 @@ def channel_gains(
     return tuple(gains)
 
 
-def _channel(name: str, sigma: float, count: np.ndarray, squares: np.ndarray) -> ChannelGain:
+def _channel(name: str, sigma: float, count: ndarray, squares: ndarray) -> ChannelGain:
     """Return the gain of a channel; ``count``: samples by horizon, shape (H,); ``squares``: sums
     before, after, of noise alone and of the black box by flight and horizon, shape (4, F, H).
     """
@@ -212,7 +213,7 @@ def _channel(name: str, sigma: float, count: np.ndarray, squares: np.ndarray) ->
     return ChannelGain(name, unit_of(name), *errors_of, value, low, high, tuple(map(tuple, rows)))
 
 
-def jackknifed(before: np.ndarray, after: np.ndarray) -> tuple[float, float, float]:
+def jackknifed(before: ndarray, after: ndarray) -> tuple[float, float, float]:
     """Gain 1 - sqrt(sum after / sum before) with a 95 % interval by the jackknife over groups.
 
     ``before``: sums of squares by group, shape (F,).

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy import ndarray
 from scipy.stats import beta
 
 from visthrow.config.effects import random_effects
@@ -42,15 +43,15 @@ class CommandStatistics:
     have columns of 0.
     """
 
-    information: np.ndarray  # shape (W, K + T, K + T)
-    score: np.ndarray  # shape (W, K + T)
+    information: ndarray  # shape (W, K + T, K + T)
+    score: ndarray  # shape (W, K + T)
     commands: int  # T
 
     @staticmethod
     def of(
         point: Point,
         windows: Sequence[Window],
-        columns: Sequence[np.ndarray],
+        columns: Sequence[ndarray],
         rows: Sequence[int],
     ) -> "CommandStatistics":
         """Ask windows under a point's noise levels.
@@ -78,7 +79,7 @@ class CommandStatistics:
         score += information[:, :, : len(point.theta)] @ point.theta
         return CommandStatistics(information, score, longest)
 
-    def gain(self, shares: np.ndarray, priors: Priors, active: Sequence[int]) -> np.ndarray:
+    def gain(self, shares: ndarray, priors: Priors, active: Sequence[int]) -> ndarray:
         """Nats of these shares of dropped commands against none, beside a set of effects."""
         evidence = [self._evidence(p, priors, active) for p in [0.0, *shares.tolist()]]
         return np.array(evidence[1:]) - evidence[0]

@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
@@ -107,8 +108,8 @@ class Linear:
         chosen: Names,
         fixed: Mapping[Candidate, float],
         c: Candidate,
-        sizes: np.ndarray = REACH,
-    ) -> tuple[np.ndarray, np.ndarray]:
+        sizes: ndarray = REACH,
+    ) -> tuple[ndarray, ndarray]:
         """Return deviations of a random share that are not negligible, in its prior's, and the nats
         by which log Z is higher with each than without the share.
         """
@@ -183,7 +184,7 @@ class Linear:
         close = [c for c, nats in promised.items() if nats > self._step - STRONG]
         return sorted(close, key=promised.get, reverse=True)[:RANDOM_TRIED]
 
-    def _promises(self, group: str, members: Sequence[Candidate], theta: np.ndarray) -> list[float]:
+    def _promises(self, group: str, members: Sequence[Candidate], theta: ndarray) -> list[float]:
         """Return the nats that random shares of one group promise beside these sizes [floors]."""
         flights = by_day(self.statistics, self.days) if group == DAY else self.statistics
         precision = np.maximum(np.diagonal(flights.information, axis1=1, axis2=2), 1e-12)

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.likelihood import noise_levels as levels
@@ -85,7 +86,7 @@ class Problem:
         return (*self.model.effects, *self.terms)
 
     @property
-    def switches(self) -> np.ndarray:
+    def switches(self) -> ndarray:
         """Which effects are another kind of block, shape (K,), bool."""
         return np.array([e.switch for e in self.effects], dtype=bool)
 
@@ -93,7 +94,7 @@ class Problem:
         """Return the problem of some of its windows."""
         return replace(self, kept=tuple(self.kept[w] for w in windows))
 
-    def flown(self, theta: np.ndarray) -> Model | None:
+    def flown(self, theta: ndarray) -> Model | None:
         """The model with the terms at their sizes as its laws; None where their columns do.
         ``theta`` is in floors.
         """
@@ -105,20 +106,20 @@ class Problem:
                 laws.append(effect.term.law(float(size * effect.floor)))
         return self.model.with_laws(laws)
 
-    def sizes(self, theta: np.ndarray) -> dict[str, float]:
+    def sizes(self, theta: ndarray) -> dict[str, float]:
         """Sizes of the model's effects in their units, of those that are not 0; ``theta`` is in
         floors.
         """
         return dict(self.model.possible(self._within_bounds(theta)))
 
-    def _within_bounds(self, theta: np.ndarray) -> dict[str, float]:
+    def _within_bounds(self, theta: ndarray) -> dict[str, float]:
         sizes = {}
         for effect, size in zip(self.model.effects, theta):
             if size != 0.0:
                 sizes[effect.name] = float(np.clip(size * effect.floor, *effect.bounds))
         return sizes
 
-    def possible(self, theta: np.ndarray) -> np.ndarray:
+    def possible(self, theta: ndarray) -> ndarray:
         """Return sizes that the model's effects can have together; both in floors, shape (K,)."""
         alone = self._within_bounds(theta)
         together = self.model.possible(alone)
@@ -133,7 +134,7 @@ class Point:
     """Windows and statistics of a problem at one theta (in floors, shape (K,))."""
 
     problem: Problem
-    theta: np.ndarray
+    theta: ndarray
     windows: Sequence[Window]
     grams: Sequence[Gram]  # latents correlated
     noise: Noise
@@ -146,7 +147,7 @@ class Point:
         # residuals
     )
     commands: Sequence[
-        np.ndarray
+        ndarray
     ]  # change of each window by each command that did not come, shape (N, T); none: all came
 
     @property
@@ -167,7 +168,7 @@ class Point:
         return Posterior.of(self.statistics, self.problem.priors)
 
     @property
-    def information(self) -> np.ndarray:
+    def information(self) -> ndarray:
         """Return the information of all flights, shape (K, K)."""
         return self.posterior.information
 
@@ -198,7 +199,7 @@ def regathered(point: Point, integrals: stack.Integrals | None = None, **changes
 
 def linearise(
     problem: Problem,
-    theta: np.ndarray,
+    theta: ndarray,
     start: Noise | None = None,
     windows: Sequence[Window] | None = None,
     varies: Varies | None = None,
@@ -246,7 +247,7 @@ def linearise(
 
 def _commands(
     problem: Problem, sizes: Mapping[str, float], windows: Sequence[Window]
-) -> list[np.ndarray]:
+) -> list[ndarray]:
     """Return the change of each window by each command that did not come, shape (N, T) each."""
     commands = []
     for change, window in zip(problem.model.without_commands(sizes, problem.kept), windows):
@@ -267,7 +268,7 @@ def _cleaned(problem: Problem, windows: Sequence[Window]) -> tuple[list[Window],
     return cleaned, grams
 
 
-def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -> Window:
+def with_terms(window: Window, terms: Sequence[TermEffect], theta: ndarray) -> Window:
     """A window with terms as its last effects, about their sizes at ``theta`` (in floors)."""
     columns = window.latent @ forces(window, terms)
     sizes = theta[-len(terms) :] * [e.floor for e in terms]
@@ -275,7 +276,7 @@ def with_terms(window: Window, terms: Sequence[TermEffect], theta: np.ndarray) -
     return replace(window, effects=effects, residual=window.residual - columns @ sizes)
 
 
-def _losing(window: Window, columns: np.ndarray, share: float) -> Window:
+def _losing(window: Window, columns: ndarray, share: float) -> Window:
     """A window some of whose commands did not come: of each that share, and its deviation among
     what nobody knows.
     """
@@ -317,7 +318,7 @@ def untracked_windows(point: Point) -> list[int]:
     return distant.tolist()
 
 
-def moved(point: Point, theta: np.ndarray) -> Point | None:
+def moved(point: Point, theta: ndarray) -> Point | None:
     """Simulate at ``theta`` but keep the derivatives and noise levels of ``point``; None where the
     simulation fails there.
     """
@@ -349,7 +350,7 @@ def moved(point: Point, theta: np.ndarray) -> Point | None:
     )
 
 
-def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int]) -> np.ndarray:
+def linearisation_bias(origin: Point, moved_point: Point, active: Sequence[int]) -> ndarray:
     """Return the sizes of all effects that the simulation's distance from its linearisation would
     be taken for, in floors, shape (K,).
 
@@ -391,7 +392,7 @@ def with_floors_noise(point: Point, active: Sequence[int]) -> Point:
     return with_noise_at(point, point.posterior.mean(active))
 
 
-def with_noise_at(point: Point, theta: np.ndarray) -> Point:
+def with_noise_at(point: Point, theta: ndarray) -> Point:
     """Return the point with noise levels estimated from the residuals at ``theta``, and each
     flight's random shares beside it.
     """
@@ -399,7 +400,7 @@ def with_noise_at(point: Point, theta: np.ndarray) -> Point:
     return regathered(point, noise=levels.maximised(grams, point.noise, point.device)[0])
 
 
-def with_shares(point: Point, theta: np.ndarray) -> list[Gram]:
+def with_shares(point: Point, theta: ndarray) -> list[Gram]:
     """Return the inner products of a point's windows at ``theta``, and with each flight's random
     shares beside it.
     """
@@ -410,7 +411,7 @@ def with_shares(point: Point, theta: np.ndarray) -> list[Gram]:
     return [shifted(gram, change) for gram, change in zip(point.grams, shares[row])]
 
 
-def shifted(gram: Gram, change: np.ndarray) -> Gram:
+def shifted(gram: Gram, change: ndarray) -> Gram:
     """Inner products of r - S change."""
     begin = gram.nuisances + gram.latents
     part = gram.inner[:, :, begin:] @ change
@@ -454,7 +455,7 @@ def predicted_gain(point: Point, active: Sequence[int], switches: bool = False) 
     return float(0.5 * remaining @ point.information @ remaining)
 
 
-def _step(point: Point, goal: np.ndarray) -> Point | None:
+def _step(point: Point, goal: ndarray) -> Point | None:
     """The largest part of a step that fits better; None where there is none."""
     share = 1.0
     while share > 0.1:
@@ -511,7 +512,7 @@ def candidates(
     return run_concurrently(simulated, range(len(pairs)))
 
 
-def switched(point: Point, active: Sequence[int]) -> np.ndarray | None:
+def switched(point: Point, active: Sequence[int]) -> ndarray | None:
     """Return where a set is to be linearised, in floors, if it asks for another kind of block than
     a point flies; else None.
     """

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy import ndarray
 from scipy.interpolate import PchipInterpolator
 
 from sim.effects.effect import RandomEffect
@@ -95,7 +96,7 @@ class Varies:
             shares[j, FLIGHT if who == DAY else who] = size
         return Varies((), shares)
 
-    def of(self, statistics: Statistics) -> Iterator[tuple[int, np.ndarray]]:
+    def of(self, statistics: Statistics) -> Iterator[tuple[int, ndarray]]:
         """Yield effects with the deviation of each flight's share, shape (F,)."""
         for (j, who), size in self.shares.items():
             if who != DAY:
@@ -104,10 +105,10 @@ class Varies:
 
 def relinearised_per_flight(
     statistics: Statistics,
-    theta: np.ndarray,
+    theta: ndarray,
     priors: Priors,
     j: int,
-    simulate: Callable[[np.ndarray], Statistics | None],
+    simulate: Callable[[ndarray], Statistics | None],
 ) -> Statistics:
     """Statistics whose scores are those about the size of one effect at which each flight fits best
     by itself.
@@ -143,7 +144,7 @@ def relinearised_per_flight(
 
 
 def over_deviations(
-    sizes: np.ndarray, nats: np.ndarray, none: float | None = None
+    sizes: ndarray, nats: ndarray, none: float | None = None
 ) -> tuple[float, tuple[float, float], float]:
     """Return the most probable deviation, its 95 % interval, and the evidence of all, which are
     half normal before.
@@ -169,8 +170,8 @@ def over_deviations(
 
 def judged(
     v: RandomEffect,
-    reach: np.ndarray,
-    nats: np.ndarray,
+    reach: ndarray,
+    nats: ndarray,
     threshold: float,
     flights: int,
     group: str = FLIGHT,
@@ -205,7 +206,7 @@ def judged(
     )
 
 
-def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | float:
+def allowed(size: ndarray | float, share: float = INEXACT) -> ndarray | float:
     """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
     floors.
     """
@@ -213,8 +214,8 @@ def allowed(size: np.ndarray | float, share: float = INEXACT) -> np.ndarray | fl
 
 
 def between_flights(
-    statistics: Statistics, priors: Priors, active: Sequence[int], theta: np.ndarray
-) -> tuple[float, np.ndarray]:
+    statistics: Statistics, priors: Priors, active: Sequence[int], theta: ndarray
+) -> tuple[float, ndarray]:
     """Return the variance among flights that named effects may have, in that which is
     :func:`allowed`, and the part of it that the mean of these flights keeps, shape (K,).
 
@@ -269,7 +270,7 @@ def by_day(statistics: Statistics, days: Sequence[int]) -> Statistics:
 
 
 def integrated(
-    statistics: Statistics, deviation: Iterable[tuple[int, float | np.ndarray]]
+    statistics: Statistics, deviation: Iterable[tuple[int, float | ndarray]]
 ) -> Statistics:
     """Integrate out the shares that each row has of some effects.
 
@@ -289,7 +290,7 @@ def integrated(
     return statistics
 
 
-def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.ndarray:
+def own_shares(statistics: Statistics, theta: ndarray, varies: Varies) -> ndarray:
     """Most probable share of each flight of the effects that vary, beside the sizes of all, in
     floors, shape (F, K).
 
@@ -304,15 +305,13 @@ def own_shares(statistics: Statistics, theta: np.ndarray, varies: Varies) -> np.
         drifts = {j: np.full(count, size) for j, size in varies.drifts.items()}
         shares = _shares(by_days, np.tile(theta, (count, 1)), drifts)
         positions = positions + shares[row]
-    sizes: dict[int, np.ndarray] = {}
+    sizes: dict[int, ndarray] = {}
     for j, size in varies.of(statistics):
         sizes[j] = np.hypot(sizes.get(j, 0.0), size)
     return positions + _shares(statistics, positions, sizes) - theta
 
 
-def _shares(
-    statistics: Statistics, theta: np.ndarray, deviation: Mapping[int, np.ndarray]
-) -> np.ndarray:
+def _shares(statistics: Statistics, theta: ndarray, deviation: Mapping[int, ndarray]) -> ndarray:
     """Return the most probable shares of each row, beside its sizes ``theta`` (F, K)."""
     shares = np.zeros(statistics.score.shape)
     columns = list(deviation)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 
 import numpy as np
+from numpy import ndarray
 
 from visthrow.diagnose.likelihood.evidence import STRONG
 from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
@@ -81,10 +82,10 @@ class Screen:
     A term is one column of latent forces; a curve is ``m`` of them, see :func:`best_curves`."""
 
     terms: tuple[Term, ...]
-    size: np.ndarray  # root mean square over the knots, shape (T,)
-    information: np.ndarray  # shape (T, m, m)
-    score: np.ndarray  # shape (T, m)
-    cross: np.ndarray  # with the effects, shape (T, m, K)
+    size: ndarray  # root mean square over the knots, shape (T,)
+    information: ndarray  # shape (T, m, m)
+    score: ndarray  # shape (T, m)
+    cross: ndarray  # with the effects, shape (T, m, K)
 
 
 def acts_in(laws: Iterable[str]) -> set[str]:
@@ -156,8 +157,8 @@ class Survey:
         return Screen(terms, np.sqrt(square / max(knots, 1)), information, score, cross)
 
     def _in_window(
-        self, w: int, block: str, values_of: Callable[[KnotValues], np.ndarray]
-    ) -> tuple[np.ndarray, int, np.ndarray, np.ndarray, np.ndarray]:
+        self, w: int, block: str, values_of: Callable[[KnotValues], ndarray]
+    ) -> tuple[ndarray, int, ndarray, ndarray, ndarray]:
         """Square, number of knots, information, score and cross information of all terms."""
         part = self.parts[w]
         transfer = through_latents(self.point.windows[w], self.knots[w], block)
@@ -175,7 +176,7 @@ class Survey:
         information = np.einsum("lti,ltj->tij", loads.reshape(informed.shape), informed)
         return square, int(acting.sum()) // 3, information, score.reshape(count, columns), cross
 
-    def _left(self, screened: Screen) -> tuple[np.ndarray, np.ndarray]:
+    def _left(self, screened: Screen) -> tuple[ndarray, ndarray]:
         """Information and score of each term, of what the names leave."""
         cross = screened.cross
         known = np.einsum("tik,kl,tjl->tij", cross, self.sigma, cross, optimize=True)
@@ -184,7 +185,7 @@ class Survey:
         np.maximum(diagonal, 0.0, out=diagonal)
         return information, screened.score - cross @ self.mean
 
-    def gains(self, screened: Screen, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    def gains(self, screened: Screen, reach: float) -> tuple[ndarray, ndarray]:
         """Nats of each term beside the names, and its prior deviation, which makes it ``reach``
         strong at the knots.
         """
@@ -199,7 +200,7 @@ class Survey:
         gain[size <= 1e-9 * most] = -np.inf
         return gain, prior
 
-    def unsaid(self, screened: Screen, causes: Sequence[int]) -> np.ndarray:
+    def unsaid(self, screened: Screen, causes: Sequence[int]) -> ndarray:
         """Nats of each screened term that no single cause explains, whatever its size, beside the
         names; shape (T,).
 
@@ -216,12 +217,12 @@ class Survey:
         return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
 
 
-def _proportional(terms: Sequence[Term], values: KnotValues) -> np.ndarray:
+def _proportional(terms: Sequence[Term], values: KnotValues) -> ndarray:
     """Return terms as one column each, shape (k, 3, T, 1)."""
     return table(terms, values)[..., None]
 
 
-def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, np.ndarray]:
+def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, ndarray]:
     """Return where a curve of each scalar may bend, evenly over what was flown, shape (m,) each."""
     places = {}
     for name in {term.factors[0] for term in terms}:
@@ -231,9 +232,7 @@ def _places(terms: Sequence[Term], values: Sequence[KnotValues]) -> dict[str, np
     return places
 
 
-def _hats(
-    terms: Sequence[Term], places: Mapping[str, np.ndarray], values: KnotValues
-) -> np.ndarray:
+def _hats(terms: Sequence[Term], places: Mapping[str, ndarray], values: KnotValues) -> ndarray:
     """Return curves as hats of their scalars times their vectors, shape (k, 3, T, m)."""
     number = np.arange(PIECES)
     columns = []
