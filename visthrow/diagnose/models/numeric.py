@@ -310,7 +310,7 @@ class NumericModel(Model, ABC):
         latent = self._slopes_by(size, "latent", steps, range(len(steps)))
         lanes = self._lanes(size)
         knots = self.knots(lanes, self.simulate(lanes))
-        windows = []
+        windows: list[Window] = []
         for i, stretch in enumerate(self.stretches):
             window = replace(
                 stretch,
