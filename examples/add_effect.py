@@ -1,4 +1,4 @@
-"""Add an effect to the catalogue: what it changes in the plant, and how far it moves the ball.
+"""Describe an effect as a table of configs/effects does, and apply it: how far it moves the ball.
 
 python examples/add_effect.py --size 0.02
 """

@@ -30,7 +30,8 @@ class Effect(BoundedFields):
     block: str  # block of the simulator that holds the equation, such as rope, motor, sensing
     bounds: tuple[float, float]  # physically possible values of theta
     prior_sd: Positive  # spread of theta where the effect is present
-    # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise
+    # size below which it does not matter: numerics, and 5 mm of landing or a tenth of the noise;
+    # the diagnosis of throws says by how much a size moves landings
     floor: Positive
     channels: tuple[str, ...]  # channels of the log without which it cannot be seen
     source: str  # of equation and prior

@@ -76,8 +76,7 @@ class Simulated:
         # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
         # replayed
     )
-    # the largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was reached
-    used: float
+    used: float  # of what ends a flight, see :attr:`SimulatedFlight.used`
 
 
 Simulate = Callable[[Sequence[Manoeuvre]], list[Simulated]]
@@ -208,8 +207,19 @@ class SimulatedFlight:
         return SAMPLE_PERIOD * np.arange(len(self.truth["pos_w"]))
 
     def simulated(self, model_of: Callable[["SimulatedFlight"], Model]) -> Simulated:
-        """Say how near it came to being aborted, and give it the model that ``model_of`` makes of
-        it if it was not.
+        """Return how near it came to being aborted, with the model that ``model_of`` makes of it if
+        it was not.
+        """
+        used = self.used
+        try:
+            return Simulated(model_of(self) if used < 1.0 else None, used)
+        except (DiagnoseError, LogError):
+            return Simulated(None, used)
+
+    @property
+    def used(self) -> float:
+        """Return the largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was
+        reached; the flight is aborted from 1.
         """
         planned = self.manoeuvre.pos_w
         off = self.truth["pos_w"][::STEPS] - planned
@@ -219,12 +229,7 @@ class SimulatedFlight:
         astray = np.max(distance) / ASTRAY
         swing = self.swing / HIGHEST
         used = np.max([swing, astray, sunk])  # NaN counts
-        used = min(float(used), LOST) if np.isfinite(used) else LOST
-        try:
-            model = model_of(self) if used < 1.0 else None
-        except (DiagnoseError, LogError):
-            model = None
-        return Simulated(model, used)
+        return min(float(used), LOST) if np.isfinite(used) else LOST
 
     @property
     def swing(self) -> float:

@@ -5,13 +5,14 @@ A pilot or controller follows the position; doublets and thrust steps are added 
 Each stays within a box of a few metres and leaves the payload well below the rotors;
 :meth:`Manoeuvre.limits` says when to abort."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
+from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.common.toml_text import tables_beside
 
 PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
@@ -204,3 +205,14 @@ def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
 def catalogue() -> tuple[Manoeuvre, ...]:
     """All manoeuvres, in the order in which they would be flown on a day."""
     return tuple(_manoeuvre(name, row) for name, row in tables_beside(__file__).items())
+
+
+def named(names: Iterable[str]) -> list[Manoeuvre]:
+    """Return the manoeuvres of these names, in their order.
+
+    Raises DiagnoseError for one that the catalogue does not hold.
+    """
+    names = list(names)
+    by_name = {m.name: m for m in catalogue()}
+    expect_known(names, by_name, "no manoeuvre '{}'", DiagnoseError)
+    return [by_name[name] for name in names]

@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from visthrow.common.errors import DiagnoseError, expect_known
+from visthrow.common.errors import DiagnoseError
 from visthrow.diagnose.inputs import model_arguments as opening
 
 add_arguments = opening.declared_with_logs(__file__)
@@ -21,12 +21,13 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.inputs import setup
     from visthrow.diagnose.planning import design, plan
     from visthrow.diagnose.planning.fly_manoeuvres import simulator_of
+    from visthrow.diagnose.planning.manoeuvres import catalogue, named
     from visthrow.diagnose.reporting import diagnosis_report as report
     from visthrow.diagnose.reporting import pictures
 
     check_place(Path(args.out) / "plan.json")
     limits = _limits(args)
-    chosen = _chosen(args.manoeuvres)
+    chosen = named(args.manoeuvres.split(",")) if args.manoeuvres else catalogue()
     opened = opening.Opened(args)
     diagnosis = opened.diagnose(laws=False)
     print(report.summary(diagnosis) + "\n")
@@ -102,15 +103,6 @@ def _limits(args: argparse.Namespace):
             " lowest that is flown"
         )
     return Limits(half=(0.5 * x, 0.5 * y), highest=z, speed=args.speed)
-
-
-def _chosen(names: str | None):
-    from visthrow.diagnose.planning import manoeuvres
-
-    by_name = {m.name: m for m in manoeuvres.catalogue()}
-    chosen = names.split(",") if names else list(by_name)
-    expect_known(chosen, by_name, "no manoeuvre '{}'", DiagnoseError)
-    return [by_name[name] for name in chosen]
 
 
 def _print(ranked) -> None:

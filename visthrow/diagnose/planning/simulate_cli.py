@@ -1,0 +1,42 @@
+"""``visthrow diagnose simulate``: fly manoeuvres in the simulator, and record them as a user's
+motion capture does.
+"""
+
+import argparse
+from pathlib import Path
+
+from visthrow.common.arguments import declared
+from visthrow.common.errors import DiagnoseError
+
+NOISE = {"pos_w": 5e-4, "quat_wb": 3.5e-3, "payload_pos_w": 8e-4}
+"""Of the recorded poses, standard deviations [m], [rad], [m]: motion capture of a hall."""
+
+
+add_arguments = declared(__file__)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fly all manoeuvres, and write a log of each.
+
+    Raises DiagnoseError: a manoeuvre that does not exist, or that this vehicle cannot fly."""
+    from visthrow.common.compute_device import resolve
+    from visthrow.common.storage import writable
+    from visthrow.diagnose.planning import manoeuvres
+    from visthrow.diagnose.planning.fly_manoeuvres import fly
+    from visthrow.task import load_experiment, plant_of
+
+    chosen = manoeuvres.named(args.manoeuvres)
+    plant = plant_of(load_experiment(args.plant, args.overrides))
+    folder = Path(args.out)
+    writable(folder)
+    for flight in fly(plant, chosen, args.seed, resolve(args.device)):
+        manoeuvre = flight.manoeuvre
+        if flight.used >= 1.0:
+            raise DiagnoseError(
+                f"manoeuvre '{manoeuvre.name}': this vehicle leaves its path, or the payload"
+                " swings towards the rotors; expected a slower manoeuvre, or another --plant"
+            )
+        path = folder / f"{Path(manoeuvre.file).stem}-{args.seed}.npz"
+        flight.log(NOISE).save(path)
+        print(f"{path}  {manoeuvre.name}, {manoeuvre.seconds:.1f} s")
+    return 0
