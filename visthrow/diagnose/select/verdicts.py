@@ -405,7 +405,10 @@ def _outside_bounds(selection: Selector, reasons: Sequence[str]) -> Answer | Non
         return None
     effects = [selection.problem.effects[j] for j in stuck]
     names = ", ".join(effect.name for effect in effects)
-    reason = f"{names} would have to lie outside what is physically possible; the form is another"
+    reason = (
+        f"{names} would have to lie outside what is physically possible: the true cause has another"
+        " equation"
+    )
     block = selection.block_of(stuck[0]) or effects[0].block
     return result.UNKNOWN, block, [*reasons, reason], set(active)
 
@@ -427,7 +430,7 @@ def _crowded(selection: Selector, reasons: Sequence[str]) -> Answer | None:
 
 def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     """Return the answer where some function of one quantity explains what the names in a block
-    leave: their form is another. Of several blocks, it is the one with most evidence.
+    leave: the true cause has another equation. Of several blocks, it is the one with most evidence.
     """
     best = selection.best
     by_block = _by_block(selection)
@@ -440,8 +443,8 @@ def _misshapen(selection: Selector, reasons: Sequence[str]) -> Answer | None:
         return None
     names = ", ".join(selection.problem.effects[j].name for j in by_block[block])
     reason = (
-        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names};"
-        " the form is another"
+        f"{formula}, with any function f, explains {nats:.0f} nats that are left beside {names}:"
+        " the true cause has another equation"
     )
     return result.UNKNOWN, block, [reason, *reasons], _parts_of(selection, {block})
 
@@ -470,7 +473,7 @@ def _unlike(scatter: Sequence[Scatter]) -> Answer | None:
     if len(forms) < 2:
         return None
     names = ", ".join(s.name for s in forms)
-    reason = f"flights differ in {names} at once; the form is another"
+    reason = f"flights differ in {names} at once: the true cause has another equation"
     return result.UNKNOWN, forms[0].block, [reason], set()
 
 
