@@ -8,7 +8,7 @@ The equation of an effect stands in the block of :mod:`sim` that it extends (or 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, get_type_hints
 
 from camera.field_bounds import BoundedFields, Positive
 from sim.effects.blocks import CONDITIONS, SWITCHES
@@ -50,6 +50,10 @@ class Change(BoundedFields):
     scale: bool = False  # times (1 + factor theta) instead of plus factor theta
     factor: float = 1.0  # of theta
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_path(self.path)
+
     def apply(self, setting: Setting, theta: float) -> Setting:
         """Return the setting with this number changed."""
         value = _read(setting, self.path)
@@ -62,6 +66,22 @@ class Change(BoundedFields):
 
     def _new(self, value: float, theta: float) -> float:
         return value * (1.0 + self.factor * theta) if self.scale else value + self.factor * theta
+
+
+def _check_path(path: str) -> None:
+    """Raise ValueError for a number that no setting has; those of the camera, which the simulator
+    knows nothing of, pass.
+    """
+    owner: Any = Setting
+    for name in path.split("."):
+        if owner is Any:
+            return
+        if not dataclasses.is_dataclass(owner):
+            raise ValueError(f"path '{path}': a number before '{name}'; expected nothing after it")
+        names = [f.name for f in dataclasses.fields(owner)]
+        if name not in names:
+            raise ValueError(f"path '{path}': no '{name}'; expected one of: {', '.join(names)}")
+        owner = get_type_hints(owner)[name]
 
 
 def _read(setting: Any, path: str) -> Any:
@@ -81,6 +101,10 @@ class Lowest(BoundedFields):
     share: float = 1.0  # part of the number that theta may take away
     factor: float = 1.0  # change of the number for each unit of theta
     least: float = 0.0  # size of theta whose change of the number remains besides [unit of theta]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_path(self.path)
 
 
 @dataclass(frozen=True)

@@ -103,6 +103,17 @@ def test_an_effect_that_changes_nothing_or_names_no_condition_is_refused():
         config.loads(kinds.schema_of("effects"), text + 'needs = "never"\n')
 
 
+@mark.parametrize("key", ["changes", "lowest"])
+def test_an_effect_on_a_number_that_does_not_exist_is_refused(key):
+    text = config.find("effects", "rope").read_text(encoding="utf-8")
+    path = "plant.rope.payload_drag"
+    wrong = text.replace(f'{key} = [{{ path = "{path}"', f'{key} = [{{ path = "{path}s"')
+    with raises(
+        config.ConfigError, match=f"path '{path}s': no 'payload_drags'; expected one of: s"
+    ):
+        config.loads(kinds.schema_of("effects"), wrong)
+
+
 def test_every_schema_has_a_config_and_every_folder_a_schema():
     folders = {path.parent.name for path in FILES}
     assert {key for key in kinds.SCHEMAS if "/" not in key} == folders
