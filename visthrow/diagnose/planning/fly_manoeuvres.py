@@ -15,7 +15,7 @@ from sim.scaling.units import Units, in_units
 from visthrow.common import mocap
 from visthrow.common.errors import DiagnoseError, LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import rotate_back, tilt_deg
+from visthrow.common.rotations import rotate, rotate_back, tilt_deg
 from visthrow.diagnose.models.model_interface import Model
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
@@ -249,6 +249,9 @@ class SimulatedFlight:
         the battery's ``voltage`` if the vehicle logs it.
         """
         poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
+        # motion capture sees the frame's origin, the simulator moves the centre of mass
+        com = np.array([self.plant.vehicle.body.com])
+        poses["pos_w"] = poses["pos_w"] - rotate(poses["quat_wb"], com)
         values = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         if voltage:
             values["battery_voltage"] = self.truth["voltage"]
