@@ -5,6 +5,7 @@
 """
 
 import argparse
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -26,6 +27,11 @@ COMMANDS: dict[str, tuple[str, str]] = _TABLES["commands"]
 """Name -> help and module."""
 
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
+
+NEW_OBJECTS = 50_000
+"""Objects between two looks for garbage: with Python's 700, an eighth of what a command takes to
+import goes into looks at objects of modules, which are never garbage.
+"""
 
 _DESCRIPTION = """\
 Train, compare and fly policies that throw a ball hanging on a rope below a quadrotor onto a target.
@@ -62,6 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after
     Ctrl-C."""
+    gc.set_threshold(NEW_OBJECTS)
     try:
         parser = build_parser()
         complete(parser)

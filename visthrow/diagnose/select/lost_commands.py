@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy import ndarray
-from scipy.stats import beta
+from scipy.special import betaincinv
 
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood import noise_levels as levels
@@ -157,5 +157,5 @@ def sized(point: Point, scatter: Scatter) -> Scatter:
         return scatter
     lost_commands = np.count_nonzero(clear & (off > 0.0))
     counts = lost_commands + 0.5, count - lost_commands + 0.5
-    size, low, high = beta.ppf((0.5, 0.025, 0.975), *counts).tolist()
+    size, low, high = betaincinv(*counts, (0.5, 0.025, 0.975)).tolist()
     return replace(scatter, size=size, low=low, high=high)

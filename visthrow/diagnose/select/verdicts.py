@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
@@ -315,7 +315,8 @@ def _events(selection: Selector, point: Point) -> tuple[int, ...]:
     rougher than its phase.
     """
     least = (1.0 - CALIBRATION_QUANTILE) / point.noise.share.size
-    roughest = np.sqrt(TAIL / chi2.ppf(least, TAIL))  # share of the roughest, with Student's tails
+    quantile = 2.0 * gammaincinv(0.5 * TAIL, least)  # of chi squared with so many degrees
+    roughest = np.sqrt(TAIL / quantile)  # share of the roughest, with Student's tails
     events = {c.flight for c in selection.best.chosen if c.group == EVENT}
     for window, share in zip(point.windows, point.noise.share):
         if share.max() > roughest:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy import ndarray
-from scipy.signal import savgol_filter
 
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
@@ -131,6 +130,8 @@ def _thinned(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
     stride = int(1.0 / (SUFFICIENT_RATE * np.median(steps)) + 0.1)  # clocks are some per cent off
     if stride < 2:
         return time, values
+    from scipy.signal import savgol_filter
+
     width = 2 * stride + 1
     gaps = np.flatnonzero(steps > 1.5 / SUFFICIENT_RATE) + 1
     table = np.column_stack((time, values))

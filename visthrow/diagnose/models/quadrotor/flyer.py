@@ -11,9 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy import ndarray
-from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import CubicHermiteSpline
-from scipy.signal import lfilter
 
 from visthrow.common.rotations import cross, normal_part
 from visthrow.diagnose.models.catalogue import ModelEffect
@@ -126,6 +124,9 @@ class FlyerModel(NumericModel):
 
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the
         step's own mean: commands switch there."""
+        from scipy.integrate import cumulative_trapezoid
+        from scipy.signal import lfilter
+
         p = self.params
         fine = self.params.step / FINE
         commanded = p.thrust(np.array([s.data["input"] for s in self.stretches]))

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from numpy import ndarray
-from scipy.signal import lfilter
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
@@ -190,6 +189,8 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
 
     Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only
     acceleration in z)."""
+    from scipy.signal import lfilter
+
     if "acc_b" not in log or not np.any(log["acc_b"].valid):
         return np.zeros((len(times), 3))
     time, force = log["acc_b"].samples()
