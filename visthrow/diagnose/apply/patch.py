@@ -91,9 +91,9 @@ def text(
         covariance=tuple(map(tuple, covariance[np.ix_(of_plant, of_plant)].tolist())),
         plants=plants,
     )
-    both = (*experiment.laws, *laws)
-    check_laws(both)
-    after = dataclasses.replace(extended(experiment, theta), diagnosed=varied, laws=both)
+    every_law = (*experiment.laws, *laws)
+    check_laws(every_law)
+    after = dataclasses.replace(extended(experiment, theta), diagnosed=varied, laws=every_law)
     changed = differences(config.to_dict(load_experiment(base)), config.to_dict(after))
     words = defaultdict(list)
     for effect, sd in zip(effects, np.sqrt(np.diag(covariance))):

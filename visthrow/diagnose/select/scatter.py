@@ -285,8 +285,8 @@ def integrated(
         information = np.subtract(statistics.information, explained, out=explained)
         known = part * score[:, j]
         square = statistics.square - known * score[:, j] + np.log1p(scaled)
-        left = score - known[:, None] * column
-        statistics = replace(statistics, information=information, score=left, square=square)
+        score = score - known[:, None] * column
+        statistics = replace(statistics, information=information, score=score, square=square)
     return statistics
 
 

@@ -125,7 +125,7 @@ def with_capped_gusts(point: Point) -> tuple[Point, list[LatentStatistics]]:
 
 
 class Survey:
-    """What windows say of forces at their knots beside a set of names."""
+    """A record of what windows say of forces at their knots beside a set of names."""
 
     def __init__(self, point: Point, parts: Sequence[LatentStatistics], active: Sequence[int]):
         """Keep a point and the statistics of its windows; ``active``: the names."""
@@ -212,9 +212,11 @@ class Survey:
         shared = (screened.cross[:, 0] @ self.sigma)[:, causes]
         variance = self.deviation**2
         spread = np.maximum(variance - self.sigma.diagonal(), SAME * variance)[causes]
-        alone = np.maximum(information[:, None] - shared**2 / spread, SAME * information[:, None])
-        left = score[:, None] - shared * self.mean[causes] / spread
-        return (0.5 * left**2 / np.maximum(alone, 1e-300)).min(axis=1, initial=np.inf)
+        curvature = np.maximum(
+            information[:, None] - shared**2 / spread, SAME * information[:, None]
+        )
+        slope = score[:, None] - shared * self.mean[causes] / spread
+        return (0.5 * slope**2 / np.maximum(curvature, 1e-300)).min(axis=1, initial=np.inf)
 
 
 def _proportional(terms: Sequence[Term], values: KnotValues) -> ndarray:
