@@ -25,7 +25,7 @@ def cross(a: ndarray, b: ndarray) -> ndarray:
 
 
 def normal_part(vector: ndarray, axis: ndarray) -> ndarray:
-    """Return what of vectors is normal to unit vectors, both of shape (..., 3)."""
+    """Return the components of vectors normal to unit vectors, both of shape (..., 3)."""
     parallel = np.einsum("...i,...i->...", vector, axis)
     return vector - parallel[..., None] * axis
 

@@ -238,9 +238,8 @@ def test_an_estimate_stays_within_its_physical_bounds():
         if f.name == "effect_03"
     )
     assert abs(diagnosis.theta.get("effect_03", 0.0)) <= 8 * floor + 1e-12
-    assert (
-        diagnosis.overall == result.UNKNOWN
-    )  # it pushes on against its bound: the form is another
+    # it pushes on against its bound: the true cause has another equation
+    assert diagnosis.overall == result.UNKNOWN
 
 
 def test_an_interval_that_shrinks_onto_a_bound_is_told_in_words():

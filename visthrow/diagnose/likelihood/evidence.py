@@ -169,7 +169,7 @@ class Posterior:
             value += self._log_within(columns, slab * mean[columns], spread).sum()
         return float(value)
 
-    def _log_within(self, sets: Sequence, mean: ndarray, sd: ndarray) -> ndarray:
+    def _log_within(self, sets: Sequence[int] | ndarray, mean: ndarray, sd: ndarray) -> ndarray:
         """Log of the posterior's mass within the bounds of some effects, less that of the prior."""
         priors = self.priors
         bounds = priors.low[sets], priors.high[sets]

@@ -234,8 +234,8 @@ def _solved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _inverse(factor: torch.Tensor) -> torch.Tensor:
-    """Inverse of matrices whose lower Cholesky factors these are; a GPU's own goes through them one
-    by one.
+    """Inverse of matrices whose lower Cholesky factors these are; on a GPU torch's function takes
+    them one by one.
     """
     if not factor.is_cuda:  # it comes by columns, beside all else by rows; it is symmetric
         return torch.cholesky_inverse(factor).mT
@@ -330,14 +330,13 @@ class _Integrated:
 
 
 class Integrals:
-    """The part of windows' statistics that no residual changes, where it was calculated."""
-
-    _gathered: Statistics | None = None  # by flights with some residuals, once it was asked for
+    """The part of windows' statistics that no residual changes; it stays on the device."""
 
     def __init__(self, order: Sequence[Sequence[int]], batches: Sequence[_Integrated]):
         """Keep it; ``order``: numbers of each batch's windows."""
         self._order = order
         self._parts = batches
+        self._gathered: Statistics | None = None  # by flights, with the first residuals
 
     @property
     def log_dets(self) -> list[float]:

@@ -95,7 +95,7 @@ def random_shares(
 
 
 def _informative(flown: ndarray, days: Sequence[int]) -> dict[str, ndarray]:
-    """Return which flights, and which days where there are several, say something of each effect.
+    """Return which flights, and which days if there are several, are informative on each effect.
 
     ``flown``: of each flight, shape (F, K), bool; ``days``: of each flight, or none."""
     groups = {FLIGHT: flown}

@@ -32,7 +32,7 @@ from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
 from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
-from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut
+from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut, Level
 from visthrow.diagnose.select.scatter import freed
 
 MOST_FOLDS = 12
@@ -385,13 +385,12 @@ def _innovations(diagnosis: Diagnosis) -> Diagnosis:
     if not unexplained:
         return diagnosis
     floors = floors_of(point)
-    block = ""
-    strongest = 0.0
-    for level in diagnosis.levels:
+
+    def strength(level: Level) -> float:
         floor = floors.get((LATENT_BLOCKS.index(level.block), level.phase), np.inf)
-        if not block or level.after / floor > strongest:
-            block = level.block
-            strongest = level.after / floor
+        return level.after / floor
+
+    block = max(diagnosis.levels, key=strength).block if diagnosis.levels else ""
     reasons = tuple(_remaining(c, work) for c in unexplained)
     return replace(diagnosis, overall=result.UNKNOWN, block=block, reasons=reasons)
 

@@ -176,13 +176,15 @@ class Linear:
         if not self.random:
             return []
         theta = self.total(subset).mean(columns_of(subset))
-        promised: dict[Candidate, float] = {}
+        close: dict[Candidate, float] = {}
         for group in (FLIGHT, DAY, EVENT):
-            members = [c for c in self.random if c.group == group and c not in subset]
-            if members:
-                promised |= zip(members, self._promises(group, members, theta))
-        close = [c for c, nats in promised.items() if nats > self._step - STRONG]
-        return sorted(close, key=promised.get, reverse=True)[:RANDOM_TRIED]
+            members = [c for c in self.random if c.group == group]
+            if not members:
+                continue
+            for c, nats in zip(members, self._promises(group, members, theta)):
+                if nats > self._step - STRONG and c not in subset:
+                    close[c] = nats
+        return sorted(close, key=close.get, reverse=True)[:RANDOM_TRIED]
 
     def _promises(self, group: str, members: Sequence[Candidate], theta: ndarray) -> list[float]:
         """Return the nats that random shares of one group promise beside these sizes [floors]."""
@@ -192,11 +194,14 @@ class Linear:
         counts = [len(c.columns) for c in members]
         columns = [j for c in members for j in c.columns]
         deviations = [sd for c in members for sd in c.deviations]
-        sizes = np.ones(1) if group == EVENT else REACH[::COARSE]
-        part = precision[:, columns] * np.multiply.outer(sizes, deviations)[:, None] ** 2
-        gain = 0.5 * (misfit[:, columns] * part / (1.0 + part) - np.log1p(part))
-        if group == EVENT:
-            gain *= flights.flights[:, None] == [c.flight for c in members]
+        sizes = REACH[::COARSE]
+        place = slice(None), columns
+        if group == EVENT:  # each in its flight alone
+            sizes = np.ones(1)
+            rows = np.searchsorted(flights.flights, [c.flight for c in members])
+            place = rows[None], columns
+        part = precision[place] * np.multiply.outer(sizes, deviations)[:, None] ** 2
+        gain = 0.5 * (misfit[place] * part / (1.0 + part) - np.log1p(part))
         begins = np.cumsum(counts) - counts
         nats = np.add.reduceat(gain.sum(1), begins, axis=1).max(0)
         return (nats - [c.penalty for c in members]).tolist()

@@ -165,8 +165,8 @@ class Selector:
         return True
 
     def _moved(self) -> bool:
-        """Simulate the best sets, and go over to the one that is worth most; False where the set
-        that is there stays.
+        """Simulate the best sets, and go over to the one that is worth most; False where the
+        present set stays.
         """
         listed = self._listed()
         leads = {}
