@@ -8,6 +8,7 @@ The equation of an effect stands in the block of :mod:`sim` that it extends (or 
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any, get_type_hints
 
 from camera.field_bounds import BoundedFields, Positive
@@ -78,10 +79,17 @@ def _check_path(path: str) -> None:
             return
         if not dataclasses.is_dataclass(owner):
             raise ValueError(f"path '{path}': a number before '{name}'; expected nothing after it")
-        names = [f.name for f in dataclasses.fields(owner)]
-        if name not in names:
-            raise ValueError(f"path '{path}': no '{name}'; expected one of: {', '.join(names)}")
-        owner = get_type_hints(owner)[name]
+        types = _field_types(owner)
+        if name not in types:
+            raise ValueError(f"path '{path}': no '{name}'; expected one of: {', '.join(types)}")
+        owner = types[name]
+
+
+@cache
+def _field_types(owner: type) -> dict[str, Any]:
+    """Return the types of a dataclass's fields."""
+    types = get_type_hints(owner)
+    return {f.name: types[f.name] for f in dataclasses.fields(owner)}
 
 
 def _read(setting: Any, path: str) -> Any:

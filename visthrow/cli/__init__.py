@@ -28,9 +28,9 @@ COMMANDS: dict[str, tuple[str, str]] = _TABLES["commands"]
 
 TRACEBACK_VARIABLE = "VISTHROW_TRACEBACK"
 
-NEW_OBJECTS = 50_000
-"""Objects between two looks for garbage: with Python's 700, an eighth of what a command takes to
-import goes into looks at objects of modules, which are never garbage.
+GC_THRESHOLD = 50_000
+"""New objects that start a garbage collection: at Python's default of 700, collections take an
+eighth of the time in which a command is imported, and free nothing, as modules stay.
 """
 
 _DESCRIPTION = """\
@@ -66,9 +66,9 @@ def build_parser() -> argparse.ArgumentParser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status.
 
-    Returns the command's own status; 2 for a mistake of the user, told in one message; 130 after
+    Returns the command's own status; 2 for a mistake of the user, stated in one message; 130 after
     Ctrl-C."""
-    gc.set_threshold(NEW_OBJECTS)
+    gc.set_threshold(GC_THRESHOLD)
     try:
         parser = build_parser()
         complete(parser)

@@ -26,9 +26,10 @@ AFTER = COLOURS[0]  # the model with what a diagnosis named
 
 
 def looks_of(tables: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Return parts of pictures -> matplotlib's keywords, of tables whose colours may be names of
-    this module and whose ``ls`` may be a list of dash and gap.
-    """
+    """Return matplotlib's keywords for each part of a picture.
+
+    ``tables``: of each part; a colour may be the name of one of this module, ``ls`` a list of dash
+    and gap."""
     looks = {}
     for part, table in tables.items():
         look = dict(table)

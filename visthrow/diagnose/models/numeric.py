@@ -18,7 +18,7 @@ from sim.params import LawParams
 from visthrow.common.errors import DiagnoseError, LogError, expect_known
 from visthrow.diagnose.models.catalogue import ModelEffect, beyond_bounds, effects_of
 from visthrow.diagnose.models.law_terms import Term, carries, term_of
-from visthrow.diagnose.models.law_terms import exerted as exerted  # for models of one's own
+from visthrow.diagnose.models.law_terms import exerted as exerted  # for users' models
 from visthrow.diagnose.models.model_interface import Linearised, Model, Window
 from visthrow.diagnose.models.thrust_map import command_of as command_of
 from visthrow.logs.check.relations import derivative as derivative

@@ -89,14 +89,11 @@ def cut(
         end = min(down, last)
         spans += [(a, b, "ballistic", LOOSE) for a, b in _split(after, end)]
         spans += [(a, b, "", NO_PAYLOAD) for a, b in _split(max(end, after), last)]
-    cuts = []
-    at_rest = False
+    cuts: list[Cut] = []
     for start, end, kind, payload in spans:
         phase = kind or _phase(flight, start, end)
-        if not cuts:  # what was before the first is taken for alike
-            at_rest = phase == "hover"
-        cuts.append(Cut(number, phase, start, end, payload, at_rest=at_rest))
-        at_rest = phase == "hover"
+        previous = cuts[-1].phase if cuts else phase  # nothing is known of before the first
+        cuts.append(Cut(number, phase, start, end, payload, at_rest=previous == "hover"))
     return [c for c in cuts if len(flight.vehicle.during(c.start, c.end).time) >= POSES_LEAST]
 
 

@@ -63,7 +63,7 @@ class DirectMeasurement(Protocol):
         ...
 
     def differs(self, setting: Setting, second: Setting) -> bool:
-        """Whether it may be another one in another setting."""
+        """Whether the measurement may differ between two settings."""
         ...
 
 

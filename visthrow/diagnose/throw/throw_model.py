@@ -405,8 +405,8 @@ class ThrowModel(Model):
         return -step if theta + step > e.bounds[1] else step
 
     def _channel(self, w: int) -> ndarray:
-        listed = list(self.channels)
-        numbers = [listed.index(name) if name in listed else -1 for name in REPLAYED]
+        channels = self.channels
+        numbers = [channels.index(name) if name in channels else -1 for name in REPLAYED]
         return self.flights.spread(w, *numbers).astype(int)
 
     def _without_slack(self, ends: States) -> list[Cut]:
