@@ -28,6 +28,7 @@ from visthrow.common import provenance
 from visthrow.common.errors import ConfigError, StorageError
 from visthrow.common.storage import atomic_write, write_json
 from visthrow.common.toml_text import dumps
+from visthrow.config.schema import NONE_WORD
 from visthrow.onboard.policy import Policy, find_policy
 
 POLICY = "policy.npz"
@@ -166,7 +167,8 @@ def is_run(folder: Path, parts: tuple[str, ...] = (CONFIG, TICKS)) -> bool:
 
 def _replayable(path: Path) -> str:
     """Return config of a run without what only reads the recording's source: its poses are here,
-    and its form has changed before. Keys that are newer than the run have their shipped values.
+    and its form has changed before. Keys that are newer than the run have their shipped values; a
+    run from before the aim holds no release back.
     """
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -180,7 +182,7 @@ def _replayable(path: Path) -> str:
         for key, value in tree.get("source", {}).items()
         if key not in ("columns", "time")
     }
-    return dumps(tree | {"base": BASE})
+    return dumps({"aim": NONE_WORD} | tree | {"base": BASE})
 
 
 def load_run(folder: str | Path) -> tuple[HilParams, Policy, list[dict[str, Any]]]:

@@ -3,6 +3,7 @@
 import json
 import math
 import shutil
+import tomllib
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from tests.hil_flight import params
 from tests.hil_runs import record_run
 from visthrow.cli import main
 from visthrow.common.errors import StorageError
+from visthrow.common.toml_text import dumps
 from visthrow.onboard.policy import Policy, find_policy
 
 
@@ -73,6 +75,15 @@ def test_what_is_no_run(run_folder, tmp_path, capsys):
     (tmp_path / "ticks.jsonl").write_text('{"n": 0}\n')
     with raises(RunError, match="ticks or poses are damaged: KeyError"):
         load_run(tmp_path)
+
+
+def test_a_run_from_before_the_aim_holds_no_release_back(run_folder, tmp_path):
+    shutil.copytree(run_folder, tmp_path, dirs_exist_ok=True)
+    config = tmp_path / "config.toml"
+    tree = tomllib.loads(config.read_text())
+    del tree["aim"]
+    config.write_text(dumps(tree))
+    assert load_run(tmp_path)[0].aim is None
 
 
 def test_a_run_with_its_poses_apart_and_without_a_later_key_replays(run_folder, tmp_path, printed):

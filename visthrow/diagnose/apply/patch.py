@@ -123,7 +123,7 @@ def _commented(
         name, equals, _ = line.partition(" = ")
         comment = words.get(f"{section}.{name}", [])
         if equals and not comment:
-            comment = ["of the diagnosis above"] if section == "diagnosed" else others
+            comment = {"diagnosed": ["of the diagnosis above"], "laws": []}.get(section, others)
         lines.append(f"{line}  # {'; '.join(comment)}" if comment else line)
     return lines
 

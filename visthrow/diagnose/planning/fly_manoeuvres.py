@@ -218,7 +218,7 @@ class SimulatedFlight:
 
     @property
     def used(self) -> float:
-        """Return the largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was
+        """The largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was
         reached; the flight is aborted from 1.
         """
         planned = self.manoeuvre.pos_w

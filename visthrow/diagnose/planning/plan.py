@@ -112,11 +112,11 @@ class PlanningGoal:
         return [pair for pair in self.pairs if self._gap(pair, count * new) > DECISIVE]
 
     def _named(self, new: np.ndarray, count: int) -> list[tuple[int, ...]]:
-        """Return the effects that so many flights tell well enough to be named."""
+        """Return the effects that so many flights measure well enough to name."""
         able = self.priors.slab[self.vague] * NAMEABLE
         unknown = self._deviations(0.0 * new) > able
         known = self._deviations(count * new) < able
-        # a name is confirmed by so many flights that tell of it
+        # a name counts as confirmed once so many flights bear on it
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
         least = TELLING * new[self.vague, self.vague]
         telling = np.sum(at_hand > least, axis=0)

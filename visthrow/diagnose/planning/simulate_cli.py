@@ -11,12 +11,11 @@ from visthrow.common.errors import DiagnoseError
 NOISE = {"pos_w": 5e-4, "quat_wb": 3.5e-3, "payload_pos_w": 8e-4}
 """Of the recorded poses, standard deviations [m], [rad], [m]: motion capture of a hall."""
 
-
 add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly all manoeuvres, and write a log of each.
+    """Fly manoeuvres, and write a log of each, or none if one of them is refused.
 
     Raises DiagnoseError: a manoeuvre that does not exist, or that this vehicle cannot fly."""
     from visthrow.common.compute_device import resolve
@@ -29,13 +28,15 @@ def run(args: argparse.Namespace) -> int:
     plant = plant_of(load_experiment(args.plant, args.overrides))
     folder = Path(args.out)
     writable(folder)
-    for flight in fly(plant, chosen, args.seed, resolve(args.device)):
-        manoeuvre = flight.manoeuvre
+    flights = fly(plant, chosen, args.seed, resolve(args.device))
+    for flight in flights:
         if flight.used >= 1.0:
             raise DiagnoseError(
-                f"manoeuvre '{manoeuvre.name}': this vehicle leaves its path, or the payload"
+                f"manoeuvre '{flight.manoeuvre.name}': this vehicle leaves its path, or the payload"
                 " swings towards the rotors; expected a slower manoeuvre, or another --plant"
             )
+    for flight in flights:
+        manoeuvre = flight.manoeuvre
         path = folder / f"{Path(manoeuvre.file).stem}-{args.seed}.npz"
         flight.log(NOISE).save(path)
         print(f"{path}  {manoeuvre.name}, {manoeuvre.seconds:.1f} s")
