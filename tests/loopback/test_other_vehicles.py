@@ -4,7 +4,7 @@
 
 from dataclasses import replace
 
-from pytest import mark, raises
+from pytest import mark, param, raises
 
 from hil.control.loop import Loop
 from hil.control.response import AXES
@@ -117,8 +117,12 @@ OTHERS = {
     "more thrust": ({"spoil": bend(1.2)}, THRUST),
     "no yaw": ({"yaw_lag": 1e6}, ("handed back: yaw: the vehicle does not turn as commanded",)),
 }
-FLOWN = [(name, kind) for i, name in enumerate(OTHERS) for kind in KINDS[i % 2 :: 2]]
-"""Each on two of the autopilots, of which each meets a weight and a thrust."""
+FLOWN = [
+    param(name, kind, marks=[mark.slow] * ((i + j) % 2))
+    for i, name in enumerate(OTHERS)
+    for j, kind in enumerate(KINDS)
+]
+"""By default each on two of the autopilots, of which each meets a weight and a thrust."""
 
 
 @mark.parametrize(("name", "kind"), FLOWN)

@@ -26,7 +26,9 @@ def nearest(number: float, sizes: Mapping[str, float]) -> tuple[str, float]:
 
 
 def nearest_unit(number: float, units: Iterable[str]) -> tuple[str, float]:
-    """Return :func:`nearest` of the sizes of units."""
+    """Return the unit in which a number comes nearest to 1 in ours, and by how much of the
+    logarithm it misses.
+    """
     return nearest(number, {unit: UNITS[unit][1] for unit in units})
 
 

@@ -328,10 +328,8 @@ class TestImu:
         )
         moment = np.array(p.torque.inertia) * (1.0 + np.array([inertia[0], inertia[0], inertia[1]]))
         hover = p.mass * G / 4.0
-        tones, unmixed = (
-            (rng.uniform(8.0, 25.0, 3), rng.uniform(0.0, 6.0, 4)),
-            np.linalg.pinv(mixer),
-        )
+        tones = rng.uniform(8.0, 25.0, 3), rng.uniform(0.0, 6.0, 4)
+        unmixed = np.linalg.pinv(mixer)
         thrust, rate, sent = np.full(4, hover), np.zeros(3), np.zeros(4)
         rows = []
         for i, t in enumerate(time):

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.random import default_rng
 from pytest import approx, fixture
 
+from bench import baseline as baseline_record
 from tests.unit.on_paper import made_up_results as made_up
 from visthrow.common.statistics import Interval
 from visthrow.paper.commands import report_command as command
@@ -161,6 +162,12 @@ def test_the_command_reports_from_records(tmp_path, full, refused, printed):
         refused(f"report {option} {tmp_path}/none --out {tmp_path}/other", said="no such folder")
         refused(f"report {option} {tmp_path} --out {tmp_path}/other", said="in it; expected")
         assert not (tmp_path / "other").exists()
+
+
+def test_what_the_report_stands_on_is_stated_once():
+    keys = [results.key_of(unit) for unit in baseline_record.full()]
+    assert len(set(keys)) == len(keys)
+    assert {unit["target"] for unit in baseline_record.full()} == {1.5, 2.0, 2.5}
 
 
 def test_pictures_show_what_they_are_given():
