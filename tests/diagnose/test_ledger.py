@@ -16,7 +16,7 @@ KINDS = (
 
 
 def cells(kind, group):
-    """Return a row's cells after the number of worlds: found, right up to class, exact, more names."""
+    """Return a row's cells: found, names right up to class, exact, more names than causes."""
     given, right, exact, found = np.sum([ledger.names(w) for w in group], axis=0)
     hidden = sum(len(ledger.truth_of(w)) for w in group)
     more = sum(ledger.names(w)[0] > len(ledger.truth_of(w)) for w in group)
