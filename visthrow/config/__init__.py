@@ -62,9 +62,9 @@ def _built(schema: type[T], tree: ConfigTable, overrides: Iterable[str]) -> T:
     try:
         built: T = _schema.build(schema, tree)
     except ConfigError as error:
-        if not overrides:
-            raise
-        raise ConfigError(f"{error} (with {', '.join(overrides)})") from None
+        if overrides:
+            error.args = (f"{error} (with {', '.join(overrides)})",)
+        raise
     return built
 
 

@@ -71,11 +71,9 @@ LOGGED = {
 class Simulated:
     """A manoeuvre as it was flown in the simulator."""
 
-    model: (
-        Model | None
-        # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
-        # replayed
-    )
+    # of this flight alone, with the diagnosis' catalogue; None where it is aborted or cannot be
+    # replayed
+    model: Model | None
     used: float  # of what ends a flight, see :attr:`SimulatedFlight.used`
 
 
@@ -89,8 +87,8 @@ def simulator_of(
     *,
     seed: int = 0,
 ) -> tuple[Simulate, Callable[[Manoeuvre], Manoeuvre | None]]:
-    """Make what simulates manoeuvres for a plan, and what tells how this vehicle flies one, if it
-    can.
+    """Return two functions for a plan: one simulates manoeuvres, the other gives a manoeuvre as
+    this vehicle flies it, or None.
 
     ``diagnosis``: for the sizes of what was found and the sensors' noise; ``build``: gives a
     setup's own model of some logs. Raises DiagnoseError: no vehicle flies in this model.
@@ -153,7 +151,7 @@ def carried(manoeuvre: Manoeuvre, params: FlyerParams) -> Manoeuvre | None:
 
 def vehicle_of(params: FlyerParams, plant: PlantParams) -> PlantParams:
     """Plant of a setup's vehicle: a known one made to its mass, at equal Froude number, with the
-    numbers that the setup tells.
+    numbers that the setup states.
     """
     ratio = plant.vehicle.body.mass / params.mass
     alike = Units(ratio ** (1 / 3), ratio)
@@ -217,6 +215,14 @@ class SimulatedFlight:
             return Simulated(None, used)
 
     @property
+    def origin_w(self) -> np.ndarray:
+        """Position of the body frame's origin [m], shape (N, 3): motion capture reports it, while
+        the simulator moves the centre of mass.
+        """
+        com = np.array([self.plant.vehicle.body.com])
+        return self.truth["pos_w"] - rotate(self.truth["quat_wb"], com)
+
+    @property
     def used(self) -> float:
         """The largest part of ``HIGHEST``, ``ASTRAY`` or the way down to the abort that was
         reached; the flight is aborted from 1.
@@ -248,10 +254,8 @@ class SimulatedFlight:
         """Return a flight log like the throw's: poses from motion capture, commands as sent, and
         the battery's ``voltage`` if the vehicle logs it.
         """
-        poses = {name: self.truth[name] for name in ("pos_w", "payload_pos_w", "quat_wb")}
-        # motion capture sees the frame's origin, the simulator moves the centre of mass
-        com = np.array([self.plant.vehicle.body.com])
-        poses["pos_w"] = poses["pos_w"] - rotate(poses["quat_wb"], com)
+        poses = {"pos_w": self.origin_w}
+        poses |= {name: self.truth[name] for name in ("payload_pos_w", "quat_wb")}
         values = mocap.measured(poses, {"payload_pos_w": noise["pos_w"], **noise}, self.rng)
         if voltage:
             values["battery_voltage"] = self.truth["voltage"]
@@ -264,7 +268,7 @@ class SimulatedFlight:
         """Return a flight log like those of a setup: its channel names, inputs through its map of
         thrust, and what an IMU on board measures.
         """
-        truth = self.truth
+        truth = {**self.truth, "pos_w": self.origin_w}
         names = {"pos_w": params.position, "quat_wb": params.attitude}
         values = {}
         for name in ("pos_w", "payload_pos_w", "rate_b"):

@@ -19,7 +19,6 @@ PERIOD = 0.02  # between two rows of a reference [s]: the paper's command rate
 SETTLE = 1.0  # hover before and after [s]
 # height of most manoeuvres above the floor [m]: out of ground effect, the payload 1.2 m up
 HEIGHT = 1.5
-MIDDLE = {"x": 0.0, "y": 0.0, "z": HEIGHT}  # where a manoeuvre without an axis stays [m]
 
 
 @dataclass(frozen=True)
@@ -185,26 +184,37 @@ def _along(shape: Any, t: np.ndarray) -> np.ndarray:
     return total
 
 
-def _manoeuvre(name: str, row: dict[str, Any]) -> Manoeuvre:
-    seconds = row["seconds"]
+def _manoeuvre(
+    name: str,
+    purpose: str,
+    seconds: float,
+    *,
+    x: Any = 0.0,
+    y: Any = 0.0,
+    z: Any = HEIGHT,
+    yaw: Any = 0.0,
+    thrust: Any = 1.0,
+    rates: str | None = None,
+    release: float = np.inf,
+    payload: bool = True,
+) -> Manoeuvre:
+    """Return a manoeuvre of a row of the table, whose shapes :func:`_along` reads."""
     time = times_of(seconds)
     t = moving_times(seconds)
-    place = [_along(row.get(axis, default), t) for axis, default in MIDDLE.items()]
-    yaw = _along(row.get("yaw", 0.0), t)
-    thrust = _along(row.get("thrust", 1.0), t)
-    rates = SHAPES[row["rates"]](t) if "rates" in row else np.zeros((len(t), 3))
+    pos_w = np.column_stack([_along(axis, t) for axis in (x, y, z)])
+    factor = _along(thrust, t)
+    added = SHAPES[rates](t) if rates else np.zeros((len(t), 3))
     moving = (time > SETTLE) & (time < seconds - SETTLE)
-    thrust[~moving] = 1.0
-    rates[~moving] = 0.0
-    release = time - SETTLE >= row.get("release", np.inf)
-    pos_w = np.column_stack(place)
-    payload = row.get("payload", True)
-    return Manoeuvre(name, row["purpose"], seconds, pos_w, yaw, rates, thrust, release, payload)
+    factor[~moving] = 1.0
+    added[~moving] = 0.0
+    released = time - SETTLE >= release
+    heading = _along(yaw, t)
+    return Manoeuvre(name, purpose, seconds, pos_w, heading, added, factor, released, payload)
 
 
 def catalogue() -> tuple[Manoeuvre, ...]:
     """All manoeuvres, in the order in which they would be flown on a day."""
-    return tuple(_manoeuvre(name, row) for name, row in tables_beside(__file__).items())
+    return tuple(_manoeuvre(name, **row) for name, row in tables_beside(__file__).items())
 
 
 def named(names: Iterable[str]) -> list[Manoeuvre]:

@@ -15,7 +15,7 @@ add_arguments = declared(__file__)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fly manoeuvres, and write a log of each, or none if one of them is refused.
+    """Fly each manoeuvre once, and write a log of each, or none if one of them is refused.
 
     Raises DiagnoseError: a manoeuvre that does not exist, or that this vehicle cannot fly."""
     from visthrow.common.compute_device import resolve
@@ -24,7 +24,7 @@ def run(args: argparse.Namespace) -> int:
     from visthrow.diagnose.planning.fly_manoeuvres import fly
     from visthrow.task import load_experiment, plant_of
 
-    chosen = manoeuvres.named(args.manoeuvres)
+    chosen = manoeuvres.named(dict.fromkeys(args.manoeuvres))
     plant = plant_of(load_experiment(args.plant, args.overrides))
     folder = Path(args.out)
     writable(folder)

@@ -93,6 +93,7 @@ class Trained:
         """Posterior mean of the weights from some groups, at the likeliest reach, shape (W,)."""
         information = self.information[keep].sum(0)
         score = self.score[keep].sum(0)
+        mean = np.zeros(len(self.reach))
         likeliest = -np.inf
         for reach in REACHES:
             prior = reach * self.reach
