@@ -83,6 +83,9 @@ def _check_path(path: str) -> None:
         if name not in types:
             raise ValueError(f"path '{path}': no '{name}'; expected one of: {', '.join(types)}")
         owner = types[name]
+    if dataclasses.is_dataclass(owner):
+        names = ", ".join(_field_types(owner))
+        raise ValueError(f"path '{path}': a group of numbers; expected one of it: {names}")
 
 
 @cache

@@ -16,7 +16,7 @@ from sim.reference.snapshot import Snapshot as Snapshot
 from visthrow import config
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.free_fall import GRAVITY, free_flight
-from visthrow.common.rotations import turned
+from visthrow.common.rotations import cross, rotate, turned
 from visthrow.task import Experiment, NoiseParams, plant_of
 from visthrow.throws.loose_rope import LooseRope
 
@@ -144,7 +144,7 @@ class HybridPlant:
             self._begin()
 
     def reset(self, pos_w: ndarray, cable_dir_w: ndarray | None = None) -> None:
-        self._sim.place(pos_w=pos_w, cable_dir_w=cable_dir_w)
+        self._sim.place(pos_w=pos_w + self.params.vehicle.body.com, cable_dir_w=cable_dir_w)
         self._begin()
 
     def _begin(self) -> None:
@@ -267,16 +267,21 @@ class HybridPlant:
         for e, rope in enumerate(self._ropes):
             if rope is not None:
                 points[e] = rope.points_w(ball[e])
-        names = ("pos_w", "quat_wb", "vel_w", "rate_b", "motor_speed")
+        centre, quat, centre_vel, rate = self.look("pos_w", "quat_wb", "vel_w", "rate_b")
+        com = np.array([self.params.vehicle.body.com])
         return Snapshot(
             self.time,
+            pos_w=centre - rotate(quat, com),
+            quat_wb=quat,
+            vel_w=centre_vel - rotate(quat, cross(rate, com)),
+            rate_b=rate,
             payload_pos_w=ball,
             payload_vel_w=ball_vel,
             cable_points_w=points,
+            motor_speed=self.look("motor_speed")[0],
             battery_voltage=self.look("voltage")[0],
             attached=self._sim.get("attached") != 0,
             latched=self._latched.copy(),
-            **dict(zip(names, self.look(*names))),
         )
 
     def measured(self) -> Snapshot:

@@ -4,7 +4,41 @@ import numpy as np
 from pytest import approx
 
 from tests.commands import run_command
+from visthrow.config.effects import catalogue
+from visthrow.diagnose.inputs.setup import load
+from visthrow.diagnose.models.catalogue import effects_of
+from visthrow.diagnose.planning import manoeuvres
 from visthrow.logs.flightlog import FlightLog
+
+BESIDE_THE_PLAN = {
+    "IMU or rotor speeds in the log",
+    "a fresh pack, an empty one, a fresh one",
+    "a log of ten minutes",
+    "a long hover",
+    "a tape",
+    "add a bar of known inertia",
+    "attitude from several markers",
+    "cut the rope",
+    "fresh and empty pack, A-B-A",
+    "gyro in the log",
+    "hang the payload",
+    "hang two loads",
+    "hang: the geometry",
+    "hover at the beginning and at the end of a pack",
+    "hover at two places",
+    "hover with and without a weighed load",
+    "hover with the payload far off the centre",
+    "log battery_voltage",
+    "mark the ball and film its spin",
+    "none: replay with finer steps",
+    "put the payload down on the target",
+    "read a barometer",
+    "stand still before the flight",
+    "throws in two directions",
+    "vary distance and direction of the target",
+    "weigh",
+}
+"""What separates effects and is no manoeuvre of a plan: work on the ground, or other equipment."""
 
 
 def hovered(folder, hidden: str) -> tuple[np.ndarray, np.ndarray]:
@@ -40,3 +74,13 @@ def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):
 def test_an_unknown_manoeuvre_is_refused(tmp_path, capsys):
     assert run_command(f"diagnose simulate hoover --out {tmp_path}") == 2
     assert "did you mean 'hover'" in capsys.readouterr().err
+
+
+def test_effects_name_manoeuvres_as_the_plan_does():
+    """A report's "rate doublets" can be asked of ``plan --manoeuvres`` and of ``simulate``."""
+    flyer = load("nanobench_cf21").flyer
+    effects = [*catalogue().values(), *effects_of("flyer", flyer)]
+    named = {manoeuvre for effect in effects for manoeuvre in effect.manoeuvres}
+    flown = {manoeuvre.name for manoeuvre in manoeuvres.catalogue()}
+    assert named - flown == BESIDE_THE_PLAN
+    assert len(named & flown) > 10

@@ -5,7 +5,7 @@ from itertools import combinations
 
 from pytest import approx, mark, raises
 
-from sim.effects.effect import Lowest, apply, possible_together
+from sim.effects.effect import Change, Lowest, apply, possible_together
 from sim.effects.setting import Setting, generalised
 from tests.plants import paper_plant
 from visthrow.config.effects import catalogue
@@ -49,3 +49,14 @@ def test_an_effect_takes_what_others_leave_of_a_number():
     assert sizes == {"rotor_drag": -drag, "rotor_drag_z": approx(-0.5 * drag)}
     assert apply(effects, setting, sizes).plant.vehicle.aero.drag_z == approx(0.0, abs=1e-15)
     assert possible_together(effects, setting, {"rotor_drag_z": -drag}) == {"rotor_drag_z": -drag}
+
+
+@mark.parametrize("kind", [Change, Lowest])
+def test_a_path_leads_to_a_number(kind):
+    with raises(ValueError, match="'plant.rope': a group of numbers; expected one of it: .*length"):
+        kind("plant.rope")
+    with raises(ValueError, match="a number before 'x'"):
+        kind("plant.rope.length.x")
+    with raises(ValueError, match="no 'ropes'"):
+        kind("plant.ropes")
+    assert kind("plant.rope.length").path == "plant.rope.length"

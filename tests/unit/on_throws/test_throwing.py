@@ -18,6 +18,7 @@ from tests.configs import load_experiment
 from visthrow import config
 from visthrow.cli import compare
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError
+from visthrow.common.rotations import rotate
 from visthrow.logs.flightlog import STANDARD_CHANNELS, FlightLog
 from visthrow.onboard.policy import Policy
 from visthrow.task import contract_of, plant_of
@@ -34,6 +35,8 @@ LINK_ERROR = 1e-5  # of a link's length [m]: Newton's last step
 ENERGY_DRIFT = (
     0.02  # of a swinging rope in half a second: first-order velocity of Verlet steps of 1 ms
 )
+ROUNDED = 1e-5  # of places in single precision [m]
+CHORD = 0.01  # of a slope over two periods [m/s]; that of the centre of mass is 0.13 off
 JOIN = 2e-3  # [m]: what the ball moves at most between two samples beyond v dt, half g dt^2
 
 
@@ -114,6 +117,21 @@ def test_ball_and_rope_fly_on_from_the_hybrid_plants_release():
     assert landing.point_w[0, 2] == approx(experiment.release.landing_height, abs=1e-5)
     assert np.isnan(landing.time[1])
     assert now.attached.tolist() == [False, True]
+
+
+def test_a_log_holds_the_origin_of_the_frame_wherever_the_centre_of_mass_lies(tmp_path):
+    """The rope begins at its mount, which is stated from the origin, and moves with it."""
+    aside = ["vehicle.body.com=[0.02,-0.01,0.005]", "rope.mount=[0.0,0.03,-0.02]"]
+    path = tmp_path / "dropper.npz"
+    dropping_policy(overrides=aside).save(path)
+    log = fly(load_policy(path), [0.5, 0.1, 0.0])
+    time, pos = log["pos_w"].samples()
+    hangs = time < log.meta["times"]["separation"]
+    quat, vel, points = (log[n].values for n in ("quat_wb", "vel_w", "cable_points_w"))
+    mount = pos + rotate(quat, np.array([[0.0, 0.03, -0.02]]))
+    assert np.abs(points[:, 0] - mount)[hangs].max() < ROUNDED
+    off = np.abs(np.gradient(pos, time, axis=0) - vel)
+    assert off[1:][hangs[1:]].max() < CHORD  # at its first end a slope is over one period
 
 
 MEASURED_VECTORS = ("pos_w", "vel_w", "rate_b", "payload_pos_w")
