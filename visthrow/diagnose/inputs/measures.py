@@ -22,6 +22,16 @@ class Measurement:
     effect: str  # that it settles
     sd: float  # of the measured value, in the effect's unit
     seconds: float
+    file = ""  # no reference is flown
+
+    @property
+    def purpose(self) -> str:
+        """Return what it is for, in words."""
+        return f"settles {self.effect}"
+
+    def limits(self) -> str:
+        """Return when to abort: never."""
+        return ""
 
 
 RIGHT = 1e-3  # deviation of a value that is stated to be right, in what is negligible

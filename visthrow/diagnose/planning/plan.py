@@ -1,8 +1,8 @@
 """Which flight to fly next: the manoeuvre that separates what these flights could not, with the
 evidence it promises.
 
-Each manoeuvre is simulated with the model as found; its expected information is added to that at
-hand. For two members of a class the promise is the expected gap of their evidence with either as
+Each manoeuvre is simulated with the model as found; its expected information, or that of a
+measurement on the ground, is added to that at hand. For two members of a class the promise is the expected gap of their evidence with either as
 the truth, the smaller of both."""
 
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from itertools import product
 import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
-from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement, narrowed
+from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
 from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
 from visthrow.diagnose.likelihood.stack import integrals
@@ -158,21 +158,34 @@ class PlanningGoal:
             deviations.append(np.sqrt(variance))
         return np.array(deviations)
 
-    def proposal(self, manoeuvre: Manoeuvre, new: np.ndarray) -> FlightProposal:
-        """Return the promise of a manoeuvre of this information."""
+    def measurements(self) -> list[tuple[Measurement, np.ndarray]]:
+        """Return the measurements on the ground of members of classes, with the information of
+        each.
+        """
+        promised = []
+        for m in MEASUREMENTS:
+            if any(m.effect in (self.names[a], self.names[b]) for a, b in self.pairs):
+                j = self.names.index(m.effect)
+                information = np.zeros_like(self.base.information)
+                information[j, j] = (self.priors.floor[j] / m.sd) ** 2
+                promised.append((m, information))
+        return promised
+
+    def proposal(self, flight: Manoeuvre | Measurement, new: np.ndarray) -> FlightProposal:
+        """Return the promise of a manoeuvre, or of a measurement, of this information."""
         separated, repeats = self.settled(new)
         separates = []
         for group in separated:
             separates.append(tuple(self.names[j] for j in group))
         return FlightProposal(
-            manoeuvre.name,
-            manoeuvre.purpose,
-            manoeuvre.seconds,
+            flight.name,
+            flight.purpose,
+            flight.seconds,
             nats=self.nats(new),
             separates=tuple(separates),
             repeats=repeats,
-            limits=manoeuvre.limits(),
-            reference=manoeuvre.file,
+            limits=flight.limits(),
+            reference=flight.file,
         )
 
 
@@ -182,8 +195,8 @@ def propose(
     """Rank manoeuvres and measurements, best first; ``informed``: manoeuvres to choose among, and
     the expected information of each.
     """
-    flights = [aim.proposal(manoeuvre, new) for manoeuvre, new in informed]
-    return sorted(flights + _measured(aim), key=_worth, reverse=True)
+    promised = [*informed, *aim.measurements()]
+    return sorted((aim.proposal(*each) for each in promised), key=_worth, reverse=True)
 
 
 def session(proposals: Sequence[FlightProposal]) -> tuple[FlightProposal, ...]:
@@ -205,41 +218,6 @@ def _worth(p: FlightProposal) -> tuple[float, float]:
     """
     settles = len(p.separates) / np.sqrt(p.seconds * max(p.repeats, 1))
     return settles, p.nats / np.sqrt(p.seconds)
-
-
-def _measured(aim: PlanningGoal) -> list[FlightProposal]:
-    """Measurements on the ground that settle members of classes."""
-    names = aim.names
-    proposals = []
-    for m in MEASUREMENTS:
-        pairs = [(a, b) for a, b in aim.pairs if m.effect in (names[a], names[b])]
-        if not pairs:
-            continue
-        j = names.index(m.effect)
-        # if it is the cause, the measurement shows it
-        shown = 0.5 * (aim.diagnosis[m.effect].estimate / m.sd) ** 2
-        gaps = [min(shown, _denied(aim.diagnosis, j, a + b - j, m)) for a, b in pairs]
-        apart = [pair for pair, gap in zip(pairs, gaps) if gap > DECISIVE]
-        separates = tuple((names[a], names[b]) for a, b in apart)
-        why = f"settles {m.effect}"
-        repeats = 1 if apart else 0
-        nats = min(gaps)
-        proposals.append(FlightProposal(m.name, why, m.seconds, nats, separates, repeats, ""))
-    return proposals
-
-
-def _denied(diagnosis: Diagnosis, j: int, truth: int, m: Measurement) -> float:
-    """Nats by which the other member is ahead once the measurement has found the configured value
-    right.
-    """
-    work = diagnosis.work
-    model = work.problem.model
-    effects = narrowed(model.effects, {m.effect: m.sd})
-    priors = Priors.of(effects, tuple(model.channels))
-    remaining = [k for k in work.active if k not in (j, truth)]
-    measured = replace(work.after.posterior, priors=priors)
-    right = measured.log_evidence([*remaining, truth])
-    return right - measured.log_evidence([*remaining, j])
 
 
 def _expected_levels(noise: Noise, phases: set[str]) -> dict[tuple[int, str], float]:
