@@ -2,8 +2,8 @@
 evidence it promises.
 
 Each manoeuvre is simulated with the model as found; its expected information, or that of a
-measurement on the ground, is added to that at hand. For two members of a class the promise is the expected gap of their evidence with either as
-the truth, the smaller of both."""
+measurement on the ground, is added to that at hand. For two members of a class the promise is the
+expected gap of their evidence with either as the truth, the smaller of both."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
