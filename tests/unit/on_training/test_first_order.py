@@ -16,6 +16,7 @@ from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import rewards
 from visthrow.training import protocol
+from visthrow.training.first_order.first_order_training import NODES
 from visthrow.training.first_order.surrogate import TAUT
 from visthrow.training.trainer import Trainer
 
@@ -210,6 +211,25 @@ def test_weights_get_what_autograd_gives_them():
     for parameter, gradient in zip(parameters, expected, strict=True):
         assert_close(parameter.grad, gradient, rtol=1e-4, atol=1e-5 * gradient.abs().max().item())
     assert by_action.any(), "nothing was differentiated"
+
+
+def test_a_release_costs_what_releases_two_steps_about_it_do():
+    """So a policy learns to release where the landing hardly moves with time."""
+    fo = first_order("state")
+    fo.collect(1.0)
+    assert (fo.flights.steps == fo.p.horizon).all()
+    release = 3
+    fo.layers.action[release, :, act.COMMANDS] = 1.0
+    cost = fo.derivatives()["cost"]
+    moving = []
+    for step, landing in enumerate(fo.flights.landing):
+        landing += 1.0
+        if fo.derivatives()["cost"] != cost:
+            moving.append(step)
+        landing -= 1.0
+    separation = release + fo.lag
+    alone = [separation + node for node in NODES]
+    assert moving == [*range(alone[0] - 2, alone[-1] + 3)]
 
 
 SLOWER = [
