@@ -1,4 +1,6 @@
-"""The factors of laws outside the catalogue, which the kernels and the diagnosis make alike."""
+"""The factors of laws outside the catalogue, and the quantities that they are made of, which the
+kernels and the diagnosis make alike.
+"""
 
 import tomllib
 from pathlib import Path
@@ -7,3 +9,66 @@ LAW_FACTORS = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encodi
 """``groups`` of quantities; ``scalars`` and, by block, ``vectors``: name -> symbol, unit, quantity
 and what it is made of.
 """
+
+UNITS = {
+    "unit_x": (1.0, 0.0, 0.0),
+    "unit_y": (0.0, 1.0, 0.0),
+    "unit_z": (0.0, 0.0, 1.0),
+    "unit_down": (0.0, 0.0, -1.0),
+}
+"""Unit vectors of a frame: the world's for forces, the body's for torques."""
+
+QUANTITIES = {
+    "axis_x": ("to_world", "quat_wb", "unit_x"),
+    "axis_y": ("to_world", "quat_wb", "unit_y"),
+    "axis_z": ("to_world", "quat_wb", "unit_z"),
+    "axis_down": ("to_world", "quat_wb", "unit_down"),
+    "rate_w": ("to_world", "quat_wb", "rate_b"),
+    "vel_b": ("to_body", "quat_wb", "vel_w"),
+    "cable_dir_b": ("to_body", "quat_wb", "cable_dir_w"),
+    "swing_b": ("to_body", "quat_wb", "swing"),
+    "|slope|": ("absolute", "slope"),
+    "along": ("inner", "vel_w", "axis_z"),
+    "across": ("normal_part", "vel_w", "axis_z"),
+    "speed_across_squared": ("inner", "across", "across"),
+    "rate_yaw": ("inner", "rate_b", "unit_z"),
+    "height": ("inner", "pos_w", "unit_z"),
+    "inverse_height": ("inverse", "height"),
+    "payload_vel": ("difference", "payload_vel_w", "vel_w"),  # against the vehicle
+    "swing": ("normal_part", "payload_vel", "cable_dir_w"),
+    "under": ("inner", "cable_dir_w", "axis_down"),
+    "sideways": ("normal_part", "cable_dir_w", "axis_z"),
+    "mount_arm": ("to_world", "quat_wb", "mount_b"),
+    "mount_pos_w": ("sum", "pos_w", "mount_arm"),
+    "reach_w": ("difference", "payload_pos_w", "mount_pos_w"),  # from the mount to the payload
+    "mount_turn": ("to_world", "quat_wb", "rate_b x mount_b"),
+    "mount_vel_w": ("sum", "vel_w", "mount_turn"),
+    "reach_vel": ("difference", "payload_vel_w", "mount_vel_w"),
+    "rope_rate": ("turn_rate", "reach_w", "reach_vel"),
+    "rope_rate_b": ("to_body", "quat_wb", "rope_rate"),
+    "joint_rate_b": ("difference", "rope_rate_b", "rate_b"),  # of the rope against the vehicle
+    "friction": ("saturated", "joint_rate_b"),
+    "apart": ("difference", "pos_w", "neighbour_pos_w"),
+    "inverse_distance": ("inverse", "|apart|"),
+    "neighbour": ("scaled", "inverse_distance", "apart"),
+    "distance_upright": ("inner", "neighbour", "unit_z"),
+}
+"""Quantities that follow from measured or simulated ones: name -> operation, and what it takes.
+
+Each simulator has the operations: ``sim/kernels/laws.py`` and ``diagnose/models/law_terms.py``."""
+
+
+def definition(name: str) -> tuple[str, ...]:
+    """Return the operation that makes a quantity, and what it takes.
+
+    ``name``: of :data:`QUANTITIES`, ``|a|`` for a size, or ``a x b`` for a cross product. Raises
+    KeyError: none of them.
+    """
+    if name in QUANTITIES:
+        return QUANTITIES[name]
+    first, crossed, second = name.partition(" x ")
+    if crossed:
+        return "cross", first, second
+    if name.startswith("|"):
+        return "size", name.strip("|")
+    raise KeyError(name)

@@ -3,14 +3,15 @@ times one vector.
 
 A law is plain data (:class:`sim.params.LawParams`). :func:`build_laws` composes the functions of
 its factors into the kernel that is built for it; its coefficient is a number of the run, so that
-one kernel serves every size of a law. The factors are those of ``sim/law_factors.toml``, of which
-``visthrow.diagnose.models.law_terms`` makes the same in NumPy. A law's force is taken at the start
-of an integration step and held over it.
+one kernel serves every size of a law. The factors are those of ``sim/law_factors.toml``, made of
+the quantities of ``sim/law_factors.py``, of which ``visthrow.diagnose.models.law_terms`` makes the
+same in NumPy. A law's force is taken at the start of an integration step and held over it.
 
 A torque M in the rope's joint acts on the vehicle, and -M on the rope: by the pair of forces that
 does the same to a straight rope of the length l in direction n, (-M x n) / l on the payload and its
 opposite at the mount. Momentum is conserved."""
 
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +20,7 @@ import warp as wp
 from sim.kernels.quadrotor.rigid_body import mount_position, mount_velocity
 from sim.kernels.quadrotor.thrust import rotor_thrust_scaled
 from sim.kernels.structs import Types
-from sim.law_factors import LAW_FACTORS
+from sim.law_factors import LAW_FACTORS, UNITS, definition
 from sim.params import LOWEST, SLOWEST, LawParams
 
 MOST_LAWS = 4
@@ -40,44 +41,9 @@ AROUND = {
 """What factors are made of: name -> type."""
 
 
-def _axis(x: float, y: float, z: float):
-    @wp.func
-    def unit(a: Any):
-        return type(a.vel_w)(type(a.thrust)(x), type(a.thrust)(y), type(a.thrust)(z))
-
-    return unit
-
-
-def _turned(vector):
-    @wp.func
-    def world(a: Any):
-        return wp.quat_rotate(a.quat_wb, vector(a))
-
-    return world
-
-
-def _turned_back(vector):
-    @wp.func
-    def body(a: Any):
-        return wp.quat_rotate_inv(a.quat_wb, vector(a))
-
-    return body
-
-
-def _crossed(first, second):
-    @wp.func
-    def cross(a: Any):
-        return wp.cross(first(a), second(a))
-
-    return cross
-
-
-def _size(vector):
-    @wp.func
-    def length(a: Any):
-        return wp.length(vector(a))
-
-    return length
+@wp.func
+def pos(a: Any):
+    return a.pos_w
 
 
 @wp.func
@@ -91,13 +57,28 @@ def rate(a: Any):
 
 
 @wp.func
-def cable(a: Any):
-    return a.cable_dir_w
+def attitude(a: Any):
+    return a.quat_wb
+
+
+@wp.func
+def payload_pos(a: Any):
+    return a.payload_pos_w
 
 
 @wp.func
 def payload_vel(a: Any):
     return a.payload_vel_w
+
+
+@wp.func
+def cable(a: Any):
+    return a.cable_dir_w
+
+
+@wp.func
+def mount(a: Any):
+    return a.mount_b
 
 
 @wp.func
@@ -115,122 +96,94 @@ def tension(a: Any):
     return a.tension
 
 
-vertical = _axis(0.0, 0.0, 1.0)
-up = _turned(vertical)
-
-
-@wp.func
-def speed_along(a: Any):
-    return wp.dot(a.vel_w, up(a))
-
-
-@wp.func
-def vel_across(a: Any):
-    return a.vel_w - speed_along(a) * up(a)
-
-
-@wp.func
-def swing(a: Any):
-    relative = a.payload_vel_w - a.vel_w
-    return relative - wp.dot(relative, a.cable_dir_w) * a.cable_dir_w
-
-
-@wp.func
-def cable_under_rotors(a: Any):
-    return -wp.dot(a.cable_dir_w, up(a))
-
-
-@wp.func
-def sideways(a: Any):
-    return a.cable_dir_w + cable_under_rotors(a) * up(a)
-
-
-@wp.func
-def abs_thrust_rate(a: Any):
-    return wp.abs(a.thrust_rate)
-
-
-@wp.func
-def speed_across_squared(a: Any):
-    return wp.dot(vel_across(a), vel_across(a))
-
-
-@wp.func
-def rate_yaw(a: Any):
-    return a.rate_b[2]
-
-
-@wp.func
-def inverse_height(a: Any):
-    return type(a.thrust)(1.0) / wp.max(a.pos_w[2], type(a.thrust)(LOWEST))
-
-
-@wp.func
-def reach(a: Any):
-    """Vector from the mount to the payload [m], world frame."""
-    return a.payload_pos_w - a.pos_w - wp.quat_rotate(a.quat_wb, a.mount_b)
-
-
-@wp.func
-def joint_rate(a: Any):
-    arm = reach(a)
-    mount_vel = a.vel_w + wp.quat_rotate(a.quat_wb, wp.cross(a.rate_b, a.mount_b))
-    rope_rate = wp.cross(arm, a.payload_vel_w - mount_vel) / wp.dot(arm, arm)
-    return wp.quat_rotate_inv(a.quat_wb, rope_rate) - a.rate_b
-
-
-@wp.func
-def friction(a: Any):
-    turn = joint_rate(a)
-    return turn / wp.sqrt(wp.dot(turn, turn) + type(a.thrust)(SLOWEST * SLOWEST))
-
-
-unit_x = _axis(1.0, 0.0, 0.0)
-unit_y = _axis(0.0, 1.0, 0.0)
-vel_body = _turned_back(vel)
-cable_body = _turned_back(cable)
-QUANTITIES = {
-    "thrust": thrust,
-    "slope": thrust_rate,
-    "|slope|": abs_thrust_rate,
-    "tension": tension,
+STATES = {
+    "pos_w": pos,
     "vel_w": vel,
     "rate_b": rate,
-    "cable_dir_w": cable,
+    "quat_wb": attitude,
+    "payload_pos_w": payload_pos,
     "payload_vel_w": payload_vel,
-    "unit_x": unit_x,
-    "unit_y": unit_y,
-    "unit_z": vertical,
-    "axis_x": _turned(unit_x),
-    "axis_y": _turned(unit_y),
-    "axis_z": up,
-    "along": speed_along,
-    "across": vel_across,
-    "speed_across_squared": speed_across_squared,
-    "rate_yaw": rate_yaw,
-    "rate_w": _turned(rate),
-    "inverse_height": inverse_height,
-    "vel_b": vel_body,
-    "cable_dir_b": cable_body,
-    "swing": swing,
-    "swing_b": _turned_back(swing),
-    "under": cable_under_rotors,
-    "sideways": sideways,
-    "joint_rate_b": joint_rate,
-    "friction": friction,
-    "spring": _crossed(vertical, cable_body),
+    "cable_dir_w": cable,
+    "mount_b": mount,
+    "thrust": thrust,
+    "slope": thrust_rate,
+    "tension": tension,
 }
-"""Quantities of ``law_factors.toml`` at a state."""
+"""Quantities that a state holds."""
 
 
+@wp.func
+def normal_part(vector: Any, axis: Any):
+    return vector - wp.dot(vector, axis) * axis
+
+
+@wp.func
+def inverse(value: Any):
+    return type(value)(1.0) / wp.max(value, type(value)(LOWEST))
+
+
+@wp.func
+def saturated(vector: Any):
+    square = wp.dot(vector, vector)
+    return vector / wp.sqrt(square + type(square)(SLOWEST * SLOWEST))
+
+
+@wp.func
+def turn_rate(arm: Any, arm_vel: Any):
+    return wp.cross(arm, arm_vel) / wp.dot(arm, arm)
+
+
+OPERATIONS = {
+    "to_world": wp.quat_rotate,
+    "to_body": wp.quat_rotate_inv,
+    "cross": wp.cross,
+    "inner": wp.dot,
+    "size": wp.length,
+    "absolute": wp.abs,
+    "sum": wp.add,
+    "difference": wp.sub,
+    "normal_part": normal_part,
+    "inverse": inverse,
+    "saturated": saturated,
+    "turn_rate": turn_rate,
+}
+"""Operations of :data:`sim.law_factors.QUANTITIES`."""
+
+
+def _unit(x: float, y: float, z: float):
+    @wp.func
+    def unit(a: Any):
+        return type(a.vel_w)(type(a.thrust)(x), type(a.thrust)(y), type(a.thrust)(z))
+
+    return unit
+
+
+def _of_one(operation, first):
+    @wp.func
+    def single(a: Any):
+        return operation(first(a))
+
+    return single
+
+
+def _of_two(operation, first, second):
+    @wp.func
+    def pair(a: Any):
+        return operation(first(a), second(a))
+
+    return pair
+
+
+@cache
 def quantity(name: str):
-    """Return the function of a quantity of the table, of a vector's size, or of a cross product."""
-    if name in QUANTITIES:
-        return QUANTITIES[name]
-    first, crossed, second = name.partition(" x ")
-    if crossed:
-        return _crossed(QUANTITIES[first], QUANTITIES[second])
-    return _size(QUANTITIES[name.strip("|")])
+    """Return the function of a quantity of the state, or of one that follows from it."""
+    if name in STATES:
+        return STATES[name]
+    if name in UNITS:
+        return _unit(*UNITS[name])
+    operation, *names = definition(name)
+    compose = _of_one if len(names) == 1 else _of_two
+    return compose(OPERATIONS[operation], *map(quantity, names))
 
 
 def _functions(rows):
@@ -300,6 +253,7 @@ def build_laws(t: Types, laws: tuple[LawParams, ...], flow, chain) -> SimpleName
     for i, law in enumerate(laws):
         total[law.block] = plus(total[law.block], law, i)
     force, torque, payload_force, joint = (total[block] for block in BLOCKS)
+    reach = quantity("reach_w")
     in_joint = any(law.block == "rope joint" for law in laws)
 
     @wp.func

@@ -22,7 +22,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy import ndarray
 
-from sim.law_factors import LAW_FACTORS
+from sim.law_factors import LAW_FACTORS, UNITS, definition
 from sim.params import LOWEST, SLOWEST, LawParams
 from visthrow.common.errors import ConfigError, suggest
 from visthrow.common.rotations import cross, normal_part, rotate, rotate_back
@@ -42,14 +42,14 @@ class KnotValues(dict):
     """Quantities at the knots, and what follows from them, computed when it is first asked for."""
 
     def __missing__(self, name: str) -> ndarray:
-        """Compute a size, a cross product, or one of the quantities of ``DERIVED``."""
-        first, crossed, second = name.partition(" x ")
-        if name.startswith("|"):
-            value = _size(self[name.strip("|")])
-        elif crossed:
-            value = cross(self[first], self[second])
+        """Compute a quantity by its definition."""
+        if name in UNITS:
+            value = np.tile(UNITS[name], (len(self["time"]), 1))
+        elif name == "slope":
+            value = _slope(self["thrust"], self["time"])
         else:
-            value = DERIVED[name](self)
+            operation, *names = definition(name)
+            value = OPERATIONS[operation](*[self[part] for part in names])
         self[name] = value
         return value
 
@@ -169,83 +169,49 @@ def _dot(a: ndarray, b: ndarray) -> ndarray:
     return np.einsum("ki,ki->k", a, b)
 
 
-def _in_world(name: str) -> Callable[[KnotValues], ndarray]:
-    return lambda k: rotate(k["quat_wb"], k[name])
+def _slope(thrust: ndarray, time: ndarray) -> ndarray:
+    return np.gradient(thrust, time) if len(thrust) > 1 else np.zeros(len(thrust))
 
 
-def _in_body(name: str) -> Callable[[KnotValues], ndarray]:
-    return lambda k: rotate_back(k["quat_wb"], k[name])
+def _size(vector: ndarray) -> ndarray:
+    return np.linalg.norm(vector, axis=1)
 
 
-def _unit(i: int) -> Callable[[KnotValues], ndarray]:
-    axis = np.eye(3)[i]
-    return lambda k: np.tile(axis, (len(k["time"]), 1))
+def _scaled(factor: ndarray, vector: ndarray) -> ndarray:
+    return factor[:, None] * vector
 
 
-def _slope(k: KnotValues) -> ndarray:
-    thrust = k["thrust"]
-    return np.gradient(thrust, k["time"]) if len(thrust) > 1 else np.zeros(len(thrust))
+def _inverse(value: ndarray) -> ndarray:
+    """Return the inverse of what is not below :data:`sim.params.LOWEST`."""
+    return 1.0 / np.maximum(value, LOWEST)
 
 
-def _reach(k: KnotValues) -> ndarray:
-    """Return the vector from the mount to the payload's centre [m], world frame."""
-    return k["payload_pos_w"] - k["pos_w"] - rotate(k["quat_wb"], k["mount_b"])
+def _saturated(vector: ndarray) -> ndarray:
+    """Direction of a vector, and less than a unit vector where it is slow."""
+    return vector / np.hypot(_size(vector), SLOWEST)[:, None]
 
 
-def _joint_rate(k: KnotValues) -> ndarray:
-    """Rate of the rope against the vehicle [1/s], body frame; 0 where nothing hangs on it."""
-    reach = k["reach_w"]
-    mount_vel = k["vel_w"] + rotate(k["quat_wb"], cross(k["rate_b"], k["mount_b"]))
-    rope_rate = cross(reach, k["payload_vel_w"] - mount_vel) / _dot(reach, reach)[:, None]
-    return (k["tension"] > 0.0)[:, None] * (rotate_back(k["quat_wb"], rope_rate) - k["rate_b"])
+def _turn_rate(arm: ndarray, arm_vel: ndarray) -> ndarray:
+    """Rate at which an arm turns whose end moves against its root [1/s]."""
+    return cross(arm, arm_vel) / _dot(arm, arm)[:, None]
 
 
-def _friction(k: KnotValues) -> ndarray:
-    """Direction of that rate, and less than a unit vector where it is slow."""
-    return k["joint_rate_b"] / np.hypot(k["|joint_rate_b|"], SLOWEST)[:, None]
-
-
-def _spring(k: KnotValues) -> ndarray:
-    """Return the direction that turns the vehicle's axis against the rope, body frame; 0 where
-    nothing hangs on it.
-    """
-    return (k["tension"] > 0.0)[:, None] * k["unit_z x cable_dir_b"]
-
-
-def _size(value: ndarray) -> ndarray:
-    return np.abs(value) if value.ndim == 1 else np.linalg.norm(value, axis=1)
-
-
-DERIVED: dict[str, Callable[[KnotValues], ndarray]] = {
-    "axis_x": _in_world("unit_x"),
-    "axis_y": _in_world("unit_y"),
-    "axis_z": _in_world("unit_z"),
-    "unit_x": _unit(0),
-    "unit_y": _unit(1),
-    "unit_z": _unit(2),
-    "slope": _slope,
-    "swing": lambda k: normal_part(k["payload_vel_w"] - k["vel_w"], k["cable_dir_w"]),
-    "along": lambda k: _dot(k["vel_w"], k["axis_z"]),
-    "across": lambda k: normal_part(k["vel_w"], k["axis_z"]),
-    "under": lambda k: -_dot(k["cable_dir_w"], k["axis_z"]),
-    "vel_b": _in_body("vel_w"),
-    "cable_dir_b": _in_body("cable_dir_w"),
-    "reach_w": _reach,
-    "joint_rate_b": _joint_rate,
-    "friction": _friction,
-    "spring": _spring,
-    "speed_across_squared": lambda k: k["|across|"] ** 2,
-    "rate_yaw": lambda k: k["rate_b"][:, 2],
-    "rate_w": _in_world("rate_b"),
-    "swing_b": _in_body("swing"),
-    "inverse_height": lambda k: 1.0 / np.maximum(k["pos_w"][:, 2], LOWEST),
-    "apart": lambda k: k["pos_w"] - k["neighbour_pos_w"],
-    "inverse_distance": lambda k: 1.0 / np.maximum(k["|apart|"], LOWEST),
-    "neighbour": lambda k: k["apart"] * k["inverse_distance"][:, None],
-    "distance_upright": lambda k: k["neighbour"][:, 2],
-    "sideways": lambda k: normal_part(k["cable_dir_w"], k["axis_z"]),
+OPERATIONS: dict[str, Callable[..., ndarray]] = {
+    "to_world": rotate,
+    "to_body": rotate_back,
+    "cross": cross,
+    "inner": _dot,
+    "size": _size,
+    "absolute": np.abs,
+    "sum": np.add,
+    "difference": np.subtract,
+    "normal_part": normal_part,
+    "scaled": _scaled,
+    "inverse": _inverse,
+    "saturated": _saturated,
+    "turn_rate": _turn_rate,
 }
-"""What :class:`KnotValues` computes of the quantities at the knots."""
+"""Operations of :data:`sim.law_factors.QUANTITIES` on arrays at the knots."""
 
 
 def _factors(rows: Mapping[str, Sequence[str]]) -> dict[str, Factor]:
@@ -309,7 +275,8 @@ def loads(block: str, knots: KnotValues, values: ndarray) -> dict[str, ndarray]:
     """
     if block != JOINT:
         return {block: values}
-    torque_b = np.swapaxes(values, 1, 2)
+    hangs = knots["tension"] > 0.0  # without a load the rope carries no torque
+    torque_b = np.swapaxes(values, 1, 2) * hangs[:, None, None]
     reach = knots["reach_w"][:, None, :]
     turn = np.stack([knots[f"axis_{i}"] for i in "xyz"], axis=-1)  # body to world
     torque_w = np.einsum("kij,ktj->kti", turn, torque_b)
