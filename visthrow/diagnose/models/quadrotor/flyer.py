@@ -27,9 +27,9 @@ from visthrow.diagnose.models.numeric import (
 )
 from visthrow.diagnose.models.quadrotor.flyer_params import MOTORS, FlyerParams
 from visthrow.diagnose.models.quadrotor.flyer_windows import (
-    FINE,
     NEIGHBOUR,
     expect_thrust,
+    lagged,
     spare,
     windows_of,
     without_each,
@@ -82,7 +82,7 @@ class FlyerModel(NumericModel):
     @property
     def motors(self) -> int:
         """Return the number of columns of the inputs."""
-        return self.stretches[0].data["input"].shape[1]
+        return self.stretches[0].data["sent"].values.shape[1]
 
     @property
     def has_voltage(self) -> bool:
@@ -124,37 +124,22 @@ class FlyerModel(NumericModel):
 
         In the middle of a step stands what makes Simpson's rule, and so the integration, give the
         step's own mean: commands switch there."""
-        from scipy.integrate import cumulative_trapezoid
-        from scipy.signal import lfilter
-
         p = self.params
-        fine = self.params.step / FINE
-        commanded = p.thrust(np.array([s.data["input"] for s in self.stretches]))
-        first = commanded[:, :1]
+        grid = 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None]
         delay = p.command_delay + self.size_of(lanes, "cmd_delay")
         tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
-        tau = np.maximum(tau, SHORTEST)
-        grid = 0.5 * p.step * np.arange(2 * self.steps + 1)[:, None]
-        position = (p.window + grid - delay) / fine  # tables begin one window early
-        index = np.clip(position.astype(int), 0, commanded.shape[1] - 1)
-        share = (position - index)[..., None]
-        thrust = np.empty((*position.shape, self.motors))
-        whole = np.empty_like(thrust)
-        for lag in np.unique(tau):
-            keep = np.exp(-fine / lag)
-            members = np.flatnonzero(tau == lag)
-            after, _ = lfilter([1.0 - keep], [1.0, -keep], commanded, 1, keep * first)
-            table = np.concatenate([first, after], 1)
-            integral = cumulative_trapezoid(table, axis=1, initial=0.0)
-            which = lanes.owner[members]
-            rows = index[:, members]
-            part = share[:, members]
-            begin = table[which, rows]
-            rise = part * (table[which, rows + 1] - begin)
-            thrust[:, members] = begin + rise
-            whole[:, members] = integral[which, rows] + part * (begin + 0.5 * rise)
-        mean = np.diff(whole[::2], axis=0) * (fine / p.step)
-        thrust[1::2] = 1.5 * mean - 0.25 * (thrust[:-1:2] + thrust[2::2])
+        columns = [lanes.owner, delay, np.maximum(tau, SHORTEST)]
+        motors, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+        thrust = np.empty((len(grid), len(lanes.owner), self.motors))
+        for number, (owner, late, lag) in enumerate(motors):
+            data = self.stretches[int(owner)].data
+            time, inputs = data["sent"]
+            at_ends = data["start"] + grid[::2] - late
+            ends, integral = lagged(time, p.thrust(inputs), at_ends, lag)
+            mean = np.diff(integral, axis=0) / p.step
+            lane = which == number
+            thrust[::2, lane] = ends[:, None]
+            thrust[1::2, lane] = (1.5 * mean - 0.25 * (ends[:-1] + ends[1:]))[:, None]
         curve = self.size_of(lanes, "thrust_curve")[:, None]
         hover = p.total_mass * p.gravity / self.motors  # of one input channel [N]
         since = self.of_windows(lanes, "since") + grid
@@ -253,7 +238,7 @@ class FlyerModel(NumericModel):
         model = copy(self)
         model.stretches = [stretch]
         for held in inputs:
-            model.stretches.append(replace(stretch, data={**stretch.data, "input": held}))
+            model.stretches.append(replace(stretch, data={**stretch.data, "sent": held}))
         start = np.tile(self._start[i], (len(model.stretches), 1))
         lanes = model._lanes(size, start)
         seen = self.measure(stretch, model.simulate(lanes), lanes)

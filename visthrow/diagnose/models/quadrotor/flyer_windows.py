@@ -14,11 +14,8 @@ from visthrow.common.rotations import cross, matrix_of_quat, normal_part, vector
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
-from visthrow.logs.flightlog import Channel, FlightLog
+from visthrow.logs.flightlog import Channel, FlightLog, Samples
 
-# entries of the commands' table in a step of the integration: between them, commands switch at
-# their own times
-FINE = 16
 # noise below which none is believed; of other channels 1e-4
 LEAST_SIGMA = {"rate_b": 2e-3, "acc_b": 1e-2}
 Table = tuple[ndarray, ndarray, ndarray]
@@ -37,7 +34,7 @@ def expect_thrust(stretches: Sequence[Stretch], params: QuadrotorParams) -> None
     Raises LogError: they are.
     """
     weight = params.gravity * params.total_mass
-    inputs = np.concatenate([s.data["input"] for s in stretches])
+    inputs = np.concatenate([s.data["sent"].values for s in stretches])
     ratio = float(np.median(params.thrust(inputs).sum(axis=1))) / weight
     if ratio > _MOST_THRUST:
         raise LogError(
@@ -54,6 +51,9 @@ def cut_flying(
     """
     sigma = [sigma_of(log[name], LEAST_SIGMA.get(name, 1e-4)) for name in channels]
     driven = [log[name] for name in driving]
+    commands = log[params.input].samples()
+    if params.input == "command":
+        commands = Samples(commands.time, commands.values[:, :1])
     first = max(c.time[0] for c in driven)
     last = min(c.time[-1] for c in driven)
     starts = np.arange(first + params.window, last - params.window, params.window)
@@ -62,12 +62,13 @@ def cut_flying(
     for start in starts[::stride].tolist():
         if not all(covered(c, start, start + params.window) for c in driven):
             continue
-        inputs = held_inputs(log[params.input], params, start)
-        if not flies(inputs, params):
+        end = start + params.window
+        if not flies(held(commands, start, end).values, params):
             continue
         rows = [take_samples(log[name], params, start) for name in channels]
         tables = [(*row, sd) for row, sd in zip(rows, sigma)]
-        common: dict[str, Any] = {"start": start, "input": inputs, "volts": 0.0}
+        sent = held(commands, start - params.window, end + params.window)
+        common: dict[str, Any] = {"start": start, "sent": sent, "volts": 0.0}
         common["since"] = start - float(log[params.input].time[0])
         if "battery_voltage" in log:
             middle = np.array([start + 0.5 * params.window])
@@ -100,7 +101,6 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
             "rate": _rates(quat, params.step),
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, times),
-            "sent": log[params.input],
         }
         if NEIGHBOUR in log:
             data[NEIGHBOUR] = on_grid(*log[NEIGHBOUR].samples(), times)
@@ -120,8 +120,7 @@ def covered(channel: Channel, start: float, end: float) -> bool:
 def flies(inputs: ndarray, params: QuadrotorParams) -> bool:
     """Whether the thrust of a window's inputs never falls to that of a vehicle on the ground."""
     thrust = params.thrust(inputs).sum(axis=1)
-    during = thrust[len(thrust) // 2 :]
-    return np.min(during) >= _IDLE * params.mass * params.gravity
+    return np.min(thrust) >= _IDLE * params.mass * params.gravity
 
 
 def spare(step: float) -> int:
@@ -129,22 +128,28 @@ def spare(step: float) -> int:
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
-def held_inputs(channel: Channel, params: QuadrotorParams, start: float) -> ndarray:
-    """Means of the held commands over fine steps, from one window before the start to its end,
-    shape (fine steps, motors).
+def held(commands: Samples, first: float, last: float) -> Samples:
+    """Return the commands that are held between two times."""
+    time, values = commands
+    begin = max(int(np.searchsorted(time, first, "right")) - 1, 0)
+    end = int(np.searchsorted(time, last))
+    return Samples(time[begin:end], values[begin:end])
+
+
+def lagged(
+    time: ndarray, commanded: ndarray, instants: ndarray, lag: float
+) -> tuple[ndarray, ndarray]:
+    """Return what follows held commands by a lag, at some instants, and its integral, each of shape
+    (T, N).
+
+    ``time``: of the commands [s], shape (C,), the first held before; ``commanded``: shape (C, N);
+    ``instants``: [s], shape (T, 1).
     """
-    fine = params.step / FINE
-    steps = 2 * FINE * round(params.window / params.step)  # of two windows
-    edges = start - params.window + fine * np.arange(steps + 1)
-    time, values = channel.samples()
-    if params.input == "command":
-        values = values[:, :1]
-    first = min(time[0], edges[0])
-    last = max(time[-1], edges[-1]) + 1.0
-    ends = np.concatenate([[first], time[1:], [last]])
-    integral = np.cumsum(values * np.diff(ends)[:, None], axis=0)
-    integral = np.pad(integral, ((1, 0), (0, 0)))
-    return np.diff(on_grid(ends, integral, edges), axis=0) / fine
+    changes = np.diff(commanded, axis=0)
+    age = np.maximum(instants - time[1:], 0.0)
+    value = commanded[0] + (1.0 - np.exp(-age / lag)) @ changes
+    since = instants - instants[0]
+    return value, since * commanded[0] + age @ changes - lag * value
 
 
 def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end: float) -> ndarray:
@@ -158,15 +163,14 @@ def find_acting(time: ndarray, values: ndarray, delay: float, start: float, end:
     return np.flatnonzero(during & np.append(False, changed))
 
 
-def without_each(channel: Channel, params: FlyerParams, start: float) -> list[ndarray]:
-    """Return a window's held inputs without each command that acts in it: the one before stays."""
-    time, values = channel.samples()
+def without_each(commands: Samples, params: FlyerParams, start: float) -> list[Samples]:
+    """Return a window's commands without each that acts in it: the one before stays."""
+    time, values = commands
     inputs = []
-    thrusts = values[:, :1]
-    for k in find_acting(time, thrusts, params.command_delay, start, start + params.window):
+    for k in find_acting(time, values, params.command_delay, start, start + params.window):
         repeated = values.copy()
         repeated[k] = values[k - 1]
-        inputs.append(held_inputs(Channel(time, repeated, channel.unit), params, start))
+        inputs.append(Samples(time, repeated))
     return inputs
 
 
