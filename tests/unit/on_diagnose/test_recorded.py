@@ -72,3 +72,12 @@ def test_rounding_counts_as_noise_of_a_twelfth_of_its_steps_square():
     log.channels["rate_b"] = Channel(at, ramp, "rad/s", "body")
     sigma = record_of(log).gyro.sigma
     assert sigma == approx(step * 12**-0.5, rel=0.5)
+
+
+def test_rounding_counts_of_axes_that_hardly_move():
+    """Positions in whole millimetres of a vehicle that flies along one axis."""
+    log = flight(200.0, 0.0)
+    at = log["pos_w"].time
+    path = np.column_stack([np.sin(at), 1e-3 * np.sin(at), np.ones(len(at))])
+    log.channels["pos_w"] = Channel(at, np.round(path, 3), "m", "world")
+    assert record_of(log).vehicle.sigma == approx(1e-3 * 12**-0.5, rel=0.2)

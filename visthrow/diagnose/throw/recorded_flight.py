@@ -11,7 +11,7 @@ from numpy import ndarray
 from visthrow.common.errors import DiagnoseError
 from visthrow.common.rotations import continuous
 from visthrow.logs.check.relations import attitude_at
-from visthrow.logs.check.signals import highpass_sigma
+from visthrow.logs.check.signals import sensor_sigma
 from visthrow.logs.flightlog import Channel, FlightLog
 
 NEVER = 1e9  # a time after every flight [s]
@@ -20,7 +20,6 @@ LEAST_SIGMA = {"pos_w": 2e-5, "quat_wb": 1e-4, "payload_pos_w": 2e-5, "rate_b": 
 [rad/s].
 """
 
-UNIFORM = 12.0**-0.5  # standard deviation of what rounding takes, of its step
 BETWEEN = 0.05  # attitudes further apart [s] tell nothing of the times between them
 # samples of the gyro a second: faster ones tell a model of 500 steps a second no more
 SUFFICIENT_RATE = 250.0
@@ -94,12 +93,11 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
     if channel is None:
         return None
     time, values = channel.samples()
-    step = resolution(values)
     fresh = np.ones(len(time), dtype=bool)
     fresh[1:] = np.any(values[1:] != values[:-1], axis=1)  # a repeated sample is a stale one
     if np.count_nonzero(fresh) < 5:
         return None
-    if not step:
+    if not _rounded(values):
         time = time[fresh]
         values = values[fresh]
     if name == "quat_wb":
@@ -108,7 +106,7 @@ def _samples(log: FlightLog, name: str) -> ChannelSamples | None:
         time, values = _thinned(time, values)
         if len(time) < 5:
             return None
-    noise = np.hypot(highpass_sigma(values), step * UNIFORM)
+    noise = sensor_sigma(values)
     # An angle moves three of four numbers of an attitude by its half.
     sigma = np.median(noise)
     if name == "quat_wb":
@@ -144,16 +142,15 @@ def _thinned(time: ndarray, values: ndarray) -> tuple[ndarray, ndarray]:
     return thinned[:, 0], thinned[:, 1:]
 
 
-def resolution(values: ndarray) -> float:
-    """Step that a channel was recorded in, of shape (T, N), where most of its changes are of one
-    step; 0 where they are not.
+def _rounded(values: ndarray) -> bool:
+    """Whether most changes of a channel, shape (T, N), are of the one step that it was recorded in.
 
     Such samples repeat themselves without being stale. Without the repeated ones those would be
     left at which a step was just taken: half a step ahead of what was measured."""
     changes = np.abs(np.diff(values, axis=0))
     changes = changes[changes > 0.0]
-    smallest = float(np.min(changes, initial=np.inf))
-    return smallest if len(changes) and np.median(changes) < 1.5 * smallest else 0.0
+    smallest = np.min(changes, initial=np.inf)
+    return len(changes) > 0 and np.median(changes) < 1.5 * smallest
 
 
 def record_of(log: FlightLog, number: int = 0) -> RecordedFlight:

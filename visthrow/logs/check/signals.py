@@ -89,6 +89,13 @@ def noise(channel: Channel) -> np.ndarray:
     good = channel.valid[:-3] & channel.valid[3:] & even[:-2] & even[1:-1] & even[2:]
     if len(values) < FEW_SAMPLES or np.sum(good) < FEW_SAMPLES:
         return np.full(values.shape[1], np.nan)
+    return sensor_sigma(values, good)
+
+
+def sensor_sigma(values: np.ndarray, good: np.ndarray | slice = slice(None)) -> np.ndarray:
+    """Return :func:`highpass_sigma` of components, shape (D,), or what their rounding leaves where
+    that is more: a rounded component that hardly moves shows no noise.
+    """
     return np.maximum(highpass_sigma(values, good), _resolution(values) / np.sqrt(12.0))
 
 
