@@ -53,7 +53,7 @@ class FlyerModel(NumericModel):
     table = "flyer"
     latent_step = 1e-2
     knot_count = 8
-    # channels that are states, and which: behind them come the motors' thrusts
+    # channels that are states, and which
     columns: Mapping[str, slice] = {}
 
     def __init__(self, logs: Sequence[FlightLog], params: FlyerParams) -> None:
@@ -151,13 +151,11 @@ class FlyerModel(NumericModel):
         """See the base class.
 
         The state: position and velocity of the vehicle, with a cable its vector to the payload and
-        that one's rate, with torques the body rates; behind it, the thrust of each motor."""
-        thrust = self._thrusts(lanes)
+        that one's rate, with torques the body rates."""
         rot = self._rotations(lanes)
         mount = self._mount(rot)
-        slope, _ = self._dynamics(lanes, thrust, rot, mount)
-        path = integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
-        return np.concatenate([path, thrust[::2].swapaxes(0, 1)], 2)
+        slope, _ = self._dynamics(lanes, self._thrusts(lanes), rot, mount)
+        return integrate(slope, self._begin(lanes, mount), self.steps, self.params.step)
 
     def knots(self, lanes: Lanes, paths: ndarray) -> list[Mapping[str, ndarray]]:
         """See the base class."""
@@ -165,16 +163,14 @@ class FlyerModel(NumericModel):
         _, quantities = self._dynamics(lanes, self._thrusts(lanes), rot, self._mount(rot))
         moments = [quantities(2 * i, state) for i, state in enumerate(paths.swapaxes(0, 1))]
         names = moments[0].keys() - {"slope"}  # which follows from the thrusts at the knots
-        grid = self.params.step * np.arange(len(moments))
+        weights = triangles(np.linspace(0.0, self.steps, self.knot_count), np.arange(len(moments)))
+        values = {}
+        for name in names:
+            values[name] = np.tensordot(weights, [moment[name] for moment in moments], 1)
         knots = []
         for i, stretch in enumerate(self.stretches):
-            time = np.unique(stretch.latent_time)
-            weights = triangles(time, stretch.data["start"] + grid)
-            values = {}
-            for name in names:
-                values[name] = weights @ [moment[name][i] for moment in moments]
-            values["time"] = time
-            knots.append(values)
+            at_knots = {name: value[:, i] for name, value in values.items()}
+            knots.append(at_knots | {"time": np.unique(stretch.latent_time)})
         return knots
 
     def _scale(self, lanes: Lanes) -> ndarray:
@@ -190,12 +186,12 @@ class FlyerModel(NumericModel):
 
     def measure(self, stretch: Stretch, path: ndarray, lanes: Lanes) -> ndarray:
         """See the base class."""
-        measured = np.empty((len(path), len(stretch.time)))
+        measured = []
         for channel, name in enumerate(self.channels):
-            rows = stretch.channel == channel
-            values = self._sampled(name, stretch.time[rows], stretch, path, lanes)
-            measured[:, rows] = values.reshape(len(path), -1)
-        return measured
+            time = stretch.time[stretch.channel == channel]
+            values = self._sampled(name, time, stretch, path, lanes)
+            measured.append(values.reshape(len(path), -1))
+        return np.concatenate(measured, axis=1)
 
     def _sampled(
         self, name: str, time: ndarray, stretch: Stretch, path: ndarray, lanes: Lanes
