@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy import ndarray
 
+from visthrow.diagnose.likelihood.evidence import UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.logs.flightlog import STANDARD_CHANNELS
@@ -28,7 +29,8 @@ HORIZONS = (
 )  # upper ends of the horizons [s]; what lies beyond the last belongs to it
 
 
-FAR_ABOVE = 9.0  # times the squares that are left, from which an expectation is no floor of them
+# times the squares that are left, from which an expectation is no floor of them
+FAR_ABOVE = UNKNOWN_RATIO**2
 
 UNITS = {"quat_wb": "rad", "angle": "rad", "thrust": "N", "current": "A", "marker_pos_c": "m"}
 """Of residuals: an attitude's are rotation vectors, and the small models have channels of their

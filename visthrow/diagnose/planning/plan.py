@@ -13,13 +13,13 @@ import numpy as np
 
 from visthrow.common.errors import DiagnoseError, expect_known
 from visthrow.diagnose.inputs.measures import MEASUREMENTS, Measurement
-from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
+from visthrow.diagnose.likelihood.evidence import FEWEST, STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Noise, correlated_of, grams_of
 from visthrow.diagnose.likelihood.stack import integrals
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS, Model
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.select import result
-from visthrow.diagnose.select.held_out import PARTS, TELLING
+from visthrow.diagnose.select.held_out import TELLING
 from visthrow.diagnose.select.result import Diagnosis
 
 DECISIVE = 11.0
@@ -120,7 +120,7 @@ class PlanningGoal:
         at_hand = self.base.statistics.information[:, self.vague, self.vague]
         least = TELLING * new[self.vague, self.vague]
         telling = np.sum(at_hand > least, axis=0)
-        confirmed = telling + count >= PARTS
+        confirmed = telling + count >= FEWEST
         return [(j,) for j in np.compress(unknown & known & confirmed, self.vague).tolist()]
 
     def _gap(self, pair: tuple[int, int], new: np.ndarray) -> float:

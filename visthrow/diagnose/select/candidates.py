@@ -13,13 +13,12 @@ from numpy import ndarray
 
 from sim.effects.effect import Effect, RandomEffect
 from visthrow.config.effects import random_effects
-from visthrow.diagnose.likelihood.evidence import Priors
+from visthrow.diagnose.likelihood.evidence import FEWEST, Priors
 from visthrow.diagnose.likelihood.grammar import TermEffect
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.scatter import DAY, EVENT, FLIGHT, Varies
 
 ALL = "all"  # group of a candidate whose size all flights share
-FEWEST_FOR_EVENT = 3  # flights: of two that differ, neither is the odd one
 
 
 @dataclass(frozen=True)
@@ -142,7 +141,7 @@ def _events(
     offered = []
     for j, e in enumerate(effects):
         flights_with = flights[flown[:, j]].tolist()
-        if not priors.visible[j] or e.switch or len(flights_with) < FEWEST_FOR_EVENT:
+        if not priors.visible[j] or e.switch or len(flights_with) < FEWEST:
             continue
         deviation = (float(priors.slab[j]),)
         for flight in flights_with:

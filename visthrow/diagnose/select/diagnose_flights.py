@@ -34,8 +34,6 @@ from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.check.run import Checked, check, contradictions, copies
 from visthrow.logs.flightlog import FlightLog
 
-MOST_REFUSED = 0.5  # share of the logs that may contradict themselves; else none tells anything
-
 
 def diagnose(
     flights: Sequence[FlightLog],
@@ -66,7 +64,7 @@ def diagnose(
     refused = refused_of(checked, vehicle)
     reasons = contradictions(checked, vehicle.unread)
     unread = [text for text in contradictions(checked) if text not in reasons]
-    if len(refused) > MOST_REFUSED * len(flights):
+    if 2 * len(refused) > len(flights):
         return Diagnosis(INCONSISTENT, "", tuple(reasons), (), {}, (), 0.0)
     model = model() if callable(model) else model
     say(f"{len(flights)} log(s), {len(model.effects)} effects on {', '.join(model.channels)}")
@@ -137,7 +135,7 @@ def explain(
     simulated = parallel_map(finite, windows)
     considered = [i for i, w in enumerate(windows) if w.flight not in without]
     usable = tuple(i for i in considered if simulated[i])
-    if len(usable) < 0.5 * len(considered) or not usable:
+    if 2 * len(usable) < len(considered) or not usable:
         return out_of_domain(model, windows, sum(simulated), seed)
     problem = Problem.of(model, windows, usable)
     for c, correlation in problem.correlated.items():

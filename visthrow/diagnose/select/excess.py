@@ -11,12 +11,12 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray
 
-from visthrow.diagnose.likelihood.evidence import NORMAL_95
+from visthrow.diagnose.likelihood.evidence import NORMAL_95, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
 from visthrow.diagnose.likelihood.stack import Stack
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point
+from visthrow.diagnose.select.point import Point
 from visthrow.diagnose.select.result import Level
 
 LANDING = 5e-3

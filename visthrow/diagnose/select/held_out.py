@@ -16,7 +16,7 @@ from numpy import ndarray
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
-from visthrow.diagnose.likelihood.evidence import NORMAL_95, STRONG
+from visthrow.diagnose.likelihood.evidence import FEWEST, NORMAL_95, STRONG, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
     errors,
@@ -31,21 +31,15 @@ from visthrow.diagnose.select.candidates import NOTHING, Names, columns_of, shar
 from visthrow.diagnose.select.excess import compares_phases, floors_of
 from visthrow.diagnose.select.occam import Linear
 from visthrow.diagnose.select.occam import window as occam_window
-from visthrow.diagnose.select.point import UNKNOWN_RATIO, Point, Problem
+from visthrow.diagnose.select.point import Point, Problem
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis, Finding, HeldOut, Level
 from visthrow.diagnose.select.scatter import freed
 
 MOST_FOLDS = 12
-PARTS = 3
-"""With fewer flights so many parts of each are left out instead, and the report says so: two sets
-that were trained on differ.
+FIRM = 1.0 - 1.0 / FEWEST
+"""More of the folds than this share must name a cause, or one of its class: of the fewest that can
+disagree, all.
 """
-FIRM = 2.0 / 3.0
-"""More of the folds than this share must name a cause, or one of its class: of three folds that
-leave a flight out, all.
-"""
-# of what flights promise in the mean, from which one counts among those that can tell
-TELLING = 0.1
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
@@ -81,12 +75,12 @@ class Work:
 
 def groups_of(point: Point) -> tuple[list[int], str]:
     flights = [w.flight for w in point.windows]
-    if len(set(flights)) >= PARTS or len(flights) < PARTS:
+    if len(set(flights)) >= FEWEST or len(flights) < FEWEST:
         return flights, "flights"
     groups = []
     for i, flight in enumerate(flights):
-        part = PARTS * flights[:i].count(flight) // flights.count(flight)
-        groups.append(flight * PARTS + part)
+        part = FEWEST * flights[:i].count(flight) // flights.count(flight)
+        groups.append(flight * FEWEST + part)
     return groups, "parts of flights"
 
 
@@ -159,7 +153,7 @@ def borne_out(
     if total <= 0.0:
         return 0.0, np.nan, np.nan
     value = float(brought.sum() / total)
-    n = int((promised > TELLING * promised.mean()).sum())
+    n = int(telling(promised))
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
@@ -167,6 +161,13 @@ def borne_out(
     chance = NORMAL_95 * np.sqrt(2.0 / total)
     reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
     return value, value - reach, value + reach
+
+
+def telling(promised: ndarray) -> ndarray:
+    """Return how many flights can tell: as many as if each promised as much; shape (...,).
+
+    ``promised``: nats of each flight, shape (F, ...). Source: Kish 1965 (effective number)."""
+    return np.rint(promised.sum(0) ** 2 / np.maximum((promised**2).sum(0), 1e-300))
 
 
 def channel_gains(
@@ -314,7 +315,7 @@ def _no_confirmation(diagnosis: Diagnosis, measured: HeldOut, uncompared: bool) 
         failed = _no_gain(measured)
     names = ", ".join(diagnosis.theta)
     reason = f"held-out {measured.left_out} do not confirm {names} ({failed})"
-    if np.isnan(measured.low) or measured.folds < PARTS:
+    if np.isnan(measured.low) or measured.folds < FEWEST:
         reason += f"; {_one_more(diagnosis, diagnosis.named)}"
     return Doubt(diagnosis.named, why="held-out flights do not confirm it", reason=reason)
 

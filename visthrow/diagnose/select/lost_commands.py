@@ -24,11 +24,9 @@ from visthrow.diagnose.likelihood.evidence import Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import correlated_of, grams_of
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.select.point import Point
-from visthrow.diagnose.select.scatter import COMMAND, REACH, Scatter, judged
+from visthrow.diagnose.select.scatter import COARSE, COMMAND, REACH, Scatter, judged
 
 NAME = "dropped_commands"  # of the random effect in the catalogue
-
-STRIDE = 5  # every which deviation is tried in a few windows, before all are asked
 
 EITHER = 0.5
 """Mean and deviation of m where either is as likely.
@@ -123,7 +121,7 @@ def verdict(point: Point, active: Sequence[int], threshold: float) -> Scatter | 
     graded = priors.visible & ~problem.switches
     sets = active, np.flatnonzero(graded[: len(problem.model.effects)]).tolist()
     numbers = range(len(problem.kept))
-    for rows, shares in ((few_of(numbers), reach[::STRIDE]), (numbers, reach)):
+    for rows, shares in ((few_of(numbers), reach[::COARSE]), (numbers, reach)):
         columns = problem.model.without_commands(sizes, [problem.kept[w] for w in rows])
         if not columns:
             return None

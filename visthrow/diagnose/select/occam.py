@@ -19,7 +19,7 @@ from itertools import combinations
 import numpy as np
 from numpy import ndarray
 
-from visthrow.diagnose.likelihood.evidence import STRONG, Posterior, Priors
+from visthrow.diagnose.likelihood.evidence import STRONG, VERY_STRONG, Posterior, Priors
 from visthrow.diagnose.likelihood.marginal import Statistics
 from visthrow.diagnose.select.candidates import (
     ALL,
@@ -41,14 +41,12 @@ from visthrow.diagnose.select.scatter import (
     over_deviations,
 )
 
-MOST_NAMES = 6  # a longer list of causes is a wrong form, not a finding
-
-WINDOW = 15.0
-"""Nats behind the best up to which sets are kept, for statistics of other sizes may be wrong; sets
-up to ``STRONG`` behind count as possible.
-"""
-
 MOST_NEW = 2  # candidates in one move: of where many lead together, derivatives tell too little
+
+WINDOW = (MOST_NEW + 1) * VERY_STRONG
+"""Nats behind the best up to which sets are kept: as many as candidates cost that a move adds, and
+one more that it takes away. Sets up to ``STRONG`` behind count as possible.
+"""
 PATIENCE = 8  # sets that are opened in vain before the search ends
 RANDOM_TRIED = (
     4  # random shares whose evidence is calculated for each set, of those that may matter
@@ -151,7 +149,7 @@ class Linear:
         if subset not in self._added:
             base = self.value(subset)
             listed = {subset: base}
-            if len(subset) < MOST_NAMES and np.isfinite(base):
+            if np.isfinite(base):
                 gain = self.total(subset).additions(columns_of(subset)).tolist()
                 price = self.penalty(subset)
                 varying = {j for c in subset if c.group != ALL for j in c.columns}
@@ -227,7 +225,7 @@ class Linear:
             offered = [c for c in self.plain if c not in subset and not c.law]
             base = self.value(subset)
             active = columns_of(subset)
-            if len(subset) + 2 > MOST_NAMES or len(offered) < 2 or not np.isfinite(base):
+            if len(offered) < 2 or not np.isfinite(base):
                 continue
             columns = [c.columns[0] for c in offered]
             prices = [self.penalty(subset | {c}) for c in offered]

@@ -16,7 +16,9 @@ from visthrow.diagnose.likelihood import stack
 from visthrow.diagnose.likelihood.correlation import Correlation, correlations, with_correlations
 from visthrow.diagnose.likelihood.evidence import (
     INEXACT,
+    LOST_SHARE,
     OWN_FLOOR,
+    UNKNOWN_RATIO,
     Posterior,
     Priors,
 )
@@ -36,10 +38,6 @@ ROUNDS = 3
 """Gauss-Newton steps between two linearisations, linearisations in a row each where the last led,
 and rounds of lost windows: each round has some tenth of what the one before had to do.
 """
-
-UNKNOWN_RATIO = 3.0  # what is so many times the noise, or the quietest phase's gusts, is neither
-# share of windows that the simulation may lose; where more are so far off, something is missing
-LOST_SHARE = 0.15
 
 SMALL_STEP = 0.5 * OWN_FLOOR
 """In floors: a step that is not worth a simulation, and the distance at which an estimate lies on

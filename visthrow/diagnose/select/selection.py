@@ -52,7 +52,6 @@ from visthrow.diagnose.select.result import SelectionStep
 from visthrow.diagnose.select.scatter import own_shares
 
 SIDE_BY_SIDE = 4  # sets that are simulated at once on a GPU
-MOST_LAWS = 2
 REPORTED_SETS = 10  # sets that a step keeps for the report
 
 
@@ -126,7 +125,7 @@ class Selector:
         if not forms:
             return total
         together = len(forms) == len(chosen) or compares_phases(self.nominal)
-        if len(forms) > MOST_LAWS or not together:
+        if not together:
             return np.inf
         blocks = terms.acts_in(c.law for c in forms)
         charged = [c for c in chosen if not c.law and self.block_of(c.columns[0]) in blocks]
@@ -403,7 +402,7 @@ class Selector:
                 break
             before = point
             point = fitted(self.origin, active)
-            close = np.abs(point.theta - before.theta).max() <= 0.5
+            close = np.abs(point.theta - before.theta).max() <= SPIKE
             if close or curvature(self.origin, point) <= SPIKE:
                 break
         return point
@@ -429,7 +428,7 @@ class Selector:
         strongest = terms.strongest_forces(self.nominal) if self.laws else {}
         present = self.best.chosen
         forms = frozenset(laws_of(present))
-        if not strongest or present in self._proposed or len(forms) >= MOST_LAWS:
+        if not strongest or present in self._proposed:
             return False
         self._proposed.add(present)
         places = [(self.best.point, self.best.columns)]

@@ -14,7 +14,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy import ndarray
 
-from visthrow.diagnose.likelihood.evidence import STRONG
+from visthrow.diagnose.likelihood.evidence import STRONG, UNKNOWN_RATIO
 from visthrow.diagnose.likelihood.grammar import TermEffect, through_latents
 from visthrow.diagnose.likelihood.marginal import (
     LatentStatistics,
@@ -36,13 +36,7 @@ from visthrow.diagnose.models.law_terms import (
 )
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 from visthrow.diagnose.select.excess import LANDING, positions_of
-from visthrow.diagnose.select.point import (
-    UNKNOWN_RATIO,
-    Point,
-    regathered,
-    with_shares,
-    with_terms,
-)
+from visthrow.diagnose.select.point import Point, regathered, with_shares, with_terms
 from visthrow.diagnose.select.result import Law
 from visthrow.diagnose.select.scatter import Varies
 

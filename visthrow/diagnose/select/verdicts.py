@@ -11,7 +11,7 @@ from scipy.special import gammaincinv
 from sim.effects.effect import RandomEffect
 from visthrow.config.effects import random_effects
 from visthrow.diagnose.likelihood.evidence import (
-    CALIBRATION_QUANTILE,
+    ALARM,
     INEXACT,
     OWN_FLOOR,
 )
@@ -28,7 +28,13 @@ from visthrow.diagnose.select.candidates import (
     laws_of,
     varies_of,
 )
-from visthrow.diagnose.select.excess import acts_on, compares_phases, levels, too_strong
+from visthrow.diagnose.select.excess import (
+    acts_on,
+    compares_phases,
+    floors_of,
+    levels,
+    too_strong,
+)
 from visthrow.diagnose.select.findings import Reading, blank
 from visthrow.diagnose.select.held_out import Work, repeated_share, share_text
 from visthrow.diagnose.select.occam import Linear
@@ -312,15 +318,18 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
 
 def _events(selection: Selector, point: Point) -> tuple[int, ...]:
     """Return flights in which an effect has a size of its own, and flights with a window far
-    rougher than its phase.
+    rougher than its phase that such a force would move.
     """
-    least = (1.0 - CALIBRATION_QUANTILE) / point.noise.share.size
+    least = ALARM / point.noise.share.size
     quantile = 2.0 * gammaincinv(0.5 * TAIL, least)  # of chi squared with so many degrees
     roughest = np.sqrt(TAIL / quantile)  # share of the roughest, with Student's tails
     events = {c.flight for c in selection.best.chosen if c.group == EVENT}
+    floors = floors_of(point)
     for window, share in zip(point.windows, point.noise.share):
-        if share.max() > roughest:
-            events.add(window.flight)
+        for (block, phase), level in point.noise.latent_sd.items():
+            strong = level * share[block] > floors.get((block, phase), 0.0)
+            if phase == window.phase and share[block] > roughest and strong:
+                events.add(window.flight)
     return tuple(sorted(events))
 
 
