@@ -320,9 +320,7 @@ def null_draws(information: ndarray, draws: int, rng: np.random.Generator) -> nd
     return rng.standard_normal(shape) @ root.T + unnamed @ information
 
 
-def threshold(
-    statistics: Statistics, priors: Priors, rng: np.random.Generator, draws: int = CALIBRATION_DRAWS
-) -> float:
+def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator) -> float:
     """Nats that the best of all effects exceeds in ``ALARM`` of null worlds, at least very strong
     ones.
 
@@ -331,6 +329,6 @@ def threshold(
     information = statistics.information.sum(0)
     if not priors.visible.any():
         raise DiagnoseError("none of the effects can be seen in the channels of these logs")
-    null = Posterior(information, null_draws(information, draws, rng), priors)
+    null = Posterior(information, null_draws(information, CALIBRATION_DRAWS, rng), priors)
     best = null.additions(()).max(axis=1)
     return float(max(np.quantile(best, 1.0 - ALARM), VERY_STRONG))

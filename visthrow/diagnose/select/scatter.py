@@ -205,11 +205,11 @@ def judged(
     )
 
 
-def allowed(size: ndarray | float, share: float = INEXACT) -> ndarray | float:
+def allowed(size: float) -> float:
     """Deviation among flights that is no disagreement: a floor, and a part of the effect's size, in
     floors.
     """
-    return np.hypot(1.0, share * size)
+    return float(np.hypot(1.0, INEXACT * size))
 
 
 def between_flights(
