@@ -16,7 +16,13 @@ from numpy import ndarray
 from scipy.special import stdtrit
 
 from visthrow.diagnose.likelihood.correlation import components
-from visthrow.diagnose.likelihood.evidence import FEWEST, NORMAL_95, STRONG, UNKNOWN_RATIO
+from visthrow.diagnose.likelihood.evidence import (
+    FEWEST,
+    INEXACT,
+    NORMAL_95,
+    STRONG,
+    UNKNOWN_RATIO,
+)
 from visthrow.diagnose.likelihood.forms import (
     HORIZONS,
     errors,
@@ -39,6 +45,10 @@ MOST_FOLDS = 12
 FIRM = 1.0 - 1.0 / FEWEST
 """More of the folds than this share must name a cause, or one of its class: of the fewest that can
 disagree, all.
+"""
+TELLING = INEXACT**2
+"""Part of what flights promise in the mean, from which one counts among those that can tell: of an
+effect's size, of which a promise is the square, it shows more than its form may be off.
 """
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
@@ -153,7 +163,7 @@ def borne_out(
     if total <= 0.0:
         return 0.0, np.nan, np.nan
     value = float(brought.sum() / total)
-    n = int(telling(promised))
+    n = int((promised > TELLING * promised.mean()).sum())
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
@@ -161,13 +171,6 @@ def borne_out(
     chance = NORMAL_95 * np.sqrt(2.0 / total)
     reach = float(max(stdtrit(n - 1, 0.975) * scatter, chance))
     return value, value - reach, value + reach
-
-
-def telling(promised: ndarray) -> ndarray:
-    """Return how many flights can tell: as many as if each promised as much; shape (...,).
-
-    ``promised``: nats of each flight, shape (F, ...). Source: Kish 1965 (effective number)."""
-    return np.rint(promised.sum(0) ** 2 / np.maximum((promised**2).sum(0), 1e-300))
 
 
 def channel_gains(
