@@ -127,7 +127,7 @@ class Problem:
         return theta + cut / self.priors.floor
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Point:
     """Windows and statistics of a problem at one theta (in floors, shape (K,))."""
 

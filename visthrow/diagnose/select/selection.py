@@ -85,7 +85,7 @@ class Selector:
         self.best = Trial(NOTHING, self.nominal)
         self.origin = self.nominal  # where the derivatives were taken
         self.window: list[tuple[Trial, float]] = []  # sets that are possible, with nats behind
-        self._linear: dict[int, tuple[Point, Linear]] = {}
+        self._linear: dict[Point, Linear] = {}
         self._turned: dict[bytes, Point] = {}  # with other kinds of blocks
         self._visited = {NOTHING}
         self._settled_sets = {NOTHING}  # at which derivatives were taken, or still held
@@ -137,12 +137,12 @@ class Selector:
 
     def linear(self, point: Point) -> Linear:
         """Return the values of sets by the statistics of a point."""
-        priors = self.problem.priors
-        days = self.problem.days
-        if id(point) not in self._linear:
-            linear = Linear(point.plain, priors, self.candidates, self.penalty, days)
-            self._linear[id(point)] = point, linear
-        return self._linear[id(point)][1]
+        problem = self.problem
+        if point not in self._linear:
+            self._linear[point] = Linear(
+                point.plain, problem.priors, self.candidates, self.penalty, problem.days
+            )
+        return self._linear[point]
 
     def run(self, begin: Names = NOTHING) -> "Selector":
         """Select, beginning with a set."""
@@ -217,7 +217,7 @@ class Selector:
             base = linear.value(present)
             for chosen, value in close.items():
                 ahead_of[chosen] = max(ahead_of.get(chosen, -np.inf), value - base)
-        self._linear.pop(id(free))
+        self._linear.pop(free)
         ahead_of.pop(present, None)
         return ahead_of
 
@@ -379,7 +379,7 @@ class Selector:
             trial = Trial(trial.chosen, point, shares, occam)
         self.best = trial
         self._visited.add(trial.chosen)
-        self._linear = {id(self.nominal): (self.nominal, self.linear(self.nominal))}
+        self._linear = {self.nominal: self.linear(self.nominal)}
 
     def _settled(self, point: Point, active: list[int], last: bool) -> Point:
         """Linearise where a set is, unless the last derivatives still hold or may lead on to other
@@ -439,11 +439,11 @@ class Selector:
         shortlist = list({effect.term: effect for effect in reversed(shortlist)}.values())
         if not shortlist:
             return False
-        points = {id(p): p for p in (self.nominal, self.origin, self.best.point)}
-        widened = dict(zip(points, terms.extended(list(points.values()), shortlist)))
-        self.best = replace(self.best, point=widened[id(self.best.point)])
-        self.nominal = widened[id(self.nominal)]
-        self.origin = widened[id(self.origin)]
+        points = list(dict.fromkeys((self.nominal, self.origin, self.best.point)))
+        widened = dict(zip(points, terms.extended(points, shortlist)))
+        self.best = replace(self.best, point=widened[self.best.point])
+        self.nominal = widened[self.nominal]
+        self.origin = widened[self.origin]
         self._offer()
         return True
 
