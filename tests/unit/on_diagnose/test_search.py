@@ -145,6 +145,21 @@ def test_what_happened_in_one_flight_is_an_event_and_no_cause():
     assert [set(names) for names, _ in diagnosis.sets] == [{"effect_03 in flight 4"}]
 
 
+@mark.parametrize(("force", "events"), [(0.006, ()), (0.2, (4,))])
+def test_a_rough_window_is_an_event_where_it_moves_more_than_a_landing(force, events):
+    """Where no gust stirs, the noise shows forces that move a body by a millimetre."""
+
+    def stirred(model, window):
+        if (window.flight, window.phase) != (4, "throw"):
+            return window
+        along = (window.latent_block == 0) & (window.latent_axis == 0)
+        push = force * np.sin(2.0 * np.pi * np.linspace(0.0, 1.0, np.count_nonzero(along)))
+        return replace(window, residual=window.residual + window.latent[:, along] @ push)
+
+    model = altered(stirred, seed=3, throws=9, gust=0.0, rate=200)
+    assert diagnose_flights.explain(model, laws=False).events == events
+
+
 def test_signs_that_change_from_flight_to_flight_are_told_as_what_varies():
     model = altered(lambda m, w: pushed(m, w, 15.0 * (-1) ** w.flight), throws=9)
     diagnosis = diagnose_flights.explain(model, laws=False)
