@@ -349,7 +349,7 @@ def _next_flights(diagnosis: Diagnosis) -> Section:
 def _ground(
     diagnosis: Diagnosis, step_check: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> Section:
-    null = "exceeded by the best of all effects in 0.5 % of null worlds"
+    null = "exceeded by the best of all effects in one of 150 null worlds"
     facts = {
         "flights, windows, samples": f"{diagnosis.flights}, {diagnosis.windows},"
         f" {diagnosis.samples}",
