@@ -321,8 +321,8 @@ def null_draws(information: ndarray, draws: int, rng: np.random.Generator) -> nd
 
 
 def threshold(statistics: Statistics, priors: Priors, rng: np.random.Generator) -> float:
-    """Nats that the best of all effects exceeds in ``ALARM`` of null worlds, at least very strong
-    ones.
+    """Return the nats that the best of all effects exceeds in a share ``ALARM`` of null worlds, at
+    least ``VERY_STRONG``.
 
     The null worlds have these flights' information, noise as fitted, and of every effect what may
     go unnamed."""
