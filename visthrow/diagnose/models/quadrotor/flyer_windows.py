@@ -10,7 +10,7 @@ from numpy import ndarray
 
 from visthrow.common.errors import LogError
 from visthrow.common.free_fall import GRAVITY
-from visthrow.common.rotations import cross, matrix_of_quat, normal_part, vectors_between
+from visthrow.common.rotations import cross, matrix_of_quat, normal_part
 from visthrow.diagnose.models.numeric import NumericModel, Stretch, sigma_of, take_samples
 from visthrow.diagnose.models.quadrotor.flyer_params import MOST_LATE, FlyerParams, QuadrotorParams
 from visthrow.logs.check.relations import attitude_at, mean_over, on_grid, rates_of
@@ -25,6 +25,7 @@ _GUESS = 0.25  # first guesses are straight lines through so much of a window [s
 _MOST_MISSING = 0.25  # largest gap in an input within a window [s]
 # median thrust over the weight, by the map: a map may be far off, a unit is off by more
 _MOST_THRUST = 5.0
+_MEMORY = 10.0  # of a filter, in its time constants
 _IDLE = 0.3  # windows in which the thrust falls below this share of the weight are on the ground
 
 
@@ -93,12 +94,13 @@ def windows_of(model: NumericModel, log: FlightLog, number: int) -> list[Stretch
         times = start + 0.5 * params.step * halves
         quat = attitude_at(*log[params.attitude].samples(), times)
         rot = matrix_of_quat(quat)
+        rates = rates_of(times, quat, params.step).values
         by_name = dict(zip(model.channels, tables))
         guess, spread, direction = _guess(by_name, params, rot[margin : margin + 2])
         data = common | {
             "rot": rot,
             "quat": quat,
-            "rate": _rates(quat, params.step),
+            "rate": np.pad(rates, ((1, 1), (0, 0)), mode="edge"),
             "direction": direction,
             "lean": _lean(log, params.attitude, params.estimator_rate, times),
         }
@@ -174,14 +176,6 @@ def without_each(commands: Samples, params: FlyerParams, start: float) -> list[S
     return inputs
 
 
-def _rates(quat: ndarray, step: float) -> ndarray:
-    """Return body rates at half steps by the attitudes about them [rad/s], shape (half steps,
-    3).
-    """
-    turn = vectors_between(quat[:-2], quat[2:])
-    return np.pad(turn / step, ((1, 1), (0, 0)), mode="edge")
-
-
 def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray:
     """Turn from a leaning estimate of the attitude to the true one, shape (half steps, 3); 0 where
     nothing tells it.
@@ -193,23 +187,18 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
 
     Source: Mueller, Hamer and D'Andrea 2015; firmware of the Crazyflie, kalman_core.c (only
     acceleration in z)."""
-    from scipy.signal import lfilter
-
     if "acc_b" not in log or not np.any(log["acc_b"].valid):
         return np.zeros((len(times), 3))
     time, force = log["acc_b"].samples()
     share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
     share = share - np.median(share, axis=0)
-    step = float(np.median(np.diff(time)))
-    even = np.arange(time[0], time[-1], step)
-    pushed = on_grid(time, share, even)
-    keep = np.exp(-rate * step)
-    tilt = lfilter([1.0 - keep], [1.0, -keep], pushed, axis=0)
+    recent = held(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
+    tilt, _ = lagged(*recent, times[:, None], 1.0 / rate)
     upright = np.array([0.0, 0.0, 1.0])
     turn = cross(np.pad(tilt, ((0, 0), (0, 1))), upright)
     if "rate_b" in log and np.any(log["rate_b"].valid):
         turn[:, :2] -= _offset(log, attitude)[:2] / rate
-    return on_grid(even, turn, times)
+    return turn
 
 
 def _offset(log: FlightLog, attitude: str) -> ndarray:
