@@ -298,6 +298,13 @@ class TestFlyer:
         bad = np.sqrt(np.mean(np.concatenate([r[own] for r, own in zip(nothing, right)]) ** 2))
         assert good < 0.1 * bad
 
+    def test_an_accelerometer_may_begin_after_a_window(self):
+        log = fly(4.0)
+        late = log["pos_w"].time > 3.5
+        force = Channel(log["pos_w"].time[late], np.tile([0.3, 0.0, G], (sum(late), 1)), "m/s^2")
+        model = FlyerModel([with_channels(log, acc_b=force)], FLYER)
+        assert np.all(np.isfinite(np.concatenate(model.residuals({"estimator_lean": 1.0}))))
+
     def test_missing_channels_are_named(self):
         log = fly(3.0)
         del log.channels["quat_wb"]

@@ -131,10 +131,10 @@ def spare(step: float) -> int:
 
 
 def held(commands: Samples, first: float, last: float) -> Samples:
-    """Return the commands that are held between two times."""
+    """Return the commands that are held between two times, at least the first or the last."""
     time, values = commands
     begin = max(int(np.searchsorted(time, first, "right")) - 1, 0)
-    end = int(np.searchsorted(time, last))
+    end = max(int(np.searchsorted(time, last)), begin + 1)
     return Samples(time[begin:end], values[begin:end])
 
 
