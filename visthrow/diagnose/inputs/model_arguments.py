@@ -151,7 +151,7 @@ def throw_model(
     Thread(target=threads.load_torch).start()
     experiment = load_experiment(args.plant, args.overrides)
     device = args.device
-    if device in ("auto", "cpu") and not wp.is_cuda_available():  # `resolve` would wait for torch
+    if device == "auto" and not wp.is_cuda_available():  # `resolve` would wait for torch
         device = "cpu"
     only = args.only.split(",") if args.only is not None else None
     measured = {
