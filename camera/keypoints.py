@@ -100,19 +100,16 @@ def goal_square(side: float) -> Tensor:
     )
 
 
-def goal_corners_w(goal_w: Array, side: float = 0.25, square_w: Array | None = None) -> Array:
+def goal_corners_w(goal_w: Array, square_w: Array) -> Array:
     """Corners of the ground square around the goal, on z = 0 whatever the goal's height.
 
     Args:
         goal_w: Goal [m], shape (E, 2) or (E, 3), world frame.
-        side: Side of the square [m].
-        square_w: `goal_square` of that side on the goal's device, to save making it.
+        square_w: `goal_square` on the goal's device [m], shape (4, 3).
 
     Returns:
         Corners [m], shape (E, 4, 3), world frame, in the order of `goal_square`.
     """
-    if square_w is None:
-        square_w = goal_square(side).to(goal_w)
     xp = library(goal_w)
     flat = goal_w[:, None, :2] + square_w[:, :2]
     heights = xp.broadcast_to(square_w[:, 2:], (*flat.shape[:2], 1))
@@ -267,7 +264,7 @@ def keypoints(
         seen.
     """
     rot_cb, position_b = (camera.rot_cb, camera.position_b) if extrinsics is None else extrinsics
-    corners_w = goal_corners_w(goal_w, square_w=camera.square_w)
+    corners_w = goal_corners_w(goal_w, camera.square_w)
     points_w = torch.cat([corners_w, payload_w.unsqueeze(-2)], -2)
     points_c = points_c_from_w(points_w, pos_w, rot_wb, rot_cb, position_b)
     rays_c = ball_extremes_c(camera.fisheye, points_c[:, 4], camera.radius, camera._axes)

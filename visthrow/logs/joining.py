@@ -134,9 +134,20 @@ def _lag(a: Samples, b: Samples) -> tuple[float, float]:
     candidates = coarse + np.arange(-_FINE, _FINE + 1e-9, _STEP)
     scores = np.array([_alignment(*_on_common_grid(a, b, offset)) for offset in candidates])
     best = int(np.argmax(scores))
-    offset = float(candidates[best] + _STEP * relations.peak(scores, best)[0])
+    offset = float(candidates[best] + _STEP * _vertex(scores, best))
     pairs = _on_common_grid(*sizes, offset)
     return offset, float(np.corrcoef(np.hstack(pairs).T)[0, 1]) if len(pairs[0]) >= RATE else -1.0
+
+
+def _vertex(scores: np.ndarray, index: int) -> float:
+    """Return where the parabola through a peak and its neighbours is highest, in steps from the
+    peak; 0 where it lacks a neighbour or they are level.
+    """
+    if not 0 < index < len(scores) - 1:
+        return 0.0
+    lower, top, upper = scores[index - 1 : index + 2]
+    curve = 2.0 * top - lower - upper
+    return 0.5 * (upper - lower) / curve if curve > 0.0 else 0.0
 
 
 def _on_common_grid(a: Samples, b: Samples, offset: float) -> tuple[np.ndarray, np.ndarray]:

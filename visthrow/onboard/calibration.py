@@ -347,7 +347,7 @@ class CalibrationProblem:
         length = self.length * (1.0 + c["length"][:, None])
         ball_w = body_w + _turned(attitude, self.mount.expand_as(body_w)) + length * rope
         goal_w = self.goal + torch.nn.functional.pad(c["goal"], (0, 1))
-        corners_w = goal_corners_w(goal_w, square_w=self.camera.square_w)
+        corners_w = goal_corners_w(goal_w, self.camera.square_w)
         corners_w = corners_w[:, None].expand(-1, body_w.shape[1], -1, -1)
         offsets = torch.cat([corners_w, ball_w[:, :, None]], 2) - body_w[:, :, None]
         place = self.camera.position_b + c["lens"]

@@ -239,7 +239,7 @@ def predicted(
             seen it, bool, shape (E, 1).
     """
     xp = library(frame)
-    corners_w = goal_corners_w(goal_xy, square_w=camera.square_w)
+    corners_w = goal_corners_w(goal_xy, camera.square_w)
     corners_c = points_c_from_w(corners_w, frame[:, :3], rot_wb, camera.rot_cb, camera.position_b)
     points, visible = camera.fisheye.project_normalized(corners_c, clip=True)
     measured_valid = valid[:, :GOAL_KEYPOINTS]

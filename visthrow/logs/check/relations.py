@@ -246,15 +246,6 @@ class _Blocks:
         return vertex, _STUDENT * (np.sqrt(variance) / -bend)
 
 
-def peak(score: np.ndarray, index: int) -> tuple[float, float]:
-    """Vertex of the parabola through the peak and its neighbours, and its curvature [1/step^2]."""
-    if not 0 < index < len(score) - 1:
-        return 0.0, 1e-9
-    lower, top, right = score[index - 1 : index + 2]
-    curve = 2 * top - lower - right
-    return (0.5 * (right - lower) / curve if curve > 0.0 else 0.0), max(float(curve), 1e-9)
-
-
 def unit_hint(ratio: float) -> str:
     """Name the unit that a ratio of two measurements suggests, or return nothing."""
     for factor, words in UNITS.items():
