@@ -68,7 +68,9 @@ class Hall:
         _, state = min(self.path, key=lambda row: abs(row[0] - (now - self.late)))
         rot = rotation_from_quat(torch.tensor(state["quat_wb"][None]).double())[0].numpy()
         eye = state["pos_w"] + rot @ self.camera.position_b.numpy()
-        points = np.vstack([goal_corners_w(self.goal, self.camera.square_w)[0].numpy(), state["payload_pos_w"]])
+        points = np.vstack(
+            [goal_corners_w(self.goal, self.camera.square_w)[0].numpy(), state["payload_pos_w"]]
+        )
         rays = (points - eye) @ (self.rot_cb @ rot.T).T
         far = norm(rays, axis=1)
         unit = rays / far[:, None] + 1e-3 * self.rng.standard_normal((5, 3))
