@@ -19,7 +19,6 @@ Source: Rasmussen and Williams 2006, section 4.2.1 (kernels) and 5.4.1 (marginal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from typing import TypeVar
 
 import numpy as np
@@ -46,7 +45,7 @@ LONGEST = 0.15
 """Of correlation times [s]: what is left of a sensor's filter for longer is no noise but something
 that the model lacks.
 """
-APART = 4  # steps among them that are tried first
+STRIDES = (4, 2, 1)  # steps among them, one after the other
 
 SHARES = (0.5, 0.8, 0.95, 0.99, 0.999)
 """Correlated parts of the variance that are tried; the rest keeps the correlations' inverse within
@@ -200,12 +199,14 @@ def _climbed(
             scores[place] = value, replace(guess, scale=scale * levels.scale[channel])
         return scores[place][0]
 
-    best = max(product(range(0, times, APART), (len(SHARES) // 2,), (1, 2)), key=tried)
-    while True:
-        better = max(_neighbours(best, times), key=tried)
-        if tried(better) <= tried(best):
-            break
-        best = better
+    begins = [(min(time, times - 1), 2, order) for order in (1, 2) for time in (4, 12)]
+    best = max(begins, key=tried)
+    for stride in STRIDES:
+        while True:
+            better = max(_neighbours(best, stride, times), key=tried, default=best)
+            if tried(better) <= tried(best):
+                break
+            best = better
     if best[0] == times - 1:  # it would last for still longer
         return scores[best][1], 0.0
     value, likeliest = scores[best]
@@ -216,12 +217,15 @@ def _climbed(
     return likeliest, value - max(white)
 
 
-def _neighbours(place: tuple[int, int, int], times: int) -> list[tuple[int, int, int]]:
-    """Places one step away: another of so many times, another share, the other order."""
+def _neighbours(place: tuple[int, int, int], stride: int, times: int) -> list[tuple[int, int, int]]:
+    """Places beside one: others of so many times, and while these are far apart, other shares and
+    the other order.
+    """
     time, share, order = place
-    neighbours = [(time, share, 3 - order)]
-    for step in (-1, 1):
-        neighbours += [(time + step, share, order), (time, share + step, order)]
+    neighbours = [(time + step, share, order) for step in (-stride, stride)]
+    if stride == STRIDES[0]:
+        neighbours += [(time, share + step, order) for step in (-1, 1)]
+        neighbours.append((time, share, 3 - order))
     return [p for p in neighbours if 0 <= p[0] < times and 0 <= p[1] < len(SHARES)]
 
 
