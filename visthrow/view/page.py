@@ -11,6 +11,9 @@ from visthrow.common.storage import atomic_write
 from visthrow.view.parts import Grid, Picture, Section, Text
 from visthrow.view.templates import rendered
 
+PAGE = "report.html"
+"""In the folder of a report."""
+
 _BOLD = re.compile(r"\*\*(.+?)\*\*")
 LEADS = {"missing": "*Missing.* ", "finding": "- "}
 """Kind of a paragraph -> what stands before it in Markdown."""
@@ -60,7 +63,7 @@ def markdown_of(title: str, lead: str, sections: Sequence[Section]) -> str:
 
 def write(folder: Path, title: str, lead: str, sections: Sequence[Section]) -> list[Path]:
     """Write ``report.html``, ``report.md`` and the pictures; returns the paths, the page first."""
-    paths = [folder / "report.html", folder / "report.md"]
+    paths = [folder / PAGE, folder / "report.md"]
     for section in sections:
         for part in section.parts:
             if isinstance(part, Picture):

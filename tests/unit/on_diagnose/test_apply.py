@@ -158,8 +158,16 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
     assert config.load(Experiment, out).laws == (
         LawParams("payload force", ("speed",), "vertical_cross_vel", 0.02),
     )
-    refused(f"{command} --laws 2", said="asks for number 2")
+    refused(f"{command} --laws 2", said="asks for number 2 of its laws; expected a number up to 1")
     assert "--laws 1 writes it" in printed(command)
+
+
+def test_a_formula_without_a_coefficient_is_no_law_to_write(diagnosis, tmp_path, refused):
+    reason = "F = f(|v|) v, with any function f, explains 40 nats"
+    path = diagnosis(theta={}, covariance=[], overall="UNKNOWN", reasons=[reason])
+    command = f"diagnose apply {path} --out {tmp_path / 'law.toml'} --laws 1"
+    refused(command, said="it holds none")
+    refused(command, said=reason)
 
 
 def test_every_effect_can_be_written():

@@ -54,6 +54,12 @@ def test_a_copied_log_counts_once(flights, once, tmp_path):
     assert twice["theta"] == approx(once["theta"])
 
 
+def test_a_page_of_an_earlier_diagnosis_is_named(flights, tmp_path, capsys):
+    (tmp_path / "report.html").write_text("of last week")
+    assert explained(flights, tmp_path)[0] == 0
+    assert f"{tmp_path / 'report.html'}, its pictures" in capsys.readouterr().out
+
+
 def test_what_was_explained_is_what_training_draws(once, tmp_path):
     """From flights to the draws of a training, through the files that users pass on."""
     out = tmp_path / "mine.toml"

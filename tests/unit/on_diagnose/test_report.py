@@ -272,6 +272,47 @@ def test_the_report_holds_sentences_pictures_and_numbers(
     assert "cannot tell it from" in text
 
 
+def texts_of(diagnosis, measured=None):
+    """What a report's page says, as Markdown."""
+    return page.markdown_of("", "", report.sections(diagnosis, measured))
+
+
+def test_terms_that_act_together_are_printed_together(found):
+    """A drag is the first explanation here by a pair; the second is one term alone."""
+    first = result.Law(
+        "F = c v_xy² v", "vehicle force", ("speed_across_squared",), "vel", 4e-3, 1e-4, "kg", 20.0
+    )
+    second = replace(first, formula="F = c |v| v_xy v", coefficient=-8e-3)
+    alone = replace(first, formula="F = c |v| v", coefficient=-2e-3)
+    both = ((first, second), (alone,))
+    unknown = replace(
+        found[1], overall=result.UNKNOWN, laws=(first, second, alone), explanations=both
+    )
+    text = texts_of(unknown)
+    (line,) = (line for line in text.splitlines() if "**Law.**" in line)
+    assert "v_xy² v with c = 0.004" in line
+    assert "|v| v_xy v with c = -0.008" in line
+    assert line.endswith("which act together.")
+    rows = [line.split("|")[1:3] for line in text.splitlines() if line.startswith("| ")]
+    numbers = [row[0].strip() for row in rows if "F = c" in row[1]]
+    assert numbers[:2] == ["1", "1"]
+    assert len(numbers) == 3
+
+
+def test_where_nothing_was_named_no_error_with_names_is_given(found, measured):
+    rows = {}
+    for theta in (found[1].theta, {}):
+        (section,) = (
+            s
+            for s in report.sections(replace(found[1], theta=theta), measured)
+            if s.title == "Gain on flights that were not used"
+        )
+        rows[bool(theta)] = section.parts[0].rows[0]
+    assert rows[True][:3] == rows[False][:3]
+    assert "-" not in rows[True][3:5]
+    assert rows[False][3:5] == ("-", "-")
+
+
 def test_a_disk_that_is_full_at_a_picture_leaves_the_verdict(tmp_path, found, monkeypatch, capsys):
     def full(*_):
         raise OSError("no space left")

@@ -176,10 +176,14 @@ def _explanation(report: Mapping[str, Any], path: str, rank: int) -> list[dict[s
     """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
     explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
     if rank > len(explanations):
-        raise DiagnoseError(
-            f"{path}: {len(explanations)} explanations by laws outside the catalogue; --laws asks"
-            f" for number {rank}"
-        )
+        known = f"expected a number up to {len(explanations)}"
+        if not explanations:
+            reasons = "; ".join(report.get("reasons") or ["none"])
+            known = (
+                "it holds none: a formula is a law only where flights that are left out repeat its"
+                f" coefficient. Reasons of its verdict: {reasons}"
+            )
+        raise DiagnoseError(f"{path}: --laws asks for number {rank} of its laws; {known}")
     return explanations[rank - 1] if rank else []
 
 

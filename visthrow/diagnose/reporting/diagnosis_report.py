@@ -175,7 +175,7 @@ def sections(
     listed = [
         _verdict(diagnosis, gain),
         _residuals(diagnosis),
-        _gain(gain),
+        _gain(gain, bool(diagnosis.theta)),
         _candidates(diagnosis),
         _levels(diagnosis),
         _laws(diagnosis),
@@ -190,10 +190,12 @@ def sections(
 def _verdict(diagnosis: Diagnosis, gain: Gain | None) -> Section:
     lines = [*diagnosis.reasons]
     lines += [f"**{word}.** {text}" for word, text in _statements(diagnosis, gain)]
-    if diagnosis.overall == result.UNKNOWN and diagnosis.laws:
-        law = diagnosis.laws[0]
-        size = f"{law.coefficient:.3g} ± {law.sd:.2g} {law.unit}"
-        lines.append(f"**Law.** {law.formula} with c = {size}.")
+    if diagnosis.explanations:
+        sizes = []
+        for law in diagnosis.explanations[0]:
+            sizes.append(f"{law.formula} with c = {law.coefficient:.3g} ± {law.sd:.2g} {law.unit}")
+        together = ", which act together" if len(sizes) > 1 else ""
+        lines.append(f"**Law.** {' and '.join(sizes)}{together}.")
     picture = None
     if gain is not None and gain.landing is not None:
         lines.append(f"**Landing.** {landing_sentence(gain.landing)}")
@@ -217,7 +219,8 @@ def _residuals(diagnosis: Diagnosis) -> Section:
     return section("residuals", "Residuals before and after", *drawn)
 
 
-def _gain(gain: Gain | None) -> Section:
+def _gain(gain: Gain | None, named: bool) -> Section:
+    """Prediction errors; where nothing was named, only those of the model as it stands."""
     title = "Gain on flights that were not used"
     if gain is None:
         return section("gain", title)
@@ -226,7 +229,8 @@ def _gain(gain: Gain | None) -> Section:
         unit, before, after, floor, box = _errors(c)
         less = f"{percent(c.gain, 1)} % {c.interval}"
         worse = "worse" if c.high < 0.0 else ""
-        rows.append((c.channel, unit, before, after, less, floor, box or "-", worse))
+        changes = (after, less) if named else ("-", "-")
+        rows.append((c.channel, unit, before, *changes, floor, box or "-", worse if named else ""))
     shares = [f"{name} in {100 * share:.0f} %" for name, share in gain.named_in.items()]
     predicted = f"predictions from the first {HEAD_SECONDS:g} s of each window"
     note = (
@@ -262,15 +266,15 @@ def _candidates(diagnosis: Diagnosis) -> Section:
 
 
 def _levels(diagnosis: Diagnosis) -> Section:
-    header = "what | phase | as it stands | with what was named | times the quietest phase | "
+    header = "what | phase | as it stands | with what was selected | times the quietest phase | "
     rows = []
     for level in diagnosis.levels:
         sizes = (f"{level.before:.3g}", f"{level.after:.3g}", f"{level.after / level.quiet:.1f}")
         excess = "more than gusts" if level.excessive else ""
         rows.append((level.block, level.phase, *sizes, excess))
     note = (
-        "Deviation of what moves the vehicle besides the model [N; N m]. Gusts do not know the"
-        " phase of the flight."
+        "Deviation of what moves the vehicle besides the model [N; N m]. Selected are causes and"
+        " laws, also those whose names were withdrawn. Gusts do not know the phase of the flight."
     )
     grid = Grid.from_rows("Latent forces", header, rows, note, heads=2)
     return section("levels", "Forces that nothing explains", grid)
@@ -278,14 +282,15 @@ def _levels(diagnosis: Diagnosis) -> Section:
 
 def _laws(diagnosis: Diagnosis) -> Section:
     rows = []
-    for law in diagnosis.laws:
-        size = f"{law.coefficient:.4g} ± {law.sd:.2g}"
-        rows.append((law.formula, law.block, size, law.unit, f"{law.nats:.1f}"))
+    for number, together in enumerate(diagnosis.explanations, start=1):
+        for law in together:
+            size = f"{law.coefficient:.4g} ± {law.sd:.2g}"
+            rows.append((str(number), law.formula, law.block, size, law.unit, f"{law.nats:.1f}"))
     note = (
-        "Nats over the same causes without the term, less the log of the number of terms as simple"
-        " as it."
+        "Terms of one number act together; `apply --laws NUMBER` writes them. Nats over the same"
+        " causes without these terms, less the log of the number of terms as simple as they."
     )
-    grid = Grid.from_rows("Terms", "law | on | c | unit | nats", rows, note)
+    grid = Grid.from_rows("Terms", "number | law | on | c | unit | nats", rows, note, heads=3)
     return section("laws", "Laws outside the catalogue", grid)
 
 
@@ -301,7 +306,11 @@ def _catalogue(diagnosis: Diagnosis) -> list[Section]:
             (f.name, f.verdict, f.block, *sizes, f"{f.floor:.3g}", f.unit, "; ".join(needs))
         )
     header = "effect | verdict | block | size | from | to | floor | unit | needs"
-    note = " ".join(f"**{verdict}**: {meaning}." for verdict, meaning in result.VERDICTS.items())
+    meanings = [f"**{verdict}**: {meaning}." for verdict, meaning in result.VERDICTS.items()]
+    meanings.append("An interval is of the size that the effect has if it is present.")
+    if diagnosis.overall == result.UNKNOWN:
+        meanings.append("Something unknown acts besides, which may shift these sizes.")
+    note = " ".join(meanings)
     caption = "95 % intervals of all effects in their floors."
     intervals = Picture("verdicts", pictures.verdicts(diagnosis), caption)
     grid = Grid.from_rows("All effects", header, rows, note, heads=3)

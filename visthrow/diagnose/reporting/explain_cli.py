@@ -27,6 +27,7 @@ def run(args: argparse.Namespace) -> int:
     """Read, search, print, write."""
     from visthrow.common.storage import check_place, write_json
     from visthrow.diagnose.reporting import diagnosis_report as report
+    from visthrow.view import page
 
     folder = Path(args.out)
     made_with = opening.made_with(args)
@@ -47,6 +48,8 @@ def run(args: argparse.Namespace) -> int:
     tested = _tested(test_flights, diagnosis) if args.test and diagnosis.work is not None else {}
     if args.no_report:
         print(f"JSON: {folder / DIAGNOSIS}")
+        if (folder / page.PAGE).exists():
+            print(f"{folder / page.PAGE}, its pictures and recording are of an earlier diagnosis")
     elif diagnosis.work is not None:
         print(f"page, JSON, pictures and recording: {folder}")
     if args.json:

@@ -25,8 +25,14 @@ VERDICTS = {
         "the flights ask for it, but held-out flights do not confirm it, or the search does not"
         " always name it without some of them"
     ),
-    BOUNDED: "if present, then within these limits",
-    NOT_IDENTIFIABLE: "these flights say hardly more than was known before",
+    BOUNDED: (
+        "the flights do not ask for it; if it is present all the same, then within these limits,"
+        " which need not hold 0"
+    ),
+    NOT_IDENTIFIABLE: (
+        "these flights say hardly more than was known before, or it explains a part of what is"
+        " missing, but not its form"
+    ),
     UNOBSERVABLE: "a channel is missing that would show it",
 }
 """Verdicts on one effect; each effect has exactly one."""

@@ -283,9 +283,12 @@ def _explanations(selection: Selector) -> tuple[list[tuple[Law, ...]], str]:
         if low > 0.0:
             repeated.append(terms.laws(best.point, columns_of(chosen), value[chosen]))
         elif chosen == best.chosen:  # none in place of a better one
+            by_flight = best.point.plain.information[:, columns, columns].sum(axis=1)
+            flight = best.point.plain.flights[int(np.argmax(by_flight))]
             return [], (
-                "a formula explains these flights, but those that are left out do not repeat it:"
-                f" {share_text(share, low, high)}"
+                "a formula, which is not printed, explains these flights, but those that are left"
+                f" out do not repeat it: {share_text(share, low, high)}; flight {flight} shows it"
+                " most: fly more like that one"
             )
     return repeated, ""
 
@@ -402,7 +405,8 @@ def _law(selection: Selector, reasons: Sequence[str]) -> Answer | None:
     for law in terms.laws(best.point, best.columns, 0.0):
         unit = unit_suffix(law.unit)
         texts.append(f"{law.formula}, c = {law.coefficient:.3g} ± {law.sd:.2g}{unit}")
-    reason = f"{' and '.join(texts)} explains what no cause of the catalogue does"
+    verb = "explains" if len(texts) == 1 else "together explain"
+    reason = f"{' and '.join(texts)} {verb} what no cause of the catalogue does"
     blocks = terms.acts_in(c.law for c in forms)
     return result.UNKNOWN, forms[0].law, [reason, *reasons], _parts_of(selection, blocks)
 
