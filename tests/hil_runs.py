@@ -13,10 +13,10 @@ AT_ONCE = (HOVER, 0.0, 0.0, 0.0, 1.0)
 """Of a policy that hovers and releases at once: the payload falls straight down."""
 
 
-def saved_policy(folder: Path, action=AT_ONCE, layout="vision") -> str:
+def saved_policy(folder: Path, action=AT_ONCE) -> str:
     """File of a policy that always says the same, as an override of a config."""
     path = folder / "always.npz"
-    simple_policy(action, layout).save(path)
+    simple_policy(action, "vision").save(path)
     return f'policy="{path}"'
 
 

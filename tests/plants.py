@@ -2,11 +2,11 @@
 knows.
 """
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 from sim.kernels.structs import EXTENSIONS
-from sim.params import PlantParams, ReleaseParams, RopeParams, SimParams, VehicleParams
+from sim.params import AeroParams, PlantParams, ReleaseParams, RopeParams, SimParams, VehicleParams
 from visthrow import config
 
 SCENES = Path(__file__).parent / "data" / "scenes"
@@ -28,6 +28,11 @@ def paper_plant() -> PlantParams:
             for name, schema in schemas.items()
         }
     )
+
+
+def calm(aero: AeroParams) -> AeroParams:
+    """Return aerodynamics that do nothing, in a kernel that computes them."""
+    return replace(aero, **{f.name: 0.0 for f in fields(aero) if f.name != "kind"})
 
 
 def plain_vehicle(vehicle: VehicleParams, **kinds: str) -> VehicleParams:

@@ -32,11 +32,11 @@ def regular(rate: float) -> Callable[[np.random.Generator], Iterator[Sample]]:
     return samples
 
 
-def restamped(change: Callable[[Sample], float], rate: float = 100.0):
-    """Regular samples with other stamps [us]."""
+def restamped(change: Callable[[Sample], float]):
+    """Regular samples of 100 Hz with other stamps [us]."""
 
     def samples(rng):
-        for sample in regular(rate)(rng):
+        for sample in regular(100.0)(rng):
             yield sample[0], max(0, round(change(sample))), sample[2]
 
     return samples

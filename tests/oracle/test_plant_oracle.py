@@ -13,7 +13,7 @@ from pytest import approx, mark
 from sim.hybrid import HybridSim
 from sim.params import PlantParams, changed
 from sim.reference.plant import ReferencePlant
-from tests.plants import paper_plant
+from tests.plants import EVERYTHING, paper_plant
 from tests.simulators import bare_quadrotor, numerics, random_commands
 
 COUNT, ASKED_AT = 4, 12
@@ -43,6 +43,8 @@ WITHIN = {"float64": 1e-4, "float32": 1e-3}
 """After half a second of full-range commands [m], at the substeps below; measured 0.63 mm in
 float32."""
 SUBSTEPS = {"float64": 5e-4, "float32": 2e-3}
+BUILT_IN = {"float64": EVERYTHING, "float32": frozenset()}
+"""Extensions: the kernel of all tests of extensions, and that of training."""
 VOLTAGE, RATE = 1e-3, 0.05
 """[V], [rad/s]"""
 RELEASE = np.arange(COUNT) % 2 == 1
@@ -63,7 +65,8 @@ def test_whole_plant(name):
     sims, separation = {}, {}
     for precision in PRECISIONS.get(name, ("float64",)):
         settings = numerics(SUBSTEPS[precision], precision)
-        sims[precision] = HybridSim(replace(plant, sim=settings), COUNT)
+        built_in = BUILT_IN[precision]
+        sims[precision] = HybridSim(replace(plant, sim=settings), COUNT, extensions=built_in)
         sims[precision].place(pos, vel_w=vel)
         separation[precision] = np.full(COUNT, np.nan)
     for k, command in enumerate(random_commands(0, steps, COUNT)):

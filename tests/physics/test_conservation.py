@@ -118,9 +118,7 @@ def test_a_linear_torque_in_the_ropes_joint_is_the_mounts_friction():
         replace(plant, rope=rubbing),
         replace(plant, laws=(law,)),
     ):
-        sim = HybridSim(
-            same, 1, gravity=0.0, extensions=EVERYTHING if same.rope.mount_damping else frozenset()
-        )
+        sim = HybridSim(same, 1, gravity=0.0, extensions=EVERYTHING)
         place = (
             [scene.pos_w],
             [scene.quat_wb],

@@ -12,6 +12,7 @@ from sim.hybrid import HybridSim, tether_lengths
 from sim.kernels.state import FALLBACK, NONFINITE
 from sim.params import PlantParams
 from tests.configs import load_experiment
+from tests.plants import EVERYTHING
 from tests.simulators import numerics, random_commands
 from visthrow.task import Experiment, plant_of
 
@@ -29,11 +30,14 @@ def experiment() -> Experiment:
     return load_experiment("state")
 
 
-def started(count: int, seed: int, plant: PlantParams | None = None) -> HybridSim:
+def started(
+    count: int, seed: int, plant: PlantParams | None = None, extensions=frozenset()
+) -> HybridSim:
     """Randomised as in training."""
     exp = experiment()
     plant = plant or plant_of(exp)
-    sim = HybridSim(plant, count, seed=seed, ropes=tether_lengths(plant.rope, exp.task.start))
+    ropes = tether_lengths(plant.rope, exp.task.start)
+    sim = HybridSim(plant, count, seed=seed, ropes=ropes, extensions=extensions)
     sim.randomize(exp.task.start)
     return sim
 
@@ -61,7 +65,8 @@ def segment_rates(
 ) -> np.ndarray:
     """Rates of all rods over the first 0.2 s [1/s], shape (T, E, L, 3)."""
     plant = replace(plant_of(experiment()), sim=numerics(substep, precision))
-    sim, rows = started(count, seed, plant), []
+    extensions = EVERYTHING if precision == "float64" else frozenset()
+    sim, rows = started(count, seed, plant, extensions), []
     for command in random_commands(seed, steps, count):
         sim.set_command(command)
         sim.step()

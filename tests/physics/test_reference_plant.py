@@ -15,14 +15,12 @@ STILL = np.zeros((1, 3))
 HIGH = np.array([[0.0, 0.0, 1.5]])
 
 
-def swinging(plant, step=5e-4, count=1, **start):
+def swinging(plant, step):
     """A plant whose rope starts at 0.5 rad and swings down."""
-    reference = ReferencePlant(plant, count=count, step=step)
-    direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (count, plant.rope.segments, 1))
-    still = np.zeros((count, 3))
-    reference.reset(
-        np.tile(HIGH, (count, 1)), np.tile(LEVEL, (count, 1)), still, still, direction, **start
-    )
+    reference = ReferencePlant(plant, step=step)
+    direction = np.tile([np.sin(0.5), 0.1, -np.cos(0.5)], (1, plant.rope.segments, 1))
+    still = np.zeros((1, 3))
+    reference.reset(HIGH, LEVEL, still, still, direction)
     return reference
 
 

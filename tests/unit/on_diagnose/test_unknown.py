@@ -54,8 +54,8 @@ def turned(knots: dict, turn: Rotation) -> dict:
     return knots | {name: turn.apply(knots[name]) for name in vectors} | {"quat_wb": quats}
 
 
-def random_knots(seed: int = 0) -> dict:
-    rng = default_rng(seed)
+def random_knots() -> dict:
+    rng = default_rng(0)
     unit = lambda v: v / norm(v, axis=1, keepdims=True)  # noqa: E731
     k = 6
     return {

@@ -77,21 +77,15 @@ def vicon(kind="Objects", unit="rad", twice=False):
     return f"{kind}\n100\n{lines(rows)}" + ("\n" if twice else "")
 
 
-def qualisys(bodies=("quad",)):
-    head = [("NO_OF_FRAMES", len(TIME)), ("NO_OF_BODIES", len(bodies)), ("FREQUENCY", 100)]
-    head += [("DESCRIPTION", "--"), ("DATA_INCLUDED", "6D"), ("BODY_NAMES", *bodies)]
-    names = ["Frame", "Time"]
-    for body in bodies:
-        names += [f"{body} X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual"]
-        names += [f"Rot[{i}]" for i in range(9)]
-    rows = [names]
+def qualisys():
+    head = [("NO_OF_FRAMES", len(TIME)), ("NO_OF_BODIES", 1), ("FREQUENCY", 100)]
+    head += [("DESCRIPTION", "--"), ("DATA_INCLUDED", "6D"), ("BODY_NAMES", "quad")]
+    names = ["Frame", "Time", "quad X", "Y", "Z", "Roll", "Pitch", "Yaw", "Residual"]
+    rows = [names + [f"Rot[{i}]" for i in range(9)]]
     matrices = TURN.as_matrix().transpose(0, 2, 1).reshape(-1, 9)
     for i, t in enumerate(TIME):
-        row = [i + 1, f"{t:.5f}"]
-        for number, _ in enumerate(bodies):
-            place = POS[i] - [0.0, 0.0, 0.5 * number]
-            row += [*(1e3 * place).round(4), 0, 0, 0, 0.3, *matrices[i].round(7)]
-        rows.append(row)
+        place = (1e3 * POS[i]).round(4)
+        rows.append([i + 1, f"{t:.5f}", *place, 0, 0, 0, 0.3, *matrices[i].round(7)])
     return lines(head, "\t") + lines(rows, "\t")
 
 

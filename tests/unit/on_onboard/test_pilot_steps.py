@@ -24,14 +24,14 @@ def seen(pilot: Pilot, time: float, now: float | None):
     return pilot.act(STILL, LEVEL, speed, 2.0 * speed, payload, GOAL, True, None, now).observation
 
 
-def responsive(response=8):
+def responsive():
     """A policy that is given the response of earlier steps too."""
     policy = simple_policy((-0.1, 0.0, 0.0, 0.0, -1.0))
     contract = {
         **policy.contract,
-        "observation": {**policy.contract["observation"], "response": response},
+        "observation": {**policy.contract["observation"], "response": 8},
     }
-    contract["observation"]["dimension"] = policy.obs_dim + response * RESPONSE
+    contract["observation"]["dimension"] = policy.obs_dim + 8 * RESPONSE
     return Policy(
         (torch.zeros(5, contract["observation"]["dimension"]),), policy.biases, "relu", contract
     )

@@ -19,8 +19,8 @@ COUNT = 4096
 SPREAD = 0.05  # relative; four and a half standard errors
 
 
-def env_of(*overrides: str, name: str = "state", count: int = COUNT) -> ThrowEnv:
-    experiment = load_experiment(name, list(overrides))
+def env_of(*overrides: str, count: int = COUNT) -> ThrowEnv:
+    experiment = load_experiment("state", list(overrides))
     torch.manual_seed(7)
     return ThrowEnv(experiment, "cpu", seed=7, count=count)
 
