@@ -35,7 +35,6 @@ _MOTOR_UNITS = ((5000.0, "1/65535"), (150.0, "1/1000"), (2.0, "%"), (-np.inf, "1
 _FIRMLY = 0.8
 _BELONGS = 0.6
 _REACH = 0.2  # delays that are tried [s]
-_LATEST = 0.15  # the longest delay that counts [s]
 _SPAN = 0.1  # over which a path is differentiated [s]
 _COARSE = 0.02  # step of the grid on which many pairs are compared [s]
 _COMPARED = 1000  # rows on which the distance of two paths is judged
@@ -382,13 +381,9 @@ class Recognition:
         """
         best = None
         for group in groups:
-            values = self._samples(group)
-            if min(len(derived.time), len(values.time)) < 100:
-                continue
-            relation = relations.relate(derived, values, reach=_REACH)
-            if relation is None or abs(relation.delay) > _LATEST:
-                continue
-            if relation.correlation > (best[0].correlation if best else _BELONGS):
+            relation = relations.relate(derived, self._samples(group), reach=_REACH)
+            least = best[0].correlation if best else _BELONGS
+            if relation is not None and relation.correlation > least:
                 best = relation, group
         return best
 
@@ -418,8 +413,6 @@ class Recognition:
             return False
         time, slope = relations.derivative(*path.samples(), _SPAN)
         attitude = self._made["quat_wb"][1].samples()
-        if min(len(time), len(attitude.time)) < 100:
-            return False
         turned = Samples(time, rotate_back(relations.attitude_at(*attitude, time), slope))
         best = self._best(turned, self._hinting("velocity"))
         if best is None:
