@@ -6,6 +6,7 @@ import numpy as np
 import warp as wp
 from numpy.linalg import norm
 from pytest import approx, mark, raises
+from scipy.spatial.transform import Rotation
 
 from sim.kernels import laws
 from sim.kernels.laws import BLOCKS, check_laws
@@ -91,6 +92,67 @@ def test_factors_are_the_grammars():
             np.testing.assert_allclose(
                 found, factor.read(known)[0], atol=1e-12, err_msg=f"{block} {name}"
             )
+
+
+def expected(k: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Quantities of a moment by matrices: what kernels and arrays share is stated again."""
+    pos, vel, rate, ball, ball_vel, cable, mount, other = (
+        k[name][0]
+        for name in (
+            *("pos_w", "vel_w", "rate_b", "payload_pos_w", "payload_vel_w", "cable_dir_w"),
+            *("mount_b", "neighbour_pos_w"),
+        )
+    )
+    turn = Rotation.from_quat(k["quat_wb"][0]).as_matrix()
+    up = turn[:, 2]
+    level = np.eye(3) - np.outer(up, up)
+    relative = ball_vel - vel
+    swing = relative - cable @ relative * cable
+    reach = ball - pos - turn @ mount
+    mount_vel = vel + turn @ np.cross(rate, mount)
+    joint = turn.T @ np.cross(reach, ball_vel - mount_vel) / (reach @ reach) - rate
+    gap = pos - other
+    return {
+        **{f"unit_{letter}": axis for letter, axis in zip("xyz", np.eye(3))},
+        **{f"axis_{letter}": axis for letter, axis in zip("xyz", turn.T)},
+        "rate_w": turn @ rate,
+        "rate_yaw": rate[2],
+        "vel_b": turn.T @ vel,
+        "along": up @ vel,
+        "across": level @ vel,
+        "speed_across_squared": vel @ level @ vel,
+        "inverse_height": 1.0 / max(pos[2], 0.05),
+        "swing": swing,
+        "swing_b": turn.T @ swing,
+        "cable_dir_b": turn.T @ cable,
+        "under": -(up @ cable),
+        "sideways": level @ cable,
+        "reach_w": reach,
+        "joint_rate_b": joint,
+        "friction": joint / np.hypot(norm(joint), 0.1),
+        "unit_z x cable_dir_b": np.cross([0.0, 0.0, 1.0], turn.T @ cable),
+        "apart": gap,
+        "inverse_distance": 1.0 / norm(gap),
+        "neighbour": gap / norm(gap),
+        "distance_upright": gap[2] / norm(gap),
+    }
+
+
+@mark.parametrize("seed", range(3))
+def test_quantities_are_what_their_names_say(seed):
+    k = knots(seed)
+    k["neighbour_pos_w"] = np.random.default_rng(seed).normal(size=(2, 3))
+    known = grammar.KnotValues(k)
+    by_hand = expected(k)
+    named = {
+        factor.quantity.strip("|")
+        for of in (grammar.SCALARS, *grammar.VECTORS.values())
+        for factor in of.values()
+    }
+    parts = {part for name in named for part in name.split(" x ")}
+    assert parts - by_hand.keys() == set(k) & parts | {"slope"}
+    for name, value in by_hand.items():
+        np.testing.assert_allclose(known[name][0], value, atol=1e-12, err_msg=name)
 
 
 def test_laws_are_part_of_the_configuration():
