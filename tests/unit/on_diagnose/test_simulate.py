@@ -4,6 +4,7 @@ import numpy as np
 from pytest import approx
 
 from tests.commands import run_command
+from visthrow.common.free_fall import GRAVITY
 from visthrow.config.effects import catalogue
 from visthrow.diagnose.inputs.setup import load
 from visthrow.diagnose.models.catalogue import effects_of
@@ -60,6 +61,19 @@ def test_flights_hold_what_the_world_hides(tmp_path):
     assert payload - vehicle - plain == approx([0.0, 0.0, -0.1], abs=2e-3)
     vehicle, payload = hovered(tmp_path, "vehicle.body.com=[0.02,0.0,0.0]")
     assert payload - vehicle - plain == approx([0.0, 0.0, 0.0], abs=5e-3)
+
+
+def test_a_thrown_payload_falls_and_stays_where_it_lands(tmp_path):
+    """It hung in the air where it had left the rope, which no cause explains."""
+    thrown = f"diagnose simulate --set rope.segments=1 --device cpu --out {tmp_path}"
+    assert run_command(thrown, "throw at 3 m/s") == 0
+    payload = FlightLog.load(tmp_path / "throw_at_3_m_s-0.npz")["payload_pos_w"]
+    height = payload.values[:, 2]
+    down = np.flatnonzero(height < 0.1)
+    falling = slice(down[0] - 40, down[0] - 5)
+    fit = np.polyfit(payload.time[falling], height[falling], 2)
+    assert 2.0 * fit[0] == approx(-GRAVITY, rel=0.05)
+    assert np.ptp(payload.values[down[20] :], axis=0).max() < 0.01
 
 
 def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):
