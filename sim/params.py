@@ -9,6 +9,7 @@ with the origin at the vehicle's centre of mass unless said otherwise."""
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from typing import Any, Literal, TypeVar
 
 from camera.field_bounds import (
@@ -24,6 +25,7 @@ from camera.field_bounds import (
     Positive,
     Share,
 )
+from sim.law_factors import LAW_FACTORS
 
 GRAVITY = 9.81
 """Standard acceleration of free fall used by every plant of the project [m/s^2]."""
@@ -460,6 +462,9 @@ class SimParams(BoundedFields):
     solver: Literal["chain", "exchanged_chain", "physx", "mujoco_warp"] = "chain"
 
 
+MOST_FACTORS = 2  # of a law
+
+
 @dataclass(frozen=True)
 class LawParams(BoundedFields):
     """A force or torque besides the blocks' own: coefficient times scalars times a vector, by the
@@ -473,6 +478,27 @@ class LawParams(BoundedFields):
     factors: tuple[str, ...]  # up to two scalars
     vector: str
     coefficient: float  # in the unit that makes the product N or N m
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        measured = LAW_FACTORS["measured"]
+        vectors = [
+            *LAW_FACTORS["vectors"].get(self.block, ()),
+            *measured["vectors"].get(self.block, ()),
+        ]
+        scalars = [*LAW_FACTORS["scalars"], *measured["scalars"]]
+        if len(self.factors) > MOST_FACTORS:
+            raise ValueError(
+                f"law on {self.block}: {len(self.factors)} factors; expected at most {MOST_FACTORS}"
+            )
+        for name, known in [(self.vector, vectors), *((f, scalars) for f in self.factors)]:
+            if name not in known:
+                near = [f"did you mean '{like}'? " for like in get_close_matches(name, known, 1)]
+                kind = "vector" if known is vectors else "factor"
+                raise ValueError(
+                    f"law on {self.block}: no {kind} '{name}'; {''.join(near)}Known:"
+                    f" {', '.join(known)}"
+                )
 
 
 LOWEST = 0.05  # height below which a law's 1/z is held [m]

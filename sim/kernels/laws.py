@@ -209,12 +209,12 @@ def check_laws(laws: tuple[LawParams, ...]) -> None:
     if len(laws) > MOST_LAWS:
         raise ValueError(f"{len(laws)} laws; expected at most {MOST_LAWS}")
     for law in laws:
-        vectors = VECTORS.get(law.block, {})
-        fits = law.vector in vectors and set(law.factors) <= set(SCALARS) and len(law.factors) <= 2
-        if not fits:
+        vectors = VECTORS[law.block]
+        if law.vector not in vectors or not set(law.factors) <= set(SCALARS):
             raise ValueError(
-                f"law {law}; expected a block of {BLOCKS}, up to two factors of {tuple(SCALARS)},"
-                f" and a vector of {tuple(vectors) or BLOCKS}"
+                f"law on {law.block}, {' '.join((*law.factors, law.vector))}: it takes a measured"
+                f" neighbour, which no simulation has; expected factors of {', '.join(SCALARS)} and"
+                f" a vector of {', '.join(vectors)}"
             )
 
 

@@ -147,6 +147,31 @@ def test_a_field_with_a_default_enters_the_contract_only_where_it_differs():
     assert contract_of(experiment("state_drag"))["rope"]["payload_drag"] == approx(1.04e-3)
 
 
+def test_a_policy_is_not_flown_in_wind_or_under_laws_without_allowance():
+    """Those that ship were trained without either, and fly. Laws have no other units, which flying
+    any vehicle takes.
+    """
+    assert not {"air", "laws"} & contract_of(experiment("state")).keys()
+    law = (
+        'laws=[{block = "payload force", factors = [], vector = "cable", coefficient = 0.1}]',
+        "laws[0].coefficient: trained with nothing, here 0.1",
+        ["laws"],
+    )
+    wind = (
+        "air.wind_w=[1,0,0]",
+        "air.wind_w[0]: trained with nothing, here 1.0",
+        ["air.wind_w"],
+    )
+    for name in ("state", "any"):
+        load_policy(name)
+        for change, said, allowed in (law, wind):
+            with raises(MismatchError) as error:
+                load_policy(name, overrides=[change])
+            assert said in str(error.value)
+            if (name, change) != ("any", law[0]):
+                assert load_policy(name, overrides=[change], allow=allowed).departures
+
+
 def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():
     params = experiment("state_drag")
     assert (

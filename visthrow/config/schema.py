@@ -80,10 +80,7 @@ def describe(annotation: Any) -> str:
     if origin is dict:
         return f"a table of {describe(args[1])}"
     if dataclass_of(annotation) is not None:
-        return (
-            f"a table with the keys {', '.join(hints(annotation))}, or the path of a file that"
-            " holds them"
-        )
+        return f"a table with the keys {', '.join(hints(annotation))}"
     names = {float: "a number", int: "a whole number", bool: "true or false", str: "a string"}
     return names.get(annotation, str(annotation))
 

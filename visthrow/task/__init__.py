@@ -520,6 +520,8 @@ def contract_of(experiment: Experiment, *, whole: bool = False) -> dict[str, Any
         "vehicle": config.to_dict(experiment.vehicle, defaults=whole),
         "rope": config.to_dict(experiment.rope, defaults=whole),
     }
+    acting = config.to_dict(experiment, defaults=whole)
+    contract |= {key: acting[key] for key in ("air", "laws") if key in acting}
     if whole or experiment.task.observation.layout == "vision":
         contract["camera"] = camera_conditions(experiment.camera)
     # for any vehicle: conditions of one are not the policy's

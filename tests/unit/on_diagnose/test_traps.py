@@ -113,7 +113,7 @@ def test_early_thrust_is_named():
             57.3,
             "rate of quat_wb, rate_b: the second is 57.* times the first: one is in degrees",
         ),
-        (("acc_b",), 1 / 9.80665, "not 9.81: one is in g"),
+        (("acc_b",), 1 / 9.80665, "not 9.81: one is in g, or in tenths, as mm taken for cm"),
         (PATHS, 1000.0, "millimetres taken for metres"),
     ],
 )

@@ -13,6 +13,7 @@ from sim.kernels.laws import BLOCKS, check_laws
 from sim.kernels.structs import make_struct, types
 from sim.params import LawParams
 from visthrow import config
+from visthrow.common.errors import ConfigError
 from visthrow.diagnose.models import law_terms as grammar
 from visthrow.task import Experiment
 
@@ -167,15 +168,27 @@ def test_laws_are_part_of_the_configuration():
 
 
 @mark.parametrize(
-    "law",
+    ("law", "said"),
     [
-        LawParams("payload force", ("no_such",), "cable", 1.0),
-        LawParams("payload force", (), "no_such", 1.0),
-        LawParams("vehicle force", ("speed", "speed", "speed"), "vel", 1.0),
+        ("factors = ['sped'], vector = 'vel'", "no factor 'sped'; did you mean 'speed'? Known: th"),
+        ("factors = [], vector = 'joint_rate'", "no vector 'joint_rate'; Known: body_z, body_x"),
+        ("factors = ['speed', 'rate', 'speed'], vector = 'vel'", "3 factors; expected at most 2"),
     ],
 )
-def test_laws_that_are_none_are_refused(law):
-    with raises(ValueError, match="expected a block"):
-        check_laws((law,))
+def test_a_law_that_is_none_is_refused_where_it_is_read(tmp_path, law, said):
+    """The message names the file and the number of the law in it."""
+    right = "{block = 'vehicle force', factors = ['speed'], vector = 'vel', coefficient = -0.01}"
+    wrong = f"{{block = 'vehicle force', {law}, coefficient = 1}}"
+    path = tmp_path / "mine.toml"
+    path.write_text(f"base = 'train/state.toml'\nlaws = [{right}, {wrong}]")
+    with raises(ConfigError) as error:
+        config.load(Experiment, path)
+    assert "mine.toml: laws[1]: law on vehicle force: " in str(error.value)
+    assert said in str(error.value)
+
+
+def test_laws_that_no_simulation_makes_are_refused():
+    with raises(ValueError, match="inverse_distance vel: it takes a measured neighbour"):
+        check_laws((LawParams("vehicle force", ("inverse_distance",), "vel", 1.0),))
     with raises(ValueError, match="at most"):
         check_laws((SWIRL,) * 5)

@@ -110,6 +110,27 @@ def test_missing_file_names_its_neighbours(write):
         config.load(Outer, path.parent / "papr.toml")
 
 
+def test_a_misspelt_ending_names_the_file_of_this_folder(write, monkeypatch):
+    monkeypatch.chdir(write("mine.toml", GOOD).parent)
+    with raises(ConfigError, match=r"no TOML file of that name\); did you mean 'mine.toml'"):
+        config.find("train", "mine.tml")
+
+
+@dataclass(frozen=True)
+class Listed:
+    inner: tuple[Inner, ...]
+
+
+@mark.parametrize("text", ['inner = "a.toml"', 'inner = ["a.toml"]'])
+def test_a_list_of_tables_is_in_no_file(write, text):
+    with raises(ConfigError, match="a table with the keys kind, gain") as caught:
+        config.load(Listed, write("b.toml", text))
+    assert "path of a file" not in str(caught.value)
+    with raises(ConfigError, match="has no keys, so '0' cannot be set") as caught:
+        config.load(Listed, write("b.toml", "inner = []"), ["inner.0.gain=1"])
+    assert "path of a file" not in str(caught.value)
+
+
 def test_an_include_falls_back_to_the_configs_folder(write, monkeypatch, tmp_path):
     write("root/inner/x.toml", 'kind = "b"\ngain = [3, 4]')
     monkeypatch.setattr(config, "configs_root", lambda: tmp_path / "root")

@@ -11,7 +11,6 @@ from sim.params import LawParams
 from visthrow import config
 from visthrow.common.errors import ConfigError, UnknownKeyError
 from visthrow.diagnose.models.ball import BallModel, BallParams
-from visthrow.diagnose.models.law_terms import term_of
 from visthrow.diagnose.models.numeric import NumericModel
 from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import FlyerParams
@@ -39,7 +38,7 @@ EXAMPLES = ("gimbal", "pendulum", "trim")
 class Setup:
     """File of ``configs/diagnose``; at most one of the models.
 
-    Raises ConfigError: more than one model, or a law of no grammar.
+    Raises ConfigError: more than one model.
     """
 
     about: str  # whose logs these are
@@ -60,8 +59,6 @@ class Setup:
         named = [name for name in MODELS if getattr(self, name) is not None]
         if len(named) > 1:
             raise ConfigError(f"{' and '.join(named)}: a setup has only one model")
-        for law in self.laws:
-            term_of(law)
 
     @property
     def model(self) -> str:

@@ -23,8 +23,7 @@ import numpy as np
 from numpy import ndarray
 
 from sim.law_factors import LAW_FACTORS, UNITS, definition
-from sim.params import LOWEST, SLOWEST, LawParams
-from visthrow.common.errors import ConfigError, suggest
+from sim.params import LOWEST, MOST_FACTORS, SLOWEST, LawParams
 from visthrow.common.rotations import cross, normal_part, rotate, rotate_back
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
 
@@ -123,20 +122,7 @@ class Term:
 
 
 def term_of(law: LawParams) -> Term:
-    """The term of a law that a file holds.
-
-    Raises ConfigError: a factor or vector that the grammar does not have there.
-    """
-    for name, present in (
-        (law.vector, VECTORS[law.block]),
-        *((factor, SCALARS) for factor in law.factors),
-    ):
-        if name not in present:
-            raise ConfigError(f"law on {law.block}: no '{name}'; {suggest(name, present)}")
-    if len(law.factors) > MOST_SCALARS:
-        raise ConfigError(
-            f"law on {law.block}: {len(law.factors)} factors; expected at most {MOST_SCALARS}"
-        )
+    """The term of a law that a file holds."""
     return Term(law.block, law.factors, law.vector)
 
 
@@ -236,8 +222,6 @@ VECTORS = {
 }
 """Vectors of a term by block, in that block's frame: world for forces, body for torques."""
 
-MOST_SCALARS = 2
-
 
 def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     """All terms of a block whose factors can be made of these knots, simplest first."""
@@ -247,7 +231,7 @@ def terms_of(block: str, quantities: Sequence[str]) -> list[Term]:
     if block != JOINT:
         scalars = [name for name in scalars if name not in ONLY_JOINT]
     terms = []
-    for count in range(MOST_SCALARS + 1):
+    for count in range(MOST_FACTORS + 1):
         for factors in combinations_with_replacement(scalars, count):
             terms += [Term(block, factors, vector) for vector in vectors]
     return terms

@@ -31,7 +31,7 @@ INDEPENDENT = 0.1
 UNITS = {
     180 / np.pi: "one is in degrees",
     1000.0: "one is in thousandths",
-    9.80665: "one is in g",
+    9.80665: "one is in g, or in tenths, as mm taken for cm",
     100.0: "one is in hundredths",
 }
 """Ratio of the larger to the smaller -> what it gives away."""
