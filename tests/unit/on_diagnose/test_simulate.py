@@ -1,11 +1,11 @@
 """``visthrow diagnose simulate``: its flights hold what the simulated world hides."""
 
 import numpy as np
-from pytest import approx
+from pytest import approx, raises
 
 from tests.commands import run_command
 from visthrow.common.free_fall import GRAVITY
-from visthrow.config.effects import catalogue
+from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.inputs.setup import load
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.planning import manoeuvres
@@ -28,12 +28,14 @@ BESIDE_THE_PLAN = {
     "hover at the beginning and at the end of a pack",
     "hover at two places",
     "hover with and without a weighed load",
+    "hover with the fans off",
     "hover with the payload far off the centre",
     "log battery_voltage",
     "mark the ball and film its spin",
     "none: replay with finer steps",
     "put the payload down on the target",
     "read a barometer",
+    "repeat identical throws",
     "stand still before the flight",
     "throws in two directions",
     "vary distance and direction of the target",
@@ -90,10 +92,18 @@ def test_an_unknown_manoeuvre_is_refused(tmp_path, capsys):
     assert "did you mean 'hover'" in capsys.readouterr().err
 
 
+def test_the_help_lists_what_can_be_flown(capsys):
+    with raises(SystemExit):
+        run_command("diagnose simulate --help")
+    _, _, listed = capsys.readouterr().out.partition("manoeuvres: ")
+    names = [name.strip(" '") for name in listed.partition("\n\n")[0].replace("\n", "").split(",")]
+    assert names == [manoeuvre.name for manoeuvre in manoeuvres.catalogue()]
+
+
 def test_effects_name_manoeuvres_as_the_plan_does():
     """A report's "rate doublets" can be asked of ``plan --manoeuvres`` and of ``simulate``."""
     flyer = load("nanobench_cf21").flyer
-    effects = [*catalogue().values(), *effects_of("flyer", flyer)]
+    effects = [*catalogue().values(), *random_effects(), *effects_of("flyer", flyer)]
     named = {manoeuvre for effect in effects for manoeuvre in effect.manoeuvres}
     flown = {manoeuvre.name for manoeuvre in manoeuvres.catalogue()}
     assert named - flown == BESIDE_THE_PLAN
