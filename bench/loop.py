@@ -82,7 +82,7 @@ import.
 RECORD = "record.json"
 """What a finished loop leaves in its folder."""
 
-CONTRACT = ("vehicle", "rope", "release", "observation.latency")
+CONTRACT = ("vehicle", "rope", "release", "air", "laws", "observation.latency")
 """Parts of a policy's contract that a hidden effect breaks."""
 
 

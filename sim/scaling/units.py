@@ -70,8 +70,8 @@ def in_units(
     have none of their own."""
     if isinstance(value, PlantParams) and value.laws:
         raise ValueError(
-            f"a plant with {len(value.laws)} laws in other units; expected none, their coefficients"
-            " have no dimension"
+            f"{len(value.laws)} laws of a plant to state in other units; expected none: the"
+            " dimensions of their coefficients are unknown"
         )
     dimension_of = dimensions.get(type(value).__name__, {})
 

@@ -14,6 +14,7 @@ from sim.hybrid import rope_variants, tether_lengths
 from tests.commands import run_command
 from tests.configs import load_experiment, quiet
 from visthrow.common.errors import ConfigError, MismatchError
+from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import Experiment, TargetParams, contract_of
 from visthrow.task.measurement import hover_start
 from visthrow.throws.loading import load_policy
@@ -170,6 +171,16 @@ def test_a_policy_is_not_flown_in_wind_or_under_laws_without_allowance():
             assert said in str(error.value)
             if (name, change) != ("any", law[0]):
                 assert load_policy(name, overrides=[change], allow=allowed).departures
+
+
+def test_an_older_policy_was_trained_in_the_wind_of_its_config(tmp_path):
+    policy = Policy.load(find_policy("state"))
+    trained = {**policy.made_by["config"], "air": {"wind_w": [1.0, 0.0, 0.0]}}
+    path = tmp_path / "windy.npz"
+    replace(policy, made_by={**policy.made_by, "config": trained}).save(path)
+    assert load_policy(path).experiment.air.wind_w == (1.0, 0.0, 0.0)
+    with raises(MismatchError, match=r"(?s)with 1\.0, here nothing.*--allow air\.wind_w$"):
+        load_policy(path, "state")
 
 
 def test_the_plain_reference_plant_has_the_drag_of_the_training_and_the_realistic_one_its_own():

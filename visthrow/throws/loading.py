@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,7 +50,7 @@ def load_policy(
             :meth:`visthrow.onboard.policy.Policy.require`.
     """
     path = find_policy(name)
-    policy = Policy.load(path)
+    policy = _with_air_and_laws(Policy.load(path))
     if config_name is not None:
         rule = policy.contract.get("camera", {}).get("invalid_reads")
         # of the program, not of the camera
@@ -68,7 +68,8 @@ def load_policy(
             key: value for key, value in departures.items() if key.split("[")[0] not in widened
         }
     except MismatchError as error:
-        allowing = " ".join(f"--allow {key}" for key in error.keys)
+        whole = dict.fromkeys(key.split("[")[0] for key in error.keys)  # a shell expands brackets
+        allowing = " ".join(f"--allow {key}" for key in whole)
         raise MismatchError(
             f"{error}\nto throw all the same (fly and compare take it): {allowing}", error.keys
         ) from None
@@ -80,6 +81,17 @@ def load_policy(
         experiment,
         departures,
     )
+
+
+def _with_air_and_laws(policy: Policy) -> Policy:
+    """Return a policy whose contract holds the air and the laws of its training: in older files
+    only the config states them.
+    """
+    trained = policy.made_by.get("config")
+    if not isinstance(trained, dict):
+        return policy
+    stated = {key: trained[key] for key in ("air", "laws") if key in trained}
+    return replace(policy, contract=stated | policy.contract)
 
 
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:

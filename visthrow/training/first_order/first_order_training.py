@@ -39,14 +39,14 @@ is noise where throws are good.
 """
 OUTLIER = 4.0  # a flight's derivatives are shortened to this many times the median flight's
 NODES = (-1, 0, 1, 2)  # steps about a separation that a cubic goes through
-HALVES = (1, -1, 1, -1)
-"""Steps by which half of the releases come late, then half of those early, and so on.
+REACH = 2
+"""Most steps by which a release comes early or late.
 
-The cost of a release is the mean over these, 2 steps early to 2 late, so a policy learns to release
-where the landing hardly moves with time. Without them it moved by 0.02 to 0.1 m a step in some
-trainings, and noise shifts a release by a step.
+Half of all releases come a step early, then half of all a step late, and both once more. The cost
+of a release is the mean over these, so a policy learns to release where the landing hardly moves
+with time. Without them it moved by 0.02 to 0.1 m a step in some trainings, and noise shifts a
+release by a step.
 """
-REACH = 2  # of them [steps]
 
 AVERAGED = 10  # gradients that the exported weights are a mean of, at most
 
@@ -240,7 +240,7 @@ class FirstOrder(Algorithm):
         hazard = smooth + self._latched * ((latch_input > 0.0).float() - smooth).detach()
         hazard = torch.where(k[:K] > steps, 1.0, hazard * (k[:K] >= self._first))
         reward = torch.where(cut, -p.termination, reward)
-        for shift in HALVES:  # first and last steps meet, where nothing is released
+        for shift in (1, -1) * REACH:  # first and last steps meet, where nothing is released
             reward = 0.5 * (reward + reward.roll(shift, 0))
         survival = torch.cat([torch.ones_like(hazard[:1]), (1.0 - hazard).cumprod(0)])
         chance = survival[:-1] * hazard
