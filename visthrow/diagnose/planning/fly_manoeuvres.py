@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,9 +27,6 @@ from visthrow.logs.flightlog import Channel, FlightLog
 from visthrow.onboard.hover import HoverController, HoverParams
 from visthrow.task import load_experiment, plant_of
 from visthrow.throws.plants import flown
-
-if TYPE_CHECKING:
-    from sim.hybrid import HybridSim
 
 SAMPLE_PERIOD = 0.005  # period of the recorded poses [s]: motion capture at 200 Hz
 COARSE = 2.0  # steps of a promise, in those of the search
@@ -337,31 +333,36 @@ def fly(
     sim = HybridSim(plant, count, device)
     sim.place(pos_w[0])
     dropped = ~np.array([m.payload for m in manoeuvres])
-    since = np.full(count, np.nan)  # the payload's separation [s]
+    falling = np.full(count, np.nan)  # time since the payload's separation [s]
     commands = []
     samples = []
+    falls = []
     for row in range(-round(APPROACH_SECONDS / PERIOD), len(goals)):
-        flown = row >= 0
+        recorded = row >= 0
         i = max(row, 0)
         state = [sim.get(name).astype(float) for name in ("pos_w", "quat_wb", "vel_w")]
         mass = np.where(dropped, plant.vehicle.body.mass, plant.total_mass)
         command = controller.step(*state, goals[i], mass, yaw[i])
-        if flown:
+        if recorded:
             command[:, 1:] += rates_b[i]
             command[:, 0] *= thrust_factor[i]
             dropped = dropped | release[i]
             commands.append(command)
         sim.set_command(command, dropped)
         for _ in range(STEPS):
-            if flown:
-                sample = {name: sim.get(name).astype(float) for name in SAMPLED}
-                sample["payload_pos_w"] = _payload_pos_w(sim, plant, since)
-                samples.append(sample)
+            if recorded:
+                samples.append([sim.get(name).astype(float) for name in SAMPLED])
+                fallen = np.minimum(np.nan_to_num(falling), sim.get("time_to_impact"))
+                falls.append((sim.get("payload_vel_w").astype(float), fallen))
             sim.step()
-            separated = sim.get("separated") != 0
             begun = SAMPLE_PERIOD - sim.get("separation_time")
-            since = np.where(separated, begun, since + SAMPLE_PERIOD)
-    truth = {name: np.array([sample[name] for sample in samples]) for name in SAMPLED}
+            falling = np.where(sim.get("separated") != 0, begun, falling + SAMPLE_PERIOD)
+    truth = {name: np.array(values) for name, values in zip(SAMPLED, zip(*samples))}
+    # the simulator keeps a payload's state at its separation; all fall at once, not step by step
+    vel_w, fallen = map(np.array, zip(*falls))
+    loose = fallen > 0.0
+    begin = truth["payload_pos_w"][loose], vel_w[loose]
+    truth["payload_pos_w"][loose] = flown(plant.rope, plant.air, *begin, fallen[loose])[0]
     sent = np.array(commands)
     flights = []
     for e, manoeuvre in enumerate(manoeuvres):
@@ -370,16 +371,6 @@ def fly(
         rng = np.random.default_rng([seed, e])
         flights.append(SimulatedFlight(manoeuvre, plant, states, sent[:rows, e], rng))
     return flights
-
-
-def _payload_pos_w(sim: "HybridSim", plant: PlantParams, since: np.ndarray) -> np.ndarray:
-    """Return where payloads are [m], shape (E, 3): on the rope, on their way down, or where they
-    landed; ``since``: their separation [s], NaN before.
-
-    The simulator keeps the place of the separation."""
-    begin = (sim.get(name).astype(float) for name in ("payload_pos_w", "payload_vel_w"))
-    time = np.minimum(np.nan_to_num(since), sim.get("time_to_impact"))
-    return flown(plant.rope, plant.air, *begin, time)[0]
 
 
 def _stacked(manoeuvres: Sequence[Manoeuvre], name: str) -> np.ndarray:
