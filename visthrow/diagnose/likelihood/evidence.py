@@ -112,9 +112,9 @@ class Priors:
         switch = np.array([bool(e.switch) for e in effects], dtype=bool)
         bounds[switch, 0] = (1.0 - INEXACT) * bounds[switch, 1]
         bounds /= floor[:, None]
-        slab = np.array([e.prior_sd for e in effects], dtype=float) / floor
+        prior = np.array([e.prior_sd for e in effects], dtype=float) / floor
+        slab = np.maximum(prior, UNKNOWN_RATIO * SPIKE)  # also of what was measured
         visible = np.array([set(e.channels) <= set(channels) for e in effects], dtype=bool)
-        slab = np.maximum(slab, UNKNOWN_RATIO * SPIKE)  # as of what was measured within its floor
         return Priors(floor, slab, bounds[:, 0], bounds[:, 1], visible)
 
     def deviation(self, active: Sequence[int]) -> ndarray:

@@ -133,7 +133,7 @@ def exerted(laws: Sequence[LawParams], values: Knots) -> dict[str, ndarray]:
     values = KnotValues(values)
     total = {}
     for law in laws:
-        value = law.coefficient * Term(law.block, law.factors, law.vector).read(values)
+        value = law.coefficient * term_of(law).read(values)
         for block, load in loads(law.block, values, value[:, :, None]).items():
             total[block] = total.get(block, 0.0) + load[:, :, 0]
     return total
@@ -168,7 +168,7 @@ def _scaled(factor: ndarray, vector: ndarray) -> ndarray:
 
 
 def _inverse(value: ndarray) -> ndarray:
-    """Return the inverse of what is not below :data:`sim.params.LOWEST`."""
+    """Return 1 over values, of which smaller ones count as :data:`sim.params.LOWEST`."""
     return 1.0 / np.maximum(value, LOWEST)
 
 

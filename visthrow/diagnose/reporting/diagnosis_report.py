@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from visthrow.diagnose.inputs.measures import MEASUREMENTS
+from visthrow.diagnose.likelihood.evidence import ALARM
 from visthrow.diagnose.likelihood.forms import HEAD_SECONDS, readable
 from visthrow.diagnose.reporting import pictures
 from visthrow.diagnose.reporting.blind import Blind
@@ -358,7 +359,7 @@ def _next_flights(diagnosis: Diagnosis) -> Section:
 def _ground(
     diagnosis: Diagnosis, step_check: Mapping[str, float], provenance: Mapping[str, Any]
 ) -> Section:
-    null = "exceeded by the best of all effects in one of 150 null worlds"
+    null = f"exceeded by the best of all effects in one of {1.0 / ALARM:.0f} null worlds"
     facts = {
         "flights, windows, samples": f"{diagnosis.flights}, {diagnosis.windows},"
         f" {diagnosis.samples}",

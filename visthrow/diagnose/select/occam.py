@@ -44,8 +44,8 @@ from visthrow.diagnose.select.scatter import (
 MOST_NEW = 2  # candidates in one move: of where many lead together, derivatives tell too little
 
 WINDOW = (MOST_NEW + 1) * VERY_STRONG
-"""Nats behind the best up to which sets are kept: as many as candidates cost that a move adds, and
-one more that it takes away. Sets up to ``STRONG`` behind count as possible.
+"""Nats behind the best up to which sets are kept: what the candidates of a move cost, those that it
+adds and one that it takes away. Sets up to ``STRONG`` behind count as possible.
 """
 PATIENCE = 8  # sets that are opened in vain before the search ends
 RANDOM_TRIED = (

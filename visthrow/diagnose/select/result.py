@@ -27,7 +27,7 @@ VERDICTS = {
     ),
     BOUNDED: (
         "the flights do not ask for it; if it is present all the same, then within these limits,"
-        " which need not hold 0"
+        " which need not include 0"
     ),
     NOT_IDENTIFIABLE: (
         "these flights say hardly more than was known before, or it explains a part of what is"

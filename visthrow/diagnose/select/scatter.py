@@ -24,7 +24,7 @@ COMMAND = "command"
 EVENT = "event"  # one flight alone has one
 REACH = np.geomspace(0.02, 6.0, 25)
 """Deviations that are tried, in their prior's."""
-COARSE = 3  # every which of them suffices to compare candidates
+COARSE = 3  # one of so many of them suffices to compare candidates
 SIZES = np.array([-1.0, -0.7, -0.45, -0.25, -0.1, 0.0, 0.1, 0.25, 0.45, 0.7, 1.0])
 """At which flights are simulated again, in the largest estimate of any flight."""
 FINE = 400  # places between them at which a curve is looked at
@@ -119,7 +119,7 @@ def relinearised_per_flight(
     misfit = statistics.score[:, j] - column @ (theta - statistics.theta)
     flown = np.flatnonzero(column[:, j] > 0.0)
     reach = np.abs(misfit[flown] / column[flown, j]).max(initial=0.0)
-    if INEXACT * reach < 1.0:  # a derivative suffices up to a floor
+    if INEXACT * reach < 1.0:  # the derivative is off by less than a floor
         return statistics
     unit = np.eye(len(theta))[j]
     places = np.clip(theta[j] + reach * SIZES, priors.low[j], priors.high[j])

@@ -129,9 +129,9 @@ class FlyerModel(NumericModel):
         delay = p.command_delay + self.size_of(lanes, "cmd_delay")
         tau = p.motor_time_constant + self.size_of(lanes, "motor_tau")
         columns = [lanes.owner, delay, np.maximum(tau, SHORTEST)]
-        motors, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+        distinct, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
         thrust = np.empty((len(grid), len(lanes.owner), self.motors))
-        for number, (owner, late, lag) in enumerate(motors):
+        for number, (owner, late, lag) in enumerate(distinct):
             data = self.stretches[int(owner)].data
             time, inputs = data["sent"]
             at_ends = data["start"] + grid[::2] - late

@@ -141,8 +141,8 @@ def held(commands: Samples, first: float, last: float) -> Samples:
 def lagged(
     time: ndarray, commanded: ndarray, instants: ndarray, lag: float
 ) -> tuple[ndarray, ndarray]:
-    """Return what follows held commands by a lag, at some instants, and its integral, each of shape
-    (T, N).
+    """Return what follows held commands by a lag, at some instants, and its integral up to a
+    constant, each of shape (T, N).
 
     ``time``: of the commands [s], shape (C,), the first held before; ``commanded``: shape (C, N);
     ``instants``: [s], shape (T, 1).
