@@ -1,7 +1,9 @@
 """``visthrow diagnose simulate``: its flights hold what the simulated world hides."""
 
+from dataclasses import replace
+
 import numpy as np
-from pytest import approx, raises
+from pytest import approx, mark, raises
 
 from tests.commands import run_command
 from visthrow.common.free_fall import GRAVITY
@@ -9,6 +11,7 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.inputs.setup import load
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.planning import manoeuvres
+from visthrow.logs.check import thrust_checks
 from visthrow.logs.flightlog import FlightLog
 
 BESIDE_THE_PLAN = {
@@ -76,6 +79,23 @@ def test_a_thrown_payload_falls_and_stays_where_it_lands(tmp_path):
     fit = np.polyfit(payload.time[falling], height[falling], 2)
     assert 2.0 * fit[0] == approx(-GRAVITY, rel=0.05)
     assert np.ptp(payload.values[down[20] :], axis=0).max() < 0.01
+
+
+@mark.parametrize("speed", [2, 3])
+def test_the_force_follows_the_thrust_past_a_release(tmp_path, speed):
+    """The thrust of a throw falls with the mass, the force does not; the thrust of another time is
+    refused all the same.
+    """
+    thrown = f"diagnose simulate --device cpu --out {tmp_path}"
+    assert run_command(thrown, f"throw at {speed} m/s") == 0
+    log = FlightLog.load(tmp_path / f"throw_at_{speed}_m_s-0.npz")
+    command = log["command"]
+    late = replace(command, values=np.roll(command.values, 40, axis=0))
+    of_another_time = FlightLog({**log.channels, "command": late}, log.meta)
+    found, refused = (list(thrust_checks.look(each)) for each in (log, of_another_time))
+    assert [row.verdict for row in found] == ["ok"], found[0].text
+    assert "the force follows the thrust" in found[0].text
+    assert [row.verdict for row in refused] == ["bad"]
 
 
 def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):

@@ -92,11 +92,13 @@ def test_a_thrown_payload_is_no_other_scale_of_the_thrust():
     lighter = {**columns, "command": columns["command"] * np.where(gone, 2.0 / 3.0, 1.0)[:, None]}
     kept = log_of(flight(seed=1))
     attached = Channel(columns["time"], ~gone, "bool")
-    told = [check([kept, log_of(lighter, **more)]) for more in ({"attached": attached}, {})]
+    pressed = Channel(columns["time"], gone, "1")
+    known = ({"attached": attached}, {"release_command": pressed}, {})
+    told = [check([kept, log_of(lighter, **more)]) for more in known]
     assert [
         any("the thrust's scale differs" in row.text for one in found for row in one.rows)
         for found in told
-    ] == [False, True]
+    ] == [False, False, True]
 
 
 UNITS_OF_OTHERS = [

@@ -10,6 +10,7 @@ import numpy as np
 from visthrow.common.toml_text import tables_beside
 from visthrow.diagnose.likelihood.forms import readable, unit_of
 from visthrow.diagnose.likelihood.marginal import Noise
+from visthrow.diagnose.likelihood.noise_levels import ENOUGH_NATS
 from visthrow.diagnose.models.model_interface import Window
 from visthrow.diagnose.planning.manoeuvres import Manoeuvre
 from visthrow.diagnose.reporting.blind import Blind
@@ -158,9 +159,9 @@ def _step(axis, step: SelectionStep) -> None:
     for name in step.refitted.keys() & set(names):
         look = LOOKS["taken" if name == step.named else "beaten"]
         axis.plot(max(step.refitted[name], 0.0), names.index(name), **look)
-    axis.axvline(step.least, **LOOKS["threshold"])
+    axis.axvline(ENOUGH_NATS, **LOOKS["threshold"])
     axis.set(xscale="symlog", xlabel="nats")
-    axis.set_xlim(0.0, 1.4 * max([step.least, *screened, *step.refitted.values()]))
+    axis.set_xlim(0.0, 1.4 * max([ENOUGH_NATS, *screened, *step.refitted.values()]))
     _plain(axis.xaxis)
     axis.tick_params(axis="y", labelsize=8)
 

@@ -97,8 +97,7 @@ class SelectionStep:
     """
 
     named: str  # names of a set with commas between them
-    nats: float  # against what was named before
-    least: float  # what it must exceed
+    nats: float  # against what was named before; a step gains more than ENOUGH_NATS
     screened: Mapping[str, float]  # effect or set -> nats by the linear statistics, best first
     refitted: Mapping[str, float]  # effect or set -> nats with the simulation run again
 

@@ -419,7 +419,7 @@ class Selector:
         screened = {names_of(s): gain for s, gain in ranked}
         name = names_of(top.chosen)
         self.progress(f"{name}: {top.lead:.1f} nats ahead")
-        self.steps.append(SelectionStep(name, top.lead, 0.0, screened, nats))
+        self.steps.append(SelectionStep(name, top.lead, screened, nats))
 
     def _propose(self) -> bool:
         """Offer the terms of laws that say most, beside the set and in place of its names; False

@@ -2,7 +2,7 @@
 and rotor against rotor.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -30,6 +30,8 @@ UNITS = {"N": 1.0, "g of thrust": 9.80665e-3, "mN": 1e-3, "kg of thrust": 9.8066
 """Units of a thrust, in newtons."""
 _UNIT = 0.25  # of the logarithm of a ratio from a unit's
 _SPAN = 0.1  # over which both forces are averaged: vibration goes [s]
+# about a change of the load, within which some delay compares thrust and force of two loads [s]
+_CHANGING = 0.5
 _VARIES = 0.003  # of the mean, that a force must vary by before it says whether it follows
 # correlation; forces of 13 real flights follow their own thrust by 0.53 to 0.94, that of another by
 # 0.38 (median 0.15)
@@ -102,13 +104,31 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
         return None  # not in newtons
     acc = relations.on_grid(*force_b, time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
-    carries = log["attached"].hold(time) > 0.5 if "attached" in log else flies
-    if np.any(carries):  # without its payload it is another mass
+    if "attached" in log:
+        carries = log["attached"].hold(time) > 0.5
+    else:
+        carries = time < np.min(_load_changes(log), initial=np.inf)
+    if np.any(flies & carries):  # without its payload it is another mass
         flies &= carries
     if not np.any(flies) or np.mean(acc[flies]) <= 0.0:
         return None
     mass = float(np.mean(thrust[flies]) / np.mean(acc[flies]))
     return mass if mass > 0.0 else None
+
+
+def _load_changes(log: FlightLog) -> np.ndarray:
+    """Return the times at which the vehicle takes up a payload or gives it up, or is commanded to
+    [s]; none where the log does not tell.
+    """
+    if "attached" in log:
+        time, values = log["attached"].samples()
+        hangs = values[:, 0] > 0.5
+    elif "release_command" in log:
+        time, values = log["release_command"].samples()
+        hangs = values[:, 0] <= 0.5
+    else:
+        return np.empty(0)
+    return time[np.diff(hangs, prepend=True)]
 
 
 def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
@@ -198,10 +218,14 @@ def _along_z(log: FlightLog, measurement: str) -> Samples | None:
 def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.ndarray, float]]:
     """Correlation of force and thrust in flight at each delay, and the nats by which no thrust
     explains the force better, for each measurement of the force that is known and varies.
+
+    Thrust is in proportion to the force while the mass is the same: each span between changes of
+    the load is compared with its mean.
     """
     thrust = command.values[:, 0]
     usual = np.median(thrust[thrust > 0.2 * np.max(thrust)])
     flies = command.time[thrust > 0.6 * usual]
+    changes = _load_changes(log)
     for measurement in ("acc_b", "path"):
         force = _along_z(log, measurement)
         if force is None:
@@ -209,21 +233,36 @@ def _correlations(log: FlightLog, command: Samples) -> Iterator[tuple[str, np.nd
         start = max(flies[0] + 0.5, force.time[0] + 0.3)
         end = min(flies[-1], force.time[-1]) - 0.5
         grid = np.arange(start, end, 0.01)
+        load = np.searchsorted(changes, grid - _CHANGING)
+        steady = load == np.searchsorted(changes, grid + _CHANGING)
+        grid = grid[steady]
         if len(grid) < 200:
             continue
         x = relations.mean_over(*command, grid, _SPAN)[:, 0]
         y = np.array([relations.mean_over(*force, grid + delay, _SPAN)[:, 0] for delay in _DELAYS])
-        curves = [_curve(x, y), _curve(_trimmed(x), np.array([_trimmed(row) for row in y]))]
+        splits = np.flatnonzero(np.diff(load[steady])) + 1
+        xs = np.split(x, splits)
+        ys = np.split(y, splits, axis=1)
+        trimmed_x = [_trimmed(part) for part in xs]
+        trimmed_y = [_trimmed(part) for part in ys]
+        curves = [
+            _curve(_relative(xs), _relative(ys)),
+            _curve(_relative(trimmed_x), _relative(trimmed_y)),
+        ]
         if known := list(filter(None, curves)):
             yield measurement, *max(known, key=lambda curve: np.max(curve[0]))
 
 
-def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
+def _relative(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return parts, each of shape (..., T), one after the other, relative to the mean of each."""
+    return np.concatenate([p / np.mean(p, axis=-1, keepdims=True) - 1.0 for p in parts], axis=-1)
+
+
+def _curve(x: np.ndarray, varies: np.ndarray) -> tuple[np.ndarray, float] | None:
     """Return the correlation of a thrust, shape (T,), with the force at each delay, shape (D, T),
-    and the nats by which no thrust explains the force better; None where one does not vary.
+    both relative to their means, and the nats by which no thrust explains the force better; None
+    where one does not vary.
     """
-    x = x / np.mean(x) - 1.0
-    varies = y / np.mean(y, axis=1, keepdims=True) - 1.0
     if np.std(x) < _VARIES or np.min(np.std(varies, axis=1)) < _VARIES:
         return None
     curve = varies @ x / (len(x) * np.std(x) * np.std(varies, axis=1))
@@ -233,10 +272,13 @@ def _curve(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float] | None:
 
 
 def _trimmed(values: np.ndarray) -> np.ndarray:
-    """Return values cut to what lies within some robust deviations of their median."""
-    middle = np.median(values)
-    reach = _OUTLIER * 1.4826 * np.median(np.abs(values - middle))
-    return np.clip(values, middle - reach, middle + reach) if reach > 0.0 else values
+    """Return values, shape (..., T), cut to what lies within some robust deviations of their
+    median.
+    """
+    middle = np.median(values, axis=-1, keepdims=True)
+    reach = _OUTLIER * 1.4826 * np.median(np.abs(values - middle), axis=-1, keepdims=True)
+    reach[reach == 0.0] = np.inf
+    return np.clip(values, middle - reach, middle + reach)
 
 
 def _weight(mass: float, vehicle: KnownVehicle, channels: str) -> Row:
