@@ -18,7 +18,6 @@ from scipy.special import stdtrit
 from visthrow.diagnose.likelihood.correlation import components
 from visthrow.diagnose.likelihood.evidence import (
     FEWEST,
-    INEXACT,
     NORMAL_95,
     STRONG,
     UNKNOWN_RATIO,
@@ -46,10 +45,8 @@ FIRM = 1.0 - 1.0 / FEWEST
 """More of the folds than this share must name a cause, or one of its class: of the fewest that can
 disagree, all.
 """
-TELLING = INEXACT**2
-"""Part of what flights promise in the mean, from which one counts among those that can tell: of an
-effect's size, of which a promise is the square, it shows more than its form may be off.
-"""
+# of what flights promise in the mean, from which one counts among those that can tell
+TELLING = 0.1
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
