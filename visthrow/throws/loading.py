@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 
-from sim.params import changed
+from sim.params import AirParams, changed
 from visthrow import config
 from visthrow.common import toml_text
 from visthrow.common.errors import ConfigError, MismatchError, PolicyError, suggest
@@ -90,8 +90,11 @@ def _with_air_and_laws(policy: Policy) -> Policy:
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         return policy
-    stated = {key: trained[key] for key in ("air", "laws") if key in trained}
-    return replace(policy, contract=stated | policy.contract)
+    still = config.to_dict(AirParams())
+    air = {key: value for key, value in trained.get("air", {}).items() if value != still.get(key)}
+    stated = {"air": air, "laws": trained.get("laws")}
+    acting = {key: value for key, value in stated.items() if value}
+    return replace(policy, contract=acting | policy.contract)
 
 
 def _check_part(part: str, contracts: Iterable[dict[str, Any]]) -> None:
