@@ -11,7 +11,8 @@ from visthrow.config.effects import catalogue, random_effects
 from visthrow.diagnose.inputs.setup import load
 from visthrow.diagnose.models.catalogue import effects_of
 from visthrow.diagnose.planning import manoeuvres
-from visthrow.logs.check import thrust_checks
+from visthrow.logs.check import physics, thrust_checks
+from visthrow.logs.check.rows import KnownVehicle
 from visthrow.logs.flightlog import FlightLog
 
 BESIDE_THE_PLAN = {
@@ -96,6 +97,17 @@ def test_the_force_follows_the_thrust_past_a_release(tmp_path, speed):
     assert [row.verdict for row in found] == ["ok"], found[0].text
     assert "the force follows the thrust" in found[0].text
     assert [row.verdict for row in refused] == ["bad"]
+
+
+@mark.parametrize("length", [0.33, 0.73])
+def test_a_thrown_payload_says_how_long_its_cable_was(tmp_path, length):
+    """Its way down and the floor are no part of the cable; a cable of another length is one."""
+    thrown = f"diagnose simulate --device cpu --set rope.length={length} --out {tmp_path}"
+    assert run_command(thrown, "throw at 2 m/s") == 0
+    log = FlightLog.load(tmp_path / "throw_at_2_m_s-0.npz")
+    rows = physics.look(log, KnownVehicle(cable_length=0.363))
+    (found,) = [row for row in rows if row.topic == "cable"]
+    assert (found.verdict == "bad") == (length == 0.73), found.text
 
 
 def test_a_manoeuvre_that_the_vehicle_cannot_fly_is_refused(tmp_path, capsys):

@@ -559,6 +559,18 @@ def _followed(relation: relations.Relation, channels: str, spread: float) -> Row
     return Row("delay", channels, verdict, text, figures)
 
 
+def hangs(log: FlightLog, time: np.ndarray) -> np.ndarray:
+    """Tell at which times [s] the payload hangs: as the log says, or until its release is commanded
+    first; always where the log does not tell.
+    """
+    if "attached" in log:
+        return log["attached"].hold(time) > 0.5
+    if "release_command" not in log:
+        return np.ones(len(time), bool)
+    stamps, pressed = log["release_command"].samples()
+    return time < np.min(stamps[pressed[:, 0] > 0.5], initial=np.inf)
+
+
 def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     place = relations.samples_of(log, "pos_w", 20)
     payload = relations.samples_of(log, "payload_pos_w", 20)
@@ -570,16 +582,20 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
         overlap &= log["attached"].hold(time).astype(bool)
     payload = Samples(time[overlap], payload.values[overlap])
     gap = payload.values - relations.on_grid(*place, payload.time)
-    length = np.linalg.norm(gap, axis=1)
     channels = "pos_w, payload_pos_w"
-    if len(length) < 20:
+    if len(gap) < 20:
         text = "vehicle and payload were never measured at one time"
         yield Row("frames", channels, "bad", text)
         return
+    hanging = hangs(log, payload.time)
+    rope = gap[hanging]
+    if len(rope) < 20:
+        return
+    length = np.linalg.norm(rope, axis=1)
     middle = np.median(length)
     low, high = np.percentile(length, [10, 90])
     spread = high - low
-    above = np.mean(gap[:, 2] > 0.5 * middle)
+    above = np.mean(rope[:, 2] > 0.5 * middle)
     figures = {"median_m": middle, "p10_to_p90_m": spread, "payload_above_share": above}
     text = f"{middle:.4f} m apart (10 to 90 %: {1e3 * spread:.1f} mm)"
     if above > 0.5:
@@ -594,7 +610,8 @@ def _cable(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
     if vehicle.cable_length:
         yield _length(middle, vehicle.cable_length, channels)
     yield from _left_early(log, payload.time, gap)
-    yield from _payload_late(place, payload, channels)
+    hung = Samples(payload.time[hanging], payload.values[hanging])
+    yield from _payload_late(place, hung, channels)
 
 
 def _left_early(log: FlightLog, time: np.ndarray, gap: np.ndarray) -> Iterator[Row]:

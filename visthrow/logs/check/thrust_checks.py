@@ -9,7 +9,15 @@ import numpy as np
 from visthrow.common.errors import suggest
 from visthrow.common.rotations import rotate_back
 from visthrow.logs.check import relations
-from visthrow.logs.check.physics import CLEARLY, GRAVITY, MOVES, accelerations, sparse, usable
+from visthrow.logs.check.physics import (
+    CLEARLY,
+    GRAVITY,
+    MOVES,
+    accelerations,
+    hangs,
+    sparse,
+    usable,
+)
 from visthrow.logs.check.rows import NOTHING, KnownVehicle, Row
 from visthrow.logs.flightlog import FlightLog, Samples
 from visthrow.logs.unit_names import nearest
@@ -104,10 +112,7 @@ def mass_of(log: FlightLog, vehicle: KnownVehicle = NOTHING) -> float | None:
         return None  # not in newtons
     acc = relations.on_grid(*force_b, time)[:, 2]
     flies = thrust[:, 0] > 0.5 * np.median(thrust)
-    if "attached" in log:
-        carries = log["attached"].hold(time) > 0.5
-    else:
-        carries = time < np.min(_load_changes(log), initial=np.inf)
+    carries = hangs(log, time)
     if np.any(flies & carries):  # without its payload it is another mass
         flies &= carries
     if not np.any(flies) or np.mean(acc[flies]) <= 0.0:
