@@ -125,15 +125,11 @@ def _load_changes(log: FlightLog) -> np.ndarray:
     """Return the times at which the vehicle takes up a payload or gives it up, or is commanded to
     [s]; none where the log does not tell.
     """
-    if "attached" in log:
-        time, values = log["attached"].samples()
-        hangs = values[:, 0] > 0.5
-    elif "release_command" in log:
-        time, values = log["release_command"].samples()
-        hangs = values[:, 0] <= 0.5
-    else:
+    known = [name for name in ("attached", "release_command") if name in log]
+    if not known:
         return np.empty(0)
-    return time[np.diff(hangs, prepend=True)]
+    time = log[known[0]].samples().time
+    return time[np.diff(hangs(log, time), prepend=True)]
 
 
 def _force(log: FlightLog, vehicle: KnownVehicle) -> Iterator[Row]:
