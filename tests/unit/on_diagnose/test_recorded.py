@@ -81,3 +81,16 @@ def test_rounding_counts_of_axes_that_hardly_move():
     path = np.column_stack([np.sin(at), 1e-3 * np.sin(at), np.ones(len(at))])
     log.channels["pos_w"] = Channel(at, np.round(path, 3), "m", "world")
     assert record_of(log).vehicle.sigma == approx(1e-3 * 12**-0.5, rel=0.2)
+
+
+def test_samples_that_rounding_repeats_are_kept_and_those_that_are_held_are_not():
+    log = flight(200.0, 0.0)
+    at = log["pos_w"].time
+    axis = np.array([1.0, 0.0, 0.0])
+    slow = 0.05 * at[:, None] * axis
+    log.channels["pos_w"] = Channel(at, np.round(slow, 3), "m", "world")
+    assert len(record_of(log).vehicle.time) == len(at)
+    fast = np.sin(at)[:, None] * axis
+    held = fast[::2].repeat(2, axis=0)[: len(at)]
+    log.channels["pos_w"] = Channel(at, held, "m", "world")
+    assert len(record_of(log).vehicle.time) == approx(len(at) / 2, abs=1)

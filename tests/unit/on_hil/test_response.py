@@ -1,5 +1,5 @@
-"""The signs of body rates by poses alone: what the first hover says of vehicles that answer fast or
-slowly, and drift meanwhile.
+"""The signs of body rates by poses or by reported rates alone: what the first hover says of vehicles
+that answer fast or slowly, and drift meanwhile.
 """
 
 from types import SimpleNamespace
@@ -40,3 +40,18 @@ def test_the_sign_of_a_rate_whatever_its_lag(sign, words, lag, delay):
     rng = np.random.default_rng(5)
     verdicts = [verdict(sign, lag, delay, rng) for _ in range(FLIGHTS)]
     assert all(words in text for text in verdicts), verdicts
+
+
+@mark.parametrize(("lag", "delay"), [(0.01, 0), (0.03, 1)])
+@mark.parametrize(("sign", "words"), [(1.0, "turns as"), (-1.0, "a sign is wrong")])
+def test_the_sign_of_reported_rates(sign, words, lag, delay):
+    """Of a vehicle whose poses do not turn: nothing else can tell."""
+    response = Response(PERIOD, MASS, 0.3, PROBE)
+    pose = SimpleNamespace(quat=(0.0, 0.0, 0.0, 1.0), pos=(0.0, 0.0, 1.0))
+    commands = [(0.0, 0.0, 0.0)] * (delay + 1)
+    rate = np.zeros(3)
+    while response.running:
+        commands.append(response.rates())
+        response.note((MASS * 9.81, *commands[-1]), pose, tuple(rate))
+        rate = rate + (1.0 - np.exp(-PERIOD / lag)) * (sign * np.array(commands[-1 - delay]) - rate)
+    assert words in (response.problem or "turns as commanded")
