@@ -491,13 +491,15 @@ class LawParams(BoundedFields):
             raise ValueError(
                 f"law on {self.block}: {len(self.factors)} factors; expected at most {MOST_FACTORS}"
             )
-        for name, known in [(self.vector, vectors), *((f, scalars) for f in self.factors)]:
-            if name not in known:
-                near = [f"did you mean '{like}'? " for like in get_close_matches(name, known, 1)]
-                kind = "vector" if known is vectors else "factor"
+        for name, options in [(self.vector, vectors), *((f, scalars) for f in self.factors)]:
+            if name not in options:
+                similar = [
+                    f"did you mean '{like}'? " for like in get_close_matches(name, options, 1)
+                ]
+                kind = "vector" if options is vectors else "factor"
                 raise ValueError(
-                    f"law on {self.block}: no {kind} '{name}'; {''.join(near)}Known:"
-                    f" {', '.join(known)}"
+                    f"law on {self.block}: no {kind} '{name}'; {''.join(similar)}Known:"
+                    f" {', '.join(options)}"
                 )
 
 

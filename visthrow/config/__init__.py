@@ -97,10 +97,10 @@ def find(kind: str, name: str | Path) -> Path:
         return root / kind / f"{text}.toml"
     if not (root / kind).is_dir():
         raise ConfigError(f"no kind of config '{kind}'; {suggest(kind, KINDS)}")
-    here = [path.name for path in Path().glob("*.toml")]
+    local_files = [path.name for path in Path().glob("*.toml")]
     raise ConfigError(
         f"no {kind} config '{text}' (no shipped name, and no TOML file of that name);"
-        f" {suggest(text, [*available(kind), *here])}"
+        f" {suggest(text, [*available(kind), *local_files])}"
     )
 
 

@@ -90,8 +90,8 @@ def _with_air_and_laws(policy: Policy) -> Policy:
     trained = policy.made_by.get("config")
     if not isinstance(trained, dict):
         return policy
-    still = config.to_dict(AirParams())
-    air = {key: value for key, value in trained.get("air", {}).items() if value != still.get(key)}
+    calm = config.to_dict(AirParams())
+    air = {key: value for key, value in trained.get("air", {}).items() if value != calm.get(key)}
     stated = {"air": air, "laws": trained.get("laws")}
     acting = {key: value for key, value in stated.items() if value}
     return replace(policy, contract=acting | policy.contract)

@@ -1,5 +1,5 @@
-"""The signs of body rates by poses or by reported rates alone: what the first hover says of vehicles
-that answer fast or slowly, and drift meanwhile.
+"""The signs of body rates by poses or by reported rates alone: what the first hover says of
+vehicles that answer fast or slowly, and drift meanwhile.
 """
 
 from types import SimpleNamespace

@@ -176,14 +176,14 @@ def _explanation(report: Mapping[str, Any], path: str, rank: int) -> list[dict[s
     """Return the laws of the explanation of this rank, from 1, as ``explain`` wrote them."""
     explanations = report.get("explanations") or [[law] for law in report.get("laws") or []]
     if rank > len(explanations):
-        known = f"expected a number up to {len(explanations)}"
+        choices = f"expected a number up to {len(explanations)}"
         if not explanations:
             reasons = "; ".join(report.get("reasons") or ["none"])
-            known = (
+            choices = (
                 "it holds none: a formula is a law only where flights that are left out repeat its"
                 f" coefficient. Reasons of its verdict: {reasons}"
             )
-        raise DiagnoseError(f"{path}: --laws asks for number {rank} of its laws; {known}")
+        raise DiagnoseError(f"{path}: --laws asks for number {rank} of its laws; {choices}")
     return explanations[rank - 1] if rank else []
 
 
@@ -276,8 +276,8 @@ def of_setup(
     comments = [*provenance, *_rows_of(list(theta), covariance)]
     if laws := laws_of(report, path, rank):
         changed["laws"] = [dataclasses.asdict(law) for law in (*setup.laws, *laws)]
-        known = _explanation(report, path, rank)
-        rows = [x.get("covariance") or [x["sd"] ** 2] for x in known]
+        terms = _explanation(report, path, rank)
+        rows = [x.get("covariance") or [x["sd"] ** 2] for x in terms]
         comments += _rows_of([term_of(law).formula for law in laws], rows)
     if theta:
         changed["effects"] = {name: float(f"{size:.9g}") for name, size in after.items()}

@@ -125,10 +125,10 @@ def _load_changes(log: FlightLog) -> np.ndarray:
     """Return the times at which the vehicle takes up a payload or gives it up, or is commanded to
     [s]; none where the log does not tell.
     """
-    known = [name for name in ("attached", "release_command") if name in log]
-    if not known:
+    channels = [name for name in ("attached", "release_command") if name in log]
+    if not channels:
         return np.empty(0)
-    time = log[known[0]].samples().time
+    time = log[channels[0]].samples().time
     return time[np.diff(hangs(log, time), prepend=True)]
 
 

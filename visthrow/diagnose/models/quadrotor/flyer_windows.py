@@ -64,11 +64,11 @@ def cut_flying(
         if not all(covered(c, start, start + params.window) for c in driven):
             continue
         end = start + params.window
-        if not flies(held(commands, start, end).values, params):
+        if not flies(cut_commands(commands, start, end).values, params):
             continue
         rows = [take_samples(log[name], params, start) for name in channels]
         tables = [(*row, sd) for row, sd in zip(rows, sigma)]
-        sent = held(commands, start - params.window, end + params.window)
+        sent = cut_commands(commands, start - params.window, end + params.window)
         common: dict[str, Any] = {"start": start, "sent": sent, "volts": 0.0}
         common["since"] = start - float(log[params.input].time[0])
         if "battery_voltage" in log:
@@ -130,7 +130,7 @@ def spare(step: float) -> int:
     return int(np.ceil(MOST_LATE / (0.5 * step))) + 1
 
 
-def held(commands: Samples, first: float, last: float) -> Samples:
+def cut_commands(commands: Samples, first: float, last: float) -> Samples:
     """Return the commands that are held between two times, at least the first or the last."""
     time, values = commands
     begin = max(int(np.searchsorted(time, first, "right")) - 1, 0)
@@ -192,7 +192,7 @@ def _lean(log: FlightLog, attitude: str, rate: float, times: ndarray) -> ndarray
     time, force = log["acc_b"].samples()
     share = force[:, :2] / np.maximum(force[:, 2:], _IDLE * GRAVITY)
     share = share - np.median(share, axis=0)
-    recent = held(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
+    recent = cut_commands(Samples(time, share), times[0] - _MEMORY / rate, times[-1])
     tilt, _ = lagged(*recent, times[:, None], 1.0 / rate)
     upright = np.array([0.0, 0.0, 1.0])
     turn = cross(np.pad(tilt, ((0, 0), (0, 1))), upright)
