@@ -12,8 +12,6 @@ def resolve(name: str = "auto") -> str:
 
     Raises DeviceError if there is no such device.
     """
-    if name == "cpu":
-        return name
     import torch
 
     count = torch.cuda.device_count() if torch.cuda.is_available() else 0

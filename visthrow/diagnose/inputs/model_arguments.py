@@ -137,10 +137,6 @@ def throw_model(
     """The whole throw, with the plant of an experiment, and its logs with their
     commands put right.
     """
-    from threading import Thread
-
-    import warp as wp
-
     from visthrow.common.compute_device import resolve
     from visthrow.diagnose.likelihood import threads
     from visthrow.diagnose.select.diagnose_flights import correct_interface_mistakes
@@ -148,16 +144,12 @@ def throw_model(
     from visthrow.task import load_experiment, plant_of
 
     threads.keep_freed_memory()
-    Thread(target=threads.load_torch).start()
     experiment = load_experiment(args.plant, args.overrides)
-    device = args.device
-    if device == "auto" and not wp.is_cuda_available():  # `resolve` would wait for torch
-        device = "cpu"
     only = args.only.split(",") if args.only is not None else None
     measured = {
         "sensing": experiment.sensing,
         "camera": experiment.camera,
-        "device": resolve(device),
+        "device": resolve(args.device),
     }
     measured |= {"only": only, "simpler": only is not None}
     plant = plant_of(experiment)

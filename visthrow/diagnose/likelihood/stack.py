@@ -4,13 +4,12 @@ where the simulation runs.
 The same algebra as :mod:`visthrow.diagnose.likelihood.marginal`, for grams that are padded to one
 size: on a GPU in one batch, on a CPU in batches that fit its cache."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
+import torch
 from numpy import ndarray
 from scipy.linalg import lapack
 
@@ -24,12 +23,9 @@ from visthrow.diagnose.likelihood.marginal import (
     gather,
     rescored,
 )
-from visthrow.diagnose.likelihood.threads import load_torch, parallel_map
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, side_by_side
 from visthrow.diagnose.models.model_interface import LATENT_BLOCKS
-
-if TYPE_CHECKING:
-    import torch
 
 T = TypeVar("T")
 
@@ -68,7 +64,7 @@ class _Shape:
 
 def integrals(
     grams: Sequence[Gram], noise: Noise, device: str = "cpu", *, latents: bool = False
-) -> Integrals:
+) -> "Integrals":
     """Integrate initial states out of windows, and latent forces unless they are asked for.
 
     Raises DiagnoseError: as :meth:`Stack.values`.
@@ -107,7 +103,6 @@ class Stack:
 
         ``grams``: of the windows, with or without effects; ``windows``: of each gram, the row of
         the noise's shares; default: their order."""
-        load_torch()
         rows = np.arange(len(grams)) if windows is None else np.asarray(windows, dtype=int)
         self.device = device
         size = BATCH if device == "cpu" else max(len(grams), 1)
@@ -118,8 +113,6 @@ class Stack:
         self._batches = parallel_map(self._padded, parts, [rows[m] for m in self._order])
 
     def _padded(self, grams: list[Gram], windows: ndarray) -> _Batch:
-        import torch
-
         sizes = [gram.nuisances + gram.latents for gram in grams]
         count = len(grams)
         channels = len(grams[0].count)
@@ -178,7 +171,7 @@ class Stack:
         parts = self._of_batches(lambda batch: _looked(batch, noise))
         return tuple(np.array(_by_window(self._order, column)) for column in zip(*parts))
 
-    def integrals(self, noise: Noise, latents: bool) -> Integrals:
+    def integrals(self, noise: Noise, latents: bool) -> "Integrals":
         """See :func:`integrals`."""
         parts = parallel_map(lambda batch: _integrated(batch, noise, latents), self._batches)
         return Integrals(self._order, parts)
@@ -204,8 +197,6 @@ def _levels(batch: _Batch, noise: Noise) -> ndarray:
 
 
 def _shape(batch: _Batch, noise: Noise) -> _Shape:
-    import torch
-
     by_block = batch.square.new_tensor(_levels(batch, noise))
     latent_level = batch.member @ by_block[:, :, None]
     level = batch.initial + latent_level[..., 0]
@@ -234,8 +225,6 @@ def _solved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the mean of [b, a] in prior deviations under a batch's residuals, shape (W, n), and
     their log-likelihood but for the powers of 2 pi, shape (W,).
     """
-    import torch
-
     right = shape.level * (shape.weight @ batch.cross)
     projected = torch.linalg.solve_triangular(shape.factor, right[:, :, None], upper=False)
     mean = torch.linalg.solve_triangular(shape.factor.mT, projected, upper=True)
@@ -248,8 +237,6 @@ def _inverse(factor: torch.Tensor) -> torch.Tensor:
     """Inverse of matrices whose lower Cholesky factors these are; on a GPU torch's function takes
     them one by one.
     """
-    import torch
-
     if not factor.is_cuda:  # it comes by columns, beside all else by rows; it is symmetric
         return torch.cholesky_inverse(factor).mT
     unit = torch.eye(factor.shape[1], dtype=factor.dtype, device=factor.device)
@@ -268,8 +255,6 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
     """Posterior variances of [b, a] (W, n), what these leave of each channel's squares (W, C), and
     curvature by [blocks, scales].
     """
-    import torch
-
     covariance = _inverse(shape.factor)
     variance = covariance.diagonal(dim1=1, dim2=2).clone()
     count, channels = batch.count.shape
@@ -296,8 +281,6 @@ def _curved(shape: _Shape, batch: _Batch) -> tuple[torch.Tensor, torch.Tensor, t
 
 def _looked(batch: _Batch, noise: Noise) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Value, gradient and curvature by [blocks, scales]."""
-    import torch
-
     shape = _shape(batch, noise)
     variance, spread, curvature = _curved(shape, batch)
     mean, value = _solved(shape, batch)
@@ -324,8 +307,6 @@ class _Integrated:
 
     def shares(self, grams: Sequence[Gram]) -> list[WindowStatistics]:
         """Return the windows' statistics with the residuals of grams of the same derivatives."""
-        import torch
-
         weight = self.weight
         count, n, columns = self.half.shape
         hidden = np.zeros((count, n))
@@ -382,8 +363,6 @@ class Integrals:
 
 
 def _integrated(batch: _Batch, noise: Noise, latents: bool) -> _Integrated:
-    import torch
-
     shape = _shape(batch, noise)
     _, channels, n = batch.cross.shape
     sizes = [gram.nuisances + gram.latents for gram in batch.grams]

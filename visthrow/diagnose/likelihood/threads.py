@@ -58,19 +58,6 @@ def limit_threads_beside_gpu() -> None:
     _aside.set()
 
 
-@cache
-def load_torch() -> None:
-    """Import torch, whose products have one thread from then on; whoever computes with it asks for
-    it first.
-
-    That takes two seconds, in which flights can be flown: a model that flies some begins it in a
-    thread."""
-    import torch
-
-    torch.set_num_threads(1)
-    gc.freeze()
-
-
 def limit_to_one_thread() -> None:
     """Give a product one thread from now on, in numpy, scipy and whatever else of the kind this
     process has loaded.

@@ -2,24 +2,17 @@
 as the copy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy import ndarray
 
 from visthrow.diagnose.likelihood.threads import parallel_map
 
-if TYPE_CHECKING:
-    import torch
-
 
 def to_host(tensor: torch.Tensor) -> ndarray:
     """A tensor's values."""
-    import torch
-
     if not tensor.is_cuda:
         return tensor.numpy()
     pinned = torch.empty(tensor.shape, dtype=tensor.dtype, pin_memory=True)
@@ -30,8 +23,6 @@ def all_to_host(tensors: Sequence[torch.Tensor]) -> list[ndarray]:
     """Values of several tensors of one kind, from a GPU in one piece: each wait for one gives
     Python away to other threads.
     """
-    import torch
-
     if not tensors or not tensors[0].is_cuda:
         return [tensor.numpy() for tensor in tensors]
     values = to_host(torch.cat([tensor.flatten() for tensor in tensors]))
@@ -44,8 +35,6 @@ def side_by_side(parts: Sequence[ndarray], shape: tuple[int, ...], device: str) 
     """Arrays one beside the other on a device, each padded with zeros to one shape; shape (arrays,
     *shape).
     """
-    import torch
-
     pinned = device.startswith("cuda")
     out = torch.zeros((len(parts), *shape), dtype=torch.float64, pin_memory=pinned)
 

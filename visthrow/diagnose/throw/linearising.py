@@ -5,20 +5,18 @@ A derivative is a difference of two lanes of the same steps. Longer steps, with 
 their own, tell most of them as well; residuals always come from the nominal steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
+import torch
 from numpy import ndarray
 
 from sim.effects.effect import SettingEffect
 from sim.effects.setting import Setting
 from sim.kernels.replay.kernel import NO_PAYLOAD
-from visthrow.diagnose.likelihood.threads import load_torch, parallel_map
+from visthrow.diagnose.likelihood.threads import parallel_map
 from visthrow.diagnose.likelihood.transfer import all_to_host, to_host
 from visthrow.diagnose.models.law_terms import KnotValues
 from visthrow.diagnose.models.model_interface import Window
@@ -31,9 +29,6 @@ from visthrow.diagnose.throw.replay import (
     Simulation,
     flown_alike,
 )
-
-if TYPE_CHECKING:
-    import torch
 
 LATENT_SIZES = (1e-3, 1e-3, 1e-3, 1e-5, 1e-5, 1e-5, 2e-4, 2e-4, 2e-4)
 """Of the latent forces' derivatives: force [N], torque [N m], force on the payload [N].
@@ -135,7 +130,6 @@ class Linearisation:
 
     def windows(self, batch: Sequence[int], channels: Sequence[ndarray]) -> list[Window]:
         """Linearise windows whose lanes fit a run; ``channels``: of the samples of each."""
-        load_torch()
         plans: list[Plan] = []
         lanes: list[Lane] = []
         first_knot = 0
@@ -198,8 +192,6 @@ class Linearisation:
 
         ``samples``: of all lanes of the run, shape (rows or more, lanes, 3).
         """
-        import torch
-
         rows = int(self._flights.rows[plan.window])
         lanes = samples[:rows, plan.first : plan.first + len(plan.lanes)]
         columns = lanes.transpose(1, 2).reshape(3 * rows, -1)
