@@ -160,6 +160,9 @@ def test_a_law_is_written_as_a_block(diagnosis, tmp_path, refused, printed):
     )
     refused(f"{command} --laws 2", said="asks for number 2 of its laws; expected a number up to 1")
     assert "--laws 1 writes it" in printed(command)
+    path = diagnosis(theta={}, covariance=[], laws=[law | {"factors": ["sped"]}])
+    command = f"diagnose apply {path} --out {tmp_path / 'other.toml'} --laws 1"
+    refused(command, said="no factor 'sped'; did you mean 'speed'?")
 
 
 def test_a_formula_without_a_coefficient_is_no_law_to_write(diagnosis, tmp_path, refused):

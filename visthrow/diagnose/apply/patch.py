@@ -163,12 +163,15 @@ def without_transient(
 def laws_of(report: Mapping[str, Any], path: str, rank: int) -> list[LawParams]:
     """All laws of the explanation of this rank, from 1, in ``explain``'s JSON; none for 0.
 
-    Raises DiagnoseError: it holds fewer.
+    Raises DiagnoseError: it holds fewer, or one that no grammar has.
     """
     laws = []
     for x in _explanation(report, path, rank):
         factors = tuple(x["factors"])
-        laws.append(LawParams(x["block"], factors, x["vector"], float(x["coefficient"])))
+        try:
+            laws.append(LawParams(x["block"], factors, x["vector"], float(x["coefficient"])))
+        except ValueError as error:
+            raise DiagnoseError(f"{path}: {error}") from None
     return laws
 
 
