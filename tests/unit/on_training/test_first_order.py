@@ -1,6 +1,4 @@
-"""First-order training: its backward pass against torch's autograd of the same surrogate and
-against the simulator itself.
-"""
+"""First-order training: its backward pass against differences of the simulator."""
 
 import itertools
 from types import SimpleNamespace
@@ -12,12 +10,11 @@ from torch.testing import assert_close
 from sim.params import GRAVITY
 from tests.configs import QUIET, load_experiment
 from visthrow.onboard import actions as act
-from visthrow.onboard import observations as ob
 from visthrow.onboard.policy import Policy, find_policy
 from visthrow.task import rewards
 from visthrow.training import protocol
 from visthrow.training.first_order.first_order_training import NODES
-from visthrow.training.first_order.surrogate import TAUT
+from visthrow.training.first_order.surrogate import STATES
 from visthrow.training.trainer import Trainer
 
 SMALL = [
@@ -28,13 +25,9 @@ SMALL = [
     "first_order.horizon=14",
     "first_order.initial_release=-0.3",
 ]
-SECOND_ORDER = 0.01
-"""A rotation's derivative is taken to second order in a step's turn, and the turn from the rates at
-its ends.
-"""
-LEAST_COSINE, MOST_BIAS = 0.97, 0.15
+LEAST_COSINE, MOST_BIAS = 0.99, 0.06
 """Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
-rates) lets them differ.
+rates) lets them differ by 0.995 and 0.04.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
@@ -48,11 +41,11 @@ ALIKE = 0.006
 pytestmark = mark.usefixtures("one_thread")
 
 
-def first_order(name="state", *changes):
+def first_order(name="state", *changes, reaction=5.0):
     """A first-order training of a small network that has been made to react to what it sees."""
     found = Trainer(load_experiment(name, [*SMALL, *changes]), "cpu", 3).algorithm
     with torch.no_grad():
-        found.network.mlp[-1].weight.mul_(5.0)
+        found.network.mlp[-1].weight.mul_(reaction)
     return found
 
 
@@ -61,141 +54,14 @@ def decided(fo, obs):
     return fo.network.mlp(fo.network.obs_normalizer(obs))
 
 
-def slowed(x, decay):
-    """x whose derivative is scaled."""
-    return decay * x + ((1.0 - decay) * x).detach()
-
-
-def at(value, slope):
-    """The slope of one tensor at the value of another."""
-    return value + slope - slope.detach()
-
-
-def exponential(vector):
-    """Rotation matrices of rotation vectors."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
-    return torch.linalg.matrix_exp(cross)
-
-
-def advance(fo, true, k, x, response, commands):
-    """The surrogate's step in torch, from state ``x`` to the dictionary of state k + 1, before the
-    decay.
-    """
-    dt, pl = fo.experiment.sim.control_period, fo.flights
-    M, m = pl.mass[:, None], pl.load_mass[:, None]
-    response_of, force, tension = (fo.surrogate[name] for name in ("response", "force", "tension"))
-    y = response_of[0] * response[k] + (response_of[1] * response[k - 1] if k else 0.0)
-    y = y + sum(response_of[2 + j] * commands[k - j] for j in range(len(response_of) - 2) if k >= j)
-    y = at(true.response[k + 1], y)
-    turned = x["rot"] @ exponential(0.5 * dt * (response[k] + y)[:, 1:])
-    rots = ob.rotation_from_quat(true.quat)
-    rot = rots[k + 1] @ turned.detach().mT @ turned
-    z = 0.5 * (x["rot"][..., 2] + rot[..., 2])
-    drag = (x["rot"] * force[1:]) @ x["rot"].mT @ x["vel"][..., None]
-    f = force[0] * 0.5 * (response[k] + y)[:, :1] * z - drag[..., 0]
-    arms = true.load_pos - true.pos - (rots @ pl.mount[..., None])[..., 0]
-    arm = (
-        x["load_pos"]
-        - x["pos"]
-        - (x["rot"] @ pl.mount[..., None])[..., 0]
-        + 0.5 * dt * (x["load_vel"] - x["vel"])
-    )
-    arm = at(0.5 * (arms[k] + arms[k + 1]), arm)
-    u = at(0.5 * (true.load_vel - true.vel)[k : k + 2].sum(0), x["load_vel"] - x["vel"])
-    length = arm.norm(dim=-1, keepdim=True)
-    n = arm / length
-    dot = lambda a, b: (a * b).sum(-1, keepdim=True)  # noqa: E731
-    a, b = tension
-    pull = M * m / (M + m) * (-a * dot(n, f) / M + b * (dot(u, u) - dot(n, u) ** 2) / length)
-    g = torch.tensor([0.0, 0.0, GRAVITY])
-    measured = -dot(n, m * ((true.load_vel[k + 1] - true.load_vel[k]) / dt + g)).detach()
-    pull = torch.where(measured > TAUT * GRAVITY * m, at(measured, pull), 0.0)
-    vel = at(true.vel[k + 1], x["vel"] + dt * (f + pull * n) / M)
-    load_vel = at(true.load_vel[k + 1], x["load_vel"] - dt * pull * n / m)
-    pos = at(true.pos[k + 1], x["pos"] + 0.5 * dt * (x["vel"] + vel))
-    load_pos = at(true.load_pos[k + 1], x["load_pos"] + 0.5 * dt * (x["load_vel"] + load_vel))
-    return {
-        "pos": pos,
-        "vel": vel,
-        "rot": rot,
-        "load_pos": load_pos,
-        "load_vel": load_vel,
-        "response": y,
-    }
-
-
-def reference(fo, by):
-    """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop, by torch's
-    autograd.
-    """
-    true, b, layout = SimpleNamespace(**fo.flights.x), fo, fo.env.layout
-    extra = torch.zeros_like(b.layers.action, requires_grad=True)
-    rots, late = (
-        ob.rotation_from_quat(true.quat),
-        (b.env.delay.age / fo.experiment.sim.control_period)[:, None],
-    )
-    x = {
-        name: getattr(true, name)[0].clone()
-        for name in ("pos", "vel", "load_pos", "load_vel", "response")
-    } | {"rot": rots[0]}
-    poses, responses, commands, cost = [], [], [], 0.0
-    previous, history = (
-        fo.env.start_action.expand(24, -1),
-        torch.zeros(24, 1 + layout.history, layout.payload),
-    )
-    for k in range(fo.p.horizon):
-        responses.append(x["response"])
-        pose = torch.cat(
-            [ob.vehicle_part(x["pos"], x["vel"], x["response"][:, 1:], x["rot"]), x["load_pos"]], -1
-        )
-        poses.append(pose)
-        seen = torch.lerp(pose, poses[max(k - 1, 0)], late)
-        frame = torch.cat(
-            [seen[:, :15], ob.state_part(seen[:, :3], b.env.views.goal_w, seen[:, 15:])], -1
-        )
-        fresh = torch.full((24,), k == 0)
-        obs, history = ob.observe(layout, frame, None, previous, torch.ones(24), history, fresh)
-        obs = at(b.flights.obs[k], obs)
-        action = decided(fo, obs) + extra[k]
-        previous = at(act.clip_action(b.layers.action[k]), action)
-        throttle = (0.5 * (b.layers.action[k, :, :1] + 1.0)).clamp(0.05, 1.0)
-        scale = torch.cat(
-            [fo.experiment.task.action.max_thrust * throttle, fo.env.max_rate.expand(24, -1)], -1
-        )
-        commands.append(action[:, :4] * scale)
-        x = advance(fo, true, k, x, responses, commands)
-        x = {name: slowed(value, fo.p.decay) for name, value in x.items()}
-        cost = cost + sum((x[name] * by[name][k + 1]).sum() for name in by)
-    return torch.autograd.grad(cost, extra)[0]
-
-
 def backward(fo, by):
-    """The same by the kernel."""
+    """Derivatives by the actions of ``sum_k <by[k], state k>`` through the closed loop."""
     for name, tensor in fo.flights.adjoint.items():
         tensor.copy_(by[name]) if name in by else tensor.zero_()
     fo.layers.by_action.zero_()
     fo.layers.by_seen.zero_()
     fo.backward()
     return fo.layers.by_action.clone()
-
-
-def test_backward_pass_equals_autograd_of_the_same_surrogate():
-    """Closed loop: queue, response, rope, latency, histories, network, over a whole flight."""
-    fo = first_order("state")
-    fo.rollout()
-    assert (fo.flights.steps == fo.p.horizon).all()
-    assert fo.layers.action.abs().max() < 1.0
-    torch.manual_seed(0)
-    by = {
-        n: torch.randn_like(fo.flights.x[n])
-        for n in ("pos", "vel", "load_pos", "load_vel", "response")
-    }
-    found, expected = backward(fo, by), reference(fo, by)
-    size = expected.square().mean(1).sqrt()
-    off = (found - expected).square().mean(1).sqrt()
-    assert (off[size > 0] / size[size > 0]).max() < SECOND_ORDER
 
 
 def test_weights_get_what_autograd_gives_them():
@@ -241,34 +107,41 @@ SLOWER = [
 
 
 @mark.parametrize(
-    "vehicle", [[], SLOWER, ["vehicle=vehicle/x500.toml"]], ids=["own", "slower", "x500"]
+    ("vehicle", "reaction"),
+    [([], 0.0), ([], 4.0), (SLOWER, 0.0), (["vehicle=vehicle/x500.toml"], 0.0)],
+    ids=["own", "closed loop", "slower", "x500"],
 )
-def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
+def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
     """Where the payload lands against thrust, roll and pitch commands at earlier steps, by
-    differences of the simulator.
+    differences of the simulator: of planned commands alone, and of a policy that reacts.
 
     Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate
     leaves. Under rates of 10 and 4 rad/s the motors of an X500 saturate, and these fail."""
     fo = first_order(
-        "state", *QUIET, *vehicle, "task.start.tether_variants=1", "first_order.decay=1.0"
+        "state",
+        *QUIET,
+        *vehicle,
+        "task.start.tether_variants=1",
+        "first_order.decay=1.0",
+        reaction=reaction,
     )
     torch.manual_seed(5)
-    plan = fo.env.start_action + torch.randn(fo.p.horizon, 24, 5) * torch.tensor(
-        [0.1, 0.25, 0.25, 0.25, 0.0]
-    )
+    plan = torch.randn(fo.p.horizon, 24, 5) * torch.tensor([0.1, 0.1, 0.1, 0.1, 0.0])
     start = fo.env.state_dict()
 
-    def fly(actions):
+    def fly(pushes):
         fo.env.load_state_dict(start)
-        left = iter(actions)
-        monkeypatch.setattr(
-            fo.layers, "forward", lambda k, seen, flying: fo.layers.action[k].copy_(next(left))
-        )
+
+        def forward(k, seen, flying):
+            return fo.layers.action[k].copy_(decided(fo, seen) + pushes[k])
+
+        monkeypatch.setattr(fo.layers, "forward", forward)
         fo.rollout()
         return fo.flights.landing[-1].clone()
 
     fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
+    assert fo.layers.action.abs().max() < 1.0
     x = {name: fo.flights.x[name].clone().requires_grad_() for name in ("load_pos", "load_vel")}
     up = x["load_vel"][-1, :, 2]
     time = (
@@ -280,7 +153,6 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
     ) / GRAVITY
     point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
     assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
-    monkeypatch.setattr(fo.layers, "backpropagate", lambda k, flown: None)
     found = []
     for axis in range(2):
         by = dict(
@@ -302,6 +174,14 @@ def test_slopes_are_those_of_the_simulator(vehicle, monkeypatch):
         surrogate, simulator = torch.cat(pairs, dim=1)
         assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE
         assert surrogate @ simulator / simulator.square().sum() == approx(1.0, abs=MOST_BIAS)
+
+
+def test_derivatives_decay_with_each_step():
+    """With a decay of next to nothing no earlier action moves a state."""
+    fo = first_order("state", "first_order.decay=1e-12")
+    fo.rollout()
+    by = {name: torch.ones_like(fo.flights.x[name]) for name in STATES}
+    assert backward(fo, by).abs().max() < 1e-9
 
 
 def test_gradients_come_from_a_coarser_simulator_where_throws_land_alike():
