@@ -1,7 +1,6 @@
 """Every box with every model it writes, against the published models written anew here."""
 
 import math
-import tomllib
 
 import numpy as np
 import torch
@@ -10,10 +9,9 @@ from pytest import approx, mark, raises
 from camera.calibrate.files import read
 from camera.calibrate.foreign import HOLDS_PX
 from camera.fisheye import Fisheye
+from tests.lens_files import FILES, LENSES
 from tests.places import DATA
 
-FILES = tomllib.loads((DATA / "lenses.toml").read_text())
-LENSES = FILES["lens"]
 EXACT_PX = 1e-9
 RAYS = 200
 W, H, FX, FY, CX, CY = 640, 480, 191.2, 191.0, 319.6, 241.1
