@@ -1,5 +1,7 @@
 """Pictures of calibration boards, drawn through a fisheye."""
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 import torch
@@ -8,7 +10,6 @@ from camera.calibrate.boards import BoardParams
 from camera.fisheye import Fisheye
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
-from tests.drawn import pixel_rays
 
 LENS = FisheyeParams(320, 320, 96.0, 97.0, 161.0, 157.0, 0.01, -0.004, fov_deg=190.0)
 LARGE = FisheyeParams(640, 640, 192.0, 194.0, 322.5, 314.5, 0.01, -0.004, fov_deg=190.0)
@@ -53,6 +54,18 @@ POSES = (
 """Rotation vector of a board [rad] and the place of its middle across the axis [m]."""
 
 
+@lru_cache(maxsize=2)
+def pixel_rays(params: FisheyeParams, samples: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Rays through all pixels of a lens, ``samples`` a pixel along each axis.
+
+    Returns unit rays, float64, shape (H s, W s, 3), camera frame, and whether each is inside the
+    field of view, shape (H s, W s).
+    """
+    u = (torch.arange(params.width * samples, dtype=torch.float64) + 0.5) / samples - 0.5
+    v = (torch.arange(params.height * samples, dtype=torch.float64) + 0.5) / samples - 0.5
+    return Fisheye(params).unproject(torch.stack(torch.meshgrid(u, v, indexing="xy"), -1))
+
+
 def pictures(name: str) -> list[np.ndarray]:
     """Draw a board in each of the poses, shape (H, W) of its lens."""
     board, lens = BOARDS[name], Fisheye(lens_of(name))
@@ -60,7 +73,7 @@ def pictures(name: str) -> list[np.ndarray]:
     samples, scale = (2 if name == "charuco" else 3), 60
     page = texture(board, scale)
     page = cv2.copyMakeBorder(page, scale, scale, scale, scale, cv2.BORDER_CONSTANT, value=255)
-    rays, seen = pixel_rays(lens, samples)
+    rays, seen = pixel_rays(lens.params, samples)
     rays = rays.float()
     found = []
     for *tilt, x, y in POSES:

@@ -13,7 +13,7 @@ from camera.mount import rotation_from_vector
 from camera.overlay import draw_overlay
 from camera.params import CameraParams, FisheyeParams, KeypointNoiseParams, MountParams
 from camera.rectify import ViewParams, rectify, view_map
-from tests.drawn import pixel_rays
+from tests.boards import pixel_rays
 
 f64 = partial(torch.tensor, dtype=torch.float64)
 
@@ -67,7 +67,7 @@ def test_rectified_view_has_straight_lines():
     # A frame whose colour is the tangent of the angle to the right of the axis rectifies to a
     # linear ramp.
     lens = CAMERA.fisheye
-    rays, _ = pixel_rays(lens)
+    rays, _ = pixel_rays(LENS, 1)
     ahead = rays[..., 2] > 0.3
     ramp = torch.where(
         ahead, rays[..., 0] / rays[..., 2].clamp(min=0.3), torch.zeros_like(rays[..., 0])

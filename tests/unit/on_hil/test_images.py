@@ -14,7 +14,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from pytest import approx, fixture, mark, raises
 
 from camera.detectors.contours import BallSeen, Detector, FrameDetections, GoalSeen
-from camera.fisheye import Fisheye
 from camera.keypoints import KeypointCamera, keypoints
 from camera.mount import rotation_from_vector
 from camera.params import FisheyeParams
@@ -32,9 +31,9 @@ from hil.poses.sources.images import (
 )
 from tests.commands import run_command
 from tests.configs import load_run
-from tests.drawn import render_scene
 from tests.waiting import eventually
 from visthrow.common.errors import ConfigError
+from visthrow.detector_training.eyes import render_hall
 
 SMALL = FisheyeParams(280, 280, 72.9, 72.9, 139.5, 139.5)
 """The lens of the pictures: the field of view of training's, a fifth of its pixels."""
@@ -58,14 +57,9 @@ def pose(i):
 
 def picture(i) -> np.ndarray:
     """BGR frame of a moment."""
-    pos, vector, ball = pose(i)
-    camera = KeypointCamera(training(), dtype=torch.float64)
-    rot = rotation_from_vector(vector)[0]
-    eye = torch.tensor(pos) + rot @ camera.position_b
-    frame = render_scene(
-        Fisheye(SMALL), eye, rot @ camera.rot_cb.T, torch.tensor(GOAL), torch.tensor(ball), 0.033
-    )
-    return np.round(frame.numpy()[..., ::-1] * 255).astype(np.uint8)
+    pos, vector, ball = (torch.as_tensor(part) for part in pose(i))
+    camera = replace(training(), fisheye=SMALL)
+    return render_hall(camera, pos, rotation_from_vector(vector)[0], ball, torch.tensor(GOAL), 4)
 
 
 def quaternion(vector) -> tuple[float, ...]:
