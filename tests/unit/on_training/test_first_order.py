@@ -25,9 +25,9 @@ SMALL = [
     "first_order.horizon=14",
     "first_order.initial_release=-0.3",
 ]
-LEAST_COSINE, MOST_BIAS = 0.99, 0.06
-"""Between slopes of surrogate and simulator: what the fit leaves (a sixth of a step's change of the
-rates) lets them differ by 0.995 and 0.04.
+LEAST_COSINE, MOST_BIAS = 0.99, 0.04
+"""Between slopes of surrogate and simulator, of all axes of a state: what the fit leaves (a sixth of a
+step's change of the rates) lets them differ by 0.991 and 0.035.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
@@ -108,15 +108,14 @@ SLOWER = [
 
 @mark.parametrize(
     ("vehicle", "reaction"),
-    [([], 0.0), ([], 4.0), (SLOWER, 0.0), (["vehicle=vehicle/x500.toml"], 0.0)],
+    [([], 0.0), ([], 2.0), (SLOWER, 0.0), (["vehicle=vehicle/x500.toml"], 0.0)],
     ids=["own", "closed loop", "slower", "x500"],
 )
 def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
-    """Where the payload lands against thrust, roll and pitch commands at earlier steps, by
-    differences of the simulator: of planned commands alone, and of a policy that reacts.
+    """Where a flight ends against commands at earlier steps, by differences of the simulator: of
+    planned commands alone, and of a policy that reacts.
 
-    Yaw moves the landing by a thirtieth of what the others do, which is less than what a surrogate
-    leaves. Under rates of 10 and 4 rad/s the motors of an X500 saturate, and these fail."""
+    Under rates of 10 and 4 rad/s the motors of an X500 saturate, and these fail."""
     fo = first_order(
         "state",
         *QUIET,
@@ -137,43 +136,30 @@ def test_slopes_are_those_of_the_simulator(vehicle, reaction, monkeypatch):
 
         monkeypatch.setattr(fo.layers, "forward", forward)
         fo.rollout()
-        return fo.flights.landing[-1].clone()
+        return {name: x[-1].clone() for name, x in fo.flights.x.items()}
 
     fly(plan)
     assert (fo.flights.steps == fo.p.horizon).all()
     assert fo.layers.action.abs().max() < 1.0
-    x = {name: fo.flights.x[name].clone().requires_grad_() for name in ("load_pos", "load_vel")}
-    up = x["load_vel"][-1, :, 2]
-    time = (
-        up
-        + (
-            up.square()
-            + 2 * GRAVITY * (x["load_pos"][-1, :, 2] - fo.experiment.release.landing_height)
-        ).sqrt()
-    ) / GRAVITY
-    point = x["load_pos"][-1, :, :2] + x["load_vel"][-1, :, :2] * time[:, None]
-    assert_close(point.detach(), fo.flights.landing[-1], atol=1e-4, rtol=0)
-    found = []
-    for axis in range(2):
-        by = dict(
-            zip(
-                x,
-                torch.autograd.grad(point[:, axis].sum(), list(x.values()), retain_graph=True),
-                strict=True,
-            )
-        )
-        found.append(backward(fo, by))
-    size = 0.02  # normalised; float32 resolves the landing to 1e-5 of the 2e-3 m that this makes
-    for axis in range(2):
-        pairs = []
-        for k, channel in itertools.product((0, 4, 8), range(3)):
-            step = torch.zeros_like(plan)
-            step[k, :, channel] = size
-            slope = (fly(plan + step) - fly(plan - step))[:, axis] / (2 * size)
-            pairs.append(torch.stack([found[axis][k, :, channel], slope]))
-        surrogate, simulator = torch.cat(pairs, dim=1)
-        assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE
-        assert surrogate @ simulator / simulator.square().sum() == approx(1.0, abs=MOST_BIAS)
+    found = {}
+    for name in STATES:
+        for axis in range(fo.flights.x[name].shape[-1]):
+            by = torch.zeros_like(fo.flights.x[name])
+            by[-1, :, axis] = 1.0
+            found[name, axis] = backward(fo, {name: by})
+    size = 0.02  # normalised
+    pairs = {name: [] for name in STATES}
+    for k, channel in itertools.product((0, 4, 8, 11), range(4)):
+        step = torch.zeros_like(plan)
+        step[k, :, channel] = size
+        above, below = fly(plan + step), fly(plan - step)
+        for (name, axis), slopes in found.items():
+            slope = (above[name] - below[name])[:, axis] / (2 * size)
+            pairs[name].append(torch.stack([slopes[k, :, channel], slope]))
+    for name, pair in pairs.items():
+        surrogate, simulator = torch.cat(pair, dim=1)
+        assert surrogate @ simulator / (surrogate.norm() * simulator.norm()) > LEAST_COSINE, name
+        assert surrogate @ simulator / simulator.square().sum() == approx(1.0, abs=MOST_BIAS), name
 
 
 def test_derivatives_decay_with_each_step():
