@@ -26,8 +26,8 @@ SMALL = [
     "first_order.initial_release=-0.3",
 ]
 LEAST_COSINE, MOST_BIAS = 0.99, 0.04
-"""Between slopes of surrogate and simulator, of all axes of a state: what the fit leaves (a sixth of a
-step's change of the rates) lets them differ by 0.991 and 0.035.
+"""Between slopes of surrogate and simulator, of all axes of a state: what the fit leaves (a sixth
+of a step's change of the rates) lets them differ by 0.991 and 0.035.
 """
 LEARNT = 0.3
 """Landing error that the small task is brought under [m]: sixteen seeds end at 0.10 to 0.22, of
