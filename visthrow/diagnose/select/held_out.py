@@ -45,8 +45,6 @@ FIRM = 1.0 - 1.0 / FEWEST
 """More of the folds than this share must name a cause, or one of its class: of the fewest that can
 disagree, all.
 """
-# of what flights promise in the mean, from which one counts among those that can tell
-TELLING = 0.1
 MOSTLY = 0.6  # share of what is left from which it is said to lie in one axis or one flight
 
 
@@ -141,6 +139,15 @@ def crossed(diagnosis: Diagnosis) -> Crossed:
     return Crossed(groups, left_out, statistics, folds, trained, shares)
 
 
+def effective_number(weights: ndarray) -> ndarray:
+    """Return how many equal flights are worth as much as these, to the nearest whole number.
+
+    ``weights``: information of each flight, not negative, shape (F, ...); the result has shape
+    (...). Source: Kish 1965, Survey Sampling, the effective size of a weighted sample."""
+    squares = np.maximum((weights**2).sum(0), np.finfo(float).tiny)
+    return np.rint(weights.sum(0) ** 2 / squares)
+
+
 def borne_out(
     statistics: Statistics, trained: ndarray, theta: ndarray
 ) -> tuple[float, float, float]:
@@ -149,7 +156,7 @@ def borne_out(
 
     A right size promises theta' I theta / 2 nats with a variance of twice that. It brings more, and
     the part exceeds 1, where unnamed effects below their floors push the same way. The interval is
-    that of the flights' scatter (Student, over flights that can tell), or of this chance where it
+    that of the flights' scatter (Student, over their effective number), or of this chance where it
     is wider. ``trained``: sizes that the other flights gave, in floors, shape (F, K); ``theta``:
     sizes that all flights gave, shape (K,)."""
     information = statistics.information
@@ -160,7 +167,7 @@ def borne_out(
     if total <= 0.0:
         return 0.0, np.nan, np.nan
     value = float(brought.sum() / total)
-    n = int((promised > TELLING * promised.mean()).sum())
+    n = effective_number(promised)
     if n < 2:
         return value, np.nan, np.nan
     square = ((brought - value * promised) ** 2).sum()
