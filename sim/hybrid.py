@@ -264,10 +264,10 @@ class HybridSim:
         self.state = st.allocate(self._step.State, count, device, rows)
         self.out = st.allocate(self._step.Output, count, device)
         self.foreseen = st.allocate(self._step.Output, count, device)
-        self.command = wp.zeros(count, dtype=t.vec4, device=device)
-        self.release, self.episode = (
-            wp.zeros(count, dtype=wp.int32, device=device) for _ in range(2)
-        )
+        self.inputs = st.allocate(self._step.Input, count, device)
+        self.command = self.inputs.command
+        self.release = self.inputs.release
+        self.episode = wp.zeros(count, dtype=wp.int32, device=device)
         self.goal_w = wp.zeros(count, dtype=t.vec3, device=device)
         self._all = wp.full(count, 1, dtype=wp.int32, device=device)
         self._used = wp.zeros(count, dtype=t.real, device=device)
@@ -277,12 +277,12 @@ class HybridSim:
         """Advance every plant by one control period under ``command`` and ``release``; with a
         ``mask``, shape (E,), where it is not 0.
         """
-        mask = self._all if mask is None else mask
+        self.inputs.mask = self._all if mask is None else mask
         if self._exchange is not None:
-            self._exchange.step(self._launch, self, mask)
+            self._exchange.step(self._launch, self)
             return
-        inputs = [self._plants, self.state, self.command, self.release, mask, self.out]
-        self._launch(self._step.step, inputs, block_dim=64)
+        arguments = [self._plants, self.state, self.inputs, self.out]
+        self._launch(self._step.step, arguments, block_dim=64)
 
     def foresee(self) -> None:
         """Write into ``foreseen`` what follows if every payload separates now; the plants stay as

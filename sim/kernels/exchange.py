@@ -33,6 +33,12 @@ WRENCH_FIELDS = {
 about its centre of mass, body frame, without gravity; force of the air on the payload [N]. And what
 the rope did to the vehicle in the last substep, by which the next middle is predicted."""
 
+FLAG_FIELDS = {
+    "moves": "int",
+    "redrawn": "int",
+}
+"""Non-zero: the plant moves in this step; the solver's bodies are put to its state after it."""
+
 BODY_FIELDS = {
     "pos_w": "vec3",
     "quat_wb": "quat",
@@ -95,6 +101,7 @@ class ExchangeKernels:
     show: wp.Kernel
     payload: wp.Kernel
     State: type
+    Flags: type
     Wrench: type
     Bodies: type
 
@@ -163,12 +170,14 @@ def build_exchange(
     loaded = bool(extensions & LOADS)
     parts = step.parts
     State = step.State
+    Input = step.Input
     Output = step.Output
     load = parts.load
     store = parts.store
     Wrench, Bodies, load_bodies, show_kernel, payload_kernel = build_bodies(t, parts, L)
     flow = parts.flow
     advance = parts.advance
+    Flags = st.array_struct(t, "Flags", FLAG_FIELDS)
     nonfinite = st.NONFINITE
     limit = real(st.SPEED_LIMIT)
     Plants = t.Plants
@@ -182,26 +191,23 @@ def build_exchange(
         # State in:
         state: State,
         # In:
-        command: wp.array(dtype=t.vec4),
-        release: Ints,
-        mask: Ints,
+        inputs: Input,
         # Out:
-        moves: Ints,
-        redrawn: Ints,
+        flags: Flags,
         out: Output,
     ):
-        """Take the command, trip the latch; ``again``: the solver's bodies are to be put back."""
+        """Take the command, trip the latch."""
         env = wp.tid() + first
-        moves[env] = mask[env]
-        redrawn[env] = 0
-        if mask[env] == 0:
-            redrawn[env] = state.attached[env]
+        flags.moves[env] = inputs.mask[env]
+        flags.redrawn[env] = 0
+        if inputs.mask[env] == 0:
+            flags.redrawn[env] = state.attached[env]
             return
         state.status[env] = 0
-        if not push(state.queue, env, command[env]):
+        if not push(state.queue, env, inputs.command[env]):
             state.status[env] = nonfinite
         out.separated[env] = 0
-        if release[env] != 0 and state.release_timer[env] < zero and state.attached[env] != 0:
+        if inputs.release[env] != 0 and state.release_timer[env] < zero and state.attached[env] != 0:
             state.release_timer[env] = release_of(plants, env).lag
 
     @unique_kernel
@@ -213,7 +219,7 @@ def build_exchange(
         h: real,
         # State in:
         state: State,
-        moves: Ints,
+        flags: Flags,
         # In:
         out: Output,
         # Out:
@@ -224,7 +230,7 @@ def build_exchange(
         wrench.force_b[env] = vec3()
         wrench.torque_b[env] = vec3()
         wrench.load_w[env] = vec3()
-        if moves[env] == 0:
+        if flags.moves[env] == 0:
             return
         p = vehicle_of(plants, state, env)
         rope = rope_of(plants, env)
@@ -247,7 +253,7 @@ def build_exchange(
                 store(state, env, s)
             else:
                 state.status[env] = state.status[env] | nonfinite
-                moves[env] = 0
+                flags.moves[env] = 0
             return
         f = flow(p, law_factors, s, active)
         force_w = wp.quat_rotate(s.quat_wb, f.force_b) + wrench.pull_w[env]
@@ -279,8 +285,7 @@ def build_exchange(
         h: real,
         # State in:
         state: State,
-        moves: Ints,
-        redrawn: Ints,
+        flags: Flags,
         wrench: Wrench,
         # In:
         bodies: Bodies,
@@ -289,7 +294,7 @@ def build_exchange(
     ):
         """Take over where the solver brought the bodies by ``time``, h seconds on; let go."""
         env = wp.tid() + first
-        if moves[env] == 0 or state.attached[env] == 0:
+        if flags.moves[env] == 0 or state.attached[env] == 0:
             return
         pos = bodies.payload_pos_w[env]
         vel = bodies.payload_vel_w[env]
@@ -299,8 +304,8 @@ def build_exchange(
         size = st.size(s) + parts.rope_size(u, n) + wp.length(vel) + wp.length(pos) * real(1.0e-3)
         if not size < limit:
             state.status[env] = state.status[env] | nonfinite
-            moves[env] = 0
-            redrawn[env] = 1
+            flags.moves[env] = 0
+            flags.redrawn[env] = 1
             return
         body = vehicle_of(plants, state, env).body
         mean_b = real(0.5) * (s.rate_b + state.rate_b[env])
@@ -348,11 +353,11 @@ def build_exchange(
         # State in:
         state: State,
         # In:
-        mask: Ints,
+        inputs: Input,
         out: Output,
     ):
         env = wp.tid() + first
-        if mask[env] == 0:
+        if inputs.mask[env] == 0:
             return
         if state.release_timer[env] >= zero:
             state.release_timer[env] = wp.max(
@@ -375,6 +380,7 @@ def build_exchange(
         show_kernel,
         payload_kernel,
         State,
+        Flags,
         Wrench,
         Bodies,
     )

@@ -42,6 +42,15 @@ STATE_FIELDS = {  # those with [] have a row a segment, the queue a row a slot
     "torque_b": "vec3",  # likewise [N m], about the centre of mass
 }
 
+INPUT_FIELDS = {
+    "command": "vec4",
+    "release": "int",  # non-zero asks for it
+    "mask": "int",  # non-zero: this plant moves
+}
+"""What a step is given. In one struct, since Warp compiles a kernel for CPUs twice if arrays are
+arguments of their own: once for contiguous ones.
+"""
+
 OUTPUT_FIELDS = {
     "payload_pos_w": "vec3",
     "payload_vel_w": "vec3",  # at the end of the step, or at separation once released

@@ -23,7 +23,7 @@ from sim.kernels.rope import release as rel
 from sim.kernels.rope.chain import build_chain
 from sim.kernels.rope.coupling import build_coupled_step
 from sim.kernels.rope.payload import build_flight
-from sim.kernels.runtime import Ints, unique_kernel
+from sim.kernels.runtime import unique_kernel
 from sim.kernels.state import air_of, release_of, rope_of, vehicle_of
 from sim.kernels.structs import Types
 from sim.params import PlantParams
@@ -37,6 +37,7 @@ class StepKernels:
     payload: wp.Kernel
     foresee: wp.Kernel
     State: type
+    Input: type
     Output: type
     parts: SimpleNamespace
 
@@ -51,7 +52,7 @@ def build_parts(
 ) -> SimpleNamespace:
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
-    Returns a namespace of the structs ``State`` and ``Output`` and of Warp functions: the blocks'
+    Returns a namespace of the structs ``State``, ``Input`` and ``Output`` and of Warp functions: the blocks'
     ``flow`` and ``advance``; ``chain``, ``coupled`` and ``laws`` with theirs; ``load``, ``store``,
     ``load_rope``, ``store_rope``, ``rope_size`` and ``hazards``; ``depart``, which writes what
     follows when the payload separates with a stated velocity."""
@@ -62,6 +63,7 @@ def build_parts(
     QuadState = t.QuadState
     L = params.rope.segments
     State = st.array_struct(t, "State", st.STATE_FIELDS)
+    Input = st.array_struct(t, "Input", st.INPUT_FIELDS)
     Output = st.array_struct(t, "Output", st.OUTPUT_FIELDS)
     flow, advance = build_flow(t, params.vehicle, extensions, motors)
     if direct:
@@ -132,6 +134,7 @@ def build_parts(
 
     return SimpleNamespace(
         State=State,
+        Input=Input,
         Output=Output,
         flow=flow,
         advance=advance,
@@ -177,6 +180,7 @@ def build_step(
     nonfinite = st.NONFINITE
     parts = build_parts(t, params, direct, extensions, motors, integrator)
     State = parts.State
+    Input = parts.Input
     Output = parts.Output
     chain = parts.chain
     coupled = parts.coupled
@@ -212,14 +216,12 @@ def build_step(
         # State in:
         state: State,
         # In:
-        command: wp.array(dtype=t.vec4),
-        release: Ints,
-        mask: Ints,
+        inputs: Input,
         # Out:
         out: Output,
     ):
         env = wp.tid() + first
-        if mask[env] == 0:
+        if inputs.mask[env] == 0:
             return
         p = vehicle_of(plants, state, env)
         natural = rope_of(plants, env)
@@ -234,11 +236,11 @@ def build_step(
         rope = chain.stretched(natural, natural, stiffness, u, zero)
         s = load(state, env)
 
-        taken = push(state.queue, env, command[env])
+        taken = push(state.queue, env, inputs.command[env])
         whole, switch = split_delay(p, period)
         timer = state.release_timer[env]
         attached = state.attached[env]
-        if release[env] != 0 and timer < zero and attached != 0:
+        if inputs.release[env] != 0 and timer < zero and attached != 0:
             timer = rel.lag(r, rope, chain.pull(rope, stiffness, u), gravity)
         tiny = real(1.0e-6)
         status = int(0)
@@ -349,4 +351,4 @@ def build_step(
         air = air_of(plants, state, env)
         separate(rope, r, air, s, n, u, plants.gravity, out, env, zero)
 
-    return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Output, parts)
+    return StepKernels(step_kernel, payload_kernel, foresee_kernel, State, Input, Output, parts)

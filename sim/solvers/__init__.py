@@ -121,23 +121,23 @@ class Exchange:
             bodies=st.allocate(kernels.Bodies, count, device, rows),
         )
         self.solver = build(self.world)
-        self._moves, self._again = (wp.zeros(count, dtype=wp.int32, device=device) for _ in "ma")
+        self._flags = st.allocate(kernels.Flags, count, device)
 
-    def step(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
+    def step(self, launch: Callable[..., None], sim: Any) -> None:
         """Advance by one control period."""
         h = self.world.substep
         k = self.world.kernels
         plants = self.world.plants
-        flags = [self._moves, self._again]
-        launch(k.begin, [plants, sim.state, sim.command, sim.release, mask, *flags, sim.out])
+        flags = self._flags
+        launch(k.begin, [plants, sim.state, sim.inputs, flags, sim.out])
         for i in range(self.world.substeps):
-            wrench = [sim.state, self._moves, sim.out, self.world.wrench]
+            wrench = [sim.state, flags, sim.out, self.world.wrench]
             launch(k.wrench, [plants, i * h, h, *wrench])
             self.solver.advance(h)
-            taken = [sim.state, *flags, self.world.wrench, self.world.bodies, sim.out]
+            taken = [sim.state, flags, self.world.wrench, self.world.bodies, sim.out]
             launch(k.take, [plants, (i + 1) * h, h, *taken])
-        launch(k.end, [plants, sim.state, mask, sim.out])
-        self.place(launch, sim, self._again)
+        launch(k.end, [plants, sim.state, sim.inputs, sim.out])
+        self.place(launch, sim, flags.redrawn)
 
     def place(self, launch: Callable[..., None], sim: Any, mask: "wp.array[Any]") -> None:
         """Put the solver's bodies to the state arrays where ``mask`` is not 0."""
