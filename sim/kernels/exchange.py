@@ -207,7 +207,11 @@ def build_exchange(
         if not push(state.queue, env, inputs.command[env]):
             state.status[env] = nonfinite
         out.separated[env] = 0
-        if inputs.release[env] != 0 and state.release_timer[env] < zero and state.attached[env] != 0:
+        if (
+            inputs.release[env] != 0
+            and state.release_timer[env] < zero
+            and state.attached[env] != 0
+        ):
             state.release_timer[env] = release_of(plants, env).lag
 
     @unique_kernel
