@@ -52,10 +52,10 @@ def build_parts(
 ) -> SimpleNamespace:
     """Compose the functions that step kernels share; arguments as of :func:`build_step`.
 
-    Returns a namespace of the structs ``State``, ``Input`` and ``Output`` and of Warp functions: the
-    blocks' ``flow`` and ``advance``; ``chain``, ``coupled`` and ``laws`` with theirs; ``load``,
-    ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and ``hazards``; ``depart``, which writes
-    what follows when the payload separates with a stated velocity."""
+    Returns a namespace of the structs ``State``, ``Input`` and ``Output`` and of Warp functions:
+    the blocks' ``flow`` and ``advance``; ``chain``, ``coupled`` and ``laws`` with theirs;
+    ``load``, ``store``, ``load_rope``, ``store_rope``, ``rope_size`` and ``hazards``; ``depart``,
+    which writes what follows when the payload separates with a stated velocity."""
     real = t.real
     vec3 = t.vec3
     Vectors = t.Vectors
