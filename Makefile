@@ -74,12 +74,14 @@ lint: $(STAMP)
 
 install: $(STAMP)
 
+# An older pip takes twice as long to find and install the packages.
 # torch comes first and from the constraints: resolved with the rest, a newer build with its CUDA libraries might be taken.
 # What is imported is compiled then; to compile all of it here takes three times as long.
 $(STAMP): pyproject.toml constraints.txt
 	@test -n "$(PYTHON)" || { echo "make: no Python 3.11 or newer with venv was found; install one, or say PYTHON=/path/to/python3" >&2; exit 1; }
 	@echo "make: installing into $(VENV); 3 GB on disk with a CPU build of torch, about 7.5 GB with CUDA; some minutes, and pip says nothing until it is done"
 	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet "pip>=25.1"
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt torch
 	$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
