@@ -37,6 +37,8 @@ class Effect(BoundedFields):
     channels: tuple[str, ...]  # channels of the log without which it cannot be seen
     source: str  # of equation and prior
     manoeuvres: tuple[str, ...] = ()  # manoeuvres that separate it from effects that look alike
+    # group of effects that differ from each other by less than their equations are exact
+    alike: str = ""
     # where theta is 0 or 1: the other kind of block that 1 puts in, of which a derivative says
     # little
     switch: str = ""

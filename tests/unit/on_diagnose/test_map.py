@@ -256,6 +256,19 @@ def test_what_falls_says_its_unit_and_a_hall_what_it_can():
         assert any(f"'{unit}' is a guess" in question for question in found.questions) == asked
 
 
+def test_a_unit_of_time_that_no_log_has_is_doubted_unless_it_is_stated():
+    """Stamps of 10,000 a row, headed milliseconds, are microseconds."""
+    rows = np.arange(2000.0)
+    path = 0.5 * np.sin(np.outer(0.01 * rows, [1.9, 2.3, 1.1]))
+    speed = np.gradient(path, 0.01, axis=0)
+    columns = {"time[ms]": 1e4 * rows, **named("pos", path), **named("vel", speed)}
+    found = propose(columns, "a.csv")
+    assert found.mapping.time.unit == "us"
+    assert found.mapping.entry("vel_w").unit == "m/s"
+    assert any("fits the units us; 'us' is a guess" in q for q in found.questions)
+    assert propose(columns, "a.csv", time_unit="ms").mapping.time.unit == "ms"
+
+
 def test_a_thrust_doubts_a_mass_in_grams_and_a_mass_says_the_unit_of_a_thrust():
     file = REAL / "payload_cf_single" / "log206.csv.gz"
     with raises(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.linalg import norm
 from numpy.random import default_rng
 from pytest import approx, mark
+from scipy.spatial.transform import Rotation
 
 from bench import delays
 from tests.commands import run_command
@@ -614,3 +615,45 @@ def test_a_thrust_that_the_model_reads_and_the_log_lacks_is_a_warning():
     (row,) = thrust_checks.look(log, KnownVehicle(thrust_input="thrust_command"))
     assert row.verdict == "warn"
     assert "did you mean 'thrust_cmd'?" in row.text
+
+
+@mark.parametrize(("stiffness", "damping", "lasting"), [(4.0, 2.0, 0.6), (2.0, 3.0, 0.8)])
+def test_thrust_that_answers_gusts_is_on_no_other_clock(stiffness, damping, lasting):
+    """A height controller commands thrust when a gust has pushed already: the force leads."""
+    time = np.arange(0.0, 25.0, 0.01)
+    rng = np.random.default_rng(0)
+    decay = np.exp(-np.arange(0.0, 4.0, 0.01) / lasting)
+    gusts = np.convolve(rng.normal(size=len(time) + len(decay) - 1), decay, "valid")
+    gusts /= np.std(gusts)
+    thrust = np.full(len(time), 9.81)
+    place = np.zeros((len(time), 3))
+    height = speed = 0.0
+    lift = 9.81
+    for i, gust in enumerate(gusts):
+        thrust[i] = 9.81 - stiffness * height - damping * speed
+        lift += 0.01 / 0.05 * (thrust[i] - lift)
+        speed += 0.01 * (lift - 9.81 + gust)
+        height += 0.01 * speed
+        place[i, 2] = height
+    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(time), 1))
+    log = log_at(time, pos_w=place, quat_wb=level, thrust_command=thrust)
+    (row,) = thrust_checks.look(log)
+    assert (row.topic, row.verdict) == ("delay", "ok")
+    early = with_channels(log, thrust_command=Channel(time - 0.4, thrust, "N"))
+    assert [row.verdict for row in thrust_checks.look(early)] != ["ok"]
+
+
+@mark.parametrize(("turned_deg", "exchanged"), [(0.0, False), (50.0, False), (90.0, True)])
+def test_an_accelerometer_that_its_own_axes_fit_is_not_exchanged(turned_deg, exchanged):
+    """Half a quarter turn is no exchange: what fits a little worse as it is belongs there."""
+    time = np.arange(0.0, 30.0, 0.01)
+    turns = np.outer(time, [1.9, 2.3, 1.1]) + [0.0, 1.0, 2.0]
+    vel = np.sin(turns)
+    acc = np.gradient(vel, time, axis=0) + [0.0, 0.0, G]
+    thrust = acc + 0.4 * vel  # against the rotors' drag
+    turn = upright(thrust / norm(thrust, axis=1, keepdims=True), [1.0, 0.0, 0.0])
+    force = turn.inv().apply(acc) + default_rng(4).normal(0.0, 0.2, acc.shape)
+    force = Rotation.from_euler("z", turned_deg, degrees=True).apply(force)
+    pos = np.cumsum(vel, axis=0) * 0.01
+    log = log_at(time, pos_w=pos, vel_w=vel, quat_wb=turn.as_quat(), acc_b=force)
+    assert ("acc_b fits as" in faults(log)) == exchanged

@@ -44,6 +44,9 @@ MEASUREMENTS = (
     Measurement("weigh the rope", "rope_mass", 1e-4, 120.0),  # the same, taken off its mount
     Measurement("tape the rope", "rope_length", 1e-3, 60.0),  # steel tape, to the payload's centre
     Measurement("gauge the payload", "payload_offset", 5e-4, 60.0),  # caliper
+    # still air by a thread beside the vehicle
+    Measurement("show that no air moves along x", "wind_x", 0.1, 60.0),
+    Measurement("show that no air moves along y", "wind_y", 0.1, 60.0),
     Measurement("read a barometer", "air_density", 3e-3, 60.0),  # 1 hPa and 0.5 K
     Measurement("tape between two markers", "frame_scale", 3e-4, 120.0),  # 1 mm in 3 m
 )

@@ -22,6 +22,7 @@ from visthrow.logs.mapping import TableMap, TimeColumn
 from visthrow.logs.readers.table import Table, logs_of
 from visthrow.logs.unit_names import UNITS, fitting_units
 
+_TIMES = ("s", "ms", "us", "ns")
 _STEP = (2e-4, 0.25)  # between two rows of a log [s]
 
 
@@ -140,9 +141,11 @@ def _clock(
     suffix = f"1/{rate[1]} s" if rate else ""
     if suffix not in UNITS:
         suffix = stated_unit or unit_by_name(name)
-    fitting = fitting_units(step, ("s", "ms", "us", "ns"), *_STEP)
-    unit = suffix if UNITS.get(suffix, ("",))[0] == "s" else next(iter(fitting), "s")
-    if not suffix and len(fitting) != 1:
+    fitting = fitting_units(step, _TIMES, *_STEP)
+    denied = fitting and suffix in _TIMES and suffix not in fitting and not stated_unit
+    known = UNITS.get(suffix, ("",))[0] == "s" and not denied
+    unit = suffix if known else next(iter(fitting), "s")
+    if denied or not suffix and len(fitting) != 1:
         proposal.questions.append(
             f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'};"
             f" '{unit}' is a guess"
@@ -220,8 +223,8 @@ def _judge_thrust(log: FlightLog, proposal: MappingProposal, weighed: float | No
     if not unit:
         proposal.questions.append(
             f"{thrust} carries {carried:.3g} kg in {entry.unit}, and the vehicle weighs"
-            f" {weighed:g} kg: no unit explains that; is it of one motor, of another vehicle, or no"
-            " force?"
+            f" {weighed:g} kg: no unit explains that; is it of one motor, of another vehicle, or a"
+            " share of the full thrust (channel throttle)?"
         )
         return
     proposal.why[entry.name] += f"; {unit} by the mass: it carries {masses[unit]:.4g} kg"

@@ -176,7 +176,8 @@ class Selector:
             tried = self._tried(self.best.point, shortlist)
             leads |= dict.fromkeys(shortlist, -np.inf)
             leads |= {t.chosen: t.lead for t in tried}
-            near += [t for t in tried if t.lead > -STRONG and self.is_admissible(t)]
+            possible = [t for t in tried if t.lead > -self._limit(t.chosen)]
+            near += [t for t in possible if self.is_admissible(t)]
             better = [t for t in near if t.lead > ENOUGH_NATS and t.chosen not in self._visited]
             if better:
                 best = max(t.lead for t in better)
@@ -196,7 +197,7 @@ class Selector:
         """
         earlier = self._visited - {self.best.chosen}
         for chosen, nats in self._simulated.items():
-            if chosen in earlier and nats > -STRONG:
+            if chosen in earlier and nats > -self._limit(chosen):
                 near.append(Trial(chosen, self.best.point, lead=nats))
         near.sort(key=lambda t: -t.lead)
         self.window = [(self.best, 0.0), *((t, -t.lead) for t in near)]
@@ -242,10 +243,28 @@ class Selector:
                 move = chosen ^ present
                 parts = (nats for part, nats in shortfalls.items() if part < move)
                 expected[chosen] = promised - max(parts, default=0.0)
-        margin = WINDOW if len(tried) < SIDE_BY_SIDE else STRONG
         ranked = sorted(expected, key=expected.get, reverse=True)[: 3 * SIDE_BY_SIDE]
-        close = [s for s in ranked if expected[s] > max(minimum, -min(margin, self._doubt(s)))]
+        close = []
+        for s in ranked:
+            margin = WINDOW if len(tried) < SIDE_BY_SIDE else self._limit(s)
+            if expected[s] > max(minimum, -min(margin, self._doubt(s))):
+                close.append(s)
         return close[: 1 if self.problem.model.device == "cpu" else SIDE_BY_SIDE]
+
+    def _limit(self, chosen: Names) -> float:
+        """Return by how many nats a set may be behind the best and still be possible: strongly, or
+        by a part of what an effect is worth that it replaces by another of its group.
+        """
+        best = self.best
+        replaced = best.chosen - chosen
+        new = chosen - best.chosen
+        effects = self.problem.effects
+        groups = {effects[j].alike for c in replaced | new for j in c.columns}
+        if len(replaced) != 1 or len(new) != 1 or len(groups) != 1 or "" in groups:
+            return STRONG
+        nats = best.point.evidence(best.columns)
+        nats -= best.point.evidence(columns_of(best.chosen - replaced))
+        return min(WINDOW, STRONG + INEXACT * nats)
 
     def _doubt(self, chosen: Names) -> float:
         """Return by how many nats the linear value of a set may be wrong: strongly, and by a part

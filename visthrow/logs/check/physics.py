@@ -402,10 +402,13 @@ def _exchanged_body(expected_b: Samples, force_b: Samples, channels: str) -> Row
     grid = time[known]
     if len(grid) < 50:
         return None
-    measured = Samples(grid, relations.mean_over(*force_b, grid, 2.0 * _SPAN))
-    expected = Samples(grid, expected_b.values[known])
+    level = np.array([1.0, 1.0, 0.0])
+    measured = Samples(grid, level * relations.mean_over(*force_b, grid, 2.0 * _SPAN))
+    expected = Samples(grid, level * expected_b.values[known])
     relation = relations.relate(expected, measured, reach=_DELAY_BAD)
     if relation is None or relation.nats < _NATS or relation.axes_correlation < _CORRELATED:
+        return None
+    if relation.correlation > BELONGS:  # other axes would leave none: an attitude that is late
         return None
     figures = {"axes": relation.axes, "of": "acc_b", "nats": relation.nats}
     return Row("frames", channels, "bad", f"acc_b fits as {_better(relation)}", figures)

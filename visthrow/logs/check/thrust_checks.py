@@ -11,6 +11,7 @@ from visthrow.common.rotations import rotate_back
 from visthrow.logs.check import relations
 from visthrow.logs.check.physics import (
     CLEARLY,
+    FIRMLY,
     GRAVITY,
     MOVES,
     accelerations,
@@ -51,7 +52,6 @@ _DELAYS = np.arange(-0.2, 0.4001, 0.01)  # that are tried [s]
 _LATEST = 0.16  # motors and their filters take 0 to 0.12 s [s]
 _OF_MOTORS = (_DELAYS > -0.005) & (_DELAYS < _LATEST)  # delays that motors have
 _MOTORS = 0.07  # what they usually take [s]
-_CLEARER = 0.04  # of correlation, by which a delay that no motor has must be better
 MASS_WARN = 0.15  # of the logarithm of thrust over weight: more than a battery's charge makes
 MASS_BAD = 1.0  # likewise: another unit or map
 IDLE_PULSE = 1000.0  # length of a pulse at which a motor stands [us]
@@ -172,7 +172,9 @@ def _following(name: str, measurement: str, curve: np.ndarray, against: float) -
         "nats_against": against,
         "felt_by": measurement,
     }
-    if best > max(_FOLLOWS, peak + _CLEARER):
+    # a controller that answers gusts makes its thrust late for them, but never firmly
+    needed = FIRMLY if peak >= _FOLLOWS else _FOLLOWS
+    if best > max(needed, peak + CLEARLY):
         delay = _DELAYS[np.argmax(curve)]
         way = "late" if delay < _MOTORS else "early"
         text = (
