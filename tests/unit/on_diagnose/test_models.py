@@ -3,6 +3,7 @@ parameters found again.
 """
 
 import json
+import re
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
@@ -30,6 +31,7 @@ from visthrow.diagnose.models.quadrotor.flyer import FlyerModel
 from visthrow.diagnose.models.quadrotor.flyer_params import CableParams, FlyerParams, TorqueParams
 from visthrow.diagnose.models.quadrotor.imu import ImuModel, ImuParams
 from visthrow.diagnose.models.stand import StandModel, StandParams
+from visthrow.diagnose.reporting.diagnosis_report import summary
 from visthrow.diagnose.reporting.gain import on_others
 from visthrow.diagnose.select import diagnose_flights, result
 from visthrow.logs.export import export
@@ -294,6 +296,15 @@ class TestFlyer:
         assert found["wind_x"].verdict == found["frame_tilt_y"].verdict == result.CLASS
         assert found["wind_x"].estimate == approx(4.0, rel=0.1)
         assert "frame_tilt_y" in found["wind_x"].partners
+
+    def test_a_flight_whose_thrust_differs_says_what_and_by_how_much(self):
+        logs = [fly(6.0, gain=(1.0, 1.0, 1.0, 0.93)[i], seed=i) for i in range(4)]
+        model = FlyerModel(logs, replace(FLYER, command_delay=LATE))
+        model.choose(["thrust_gain", "thrust_curve", "rotor_drag_xy", "cmd_delay"])
+        text = summary(diagnose_flights.explain(model, laws=False))
+        event = next(line for line in text.splitlines() if line.startswith("EVENT"))
+        size = re.fullmatch(r"EVENT +flight 3 differs from the others in thrust_gain by (.+)", event)
+        assert float(size[1]) == approx(-0.07, abs=0.005)
 
     def test_motor_gains_from_rates(self):
         """Rates of closed form: one motor weaker by a tenth turns the vehicle as rigid-body

@@ -17,6 +17,7 @@ from visthrow.diagnose.reporting.blind import Blind
 from visthrow.diagnose.reporting.gain import Gain, LandingGain
 from visthrow.diagnose.select import result
 from visthrow.diagnose.select.result import ChannelGain, Diagnosis
+from visthrow.diagnose.select.scatter import unit_suffix
 from visthrow.view.parts import Grid, Picture, Section, Text, section
 
 OPEN = (result.CLASS, result.NOT_IDENTIFIABLE)
@@ -119,9 +120,16 @@ def landing_sentence(landing: LandingGain) -> str:
 
 
 def _event(diagnosis: Diagnosis, flight: int) -> str:
-    """Return what happened in a flight: in one that was left out, or in one with a window far
-    rougher than its phase.
+    """Return what happened in a flight: in one that was left out, one with a size of its own, or
+    one with a window far rougher than its phase.
     """
+    differs = []
+    for name, size in diagnosis.alone.items():
+        effect, _, number = name.partition(" in flight ")
+        if number == str(flight):
+            differs.append(f"{effect} by {size:+.3g}{unit_suffix(diagnosis[effect].unit)}")
+    if differs:
+        return f"flight {flight} differs from the others in {', '.join(differs)}"
     if diagnosis.work is not None and flight in {w.flight for w in diagnosis.work.after.windows}:
         return (
             f"something happened in flight {flight} that the rest of its phase does not show; there"

@@ -195,6 +195,8 @@ class Diagnosis:
     levels: tuple[Level, ...] = ()
     laws: tuple[Law, ...] = ()  # terms outside the catalogue, best first
     events: tuple[int, ...] = ()  # flights in which something happened once
+    # by how much effects of a single flight differ there, as "thrust_gain in flight 3"
+    alone: dict[str, float] = field(default_factory=dict)
     duplicates: Mapping[int, int] = field(
         default_factory=dict
     )  # flight -> the earlier flight that it repeats

@@ -55,6 +55,7 @@ from visthrow.diagnose.select.scatter import (
     by_day,
     freed,
     judged,
+    own_shares,
     relinearised_per_flight,
     unit_suffix,
 )
@@ -78,6 +79,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
     if overall == result.UNKNOWN:
         explanations, unrepeated = _explanations(selection)
         reasons = [unrepeated, *reasons[1:]] if unrepeated else reasons
+    alone = _sizes_alone(selection.best.chosen, point)
     point = terms.without_laws(point)
     nominal = terms.without_laws(selection.nominal)
     problem = point.problem
@@ -108,6 +110,7 @@ def conclude(selection: Selector, commands: Scatter | None = None) -> Diagnosis:
         levels=block_levels,
         laws=_different(explanations),
         events=_events(selection, point),
+        alone=alone,
         sensor_scale=dict(zip(model.channels, point.noise.scale.tolist())),
         scatter=_with_means(scatter, means),
         mistakes=tuple(model.mistakes),
@@ -317,6 +320,14 @@ def _different(explanations: Sequence[Sequence[Law]]) -> tuple[Law, ...]:
         for law in together:
             laws.setdefault(law.formula, law)
     return tuple(laws.values())
+
+
+def _sizes_alone(chosen: Names, point: Point) -> dict[str, float]:
+    """Return by how much each effect of one flight alone differs there from all flights' size."""
+    shares = own_shares(point.plain, point.theta, point.varies) * point.problem.priors.floor
+    row = {flight: i for i, flight in enumerate(point.plain.flights.tolist())}
+    events = [c for c in chosen if c.group == EVENT]
+    return {c.name: float(shares[row[c.flight], c.columns[0]]) for c in events}
 
 
 def _events(selection: Selector, point: Point) -> tuple[int, ...]:
