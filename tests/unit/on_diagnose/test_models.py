@@ -303,7 +303,9 @@ class TestFlyer:
         model.choose(["thrust_gain", "thrust_curve", "rotor_drag_xy", "cmd_delay"])
         text = summary(diagnose_flights.explain(model, laws=False))
         event = next(line for line in text.splitlines() if line.startswith("EVENT"))
-        size = re.fullmatch(r"EVENT +flight 3 differs from the others in thrust_gain by (.+)", event)
+        size = re.fullmatch(
+            r"EVENT +flight 3 differs from the others in thrust_gain by (.+)", event
+        )
         assert float(size[1]) == approx(-0.07, abs=0.005)
 
     def test_motor_gains_from_rates(self):

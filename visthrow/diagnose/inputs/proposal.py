@@ -145,7 +145,7 @@ def _clock(
     denied = fitting and suffix in _TIMES and suffix not in fitting and not stated_unit
     known = UNITS.get(suffix, ("",))[0] == "s" and not denied
     unit = suffix if known else next(iter(fitting), "s")
-    if denied or not suffix and len(fitting) != 1:
+    if denied or (not suffix and len(fitting) != 1):
         proposal.questions.append(
             f"time '{name}': a step of {step:g} fits the units {', '.join(fitting) or 'of none'};"
             f" '{unit}' is a guess"
