@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 
 from sim.kernels.quadrotor.rigid_body import angular_acceleration, quat_rate
-from sim.kernels.rope.chain import tangent_basis, viscous
+from sim.kernels.rope.chain import tangent_basis
 from sim.solvers import World
 
 
@@ -52,7 +52,7 @@ def free(p: Any, rope: Any, rot: Any, w: Any, force_b: Any, torque_b: Any, g: An
 @wp.func
 def damping_of(c: Any, n: Any, u: Any, neighbour_n: Any, neighbour_u: Any):
     """Damping c of the joint to a neighbouring rod, as a force on ``n'``."""
-    return c * (viscous(n, neighbour_n, neighbour_u) - u)
+    return c * (wp.cross(wp.cross(neighbour_n, neighbour_u), n) - u)
 
 
 class TreeSolver:

@@ -78,12 +78,6 @@ def tangent_basis(n: Any):
 
 
 @wp.func
-def viscous(n: Any, neighbour_n: Any, neighbour_u: Any):
-    """Angular velocity ``n' x u'`` of a neighbouring rod, crossed into n."""
-    return neighbour_u * wp.dot(neighbour_n, n) - neighbour_n * wp.dot(neighbour_u, n)
-
-
-@wp.func
 def growing(rope: Any, u: Any):
     """Coriolis acceleration ``2 l' u`` of the lower end of a rod that lengthens."""
     return (type(rope.strain_rate)(2.0) * rope.strain_rate * rope.segment_length) * u
@@ -202,28 +196,33 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
         b = vec3()
         ni = direction(n, n2, L - 1)
         ui = rate(u, k1, h, L - 1)
-        n_below = ni
-        u_below = ui
+        spin = wp.cross(ni, ui)
+        spin_below = spin  # as if a joint there stood still
         for step in range(L):
             i = L - 1 - step
             m, c, inertia = rods.rod(rope, i)
             n_above = ni
             u_above = ui
-            damping = rods.upper_damping(rope, i)
-            couple = wp.cross(root_rate_w, ni) - ui
-            above = couple
+            spin_above = root_rate_w
             if i > 0:
                 n_above = direction(n, n2, i - 1)
                 u_above = rate(u, k1, h, i - 1)
-                couple = viscous(ni, n_above, u_above) - ui
+                spin_above = wp.cross(n_above, u_above)
+            couple = wp.cross(spin_above + spin_below, ni) - two * ui
+            damping = rods.upper_damping(rope, i)
             if i < L - 1:
-                couple += viscous(ni, n_below, u_below) - ui
                 damping += rope.joint_damping
             speed2 = wp.dot(ui, ui)
-            a_n = sym_mul(d, o, ni)
+            tip_acc = -(l * speed2) * ni  # of the lower end, beside what a and beta give it
             f = m * gravity
             cm = c * m
-            g = c * f - l * b + (l2 * speed2) * a_n + rope.joint_damping * couple
+            if wp.static(giving):
+                if rope.compliance != real(0.0):  # lanes of a replay differ in it
+                    growth = growing(rope, ui)
+                    tip_acc += growth
+                    f -= (m * rods.centre_share(rope, i)) * growth
+            b += sym_mul(d, o, tip_acc)
+            g = c * f - l * b + rope.joint_damping * couple
             if wp.static(second):
                 g += (
                     gh * stiffness[i] * ui
@@ -234,13 +233,7 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             g = rods.with_load(i, g, rope.payload_arm, load)
             if wp.static("mount_damping" in extensions):
                 if i == 0:
-                    g += rope.mount_damping * above
-            if wp.static(giving):
-                if rope.compliance != real(0.0):  # lanes of a replay differ in it
-                    growth = growing(rope, ui)
-                    share = rods.centre_share(rope, i)
-                    g = g - l * sym_mul(d, o, growth) - (cm * share) * growth
-                    b = b + sym_mul(d, o, growth) + (m * share) * growth
+                    g += rope.mount_damping * (wp.cross(root_rate_w, ni) - ui)
             e1, e2 = tangent_basis(ni)
             a_e1 = sym_mul(d, o, e1)
             a_e2 = sym_mul(d, o, e2)
@@ -249,35 +242,29 @@ def build_stage(t: Types, rods: SimpleNamespace, extensions: frozenset[str], sec
             s12 = l2 * wp.dot(e1, a_e2)
             s22 = effective + l2 * wp.dot(e2, a_e2)
             inv = real(1.0) / (s11 * s22 - s12 * s12)
-            s11 *= inv
-            s12 *= inv
-            s22 *= inv
             b1 = cm * e1 + l * a_e1
             b2 = cm * e2 + l * a_e2
+            # times the determinant: so neither waits for the division
             q1 = s22 * b1 - s12 * b2
             q2 = s11 * b2 - s12 * b1
             g1 = wp.dot(e1, g)
             g2 = wp.dot(e2, g)
-            h1 = s22 * g1 - s12 * g2
-            h2 = s11 * g2 - s12 * g1
-            b = (
-                b
-                - rods.with_load(i, f, real(1.0), load)
-                - speed2 * (cm * ni + l * a_n)
-                + h1 * b1
-                + h2 * b2
-            )
-            d = d + vec3(m, m, m) - wp.cw_mul(b1, q1) - wp.cw_mul(b2, q2)
-            o = o - vec3(
+            h1 = inv * (s22 * g1 - s12 * g2)
+            h2 = inv * (s11 * g2 - s12 * g1)
+            b += h1 * b1 + h2 * b2 - (cm * speed2) * ni - rods.with_load(i, f, real(1.0), load)
+            d = d + vec3(m, m, m) - inv * (wp.cw_mul(b1, q1) + wp.cw_mul(b2, q2))
+            o = o - inv * vec3(
                 b1[0] * q1[1] + b2[0] * q2[1],
                 b1[0] * q1[2] + b2[0] * q2[2],
                 b1[1] * q1[2] + b2[1] * q2[2],
             )
+            q1 *= inv
+            q2 *= inv
             c1[i] = q1
             c2[i] = q2
             hs[i] = vec2(h1, h2)
-            n_below = ni
-            u_below = ui
+            spin_below = spin
+            spin = spin_above
             ni = n_above
             ui = u_above
         return d, o, b

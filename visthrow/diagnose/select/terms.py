@@ -161,9 +161,8 @@ class Survey:
         values = values.reshape(transfer.shape[1], -1)
         latent_block = self.point.grams[w].latent_block
         acting = latent_block == LATENT_BLOCKS.index(level_block(block))
-        exerted = transfer[acting] @ values
-        square = (exerted**2).sum(0).reshape(count, columns).sum(1)
         loads = transfer @ values
+        square = (loads[acting] ** 2).sum(0).reshape(count, columns).sum(1)
         informed = (part.latent_information @ loads).reshape(-1, count, columns)
         score = (part.latent_score + part.latent_effects @ self.point.theta) @ loads
         cross = (loads.T @ part.latent_effects).reshape(count, columns, -1)
