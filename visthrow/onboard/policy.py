@@ -35,6 +35,10 @@ from visthrow.onboard.shipped import find_policy as find_policy
 FORMAT_VERSIONS = (1, 2)
 """Without and with an estimator."""
 
+NORMALIZER = ("normalizer_mean", "normalizer_std", "normalizer_eps")
+ESTIMATOR = "estimator_"
+"""Names in the file: of the normaliser, and what those of the estimator begin with."""
+
 RELATIVE_TOLERANCE = 1e-9
 """Two numbers of a contract are the same up to this: what a round trip through text or a unit
 conversion may cost.
@@ -173,19 +177,23 @@ class Policy:
             x = activation(F.linear(x, weight, bias))
         return F.linear(x, self.weights[-1], self.biases[-1])
 
-    def to(self, device: str | torch.device) -> "Policy":
-        """Return the policy with its tensors on another device."""
-        changed: dict[str, Any] = {
-            "weights": tuple(weight.to(device) for weight in self.weights),
-            "biases": tuple(bias.to(device) for bias in self.biases),
-        }
+    def tensors(self) -> dict[str, Tensor]:
+        """Return all numbers by their names in the file."""
+        named = {}
+        for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
+            named |= {f"layer{i}_weight": weight, f"layer{i}_bias": bias}
         if self.mean is not None and self.std is not None:
-            changed |= {"mean": self.mean.to(device), "std": self.std.to(device)}
+            eps = torch.tensor(self.eps, dtype=torch.float64)
+            named |= dict(zip(NORMALIZER, (self.mean, self.std, eps)))
         if self.estimator is not None:
             parts = self.estimator.parts()
-            moved = {name: part.to(device) for name, part in parts.items()}
-            changed["estimator"] = Estimator.of_parts(moved)
-        return replace(self, **changed)
+            named |= {f"{ESTIMATOR}{name}": part for name, part in parts.items()}
+        return named
+
+    def to(self, device: str | torch.device) -> "Policy":
+        """Return the policy with its tensors on another device."""
+        moved = {name: tensor.to(device) for name, tensor in self.tensors().items()}
+        return replace(self, **_fields_of(moved))
 
     def require(
         self,
@@ -240,16 +248,7 @@ class Policy:
             arrays = {"header": json_array(header)}
         except (TypeError, ValueError) as error:
             raise PolicyError(f"contract or made_by cannot be written as JSON: {error}") from error
-        for i, (weight, bias) in enumerate(zip(self.weights, self.biases)):
-            arrays[f"layer{i}_weight"] = weight.cpu().numpy()
-            arrays[f"layer{i}_bias"] = bias.cpu().numpy()
-        if self.mean is not None and self.std is not None:
-            arrays["normalizer_mean"] = self.mean.cpu().numpy()
-            arrays["normalizer_std"] = self.std.cpu().numpy()
-            arrays["normalizer_eps"] = np.array(self.eps)
-        if self.estimator is not None:
-            for name, part in self.estimator.parts().items():
-                arrays[f"estimator_{name}"] = part.cpu().numpy()
+        arrays |= {name: tensor.cpu().numpy() for name, tensor in self.tensors().items()}
         savez(path, arrays)
 
     @staticmethod
@@ -259,35 +258,16 @@ class Policy:
         Raises PolicyError if the file is missing, cut short, of another version or incomplete, or
         contradicts itself."""
         arrays = loadz(path, PolicyError, "a policy file written by `visthrow train`")
-
-        def take(name: str) -> Tensor:
-            if name not in arrays:
-                raise PolicyError(f"{path}: no entry '{name}'; {suggest(name, arrays)}")
-            return torch.from_numpy(arrays[name]).to(device)
-
-        header = _header(take("header").cpu().numpy(), path)
-        count = sum(name.startswith("layer") and name.endswith("_weight") for name in arrays)
-        further: dict[str, Any] = {}
         try:
-            if "normalizer_mean" in arrays:
-                further = {name: take(f"normalizer_{name}") for name in ("mean", "std", "eps")}
-                further["eps"] = float(further["eps"])
-            if header["format_version"] == FORMAT_VERSIONS[1]:
-                names = [name for name in arrays if name.startswith("estimator_")]
-                parts = {name.removeprefix("estimator_"): take(name) for name in names}
-                further["estimator"] = Estimator.of_parts(parts)
-            return Policy(
-                tuple(take(f"layer{i}_weight") for i in range(count)),
-                tuple(take(f"layer{i}_bias") for i in range(count)),
-                header["activation"],
-                header["contract"],
-                header["made_by"],
-                **further,
-            )
+            header = _header(arrays)
+            tensors = {
+                name: torch.from_numpy(array).to(device)
+                for name, array in arrays.items()
+                if name.startswith(("layer", *NORMALIZER, ESTIMATOR))
+            }
+            return Policy(**_fields_of(tensors), **header)
         except PolicyError as error:
-            raise (
-                PolicyError(f"{path}: {error}") if str(path) not in str(error) else error
-            ) from None
+            raise PolicyError(f"{path}: {error}") from error
 
     @staticmethod
     def from_actor_state(
@@ -387,25 +367,52 @@ def _check_shapes(policy: Policy) -> None:
         )
 
 
-def _header(array: np.ndarray, path: str | Path) -> dict[str, Any]:
+def _fields_of(tensors: Mapping[str, Tensor]) -> dict[str, Any]:
+    """Return the fields of a policy by :meth:`Policy.tensors`; raises PolicyError where one is
+    missing.
+    """
+    count = sum(name.startswith("layer") and name.endswith("_weight") for name in tensors)
+    fields: dict[str, Any] = {
+        "weights": tuple(_entry(tensors, f"layer{i}_weight") for i in range(count)),
+        "biases": tuple(_entry(tensors, f"layer{i}_bias") for i in range(count)),
+    }
+    if NORMALIZER[0] in tensors:
+        mean, std, eps = (_entry(tensors, name) for name in NORMALIZER)
+        fields |= {"mean": mean, "std": std, "eps": float(eps)}
+    parts = {
+        name.removeprefix(ESTIMATOR): part
+        for name, part in tensors.items()
+        if name.startswith(ESTIMATOR)
+    }
+    if parts:
+        fields["estimator"] = Estimator.of_parts(parts)
+    return fields
+
+
+def _entry(entries: Mapping[str, Any], name: str) -> Any:
+    if name not in entries:
+        raise PolicyError(f"no entry '{name}'; {suggest(name, entries)}")
+    return entries[name]
+
+
+def _header(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return activation, contract and made_by of a policy file."""
     try:
-        header: dict[str, Any] = from_json_array(array)
+        header: dict[str, Any] = from_json_array(_entry(arrays, "header"))
         version = header["format_version"]
     except (ValueError, KeyError, TypeError) as error:
-        raise PolicyError(f"{path}: its header is not readable: {error!r}") from error
+        raise PolicyError(f"its header is not readable: {error!r}") from error
     if version not in FORMAT_VERSIONS:
         readable = " and ".join(map(str, FORMAT_VERSIONS))
-        raise PolicyError(
-            f"{path}: format version {version}; this program reads versions {readable}"
-        )
+        raise PolicyError(f"format version {version}; this program reads versions {readable}")
     schema = {"activation": str, "contract": dict, "made_by": dict}
     for key, kind in schema.items():
         if not isinstance(header.get(key), kind):
             raise PolicyError(
-                f"{path}: no policy: header entry '{key}' is {header.get(key)!r}; expected a"
+                f"no policy: header entry '{key}' is {header.get(key)!r}; expected a"
                 f" {kind.__name__}"
             )
-    return header
+    return {key: header[key] for key in schema}
 
 
 def flattened(tree: Mapping[str, Any], sections: Collection[str] | None = None) -> dict[str, Any]:
